@@ -11,27 +11,27 @@ import argparse
 import itertools
 import math
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from sst_ros import demo
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import slices
 from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
-from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, free_figure, note, styled
-from sst_ros.recording import recording
-from sst_ros.report import reference_solution as truth
-from sst_ros.report.reference import of_samples
-from sst_ros.report.reference_solution import InitialValueProblem, ReferenceSolution
+from sst_ros.mechanism.geometry import Array
+from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, styled
+from sst_ros.report.reference_solution import (
+    InitialValueProblem,
+    ReferenceSolution,
+    solve_reference,
+)
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
@@ -42,17 +42,12 @@ from studies.control_loop import run_in_loop
 from studies.sampled_data import ORDERS, slope
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 RATES = (100, 200, 500, 1000, 2000, 5000, 10_000)
 """Control rates [Hz]."""
 
-NODE_RATES = (100, 500, 1000)
-"""Rates at which the nodes are run, too [Hz]."""
-
 START, MIDDLE, EXACT = "start", "middle", "exact"
-RUN_LOOP, NODES = "run loop", "nodes"
 HOLDS = (START, MIDDLE, EXACT)
 """What acts over a period: the torque at its start, at its middle, or the profile itself."""
 
@@ -66,25 +61,18 @@ SAME_ERROR = 1.05
 """Methods whose errors differ by less than this ratio have the same error."""
 
 COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad", "estimate_rad",
-           "tick_us", "core_share", "by")  # fmt: skip
+           "tick_us", "core_share")  # fmt: skip
 
 
-class ControlRun(NamedTuple):
-    """One point of the grid, with a sample at every tick."""
-
-    rate: int  # [Hz]
-    method: str
-    hold: str
-    times_ns: NDArray[np.int64]  # of the samples (n,)
-    states: Array  # quaternions and body rates (n, 7)
-    estimate: float  # error estimate of the integrator at the end [rad]
-    tick_s: float  # median processor time of a tick [s]
+Run = tuple[NDArray[np.int64], Array, float, float]
+"""Times of the samples (n,) [ns], quaternions and body rates (n, 7), error estimate at the end
+[rad], median processor time of a tick [s]."""
 
 
 def run_controlled(
-    scene: Scene, rate: int, method: str, hold: str, seconds: float, *, compiled: bool = True
-) -> ControlRun:
-    """Run a scene with torques at a control rate [Hz], a divisor of 1e9, over a time span [s].
+    scene: Scene, seconds: float, rate: int, method: str, hold: str, *, compiled: bool = True
+) -> Run:
+    """Run a scene with torques at a control rate [Hz], a divisor of 1e9, with a sample a tick.
 
     Raises:
         RunStopped: the run stopped early.
@@ -99,15 +87,13 @@ def run_controlled(
             return profile
         return profile.at((simulation.time_ns + shift_ns) / NANOSECONDS)
 
-    ticks = math.ceil(seconds * rate - 1e-6)
     fast = compiled and numba_version() is not None
     simulation = Simulation(scene, method, tolerance=TOLERANCE, compiled=fast)
+    ticks = math.ceil(seconds * rate - 1e-6)
     states, times = run_in_loop(simulation, torque, period_ns, ticks, warm=True)
-    rows = [(*state.quaternion, *state.body_rate) for state in states]
-    return ControlRun(
-        rate, method, hold, np.array([state.time_ns for state in states]), np.array(rows),
-        simulation.error_estimate, float(np.median(np.diff(times))),
-    )  # fmt: skip
+    times_ns = np.array([state.time_ns for state in states])
+    rows = np.array([(*state.quaternion, *state.body_rate) for state in states])
+    return times_ns, rows, simulation.error_estimate, float(np.median(np.diff(times)))
 
 
 @dataclass(frozen=True)
@@ -127,7 +113,7 @@ class ControlStudy:
         of that with held torques. Below, errors of either sign may cancel.
         """
         found = {}
-        for method, runs in self.rows[self.rows.by == RUN_LOOP].groupby("method", sort=False):
+        for method, runs in self.rows.groupby("method", sort=False):
             errors = runs.pivot(index="rate_Hz", columns="hold", values="largest_rad").sort_index()
             resolved = errors[EXACT] <= OWN_ERROR * errors.drop(columns=EXACT).min(axis=1)
             from_here_on = resolved[::-1].cummin()
@@ -136,7 +122,7 @@ class ControlStudy:
 
     def resolved(self, hold: str) -> DataFrame:
         """Rows of the run loop whose error is that of the hold."""
-        rows = self.rows[(self.rows.hold == hold) & (self.rows.by == RUN_LOOP)]
+        rows = self.rows[self.rows.hold == hold]
         return rows[rows.rate_Hz >= rows.method.map(self.least_rates)]
 
     def order(self, hold: str) -> float:
@@ -156,13 +142,11 @@ def control_study(
     rates: Sequence[int] = RATES,
     methods: Sequence[str] = tuple(METHODS),
     compiled: bool = True,
-    recorded: Callable[[int, str], ControlRun] | None = None,
     shown: bool = False,
 ) -> ControlStudy:
     """Run the grid, one point after another: processor times are those of a core that is free.
 
-    Rates whose period does not divide the spacing of the reference are left out. `recorded` runs
-    the nodes at one of NODE_RATES with a hold.
+    Rates whose period does not divide the spacing of the reference are left out.
 
     Raises:
         InputError: the scene has no torques of its own, or cannot start.
@@ -172,48 +156,43 @@ def control_study(
     if scene.torque is None:
         raise InputError(scene.name, [Problem("torque", None, "must be given")])
     problem = InitialValueProblem(scene)
-    reference = truth.solve_reference(problem)
+    reference = solve_reference(problem)
+
     whole = [rate for rate in rates if problem.interval_ns % (NANOSECONDS // rate) == 0]
-    points = list(itertools.product(whole, methods, HOLDS))
-    run = partial(run_controlled, scene, seconds=problem.seconds, compiled=compiled)
-    rows = [
-        row_of(problem, reference, run(*points[part.start]))
-        for part in slices(len(points), 1, f"{scene.name:<16}", shown)
-    ]
-    if recorded is not None:
-        pairs = itertools.product(NODE_RATES, (START, MIDDLE))
-        rows += [row_of(problem, reference, recorded(*pair), NODES) for pair in pairs]
-    return ControlStudy(scene.name, problem.seconds, reference, data_frame(rows, COLUMNS))
-
-
-def row_of(
-    problem: InitialValueProblem, reference: ReferenceSolution, run: ControlRun, by: str = RUN_LOOP
-) -> dict[str, Any]:
-    """Compare a run with the reference: a row with the keys of COLUMNS."""
-    chosen = np.isin(run.times_ns, problem.interval_ns * np.arange(problem.count + 1))
-    final, largest = problem.errors(run.states[chosen], reference.states)
-    values = (
-        problem.scene.name, run.rate, run.method, run.hold, final.orientation,
-        largest.orientation, run.estimate, 1e6 * run.tick_s, run.tick_s * run.rate, by,
-    )  # fmt: skip
-    return dict(zip(COLUMNS, values, strict=True))
+    points, rows = list(itertools.product(whole, methods, HOLDS)), []
+    for part in slices(len(points), 1, f"{scene.name:<16}", shown):
+        rate, method, hold = points[part.start]
+        times_ns, states, estimate, tick = run_controlled(
+            scene, problem.seconds, rate, method, hold, compiled=compiled
+        )
+        chosen = np.isin(times_ns, problem.interval_ns * np.arange(problem.count + 1))
+        final, largest = problem.errors(states[chosen], reference.states)
+        errors = final.orientation, largest.orientation
+        rows.append((scene.name, rate, method, hold, *errors, estimate, 1e6 * tick, tick * rate))
+    return ControlStudy(
+        scene.name,
+        problem.seconds,
+        reference,
+        data_frame(dict(zip(COLUMNS, row, strict=True)) for row in rows),
+    )
 
 
 def advice(study: ControlStudy) -> str:
     """Return what to change for a smaller error, from the grid."""
-    least_rates = study.least_rates.items()
-    late = "; ".join(f"{name}, below {rate:g} Hz," for name, rate in least_rates if rate > RATES[0])
-    largest = max(map(study.spread, (START, MIDDLE)))
-    if math.isinf(min(study.least_rates.values())) or largest > SAME_ERROR:
-        differ = f"the methods differ by up to {largest:.2g} times at the same rate"
+    rates, spread = study.least_rates, max(map(study.spread, (START, MIDDLE)))
+    if math.isinf(min(rates.values())) or spread > SAME_ERROR:
+        differ = f"the methods differ by up to {spread:.2g} times at the same rate"
         return f"{differ}: choose a finer method or tolerance first"
     held = [study.resolved(hold) for hold in (START, MIDDLE)]
     least = held[0].rate_Hz.min()
     start, middle = (rows[rows.rate_Hz == least].largest_rad.max() for rows in held)
+    late = "; ".join(
+        f"{name}, below {rate:g} Hz," for name, rate in rates.items() if rate > RATES[0]
+    )
     other, own_errors = ("other ", f"; {late} has errors of its own") if late else ("", "")
     return (
         "raise the rate or command the torque of the middle of the hold; do not change the method: "
-        f"at the same rate all {other}methods have the same error, to {100 * (largest - 1):.1g} %, "
+        f"at the same rate all {other}methods have the same error, to {100 * (spread - 1):.1g} %, "
         f"and at {least:g} Hz the middle gives {start / middle:.0f} times less than the "
         f"start{own_errors}"
     )
@@ -228,8 +207,7 @@ SCENES = ("example2", "friction")
 INTRODUCTION = """\
 # Control rate and accuracy
 
-Written by `python -m studies.control_rate`, `--nodes` for the rows of the nodes; all
-figures are from the machine and the date below.
+Written by `python -m studies.control_rate`; all figures are from the machine and the date below.
 
 A simulator in a control loop holds each torque over a control period. What the motion then differs
 from that under the continuous torques is the error of the hold, not that of the integrator. Each
@@ -240,51 +218,35 @@ is compared with the reference solution of the accuracy page. Theory: the error 
 period to the power 1 for the start, 2 for the middle (`studies/sampled_data.py`).
 
 Processor time is that of the thread of the run per tick, its median, with the making of the sample,
-without publishing it; a share of a core is that time the rate. The rows "nodes" are recorded runs
-of simulator, player and recorder in lockstep; their time is the mean wall time of a step.
+without publishing it; a share of a core is that time the rate.
 """
 
 
 def report(options: argparse.Namespace) -> bool:
-    """Study scenes; print each, and write control_rate.csv, .json, .md and figures."""
-    studies = []
+    """Study scenes; print the page, and write control_rate.csv, .json, .md and figures."""
+    studies: list[ControlStudy] = []
     for name in options.scene:
-        recorded = partial(record_run, name, options.out / "bags") if options.nodes else None
-        studies.append(control_study(scenes.load(name), recorded=recorded, shown=True))
-        print(section(studies[-1]), flush=True)
-        whole = data_frame(row for study in studies for row in records(study.rows))
-        publish(
-            options.out, "control_rate", csv=whole,
-            document={"rows": records(whole), "advice": {s.scene: advice(s) for s in studies}},
-            page=page(studies), figures={f"control_rate_{s.scene}": figure(s) for s in studies},
-        )  # fmt: skip
+        studies.append(control_study(scenes.load(name), shown=True))
+    rows = data_frame(row for study in studies for row in records(study.rows))
+    print(page(studies))
+    publish(
+        options.out, "control_rate", csv=rows, page=page(studies),
+        document={"rows": records(rows), "advice": {s.scene: advice(s) for s in studies}},
+        figures={f"control_rate_{s.scene}": figure(s) for s in studies},
+    )  # fmt: skip
     return True
 
 
-def record_run(name: str, folder: Path, rate: int, hold: str) -> ControlRun:
-    """Record a run of the nodes, and read it."""
-    bag = demo.empty_bag(folder, f"{name}_{rate}_{hold}")
-    demo.record(name, bag, rate=rate, hold=hold)
-    run = recording.read(bag)
-    reported = run.diagnostics
-    return ControlRun(
-        rate, reported.get("integrator", "auto"), hold, run.time_ns,
-        of_samples(Geometry.of(run.scene), run, slice(None))[:, :7],
-        float(reported.get("error_estimate", "nan")), 1e-6 * float(reported["step_mean_us"]),
-    )  # fmt: skip
-
-
 def grid(study: ControlStudy) -> DataFrame:
-    """Return errors and times as texts by rate and hold: of the methods, and of the nodes."""
+    """Return errors and times as texts by rate and hold."""
     rows = []
-    for (rate, hold, by), group in study.rows.groupby(["rate_Hz", "hold", "by"], sort=False):
+    for (rate, hold), group in study.rows.groupby(["rate_Hz", "hold"], sort=False):
         low, high = group.largest_rad.min(), group.largest_rad.max()
         error = f"{high:.3e}" if high < 1.001 * low else f"{low:.0e} to {high:.0e}"
         fast, slow = group.tick_us.min(), group.tick_us.max()
         rows.append({
             "rate [Hz]": f"{rate:g}",
             "torque": hold,
-            "by": by if by == NODES else f"{by}, {len(group)} methods",
             "largest error [rad]": error,
             "at the end [rad]": f"{group.final_rad.max():.1e}",
             "per tick [us]": f"{fast:.0f} to {slow:.0f}" if slow > 1.1 * fast else f"{slow:.0f}",
@@ -315,23 +277,19 @@ HOLD_NAMES = {
 @styled
 def figure(study: ControlStudy) -> Figure:
     """Draw the largest error over the control period and over the share of a core."""
-    figure = free_figure(12.0, 6.6)
+    figure = Figure(figsize=(12.0, 6.6))
     left, right = figure.subplots(1, 2, sharey=True)
-    figure.subplots_adjust(left=0.075, right=0.985, top=0.87, bottom=0.235, wspace=0.06)
-    rows = study.rows
-    loop, nodes = rows[rows.by != NODES], rows[rows.by == NODES]
+    loop = study.rows
     for (hold, method), group in loop.groupby(["hold", "method"], sort=False):
-        marker, colour = MARKERS[method][1], HOLD_NAMES[hold][0]
         group = group.sort_values("rate_Hz")
         error = np.maximum(group.largest_rad.to_numpy(), 1e-17)
-        given = {"color": colour, "marker": marker, "markerfacecolor": "none", "linewidth": 1.0}
+        look: Any = {"color": HOLD_NAMES[hold][0], "marker": MARKERS[method][1],
+                     "markerfacecolor": "none"}  # fmt: skip
         left.plot(1e3 / group.rate_Hz, error, markersize=5 + 2.5 * list(MARKERS).index(method),
-                  **{**given, "linewidth": 0.0 if hold != "exact" else 1.0})  # fmt: skip
-        right.plot(100.0 * group.core_share, error, markersize=7, **given)
-    left.plot(1e3 / nodes.rate_Hz, nodes.largest_rad, "*", color=INK, markersize=9)
+                  linewidth=float(hold == EXACT), **look)  # fmt: skip
+        right.plot(100.0 * group.core_share, error, markersize=7, linewidth=1.0, **look)
     for hold, power in ORDERS.items():
-        colour = HOLD_NAMES[hold][0]
-        group = loop[loop.hold == hold].sort_values("rate_Hz")
+        colour, group = HOLD_NAMES[hold][0], loop[loop.hold == hold].sort_values("rate_Hz")
         period = 1e3 / group.rate_Hz.to_numpy()
         line = group.largest_rad.to_numpy()[0] * (period / period[0]) ** power
         left.plot(period, line, color=colour, linewidth=1.6, zorder=1)
@@ -344,31 +302,24 @@ def figure(study: ControlStudy) -> Figure:
     right.set(xlabel="processor time of the run loop, share of a core [%]", **log)
     handles = [Line2D([], [], color=colour, label=name) for colour, name in HOLD_NAMES.values()]
     handles += [
-        Line2D([], [], color=INK, marker=MARKERS[method][1], linestyle="none",
-               markerfacecolor="none", label=method) for method in loop.method.unique()
+        Line2D([], [], color=INK, marker=MARKERS[method][1], linestyle="", label=method,
+               markerfacecolor="none") for method in loop.method.unique()
     ]  # fmt: skip
-    if len(nodes):
-        handles.append(Line2D([], [], color=INK, marker="*", linestyle="none", label="ROS nodes"))
-    figure.legend(handles=handles, loc="center", bbox_to_anchor=(0.5, 0.12), ncol=4, fontsize=9,
-                  frameon=False)  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     found, _, why = advice(study).partition(": ")
     title = f"{study.scene} over {study.seconds:g} s: {found}\n{textwrap.fill(why, 125)}"
     figure.suptitle(title, fontsize=12)
-    note(figure, provenance(), 200)
     return figure
 
 
 def page(studies: Sequence[ControlStudy]) -> str:
     """Write studies as one Markdown page."""
-    return "\n".join([INTRODUCTION, *map(section, studies), provenance(), ""])
-
-
-def section(study: ControlStudy) -> str:
-    """Write a study as a section of the page."""
-    return "\n".join([
-        f"## {study.scene}", "", f"![error against control period](control_rate_{study.scene}.png)",
-        "", *(f"- {line}" for line in findings(study)), "", markdown(grid(study)), "",
-    ])  # fmt: skip
+    lines = [INTRODUCTION]
+    for study in studies:
+        picture = f"![error against control period](control_rate_{study.scene}.png)"
+        lines += [f"## {study.scene}", "", picture, "", *(f"- {line}" for line in findings(study))]
+        lines += ["", markdown(grid(study)), ""]
+    return "\n".join([*lines, provenance(), ""])
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -376,7 +327,6 @@ def main(words: Sequence[str] | None = None) -> int:
     return run(
         report, "control_rate", DOCS, words,
         scene={"nargs": "+", "default": SCENES, "help": "with torques: names, or .yaml files"},
-        nodes={"action": "store_true", "help": "run the real nodes, too"},
     )  # fmt: skip
 
 

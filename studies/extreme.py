@@ -1,38 +1,222 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of stability: extreme cases, largest stable steps and stability regions."""
+"""The page of stability: runs of extreme cases and what they have to agree with, and regions.
+
+A method multiplies the solution of y' = lambda y by its stability function R(h lambda) a step; it
+is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and IV.3).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, replace
-from itertools import chain
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.errors import RunStopped, SstError
 from sst_ros.integration.codegen import numba_version
+from sst_ros.integration.compiled_method import Method
+from sst_ros.integration.methods import METHODS, Rosenbrock
+from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records
+from sst_ros.report.scene_summary import FAR, eigenvalues, stability_function, step_advice
+from sst_ros.scene import scene as scenes
+from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.state import Array
 from studies import DOCS, run, run_jobs
-from studies import extreme_runs as runs
-from studies import stability_limits as limits
-from studies.extreme_cases import LOOSE, catalogue
-from studies.extreme_runs import BATCH_TOLERANCE, FACTOR, LOOSER, SAME_ORIENTATION, CaseResult
-from studies.stability_limits import LargestStep
+from studies.control_loop import run_in_loop
+from studies.extreme_cases import LOOSE, Case, apart, catalogue
+
+LOOSER = 1e-4
+"""Tolerance at which the error estimate is checked where LOOSE resolves no error."""
+
+FACTOR = 10.0
+"""The error estimate must lie within this factor of the true error."""
+
+ROUNDING = 1e-12
+"""True errors below this [rad], or 100 times the estimate of the run at the default tolerance, are
+not resolved: then the estimate must not be above FACTOR times that either."""
+
+
+class CaseRun(NamedTuple):
+    """A simulation at its end, or the refusal and the simulation at its last state."""
+
+    simulation: Simulation | None
+    error: SstError | None
+
+    def same_as(self, other: CaseRun) -> bool:
+        """Whether both ended in the same bits, or with the same error."""
+        if self.simulation is None or other.simulation is None:
+            return False
+        ends = (self.simulation.state, str(self.error))
+        return ends == (other.simulation.state, str(other.error))
+
+
+class EstimateCheck(NamedTuple):
+    """True error and estimate at a loose tolerance [rad], None without such a run; a verdict."""
+
+    true: float | None
+    estimate: float | None
+    verdict: str
+    holds: bool = True
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """Result of a case; None for what was not run or has no value."""
+
+    name: str
+    group: str
+    difficulty: str
+    expected: str
+    bound: float
+    result: str  # what happened, in words
+    deviation: float | None = None  # from the truth
+    energy: float | None = None  # residual at the end relative to the energy
+    closure: float | None = None  # largest abs(r_k . t_k) at the end
+    estimate: float | None = None  # of the error of the orientation at the end [rad]
+    loose_error: float | None = None  # true error at a loose tolerance [rad]
+    loose_estimate: float | None = None  # its estimate [rad]
+    check: str = ""  # what the estimate was found to be, or why it cannot be checked
+    wall_s: float | None = None  # time of the interpreted run [s]
+    compiled_s: float | None = None  # time of the compiled run, compilation included [s]
+    same_bits: bool | None = None  # the compiled run ended in the same bits, or error
+    run_loop: bool | None = None  # so did that through the loop of the node
+    correct: bool = False  # the result is the truth, and the error estimate holds
+
+    @property
+    def passed(self) -> bool:
+        """The result is correct, and no run differs from the interpreted one."""
+        return self.correct and self.same_bits is not False and self.run_loop is not False
+
+
+def run_case(
+    case: Case, *, compiled: bool = False, tolerance: float | None = None, looped: bool = False
+) -> CaseRun:
+    """Run a case, also through the tick loop of the node; refusals are results.
+
+    A given tolerance allows steps of any length.
+    """
+    simulation = None
+    try:
+        simulation = Simulation(
+            case.scene(), case.integrator, tolerance=tolerance or 1e-10, compiled=compiled,
+            step_budget=WHOLE_MOTION_BUDGET,
+        )  # fmt: skip
+        if looped:
+            run_in_loop(simulation, case.torque_at, case.period_ns, case.steps)
+        elif not callable(case.torque) and tolerance is not None:
+            simulation.step(case.torque, case.steps * case.period_ns)
+        elif not callable(case.torque) and compiled:
+            simulation.steps(case.torque, case.period_ns, case.steps)
+        else:
+            for _ in range(case.steps):
+                simulation.step(case.torque_at(simulation), case.period_ns)
+    except SstError as error:
+        return CaseRun(simulation, error)
+    return CaseRun(simulation, None)
+
+
+def evaluate_case(case: Case, *, compiled: bool = True) -> CaseResult:
+    """Run a case, compare it with the truth, with the tick loop, and with its compiled run."""
+    jit = numba_version() is not None and (compiled or case.compiled_only)
+    began = time.perf_counter()
+    first = run_case(case, compiled=case.compiled_only and jit)
+    clock = "compiled_s" if case.compiled_only else "wall_s"
+    found: dict[str, Any] = {clock: time.perf_counter() - began}
+    deviation, correct, result = _judge(case, first)
+    check = estimate_check(case, first)
+    remarks = [result]
+    if first.simulation is not None:
+        found |= _measure_end(first.simulation)
+        if not case.compiled_only:
+            found["run_loop"] = first.same_as(run_case(case, looped=True))
+            remarks += [] if found["run_loop"] else ["the run loop differs"]
+            if jit:
+                began = time.perf_counter()
+                found["same_bits"] = first.same_as(run_case(case, compiled=True))
+                found["compiled_s"] = time.perf_counter() - began
+                remarks += [] if found["same_bits"] else ["the compiled run differs"]
+    remarks += [] if check.holds else [f"error estimate: {check.verdict}"]
+    return CaseResult(
+        case.name, case.group, case.difficulty, case.expected, case.bound, "; ".join(remarks),
+        deviation=deviation, correct=correct and check.holds, loose_error=check.true,
+        loose_estimate=check.estimate, check=check.verdict, **found,
+    )  # fmt: skip
+
+
+def _judge(case: Case, done: CaseRun) -> tuple[float | None, bool, str]:
+    """Compare the end of a run with the truth: deviation, whether it is correct, and words."""
+    simulation, error = done
+    if error is not None:
+        result = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+        correct = type(error).__name__ == case.refusal
+        if correct and case.stop_time is not None and isinstance(error, RunStopped):
+            exact = case.stop_time()
+            late = abs(error.time - exact)
+            result += f" ({late:.1e} s off)"
+            correct = late <= 1e-6 * exact + 1e-15
+        return None, correct, result
+    if simulation is None or case.deviation is None:
+        return None, False, "finished"
+    deviation = float(case.deviation(case, simulation))
+    return deviation, deviation <= case.bound, "finished"
+
+
+def _measure_end(simulation: Simulation) -> dict[str, float]:
+    began = *initial_state(simulation.scene, simulation.geometry), 0.0, 0.0, 0.0
+    energies = map(simulation.dynamics.total_energy, (simulation.sample[0], began))
+    return {
+        "energy": abs(simulation.energy_residual) / max(*map(abs, energies), 1e-300),
+        "closure": simulation.closure_residual,
+        "estimate": simulation.error_estimate,
+    }
+
+
+def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
+    """Compare the error estimate with the true error, by the run at the default tolerance."""
+    if accurate.error is not None or accurate.simulation is None:
+        held = "its time is held to theory" if case.stop_time else "there is no motion"
+        return EstimateCheck(None, None, f"none: the run is refused, {held}")
+    if case.loose is None:
+        return EstimateCheck(None, None, f"none: {case.estimate}")
+    unresolved = None
+    for tolerance in dict.fromkeys((case.loose, max(case.loose, LOOSER))):
+        loose = run_case(case, tolerance=tolerance).simulation
+        if loose is None or loose.time_ns != accurate.simulation.time_ns:
+            break
+        true, estimate = apart(loose, accurate.simulation), loose.error_estimate
+        resolved = max(ROUNDING, 100.0 * accurate.simulation.error_estimate)
+        if true >= resolved:
+            holds = true / FACTOR <= estimate <= FACTOR * true
+            words = f"{estimate / true:.2g} of the true error at a tolerance of {tolerance:g}"
+            words += f"; {case.estimate}" if case.estimate else ""
+            return EstimateCheck(true, estimate, words, holds)
+        if true == 0.0 == estimate:
+            return EstimateCheck(0.0, 0.0, "both are zero: it rests")
+        words = f"true error below {resolved:.0e} rad, which is not resolved; so is the estimate"
+        holds = estimate <= FACTOR * resolved
+        unresolved = unresolved or EstimateCheck(true, estimate, words, holds)
+    return unresolved or EstimateCheck(None, None, "there is no run at a loose tolerance", False)
+
 
 INTRODUCTION = f"""\
 # Stability
 
-Written by `python -m studies.extreme --long`; all figures are from the machine and the
-date below. Without `--long` the cases of 1e5 s and of a thousand contacts are left out.
+Written by `python -m studies.extreme --long`, on the machine and the date below. Without `--long`
+the cases of 1e5 s and of a thousand contacts are left out.
 
 Each case is run by `Simulation` interpreted, a control period a call; through the run loop of the
 simulator node; and compiled, in as few calls as possible. It passes if its result is that of theory
 within the bound, or the named error where the motion must end, and if all runs end in the same
-bits. The column "batch" is a run by `Batch` with DOP853, a step a control period, in which all
-cases with the same terms are scenarios of one batch: it must have the bits of fixed steps of the
-case's own scene, and where its local error estimate stays below {BATCH_TOLERANCE:g} the end of the
-simulation too, to {SAME_ORIENTATION:g}, or its limit within a step. Torques that read the state
-cannot be a batch. Energy is the energy residual relative to the energy. Times include the making of
-the scene, those of compiled runs compilation too; cases marked "compiled only" would take hours in
-plain Python.
+bits. Energy is the energy residual relative to the energy. Times include the making of the scene,
+those of compiled runs compilation too; "compiled only" would take hours in plain Python.
 
 The error estimate must lie within a factor {FACTOR:g} of the true error, or the column "estimate"
 gives the reason why there is nothing to compare. The case is run at the tolerance {LOOSE:g}, or at
@@ -43,80 +227,44 @@ estimate of an error that is not resolved must not be above {FACTOR:g} times wha
 
 
 def report(out: Path, *, long: bool = False) -> bool:
-    """Run all cases, find the largest steps, print it all and write it into `out`.
+    """Run all cases, print the page, and write it with stability.csv, .json and the picture.
 
-    Files: stability.csv, .json, .md, and stability_regions.png. With `long` the cases that
-    take minutes even compiled are run, too. The result is whether every case passed.
+    With `long` the cases that take minutes even compiled are run, too. The result is whether every
+    case passed.
     """
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
-    cases = with_batches(run_jobs(_evaluate, jobs[::-1], "extreme cases   ")[::-1])
-    steps = limits.largest_steps(progress="largest steps   ")
-    print(page(cases, steps))
+    cases = run_jobs(_evaluate, jobs[::-1], "extreme cases   ")[::-1]
+    print(page(cases))
     table = data_frame(asdict(case) | {"passed": case.passed} for case in cases)
-    found = records(data_frame(step._asdict() for step in steps))
-    regions = limits.draw_regions(limits.scene_points(), provenance())
     publish(
-        out, "stability", csv=table, page=page(cases, steps),
-        document={"cases": records(table), "largest_stable_steps": found},
-        figures={"stability_regions": regions},
+        out, "stability", csv=table, page=page(cases), document={"cases": records(table)},
+        figures={"stability_regions": draw_regions(scene_points())},
     )  # fmt: skip
     return all(case.passed for case in cases)
 
 
 def _evaluate(number: int) -> CaseResult:
-    return runs.evaluate_case(catalogue()[number])
+    return evaluate_case(catalogue()[number])
 
 
-def with_batches(cases: Sequence[CaseResult]) -> list[CaseResult]:
-    """Add to results of cases those of the batches that they are scenarios of."""
-    if numba_version() is None:
-        return list(cases)
-    groups = runs.batch_groups(catalogue())
-    names = [catalogue()[number].name for number in chain.from_iterable(groups)]
-    found = chain.from_iterable(run_jobs(_batched, groups, "batches         "))
-    rows = dict(zip(names, found, strict=True))
-    return [
-        replace(case, batch=words, correct=case.correct and agrees)
-        for case in cases
-        for words, agrees in [rows.get(case.name, ("", True))]
-    ]
-
-
-def _batched(group: tuple[int, ...]) -> list[tuple[str, bool]]:
-    return runs.run_batch([catalogue()[number] for number in group])
-
-
-def summary(cases: Sequence[CaseResult]) -> str:
-    """Count the cases in a sentence."""
-    failed = sum(not case.passed for case in cases)
-    both = sum(case.same_bits is not None for case in cases)
-    loops = sum(case.run_loop is not None for case in cases)
-    batches = sum(bool(case.batch) for case in cases)
-    checked = sum(case.loose_error is not None for case in cases)
-    return (
-        f"{len(cases)} cases, {failed} failed; {both} run interpreted and compiled, {loops} "
-        f"through the run loop and {batches} as scenarios of a batch, with the same bits compared; "
-        f"error estimate checked in {checked}, the others give the reason."
-    )
-
-
-def page(cases: Sequence[CaseResult], steps: Sequence[LargestStep]) -> str:
+def page(cases: Sequence[CaseResult]) -> str:
     """Write the report as one Markdown page."""
-    parts = [INTRODUCTION, f"**{summary(cases)}**", ""]
+    failed, both, loops, checked = np.sum([
+        (not case.passed, case.same_bits is not None, case.run_loop is not None,
+         case.loose_error is not None) for case in cases
+    ], axis=0)  # fmt: skip
+    counts = (
+        f"{len(cases)} cases, {failed} failed; {both} run interpreted and compiled, and {loops} "
+        f"through the run loop, with the same bits compared; error estimate checked in {checked}, "
+        "the others give the reason."
+    )
+    parts = [INTRODUCTION, f"**{counts}**", ""]
     parts += ["## Regions of absolute stability", "",
               "![regions of absolute stability](stability_regions.png)", "",
               "The marks are the eigenvalues of the linearised scenes at their start, times the "
-              "step that `scene show` recommends.", "",
-              *(f"- {line}." for line in limits.limits_of_theory()), ""]  # fmt: skip
-    parts += ["## Largest stable steps", "",
-              "In milliseconds, in brackets times the largest modulus of the eigenvalues. The "
-              "damped family is `stiff` with other viscous coefficients [N m s/rad]; the "
-              "oscillating one is the star of `example2_heavy` on springs [N m/rad]. A step "
-              "counts as stable if rates do not grow tenfold in 400 steps: growth as weak as that "
-              "of dopri5 on the imaginary axis beyond 0.997 i is not seen.", ""]  # fmt: skip
-    for family in ("decay", "oscillation"):
-        parts += [f"### {family.capitalize()}", "", markdown(limits.step_table(steps, family)), ""]
-    parts += ["## Cases", ""]
+              "step that `scene show` recommends. Steps at the ends of the intervals are tested on "
+              "`stiff` and on a star that swings on springs.", "",
+              *(f"- {line}." for line in limits_of_theory()), "", "## Cases", ""]  # fmt: skip
     for group in dict.fromkeys(case.group for case in cases):
         own = [case for case in cases if case.group == group]
         parts += [f"### {group}", "", markdown(data_frame(map(_row, own))), ""]
@@ -143,8 +291,81 @@ def _row(case: CaseResult) -> dict[str, str]:
         "compiled [s]": number(case.compiled_s, ".2f"),
         "bits compiled": bits[case.same_bits],
         "run loop": bits[case.run_loop],
-        "batch": case.batch or "-",
     }  # fmt: skip
+
+
+def limits_of_theory() -> Iterator[str]:
+    """Yield where each method is stable on the axes, from its stability function."""
+    for name, method in METHODS.items():
+        if isinstance(method, Rosenbrock):
+            on_axis = _growth(method, 1j * np.geomspace(1e-3, 1e9, 100_000)).max()
+            far = _growth(method, np.array([FAR]))[0]
+            yield (
+                f"{name}: A-stable and L-stable; abs(R) is at most {on_axis:.15g} on the imaginary "
+                f"axis, all poles lie at z = {1.0 / method.gamma:.4g}, and abs(R({FAR:g})) = "
+                f"{far:.0e}"
+            )
+            continue
+        line = np.linspace(0.0, 10.0, 100_001)
+        real, imaginary = (
+            1e-4 * (np.flatnonzero(_growth(method, axis * line) > 1.0 + 1e-9)[0] - 1)
+            for axis in (-1.0, 1j)
+        )
+        yield (
+            f"{name}: stable for h lambda from -{real:.3f} to 0, and up to {imaginary:.3f} i on "
+            "the imaginary axis"
+        )
+
+
+def _growth(method: Method, z: NDArray[Any]) -> Array:
+    """Return abs(R(z))."""
+    return np.abs(stability_function(method, z.astype(np.complex128)))
+
+
+def scene_points() -> dict[str, NDArray[np.complex128]]:
+    """Eigenvalues of the shipped scenes times the steps that `step_advice` recommends."""
+    found = {}
+    for name in scenes.names():
+        step = step_advice(scenes.load(name)).step
+        if math.isfinite(step):
+            found[name] = step * eigenvalues(scenes.load(name))
+    return found
+
+
+@styled
+def draw_regions(points: Mapping[str, NDArray[np.complex128]]) -> Figure:
+    """Draw the regions of absolute stability, and by scene its eigenvalues times its step."""
+    x, y = np.linspace(-8.0, 2.0, 401), np.linspace(-6.0, 6.0, 401)
+    z = x[None, :] + 1j * y[:, None]
+    figure = Figure(figsize=(13.0, 8.0))
+    halves: Any = figure.subfigures(1, 2, width_ratios=(2.0, 1.0))
+    left, right = halves
+    panels = left.subplots(2, 2, sharex=True, sharey=True)
+    near, key = right.subplots(2, 1)
+    for axes, (name, method) in zip(panels.flat, METHODS.items(), strict=True):
+        colour, modulus = MARKERS[name][0], _growth(method, z)
+        axes.contourf(x, y, modulus, levels=[0.0, 1.0], colors=[colour], alpha=0.25)
+        axes.contour(x, y, modulus, levels=[1.0], colors=[colour], linewidths=1.8)
+        axes.set_title(f"{name}: stable where coloured")
+    colours = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK)
+    for k, (name, rates) in enumerate(points.items()):
+        shown = rates[(np.abs(rates.real + 3.0) <= 5.0) & (np.abs(rates.imag) <= 6.0)]
+        label = name if len(shown) == len(rates) else f"{name} (some beyond the axes)"
+        for axes in (*panels.flat, near):
+            axes.plot(shown.real, shown.imag, linestyle="", marker="osD^v<>phX*P"[k % 12],
+                      color=colours[(k + k // 12) % 6], markersize=6, markerfacecolor="none",
+                      label=label)  # fmt: skip
+    for axes in (*panels.flat, near):
+        axes.axhline(0.0, color=INK, linewidth=0.6)
+        axes.axvline(0.0, color=INK, linewidth=0.6)
+        axes.set(xlabel="Re hλ", ylabel="Im hλ")
+    for axes in panels.flat:
+        axes.label_outer()
+    near.set(xlim=(-0.6, 0.6), ylim=(-0.6, 0.6), title="Near the origin")
+    key.axis("off")
+    key.legend(*near.get_legend_handles_labels(), loc="upper left", ncols=2, frameon=False,
+               fontsize=8, title="hλ of the scenes at their start, step h as advised")  # fmt: skip
+    return figure
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -25,11 +25,15 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import INSTANTS, MODES
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import evaluate_tracking
+from sst_ros.plot.style import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
@@ -38,7 +42,6 @@ from sst_ros.sweeps.sweep_study import SampledControl
 from studies import DOCS, run, run_jobs
 from studies import control_loop as loops
 from studies.control_loop import SHARE, ControlLoop, ModelError, model_errors, run_loop
-from studies.feedforward_figure import draw_study
 from studies.sampled_data import ORDERS, slope
 
 if TYPE_CHECKING:
@@ -325,6 +328,101 @@ def page(study: FeedforwardStudy) -> str:
         at = "" if row.mode == OPEN_LOOP else f" at {row.bandwidth_rad_per_s:g} rad/s"
         lines.append(f"- [{number}] {row.error}, {row.mode}{at}: {row.failure}")
     return "\n".join([*lines, "", provenance(), ""])
+
+
+_LOOKS = ((GREY, "D"), (BLUE, "o"), (GREEN, "^"), (VERMILION, "s"), (ORANGE, "v"))
+MARKERS = dict(zip(MODES, _LOOKS, strict=True))
+"""Colour and marker of each mode."""
+
+_FAILED, _SPREAD = 12.0, 0.13
+
+
+@styled
+def draw_study(study: FeedforwardStudy, title: str) -> Figure:
+    """Draw a study: a panel of errors for each bandwidth, orders of the hold, and limits."""
+    figure = Figure(figsize=(12.5, 10.6))
+    figure.suptitle(title, fontsize=12)
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1.6, 1.0))
+    upper, lower = halves
+    bandwidths = study.plan.bandwidths
+    panels = upper.subplots(1, len(bandwidths), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, bandwidth in zip(panels, bandwidths, strict=True):
+        _errors(axes, study.loops, bandwidth)
+    holds, limits = lower.subplots(1, 2)
+    _holds(holds, study)
+    _limits(limits, study.limits)
+    marks = [*((mode, *look) for mode, look in MARKERS.items()), ("failed", INK, "x")]
+    handles = [
+        Line2D([], [], color=colour, marker=marker, linestyle="", label=name)
+        for name, colour, marker in marks
+    ]
+    upper.legend(handles=handles, loc="outside upper center", ncols=7, fontsize=9, frameon=False)
+    return figure
+
+
+def _errors(axes: Axes, loops: DataFrame, bandwidth: float) -> None:
+    names = list(loops.error.unique())
+    low, high = 0.5 * loops.rms_rad.min(), 2.0 * loops.rms_rad.max()
+    axes.set_xscale("log")
+    own = loops.bandwidth_rad_per_s
+    for loop in loops[(own == bandwidth) | own.isna()].itertuples():
+        colour, marker = MARKERS[loop.mode]
+        place = MODES.index(loop.mode)
+        y = names.index(loop.error) + (place - 2) * _SPREAD
+        if loop.failure:
+            x = high * _FAILED ** ((place + 0.5) / len(MODES))
+            axes.plot(x, y, marker, color=colour, markerfacecolor="white", markersize=5.5, zorder=3)
+            axes.plot(x, y, "x", color=INK, markersize=4, zorder=4)
+        else:
+            axes.plot(loop.rms_rad, y, marker, color=colour, markersize=5.5, zorder=3)
+    for row in range(len(names)):
+        axes.axhline(row + 0.5, color="#cccccc", linewidth=0.6)
+    axes.axvspan(high, high * _FAILED, color="#f4e3d7", linewidth=0)
+    axes.set(xlim=(low, high * _FAILED), ylim=(len(names) - 0.5, -0.5))
+    axes.set_yticks(range(len(names)), names)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="y", visible=False)
+    axes.set(title=f"feedback at {bandwidth:g} rad/s", xlabel="RMS error of γ [rad]")
+
+
+def _holds(axes: Axes, study: FeedforwardStudy) -> None:
+    """Error over period, each with the line of its theory through the shortest period."""
+    holds, unheld, orders = study.holds, study.unheld[0], study.orders()
+    for (at, group), colour, marker in zip(
+        holds.groupby("at", sort=False), (BLUE, VERMILION), ("o", "s"), strict=False
+    ):
+        x, y = 1e3 * group.period_s.to_numpy(), group.error.to_numpy()
+        order, theory = orders[at], ORDERS[at]
+        axes.plot(x, y[0] * (x / x[0]) ** theory, color=colour, linewidth=1.0)
+        axes.plot(x, y, marker, color=colour, markersize=7,
+                  label=f"torque at the {at} of the hold: order {order:.3f} "
+                        f"(line: {theory})")  # fmt: skip
+    axes.axhline(unheld, color=GREEN, linewidth=2.0, label=f"nothing held: {unheld:.0e} rad")
+    periods = 1e3 * np.unique(holds.period_s.to_numpy())
+    axes.set_xscale("log", base=2)
+    axes.set(yscale="log", ylim=(0.2 * unheld, 10.0 * holds.error.max()))
+    axes.set_xticks(periods, [f"{period:g}" for period in periods])
+    axes.set(xlabel="control period [ms]", ylabel="largest error of γ [rad]")
+    axes.set_title("Exact model, feedforward alone")
+    axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.33), fontsize=8.5)
+
+
+def _limits(axes: Axes, limits: DataFrame) -> None:
+    """Largest stable bandwidth over delay: theory as a line, simulations as markers."""
+    axes.set_title("computed_torque, exact model: stable below")
+    axes.set(xlabel="delay of the command [samples]", ylabel="largest stable bandwidth [rad/s]")
+    if limits.empty:
+        return
+    axes.fill_between(limits.delay, 1.0, limits.theory, color=GREEN, alpha=0.12, linewidth=0.0)
+    axes.plot(limits.delay, limits.theory, color=GREEN,
+              label="poles of the sampled double integrator")  # fmt: skip
+    axes.plot(limits.delay, limits.ideal, "^", color=GREEN, markersize=8,
+              label="simulated, without friction and lag")  # fmt: skip
+    axes.plot(limits.delay, limits.real, "o", color=BLUE, markersize=8, markerfacecolor="none",
+              label="simulated, the plant as it is")  # fmt: skip
+    axes.set(yscale="log", ylim=(0.5 * limits.theory.min(), 2.0 * limits.theory.max()))
+    axes.set_xticks(limits.delay)
+    axes.legend(loc="upper right", fontsize=8.5)
 
 
 def document(study: FeedforwardStudy) -> dict[str, Any]:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The study of the error estimate: a case of each class."""
+"""The studies of the error estimate and of orders: a case of each class, a method of each order."""
 
 import pytest
 
+from sst_ros.report.results import data_frame
 from studies.estimate import CLASSES, measure
+from studies.orders import ORDER, measure_steps, measure_tolerance, order_table
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -18,3 +20,17 @@ def test_the_estimate_holds_in_a_case_of_each_class(name):
 def test_a_case_depends_on_its_seed_and_number_alone():
     one, other = (measure(("jump", 5, 3)) for _ in range(2))
     assert one == other
+
+
+@pytest.mark.parametrize("method", ["rk4", "dopri5", "dop853", "gauss"])
+def test_a_method_has_its_order_on_a_smooth_motion(method):
+    table = order_table(data_frame(row._asdict() for row in measure_steps(("lag", method))))
+    found = float(table["order, shortest steps"][0])
+    assert ORDER[method] - 0.2 < found < 1.4 * ORDER[method]
+
+
+def test_events_and_samples_have_errors_below_the_tolerance():
+    for name in ("stop", "contact", "friction"):
+        rows = measure_tolerance((name, "dop853", 1e-7))
+        assert rows and all(row.known < row.error < 1e-7 for row in rows)
+    assert measure_tolerance(("contact", "gauss", 1e-7)) == []

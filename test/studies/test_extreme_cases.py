@@ -16,21 +16,12 @@ from models import inertia_of
 
 from sst_ros.dynamics import kernel
 from sst_ros.errors import AssemblyError, RunStopped, SingularConfiguration, SstError
-from sst_ros.integration.batch import Batch
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.scene.scene import Initial, load
 from sst_ros.simulation.simulation import Simulation
-from studies import extreme_runs
+from studies import extreme
+from studies.extreme import FACTOR, estimate_check, evaluate_case, run_case
 from studies.extreme_cases import LOOSE, Case, apart, catalogue, tight_end
-from studies.extreme_runs import (
-    FACTOR,
-    batch_groups,
-    compare_row,
-    estimate_check,
-    evaluate_case,
-    run,
-    run_batch,
-)
 from studies.extreme_scenes import (
     about_e,
     bouncing_thrice,
@@ -59,7 +50,7 @@ def finite(state):
 )
 def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
     began = time.perf_counter()
-    done = run(case)
+    done = run_case(case)
     assert time.perf_counter() - began < LONGEST
     if done.simulation is not None:
         assert finite(done.simulation.state)
@@ -72,7 +63,7 @@ def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
     assert check.holds, check.verdict
     if check.true is None:
         assert check.verdict.startswith("none: ")
-    elif check.true >= extreme_runs.ROUNDING:
+    elif check.true >= extreme.ROUNDING:
         assert check.true / FACTOR <= check.estimate <= FACTOR * check.true
     if isinstance(done.error, RunStopped):
         assert done.error.state is done.simulation.state
@@ -89,7 +80,7 @@ def test_a_tolerance_of_its_own_is_needed_where_it_is_given(case):
     """At LOOSE the estimate is off by more than the factor, as the reason states."""
     case = named(case)
     at_loose = replace(case, loose=LOOSE)
-    assert not estimate_check(at_loose, run(case)).holds
+    assert not estimate_check(at_loose, run_case(case)).holds
 
 
 def test_forty_contacts_multiply_differences():
@@ -108,19 +99,19 @@ def test_an_error_estimate_that_is_far_off_fails_a_case(monkeypatch):
     case = named("time x 10")
     good = evaluate_case(case, compiled=False)
     assert good.passed and good.run_loop and good.loose_error > 1e-3 * LOOSE
-    distance = extreme_runs.apart
+    distance = extreme.apart
     for factor in (0.01, 100.0):
-        monkeypatch.setattr(extreme_runs, "apart", lambda *ends, f=factor: f * distance(*ends))
+        monkeypatch.setattr(extreme, "apart", lambda *ends, f=factor: f * distance(*ends))
         bad = evaluate_case(case, compiled=False)
         assert not bad.passed and "of the true error" in bad.result
 
 
 def test_an_estimate_of_an_error_that_is_not_resolved_is_bounded(monkeypatch):
     case = named("base triangle of 0.1 rad")
-    done = run(case)
+    done = run_case(case)
     assert estimate_check(case, done).holds
     monkeypatch.setattr(Simulation, "error_estimate", 1e-9)
-    monkeypatch.setattr(extreme_runs, "ROUNDING", 1e-11)
+    monkeypatch.setattr(extreme, "ROUNDING", 1e-11)
     end = {name: getattr(done.simulation, name) for name in ("time_ns", "state")}
     accurate = SimpleNamespace(error_estimate=0.0, **end)
     assert not estimate_check(case, done._replace(simulation=accurate)).holds
@@ -135,7 +126,7 @@ LOOPED = (
 
 @pytest.mark.parametrize("name", LOOPED)
 def test_the_run_loop_ends_in_the_same_bits(name):
-    direct, looped = run(named(name)), run(named(name), looped=True)
+    direct, looped = run_case(named(name)), run_case(named(name), looped=True)
     assert looped.simulation.state == direct.simulation.state
     assert str(looped.error) == str(direct.error)
 
@@ -144,41 +135,10 @@ def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
     case = named("control period of 333333 ns")
     shorter = replace(case, steps=case.steps - 1)
     monkeypatch.setattr(
-        extreme_runs, "run", lambda case, looped=False, **_: run(shorter if looped else case)
+        extreme, "run_case", lambda case, looped=False, **_: run_case(shorter if looped else case)
     )
     bad = evaluate_case(case, compiled=False)
     assert not bad.passed and bad.run_loop is False and "the run loop differs" in bad.result
-
-
-GROUPS = batch_groups(CASES)
-
-
-def test_all_cases_can_be_a_batch_but_those_that_read_the_state_or_are_refused():
-    found = {CASES[number].name for group in GROUPS for number in group}
-    without = [case for case in CASES if case.name not in found]
-    assert len({case.name for case in CASES}) == len(CASES)
-    assert len(found) > 60 and len(GROUPS) < 10
-    assert all(case.feedback or case.refusal for case in without)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("group", GROUPS, ids=[CASES[group[0]].name for group in GROUPS])
-def test_cases_as_scenarios_of_a_batch(group):
-    pytest.importorskip("numba")
-    found = run_batch([CASES[number] for number in group])
-    assert [words for words, agrees in found if not agrees] == []
-
-
-@pytest.mark.slow
-def test_a_batch_of_another_motion_is_seen():
-    pytest.importorskip("numba")
-    case = named("actuator lag of 0.001 s")
-    assert run_batch([case]) == [("bits", True)]
-    batch = Batch(case.scene())
-    other = replace(case, torque=tuple(x * (1.0 + 1e-15) for x in case.torque))
-    assert compare_row(batch, 0, other, 1)[1]
-    later = {**case.changes, "actuators": {"time_constant": 1.1e-3}}
-    assert not compare_row(batch, 0, replace(case, changes=later), 1)[1]
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4, 1e9])

@@ -29,11 +29,11 @@ from studies.feedforward import (
     RESTLESS,
     FeedforwardPlan,
     document,
+    draw_study,
     feedforward_study,
     page,
     title,
 )
-from studies.feedforward_figure import draw_study
 from studies.sampled_data import ORDERS, stability_limit
 
 REACH = load("reach")
