@@ -100,14 +100,12 @@ LABELS = {
 Guide = tuple[str, Callable[[Array], Array]]
 TOLERANCE: Guide = ("error = tolerance", lambda x: x)
 ROUNDING: Guide = ("1e-15 J sqrt(t / 1 s)", lambda t: 1e-15 * np.sqrt(t))
-"""Lines beside the curves."""
 SHOWN = ("smooth", "friction", "lag", "short lag", "clamp", "function")
 TIGHTEST = 1e-13
 STEPS = tuple(dict.fromkeys(round(2 ** (k / 2)) for k in range(21)))
 """Numbers of steps of a whole motion."""
 TOLERANCES = tuple(10.0**-k for k in range(3, 12))
-PERIOD_NS, UNIT = 10_000_000, 0.1
-"""Period of the energy's run [ns], and step at which error constants are given [s]."""
+PERIOD_NS, UNIT = 10_000_000, 0.1  # of the energy's run [ns]; step of error constants [s]
 
 
 @cache
@@ -226,7 +224,9 @@ def ratio_table(rows: DataFrame) -> DataFrame:
     chosen = rows[~rows.of.isin(["step", "energy"]) & (rows.error > 10.0 * rows.known)]
     ratios = (chosen.error / chosen.x).groupby([chosen.of, chosen.scene, chosen.method]).max()
     table = ratios.unstack().reindex(columns=list(ALL)).map("{:.2g}".format).replace("nan", "-")
-    return table.rename(LABELS, level=0).rename(TITLES, level=1).reset_index()
+    return (
+        table.rename(LABELS, level=0).rename(TITLES, level=1).reset_index(names=["error", "motion"])
+    )
 
 
 @styled
