@@ -227,11 +227,7 @@ estimate of an error that is not resolved must not be above {FACTOR:g} times wha
 
 
 def report(out: Path, *, long: bool = False) -> bool:
-    """Run all cases, print the page, and write it with stability.csv, .json and the picture.
-
-    With `long` the cases that take minutes even compiled are run, too. The result is whether every
-    case passed.
-    """
+    """Run all cases, with `long` those of minutes, too; write the page; whether all passed."""
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
     cases = run_jobs(_evaluate, jobs[::-1], "extreme cases   ")[::-1]
     print(page(cases))

@@ -22,7 +22,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.gauss import NODES, Collocation
+from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -144,10 +144,10 @@ def _collocate(motion: Motion, h: float, count: int) -> Array | None:
     if motion.torque is not SINE or scene.torque_limit is not None:
         return None
     start = *initial_state(scene, Geometry.of(scene)), *(0.0,) * (3 if scene.lags else 0)
-    method = Collocation(ODE(Dynamics.of(scene), SINE), compiled=False)
-    prepared = method.prepare(0.0, h, count, start, iterations=20)
+    steps = PreparedMotion(Collocation(ODE(Dynamics.of(scene), SINE), compiled=False), count, 20)
+    steps.begin(0.0, h, start)
     try:
-        return np.array(prepared.end[:4]) if prepared.run() < 1e-3 else None
+        return steps.states[-1, :4] if steps.run() < 1e-3 else None
     except (ArithmeticError, ValueError):
         return None
 
