@@ -149,7 +149,8 @@ class HeldTorques:
             self._torques = [*self._torques[:2], torque]
             self._changes += 1
         self._seconds += seconds
-        self._impulse = axpy(1.0, self._impulse, seconds, torque)
+        p, (x, y, z) = self._impulse, torque
+        self._impulse = p[0] + seconds * x, p[1] + seconds * y, p[2] + seconds * z
 
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
         """Estimated errors of the orientation [rad]: torques of the start, and of the middle.
