@@ -7,7 +7,7 @@ are. Identification by torques takes a `MeasuredMotion`, identification by simul
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -91,11 +91,8 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
     """
     data = open_data(data)
     given = data if isinstance(data, Mapping) else _take_samples(data)
-    allowed = f"must be one of {', '.join(KEYS)}"
-    problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
-    arrays, held = _read_arrays(given, problems), bool(given.get("held", False))
-    if not problems:
-        problems += _find_misfits(arrays, held)
+    held = bool(given.get("held", False))
+    arrays, problems = _read_arrays(given, held)
     if problems:
         raise InputError("identify", problems)
     t, torque = arrays["t"], arrays["torque"]
@@ -166,38 +163,36 @@ def _shift(t: Array, torque: Array, held: bool, delay: float) -> Array:
     return np.stack([np.interp(t + delay, t, column) for column in torque.T], axis=1)
 
 
-def _read_arrays(given: Mapping[str, Any], problems: list[Problem]) -> dict[str, Array]:
-    """Arrays of a mapping; what is wrong joins the problems."""
+def _read_arrays(given: Mapping[str, Any], held: bool) -> tuple[dict[str, Array], list[Problem]]:
+    """Arrays of a mapping, and what is wrong with them: first with each, then as a motion."""
+    allowed = f"must be one of {', '.join(KEYS)}"
+    problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
     arrays: dict[str, Array] = {}
     for key in ("t", "gamma", "torque", "gamma_dot", "quaternion"):
-        value = given.get(key)
-        if value is None:
+        if given.get(key) is None:
             if key in ("t", "gamma", "torque"):
                 problems.append(Problem(key, None, "must be given"))
             continue
         try:
-            arrays[key] = np.asarray(value, dtype=float)
+            arrays[key] = np.asarray(given[key], dtype=float)
         except (TypeError, ValueError):
-            problems.append(Problem(key, value, "must be numbers"))
+            problems.append(Problem(key, given[key], "must be numbers"))
             continue
         for bad in np.argwhere(~np.isfinite(arrays[key]))[:1].tolist():
             problems.append(Problem(f"{key}{bad}", "not finite", "must be finite numbers"))
-    return arrays
-
-
-def _find_misfits(arrays: Mapping[str, Array], held: bool) -> Iterator[Problem]:
+    if problems:
+        return arrays, problems
     t = arrays["t"]
     if t.ndim != 1 or np.any(np.diff(t) <= 0.0):
-        yield Problem("t", t, "must be rising times [s], shape (n,)")
-        return
+        return arrays, [Problem("t", t, "must be rising times [s], shape (n,)")]
     if len(t) < FEWEST:
-        yield Problem("t", len(t), f"must be {FEWEST} samples or more")
-    samples = (len(t), 3)
-    shapes = {"gamma": samples, "gamma_dot": samples, "quaternion": (4,), "torque": samples}
-    for name, shape in shapes.items():
-        found = arrays[name].shape if name in arrays else shape
-        if found != shape and not (held and name == "torque" and found == (len(t) - 1, 3)):
-            yield Problem(name, found, f"must have the shape {shape}")
+        problems.append(Problem("t", len(t), f"must be {FEWEST} samples or more"))
+    for name in [*arrays][1:]:
+        shape = (4,) if name == "quaternion" else (len(t), 3)
+        also = (len(t) - 1, 3) if held and name == "torque" else shape
+        if arrays[name].shape not in (shape, also):
+            problems.append(Problem(name, arrays[name].shape, f"must have the shape {shape}"))
+    return arrays, problems
 
 
 @dataclass(frozen=True)
@@ -277,19 +272,23 @@ def take_readings(data: Measured, scene: Scene) -> Readings:
 
 
 def _take_figure(data: Mapping[str, Any], scene: Scene) -> Readings:
+    known = f"one of {', '.join(OBSERVABLES)}"
     problems = [
-        Problem(name, data[name], f"must be t, deviation or one of {', '.join(OBSERVABLES)}")
+        Problem(name, data[name], f"must be t, deviation or {known}")
         for name in data
         if name not in (*OBSERVABLES, "t", "deviation")
     ]
-    columns = tuple(i for i, name in enumerate(OBSERVABLES) if name in data)
     t = np.atleast_1d(np.asarray(data.get("t", ()), dtype=float))
     if not (len(t) and np.all(np.isfinite(t)) and t[0] >= 0.0 and np.all(np.diff(t) > 0.0)):
         problems.append(Problem("t", t, "must be ascending times >= 0 [s]"))
-    if not columns:
-        problems.append(Problem("data", list(data), f"must have one of {', '.join(OBSERVABLES)}"))
-    rows = [np.atleast_1d(np.asarray(data[OBSERVABLES[i]], dtype=float)) for i in columns]
-    for i, row in zip(columns, rows, strict=True):
+    read = {
+        i: np.atleast_1d(np.asarray(data[name], dtype=float))
+        for i, name in enumerate(OBSERVABLES)
+        if name in data
+    }
+    if not read:
+        problems.append(Problem("data", list(data), f"must have {known}"))
+    for i, row in read.items():
         if row.shape != t.shape or np.any(np.isinf(row)):
             problems.append(Problem(OBSERVABLES[i], row.shape, f"must have the shape {t.shape}"))
     deviation = data.get("deviation")
@@ -297,12 +296,11 @@ def _take_figure(data: Mapping[str, Any], scene: Scene) -> Readings:
         problems.append(Problem("deviation", deviation, "must be > 0"))
     if scene.torque is None:
         problems.append(Problem("torque", None, "must be in the scene, or be given as samples"))
-    if problems:
+    if problems or scene.torque is None:
         raise InputError("identify", problems)
-    assert scene.torque is not None
-    values = np.stack(rows, axis=1)
+    values = np.stack([*read.values()], axis=1)
     spread = None if deviation is None else np.broadcast_to(deviation, values.shape)
-    return Readings(t, columns, values, spread, SineProfile(scene.torque))
+    return Readings(t, tuple(read), values, spread, SineProfile(scene.torque))
 
 
 @lru_cache(maxsize=8)

@@ -111,7 +111,6 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
     off, slopes = compare(*found.x)
     fitted = found.x * size
     scale = np.where(fitted == 0.0, 1.0, fitted)  # changes of logarithms
-    error = float(np.sqrt(np.mean(off**2)))
     unit = 1.0
     if read.deviation is None:  # estimated from the residuals
         unit = float(np.sqrt(np.sum(off**2) / max(len(off) - len(names), 1))) + 1e-300
@@ -119,9 +118,9 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
     relative = np.full(len(names), np.inf)
     some = singular > 1e-12 * max(float(singular[0]), 1e-300)
     relative[: len(singular)][some] = 1.0 / singular[some]
-    finite = np.minimum(relative, 1e9)
-    spread = (rows.T * finite**2) @ rows * np.outer(scale, scale)
+    spread = (rows.T * np.minimum(relative, 1e9) ** 2) @ rows * np.outer(scale, scale)
     adjusted, values, warnings = _make_possible_scene(scene, names, fitted)
+    vague = rows[relative >= NOT_DETERMINED]
     return SimulationFit(
         scene=adjusted,
         given=scene,
@@ -131,13 +130,11 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
         before=given,
         estimate=fitted,
         covariance=spread,
-        undetermined=tuple(
-            describe_combination(row, names) for row in rows[relative >= NOT_DETERMINED]
-        ),
+        undetermined=tuple(describe_combination(row, names) for row in vague),
         warnings=warnings,
         relative=relative,
         directions=rows,
-        error=error,
+        error=float(np.sqrt(np.mean(off**2))),
     )
 
 
@@ -175,14 +172,13 @@ class Sensitivities:
     def __init__(self, scene: Scene, names: Sequence[str], torque: TorqueProfile) -> None:
         self.scene, self.names = scene, tuple(names)
         self._torque, self._geometry = torque, Geometry.of(scene)
-        problems = []
-        for name in self.names:
-            if value_of(scene, name) is None:
-                allowed = "must be the key of a number that the scene has"
-                problems.append(Problem("parameters", name, allowed))
-            elif name.startswith(GEOMETRY):
-                allowed = "is geometry, which is taken as known"
-                problems.append(Problem("parameters", name, allowed))
+        problems = [
+            Problem("parameters", name, "must be the key of a number that the scene has")
+            if value_of(scene, name) is None
+            else Problem("parameters", name, "is geometry, which is taken as known")
+            for name in self.names
+            if value_of(scene, name) is None or name.startswith(GEOMETRY)
+        ]
         if problems:
             raise InputError("identify", problems)
         self._inner = [i for i, name in enumerate(self.names) if not name.startswith("initial")]

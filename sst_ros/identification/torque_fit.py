@@ -34,6 +34,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import compress
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,22 +163,23 @@ def fit_torques(
     measured = read_motion(data, scene, delay)
     reached = float(np.ptp(measured.gamma, axis=0).max())
     if reached < STILL and scene.gravity is None:
-        allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
-        raise InputError("identify", [Problem("gamma", reached, allowed)])
+        _refuse(
+            "gamma",
+            reached,
+            f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia",
+        )
     regressor = Regressor(scene, names)
     known, columns, rows, band = form_equations(measured, regressor, cutoff)
     sound = ~measured.saturated[rows]
-    warnings = []
-    if not sound.all():
-        warnings.append(
-            f"{int((~sound).sum())} of {len(sound)} samples left out: a torque was at the limit of "
-            "the actuators, and what was recorded may not be what acted"
-        )
+    warning = (
+        f"{int((~sound).sum())} of {len(sound)} samples left out: a torque was at the limit of "
+        "the actuators, and what was recorded may not be what acted"
+    )
     torque, columns = (measured.torque[rows] - known)[sound], columns[sound]
-    if len(torque) <= len(names):
-        allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
-        raise InputError("identify", [Problem("t", len(torque), allowed)])
     samples = len(torque)
+    if samples <= len(names):
+        allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
+        _refuse("t", samples, allowed)
     if band is not None:
         period = float(np.median(np.diff(measured.t)))
         sines = max(int(np.ceil(2.0 * band * period * samples)), len(names))
@@ -186,10 +189,13 @@ def fit_torques(
     base = find_independent(columns, names)
     if not base.chosen:
         allowed = "must determine something: no torque depends on these parameters here"
-        raise InputError("identify", [Problem("parameters", list(names), allowed)])
-    fit = fit_weighted(
-        base.of_columns(columns), torque, None if noise is None else _check_deviations(noise)
-    )
+        _refuse("parameters", list(names), allowed)
+    deviations = None if noise is None else np.asarray(list(noise), dtype=float)
+    if deviations is not None and not (
+        deviations.shape == (3,) and np.all(np.isfinite(deviations) & (deviations > 0.0))
+    ):
+        _refuse("noise", noise, "must be three finite standard deviations > 0 [N m]")
+    fit = fit_weighted(base.of_columns(columns), torque, deviations)
     given = parameters.values(scene, names)
     reach = max(scene.base.radius, scene.star.radius)
     values, excess = find_consistent_values(
@@ -197,10 +203,10 @@ def fit_torques(
     )
     whole = find_base_parameters(regressor)
     vague = fit.deviation > scales(names, given)[list(base.chosen)]
+    note = f"identified from {samples} samples"
+    lost = [chosen not in base.chosen for chosen in whole.chosen]
     return TorqueFit(
-        scene=parameters.with_parameters(
-            scene, names, values, f"identified from {samples} samples"
-        ),
+        scene=parameters.with_parameters(scene, names, values, note),
         given=scene,
         names=names,
         values=values,
@@ -208,28 +214,20 @@ def fit_torques(
         before=np.asarray(base.transform @ given),
         estimate=fit.estimate,
         covariance=fit.covariance,
-        undetermined=tuple(
-            label
-            for label, chosen in zip(whole.labels, whole.chosen, strict=True)
-            if chosen not in base.chosen
-        ),
-        warnings=tuple(warnings),
+        undetermined=tuple(compress(whole.labels, lost)),
+        warnings=() if sound.all() else (warning,),
         base=base,
         fit=fit,
         excess=excess,
-        vague=tuple(label for label, yes in zip(base.labels, vague, strict=True) if yes),
+        vague=tuple(compress(base.labels, vague)),
         samples=samples,
         band=band,
         regressor=regressor,
     )
 
 
-def _check_deviations(noise: Iterable[float]) -> Array:
-    numbers = np.asarray(list(noise), dtype=float)
-    if numbers.shape != (3,) or not np.all(np.isfinite(numbers) & (numbers > 0.0)):
-        allowed = "must be three finite standard deviations > 0 [N m]"
-        raise InputError("identify", [Problem("noise", noise, allowed)])
-    return numbers
+def _refuse(name: str, value: object, allowed: str) -> NoReturn:
+    raise InputError("identify", [Problem(name, value, allowed)]) from None
 
 
 def form_equations(
@@ -285,7 +283,7 @@ def _follow_orientations(
         coarse = continuation.follow(coordinates.geometry, points, start).rotation
     except (AssemblyError, continuation.BranchEnds) as error:
         allowed = f"must be angles of this manipulator ({error})"
-        raise InputError("identify", [Problem("gamma", first[0].tolist(), allowed)]) from None
+        _refuse("gamma", first[0].tolist(), allowed)
     nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
     return coordinates.orientations(quaternion_of(coarse)[nearest], gamma)
 
@@ -317,18 +315,17 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
     spacing = np.diff(t)
     period = float(np.median(spacing))
     if np.abs(spacing - period).max() > 1e-3 * period:
-        allowed = "must be evenly spaced (to 0.1 %) for angles to be filtered"
-        raise InputError("identify", [Problem("t", spacing, allowed)])
+        _refuse("t", spacing, "must be evenly spaced (to 0.1 %) for angles to be filtered")
     if cutoff is None:
         cutoff = min(MARGIN * find_bandwidth(period, gamma), 0.4 / period)
     if not 0.0 < cutoff < 0.5 / period:
         allowed = f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz"
-        raise InputError("identify", [Problem("cutoff", cutoff, allowed)])
+        _refuse("cutoff", cutoff, allowed)
     sections = butter(4, cutoff, fs=1.0 / period, output="sos")
     settled = int(np.ceil(1.0 / (cutoff * period)))
     if len(t) < 4 * settled + 10:
         allowed = f"must last {(4 * settled + 10) * period:g} s or more at {cutoff:g} Hz"
-        raise InputError("identify", [Problem("t", float(t[-1] - t[0]), allowed)])
+        _refuse("t", float(t[-1] - t[0]), allowed)
     smooth = sosfiltfilt(sections, gamma, axis=0, padlen=min(3 * settled, len(t) - 1))
     return np.asarray(smooth), settled
 

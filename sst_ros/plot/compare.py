@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.plot import workspace
-from sst_ros.plot.pictures import DEGREES, draw_legs, known, save, tick_torques
+from sst_ros.plot.pictures import DEGREES, Picture, draw_legs, known, save, tick_torques
 from sst_ros.plot.style import LINES, hide_zeros, legend, stack, styled
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
@@ -28,14 +28,6 @@ if TYPE_CHECKING:
 
 Drawn: TypeAlias = "Sequence[tuple[Signals, str, dict[str, Any]]]"
 """Runs with their names and styles."""
-
-
-class Overlay(NamedTuple):
-    """A picture of several runs: title, topics needed, and what draws it."""
-
-    title: str
-    needs: tuple[str, ...]
-    make: Callable[[Drawn], Figure]
 
 
 def _overlay(quantity: str, label: str, scale: float = 1.0) -> Callable[[Drawn], Figure]:
@@ -81,14 +73,14 @@ def _sphere(runs: Drawn) -> Figure:
 
 JOINTS, ERROR, TICKS, TURN = "joint_states", "tracking_error", "applied_torques", "orientation"
 PICTURES = {
-    "gamma": Overlay("Actuator angles", (JOINTS,), _overlay("gamma", "γ [deg]", DEGREES)),
-    "gamma_dot": Overlay("Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇ [rad/s]")),
-    "tracking_error": Overlay(
+    "gamma": Picture("Actuator angles", (JOINTS,), _overlay("gamma", "γ [deg]", DEGREES)),
+    "gamma_dot": Picture("Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇ [rad/s]")),
+    "tracking_error": Picture(
         "Desired less measured angles", (ERROR,), _overlay("gamma_error", "Δγ [rad]")
     ),
-    "torques": Overlay("Applied torques", (TICKS,), _torques),
-    "difference": Overlay("Differences from the first run", (JOINTS,), _difference),
-    "sphere": Overlay("Path of E in the workspace", (TURN, SCENE.key), _sphere),
+    "torques": Picture("Applied torques", (TICKS,), _torques),
+    "difference": Picture("Differences from the first run", (JOINTS,), _difference),
+    "sphere": Picture("Path of E in the workspace", (TURN, SCENE.key), _sphere),
 }
 
 

@@ -45,18 +45,14 @@ ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
 
 
 class Picture(NamedTuple):
-    """A picture of a run.
+    """A picture: what it shows, keys of the topics without which it cannot be drawn, what draws it.
 
-    Attributes:
-        title: what it shows.
-        needs: keys of the topics without which it cannot be drawn.
-        make: draws it; the scene is there if it is needed.
-
+    That of one run takes the run and its scene, which is there if it is needed.
     """
 
     title: str
     needs: tuple[str, ...]
-    make: Callable[[Signals, Scene], Figure]
+    make: Callable[..., Figure]
 
 
 Curves: TypeAlias = "tuple[str, Sequence[str], Callable[[Signals], Array]]"
@@ -100,10 +96,6 @@ def solution(run: Signals) -> Solution:
     rows = envelope(both, len(quaternion))
     shown = None if euler is None else euler[rows]
     return Solution("run", run.seconds()[rows], quaternion[rows], shown)
-
-
-def _angle(which: int) -> Callable[[Signals, Scene], Figure]:
-    return lambda run, _: motion.angle([solution(run)], which)
 
 
 def _tracking(run: Signals, _: Scene) -> Figure:
@@ -227,7 +219,11 @@ PICTURES = {
         lambda run, scene: motion.position_of_e(scene, [solution(run)]),
     ),
     **{
-        name: Picture(f"The angle {letter}", (ORIENTATION,), _angle(which))
+        name: Picture(
+            f"The angle {letter}",
+            (ORIENTATION,),
+            lambda run, _, which=which: motion.angle([solution(run)], which),
+        )
         for which, (name, letter) in enumerate({"theta": "θ", "phi": "φ", "psi": "ψ"}.items())
     },
     "tracking": Picture("Desired and measured angles", (JOINTS, REFERENCE), _tracking),
@@ -273,8 +269,7 @@ def draw_run(
             continue
         scene = run.scene.name if run.scene else None
         stem, title = motion.caption(name, picture.title, scene)
-        figure = picture.make(run, run.scene)  # type: ignore[arg-type]
-        paths += save(figure, title, out, stem, formats)
+        paths += save(picture.make(run, run.scene), title, out, stem, formats)
     return paths, missing
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,11 +64,9 @@ def write_accuracy_report(
         figures = {} if study.rests else {f"accuracy_{each.name}": draw_accuracy(study)}
         if len(studies) == len(names):
             figures["accuracy"] = draw_fastest(list_fastest(studies), provenance())
-        document = {"studies": [*documents(studies)], "terms": terms}
-        said = accuracy_page(studies, terms)
-        publish(
-            out, "accuracy", csv=join_grids(studies), document=document, page=said, figures=figures
-        )
+        whole = {"studies": [document(one) for one in studies], "terms": terms}
+        said, grids = accuracy_page(studies, terms), join_grids(studies)
+        publish(out, "accuracy", csv=grids, document=whole, page=said, figures=figures)
     return studies
 
 
@@ -77,23 +75,22 @@ def join_grids(studies: Sequence[WorkPrecision]) -> DataFrame:
     return data_frame(row for study in studies for row in records(study.rows))
 
 
-def documents(studies: Sequence[WorkPrecision]) -> Iterator[dict[str, Any]]:
-    """Yield each study as JSON has it."""
-    for study in studies:
-        yield {
-            "scene": study.scene,
-            "seconds": study.seconds,
-            "ends": study.ends,
-            "compiled": numba_version() is not None,
-            "reference": study.reference.how,
-            "reference_own_error": study.reference.own._asdict(),
-            "formulation_difference_relative": study.formulation,
-            "advice": study.advice._asdict(),
-            "advice_measured_error_rad": study.measured and study.measured[0],
-            "fastest": fastest(study),
-            "warnings": list(study.warnings),
-            "rows": records(study.rows),
-        }
+def document(study: WorkPrecision) -> dict[str, Any]:
+    """Return a study as JSON has it."""
+    return {
+        "scene": study.scene,
+        "seconds": study.seconds,
+        "ends": study.ends,
+        "compiled": numba_version() is not None,
+        "reference": study.reference.how,
+        "reference_own_error": study.reference.own._asdict(),
+        "formulation_difference_relative": study.formulation,
+        "advice": study.advice._asdict(),
+        "advice_measured_error_rad": study.measured and study.measured[0],
+        "fastest": fastest(study),
+        "warnings": list(study.warnings),
+        "rows": records(study.rows),
+    }
 
 
 def list_fastest(studies: Sequence[WorkPrecision]) -> DataFrame:

@@ -173,7 +173,11 @@ def pair_commands(
     most = np.inf if limit is None else limit
     asked, applied = (np.clip(each.torque, -most, most) for each in (commands, ticks))
     new, changed = _changes(asked), _changes(applied)
-    step_ns = _reception_of(recording, ticks.end_ns[changed])
+    # When the steps of ticks began, interpolated between the receptions of samples.
+    first = recording.received_ns[0]
+    since = (recording.received_ns - first).astype(float)
+    passed = np.interp(ticks.end_ns[changed], recording.time_ns, since)
+    step_ns = first + passed.astype(np.int64)
     # The recorder may have received a command a little later than the simulator.
     earliest_ns = commands.received_ns[new] - ticks.period_ns
     command, tick = _pairs(asked[new], earliest_ns, applied[changed], step_ns)
@@ -208,13 +212,6 @@ def _measure_answers(recording: Recording, begins: Integers) -> dict[str, float]
     share = 100.0 * float(np.mean(answered[:-1]))
     age = float(held.mean() / NANOSECONDS) if len(held) else 0.0
     return {"samples_answered_percent": share, "command_age_mean_s": age}
-
-
-def _reception_of(recording: Recording, time_ns: Integers) -> Integers:
-    """Return when times of the run were received [ns], interpolated between samples."""
-    first = recording.received_ns[0]
-    since = (recording.received_ns - first).astype(float)
-    return np.asarray(first + np.interp(time_ns, recording.time_ns, since).astype(np.int64))
 
 
 def _changes(torque: Array) -> NDArray[np.intp]:

@@ -8,6 +8,7 @@ from collections import deque
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 from viser import ArrowsHandle, ViserServer
 
 from sst_ros.description.tree import (
@@ -187,20 +188,13 @@ def add_shape(server: ViserServer, name: str, shape: Shape) -> None:
             length,
             shape.colour,
             position=(shape.begin + shape.end) / 2.0,
-            wxyz=wxyz(_z_along(along / length)),
+            wxyz=wxyz(Rotation.align_vectors(along, [0.0, 0.0, 1.0])[0].as_matrix()),
         )
 
 
 def wxyz(rotation: Array) -> Array:
     """Quaternion (w, x, y, z), as viser takes it, of a rotation matrix."""
     return np.roll(quaternion_of(rotation), 1)
-
-
-def _z_along(z: Array) -> Array:
-    """Return a rotation matrix whose third column is a unit vector."""
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 def _angles(state: ViewState) -> dict[str, float]:

@@ -19,7 +19,7 @@ from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.report import work_precision
-from sst_ros.report.accuracy import accuracy_page, documents
+from sst_ros.report.accuracy import accuracy_page, document
 from sst_ros.report.scene_summary import (
     TERMS,
     WIDTH,
@@ -164,7 +164,7 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
     monkeypatch.setattr(work_precision, "solver_grid", lambda *_: [])
     study = work_precision.work_precision(scene)
     assert study.advice == advice and study.measured[0] < 1e-8
-    assert next(documents([study]))["advice"]["text"] == advice.text
+    assert document(study)["advice"]["text"] == advice.text
     assert f"Advice: {advice.text}. Measured: {study.measured[0]:.1e} rad" in accuracy_page([study])
 
 

@@ -17,7 +17,7 @@ from sst_ros.report import work_precision as study
 from sst_ros.report.accuracy import (
     accuracy_page,
     accuracy_text,
-    documents,
+    document,
     draw_accuracy,
     draw_fastest,
     fastest,
@@ -109,13 +109,13 @@ def test_what_it_writes_can_be_read(short, tmp_path):
     assert fastest(short) in said and fastest(short).startswith("1e-09 rad over 0.2 s: ")
     assert all(len(line) < 200 for line in said.splitlines())
     given = {"page": accuracy_page([short]), "figures": {"picture": draw_accuracy(short)}}
-    document = {"studies": [*documents([short])]}
-    publish(tmp_path, "accuracy", csv=join_grids([short]), document=document, **given)
+    whole = {"studies": [document(short)]}
+    publish(tmp_path, "accuracy", csv=join_grids([short]), document=whole, **given)
     rows = list(csv.DictReader(io.StringIO((tmp_path / "accuracy.csv").read_text())))
     assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
     assert [float(row["wall_min_s"]) for row in rows] == short.rows.wall_min_s.tolist()
-    document = json.loads((tmp_path / "accuracy.json").read_text())
-    assert document["studies"][0]["rows"][0]["method"] == "rk4" and "date" in document["report"]
+    read = json.loads((tmp_path / "accuracy.json").read_text())
+    assert read["studies"][0]["rows"][0]["method"] == "rk4" and "date" in read["report"]
     assert "accuracy_example2_heavy.png" in (tmp_path / "accuracy.md").read_text()
     pixels = image.imread(tmp_path / "picture.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
