@@ -22,13 +22,13 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
 from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion
+from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.style import GREY, INK, MARKERS, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish
-from sst_ros.simulation.simulate_gauss import GAUSS
+from sst_ros.simulation.simulate_gauss import GAUSS, NODES
 from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET
 from studies import DOCS, run, run_jobs
 from studies.extreme_scenes import FREE, Changes, bouncing, changed
@@ -144,7 +144,8 @@ def _collocate(motion: Motion, h: float, count: int) -> Array | None:
     if motion.torque is not SINE or scene.torque_limit is not None:
         return None
     start = *initial_state(scene, Geometry.of(scene)), *(0.0,) * (3 if scene.lags else 0)
-    steps = PreparedMotion(Collocation(ODE(Dynamics.of(scene), SINE), compiled=False), count, 20)
+    method = Collocation(ODE(Dynamics.of(scene), SINE), NODES, compiled=False)
+    steps = PreparedMotion(method, count, 20)
     steps.begin(0.0, h, start)
     try:
         return steps.states[-1, :4] if steps.run() < 1e-3 else None

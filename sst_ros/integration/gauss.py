@@ -5,10 +5,8 @@ A step puts a polynomial through the accelerations at the Gauss nodes (order 2 s
 equations are solved by fixed-point iteration (Picard; van der Houwen & Sommeijer, J. Comput. Appl.
 Math. 29 (1990) 111-127): all s accelerations are evaluated at once, which costs a compiler with
 SIMD little more than one. The first evaluation of a step is at the state of its beginning, where
-only time differs from lane to lane. Steps have one length and no memory of each other.
-
-For motions that are smooth over long steps, as under torques that are functions of time in a
-scene; not for stiff scenes, nor for torques that jump, nor for contacts.
+only time differs from lane to lane. Steps have one length and no memory of each other. Not for
+stiff scenes, nor for torques that jump, nor for contacts.
 """
 
 from __future__ import annotations
@@ -40,12 +38,8 @@ from sst_ros.mechanism.geometry import Array
 
 Code: TypeAlias = Callable[[Any, Any], float]
 
-NODES = 8
-"""Two registers of AVX2; order 16."""
-
 _WORTH_LOADING, _WORTH_COMPILING = 20_000, 300_000
-"""Evaluations in plain Python after which machine code is loaded, and made: they take half a second
-and seven, as numba does."""
+"""Evaluations in plain Python that take as long as numba to load machine code, and to make it."""
 
 _EVALUATIONS: Counter[str] = Counter()
 """In plain Python, by the text of the code, which all scenes of one structure share."""
@@ -65,18 +59,15 @@ class Collocation:
     """
 
     def __init__(
-        self,
-        ode: ODE,
-        nodes: int = NODES,
-        *,
-        limits: Program | None = None,
-        compiled: bool | None = True,
+        self, ode: ODE, nodes: int, *, limits: Program | None = None, compiled: bool | None = True
     ) -> None:
         self.size, self.inputs = len(ode.state), len(ode.program.inputs)
         self._texts, self.layout, self.numbers = source(ode, nodes, limits)
         known = compiled is not False and codegen.numba_version() is not None
         self._ask_at = _WORTH_LOADING if known and compiled is None else math.inf
-        self.code = _compile(self._texts, rounding=False) if known and compiled else None
+        self.code: Code | None = (
+            _compile(self._texts, rounding=False) if known and compiled else None
+        )
         self.plain: Code = codegen.load(self._texts, {}, numba=False).integrate
 
     def charge(self, evaluations: int) -> None:
@@ -126,8 +117,7 @@ class PreparedMotion:
             return self.run()
         lists = [array.tolist() for array in self._arrays]
         change = self._method.plain(*lists)
-        for array, values in zip(self._arrays, lists, strict=True):
-            array[:] = values
+        self._arrays[0][:], self._arrays[1][:] = lists
         return change
 
     def begin(self, t: float, h: float, y: Sequence[float], d: Sequence[float] = ()) -> None:
@@ -140,30 +130,24 @@ class PreparedMotion:
 
 @lru_cache(maxsize=16)
 def tables(nodes: int) -> Array:
-    """Rows: nodes, weights, then columns of A.
-
-    A integrates the polynomial through the nodes from 0 to each node.
-    """
+    """Rows: nodes, weights, columns of A, which integrates a polynomial from 0 to each node."""
     x, w = legendre.leggauss(nodes)
     inverse = np.linalg.inv(legendre.legvander(x, nodes - 1))
     integrals = legendre.legval(x, legendre.legint(np.eye(nodes), lbnd=-1)).T / 2.0
     return np.vstack([(x + 1.0) / 2.0, w / 2.0, (integrals @ inverse).T])
 
 
-def _compile(texts: list[str], *, rounding: bool) -> Code:
+def _compile(texts: list[str], *, rounding: bool) -> Any:
     """Compile for two arrays: numba then need not look at the arguments in each call."""
     import numba
 
     integrate = codegen.load(texts, {}, numba=True, rounding=rounding).integrate
     array = numba.types.Array(numba.float64, 1, "C")
     integrate.compile((array, array))
-    found: Code = integrate.get_overload((array, array))
-    return found
+    return integrate.get_overload((array, array))
 
 
-def source(
-    system: ODE, nodes: int, limits: Program | None
-) -> tuple[list[str], Layout, list[float]]:
+def source(ode: ODE, nodes: int, limits: Program | None) -> tuple[list[str], Layout, list[float]]:
     """Texts of flat_sin and of `integrate(block, states)`, what is in `block`, and numbers in it.
 
     An iteration integrates the slopes at the nodes to rates, turns the quaternion with these
@@ -185,12 +169,12 @@ def source(
                     for i in range(8):
                         block[200 + i] = y4 + (block[104 + i] * g4_0 + block[112 + i] * g4_1)
     """
-    size, inputs = len(system.state), len(system.program.inputs)
-    # What is known from time and drive alone, and is needed where the state is known, too.
+    size, inputs = len(ode.state), len(ode.program.inputs)
     slots, of_time = Slots(), [True, *(False,) * size, *(True,) * (inputs - 1 - size)]
-    before, after, results = split(system.program, of_time, slots)
-    held, moving, _ = split(system.program, [False, *(True,) * (inputs - 1)], slots)
-    _, turn, turned = split(system.program.first(4), of_time, slots)
+    before, after, results = split(ode.program, of_time, slots)
+    held, moving, _ = split(ode.program, [False, *(True,) * (inputs - 1)], slots)
+    _, turn, turned = split(ode.program.first(4), of_time, slots)
+    # What is known from time and drive alone, and is needed where the state is known, too.
     needed = set(re.findall(r"\bv\d+\b", "\n".join([*after, *results])))
     known = [name for line in before if (name := line.split(" = ")[0]) in needed]
     limited = len(limits.body(slots)[1]) if limits else 0

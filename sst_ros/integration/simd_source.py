@@ -43,9 +43,8 @@ def split(
 ) -> tuple[list[str], list[str], list[str]]:
     """Lines of a program that need early inputs only, the other lines, and the results.
 
-    Inputs of the program are called u0, u1, ... here, and results of its lines v0, v1, ...; `early`
-    says of each input whether it is known earlier than others. `slots` are of numbers that are not
-    in the text.
+    Inputs are called u0, u1, ... here, and results of lines v0, v1, ...; `early` says of each input
+    whether it is known earlier than others.
     """
     count = len(program.inputs)
     lines, results = replace(program, inputs=tuple(f"u{i}" for i in range(count))).body(slots)

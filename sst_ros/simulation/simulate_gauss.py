@@ -15,7 +15,7 @@ from sst_ros.dynamics.expression import number_constants, trace
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
 from sst_ros.integration.events import first_event, limit_distances
-from sst_ros.integration.gauss import NODES, Collocation, PreparedMotion
+from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.propagator import orientation_distance
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
@@ -27,12 +27,15 @@ from sst_ros.state import NANOSECONDS, clamp
 
 GAUSS = "gauss"
 
+NODES = 8
+"""Of a step, two registers of AVX2; the order is 16."""
+
 _NEAR = 0.05
 """Distance above which no limit is met between nodes that resolve the motion to the tolerance."""
 
 _HOPELESS, _SLOW = 128, 4.0
-"""Steps from which on doubling them must bring two solutions nearer by this factor: a motion that
-is smooth enough gains far more, one with kinks a factor of two."""
+"""Steps from which on doubling them must bring two solutions of `auto` nearer by this factor:
+smooth motions gain far more, those with kinks a factor of two."""
 _FINEST_PER_SECOND, _FINEST = 1024, 4096
 """Steps a second beyond which `auto` turns to methods with error control, and the most of all."""
 _ITERATIONS, _MOST_ITERATIONS = (5, 6, 8), 10
@@ -101,13 +104,11 @@ class CollocatedMotion:
 
     def _inside(self, k: int, x: float) -> Sequence[float]:
         """State x [s] after step k began; that of the run itself where it begins, or all end."""
-        begin: list[float] = self._states[k].tolist()
         if x == 0.0:
-            return begin
-        self._single.begin(float(self._grid[k]), x, begin, self._drive)
+            return list[float](self._states[k].tolist())
+        self._single.begin(float(self._grid[k]), x, self._states[k].tolist(), self._drive)
         self._single.run()
-        end: list[float] = self._single.states[-1].tolist()
-        return end
+        return list[float](self._single.states[-1].tolist())
 
     def _find_limit(self) -> Limit | None:
         """Return the first limit that is met, if there is one; the motion ends there."""
@@ -151,18 +152,14 @@ class CollocatedMotion:
 
     def _balance_energy(self) -> float:
         """Energy at the end, less that at the start, less the work done by another motion [J]."""
-        method = Collocation(ODE(self._dynamics, self._sine, work=True), compiled=False)
+        method = Collocation(ODE(self._dynamics, self._sine, work=True), NODES, compiled=False)
         motion = self._prepare(method, self._count, self._iterations)
         motion.run()
-        ends = self.at(np.array([0.0, self._end])).tolist()
-        before, after = map(self._dynamics.total_energy, ends)
-        return after - before - float(motion.states[-1, -1])
+        energy, end = self._dynamics.total_energy, self.at(np.array([self._end]))[0].tolist()
+        return energy(end) - energy(self._start) - float(motion.states[-1, -1])
 
     def _choose_steps(self, tolerance: float) -> tuple[int, int, float]:
-        """Choose steps and iterations that reach the tolerance at the least cost; their error.
-
-        Steps are doubled until two ends are the same to a hundredth of the tolerance.
-        """
+        """Choose steps and iterations of least cost for the tolerance, and estimate their error."""
         most = _FINEST if self._asked else min(_FINEST, 16 + _FINEST_PER_SECOND * self._end)
         count, iterations, distance = 1, _MOST_ITERATIONS, math.inf
         y, z = self._solve(1), self._solve(2)
@@ -195,8 +192,7 @@ class CollocatedMotion:
             cheaper = [steps for steps in ladder if steps * iterations < cost]
             found = bisect_left(cheaper, True, key=partial(reaches, iterations=iterations))
             if found < len(cheaper):
-                best = cheaper[found], iterations
-                cost = math.prod(best)
+                best, cost = (cheaper[found], iterations), cheaper[found] * iterations
         return best
 
     def _solve(self, count: int, iterations: int = _MOST_ITERATIONS) -> list[float]:
@@ -234,7 +230,7 @@ def _collocation(
             lambda *state: limit_distances(limits, ends, dynamics.numbers, state)[: len(limits)],
             (*QUATERNION, *RATE),
         )
-    return Collocation(ODE(dynamics, sine), limits=program, compiled=compiled)
+    return Collocation(ODE(dynamics, sine), NODES, limits=program, compiled=compiled)
 
 
 def _choose_torque(task: Task) -> tuple[SineTorque | None, tuple[float, ...]]:

@@ -137,6 +137,6 @@ def test_every_term_lag_and_a_drive_are_carried_along():
     y = start_of(scene, len(system.state))
     drive = [0.5, -0.3, 0.2, 0.1, 0.0, -0.2][: len(system.drive)]
     wanted = CompiledMethod(system, DOP853, compiled=False).step_fixed(0.0, 2.5e-4, 80, y, drive)
-    method = Collocation(system, compiled=False)
+    method = Collocation(system, 8, compiled=False)
     _, found = solved(method, 0.0, 2e-3, 10, y, drive, iterations=9)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
