@@ -337,16 +337,17 @@ class BatchStates:
     def _quantity(self, name: str) -> Array:
         if name not in self._computed:
             function, inputs = self._model.outputs[name], self._columns.inputs
-            states = np.moveaxis(self._state, -1, 0)[:7]
-            parts, count = [], self.t.shape[-1]
+            states, count = np.moveaxis(self._state, -1, 0)[:7], self.t.shape[-1]
+            found = np.empty((1 if name == "energy" else 3, *self.t.shape))
             size = max(1, _BLOCK * count // max(self.t.size, 1))
             with np.errstate(all="ignore"):
-                for first in range(0, max(count, 1), size):
+                for first in range(0, count, size):
                     rows = slice(first, first + size)
                     numbers = function(*states[..., rows], *inputs[:, rows])
-                    parts.append(np.stack(numbers, axis=-1))
-            self._computed[name] = found = np.concatenate(parts, axis=-2)
-            found[..., ~self._valid, :] = np.nan
+                    for part, number in zip(found, numbers, strict=True):
+                        part[..., rows] = number
+            found[..., ~self._valid] = np.nan
+            self._computed[name] = np.moveaxis(found, 0, -1)
         return self._computed[name]
 
     @cached_property

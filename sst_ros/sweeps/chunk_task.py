@@ -251,7 +251,7 @@ def summarize(table: pd.DataFrame) -> str:
     steps, length = table.attrs["steps"], table.attrs["duration"]
     lines = [f"{len(table)} runs of {length:g} s, {steps} steps each"]
     lines += [f"  {count:>10}  {reason}" for reason, count in counts.items() if count]
-    causes = correlate_early_ends(table)
+    causes = correlate(table)
     if len(causes):
         lines.append("Rank correlation of inputs with an early end:")
         lines += [f"  {value:>10.3f}  {name}" for name, value in causes.head(SHOWN).items()]
@@ -269,16 +269,12 @@ def list_outputs(table: pd.DataFrame) -> list[str]:
     return [name for name in table.columns if name not in known]
 
 
-def correlate_early_ends(table: pd.DataFrame) -> pd.Series:
-    """Spearman's rank correlation of each input with an early end, largest first.
+def correlate(table: pd.DataFrame, column: pd.Series | None = None) -> pd.Series:
+    """Spearman's rank correlation of each input with a column, largest first; none if constant.
 
-    Empty where all runs ended alike, or no input differs.
+    The column is by default whether a run ended early.
     """
-    return correlate(table, (table["status"] != 0).astype(float))
-
-
-def correlate(table: pd.DataFrame, column: pd.Series) -> pd.Series:
-    """Spearman's rank correlation of each input with a column, largest first; none if constant."""
+    column = (table["status"] != 0).astype(float) if column is None else column
     inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
     if column.nunique() < 2 or not inputs:
         return table[[]].sum()

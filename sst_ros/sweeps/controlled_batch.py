@@ -300,42 +300,19 @@ class ControlledBatch:
     def _command(
         self, joints: Any, given: Group, memory: Group, gains: Group, noise: Sequence[Any]
     ) -> tuple[Any, ...]:
-        """Return three torques and the new memory.
-
-        Args:
-            joints: angles and rates of the plant.
-            given: references of the sample, by the names in REFERENCES.
-            memory: by name.
-            gains: by the names in GAINS.
-            noise: six standard normal numbers, or none.
-
-        """
+        """Return three torques and the new memory; the noise is six normal numbers, or none."""
         control, new = self._control, dict(memory)
         angle, rate = gains["noise"]
         scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
-        gamma, gamma_dot, new["before"] = control.measure(
-            joints.gamma, joints.gamma_dot, memory["before"], scaled
-        )
+        exact = joints.gamma, joints.gamma_dot
+        gamma, gamma_dot, new["before"] = control.measure(*exact, memory["before"], scaled)
         new["observed"] = self._observe(gamma, memory["observed"])
         desired = Reference(**{name: given[name] for name in _DESIRED})
-        command = ControlLaw(
-            control,
-            self._torque,
-            self._accelerate,
-            gains["kp"],
-            gains["kd"],
-            gains["inertia"],
-            gains["rate"][0],
-            gains["limit"][0] if self._limited else None,
-            control.period,
-        ).answer(
-            desired,
-            (given["feedforward"], given["held"]),
-            gamma,
-            gamma_dot,
-            new["observed"],
-            memory["integral"],
-        )
+        limit = gains["limit"][0] if self._limited else None
+        numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
+        law = ControlLaw(control, self._torque, self._accelerate, *numbers, control.period)
+        torques, observed = (given["feedforward"], given["held"]), new["observed"]
+        command = law.answer(desired, torques, gamma, gamma_dot, observed, memory["integral"])
         new["integral"] = command.integral
         torque, new["queue"] = control.transmit(command.torque, memory["queue"], given["first"][0])
         if self._limited:

@@ -7,7 +7,7 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,10 +120,19 @@ def run_study(
             text = json.dumps(ready.about, indent=1) + "\n"
             (out / "study.json").write_text(text, encoding="utf-8")
     missing = [index for index in range(study.chunks) if index not in complete]
-    bar, tables = SweepProgress(study, missing, shown=progress), dict[int, ChunkOutcome]()
+    bar, began, reasons = Bar("sweep", progress), time.monotonic(), Counter[str]()
+    left = total = sum(len(study.rows_of(index)) for index in missing)
+    tables: dict[int, ChunkOutcome] = {}
 
     def done(outcome: ChunkOutcome) -> None:
-        bar.add(outcome)
+        """Keep a chunk, and show the runs that are done and how the early ones ended."""
+        nonlocal left
+        left -= len(study.rows_of(outcome.index))
+        reasons.update(outcome.reasons)
+        rate = (total - left) / max(time.monotonic() - began, 1e-9)
+        ended = ", ".join(f"{count} {text}" for text, count in reasons.most_common(3))
+        text = f"{rate:.0f} runs/s, {left / max(rate, 1e-9):.0f} s left"
+        bar.draw(1.0 - left / study.rows, text + (f"; early: {ended}" if ended else ""))
         if out is None:
             tables[outcome.index] = outcome
 
@@ -156,29 +165,3 @@ def _read_steps(out: Path) -> int | None:
         return int(json.loads((out / "study.json").read_text(encoding="utf-8"))["steps"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-class SweepProgress:
-    """A bar with the runs that are done and how the early ones ended.
-
-    Args:
-        study: what runs.
-        missing: chunks that are not there already.
-        shown: draw it, if stderr is a terminal.
-
-    """
-
-    def __init__(self, study: SweepStudy, missing: Sequence[int], *, shown: bool) -> None:
-        self._study, self._bar, self._began = study, Bar("sweep", shown), time.monotonic()
-        self._left = self._missing = sum(len(study.rows_of(index)) for index in missing)
-        self._reasons: Counter[str] = Counter()
-
-    def add(self, outcome: ChunkOutcome) -> None:
-        """Count a chunk that is done."""
-        self._left -= len(self._study.rows_of(outcome.index))
-        self._reasons.update(outcome.reasons)
-        rate = (self._missing - self._left) / max(time.monotonic() - self._began, 1e-9)
-        ended = ", ".join(f"{count} {text}" for text, count in self._reasons.most_common(3))
-        text = f"{rate:.0f} runs/s, {self._left / max(rate, 1e-9):.0f} s left"
-        share = 1.0 - self._left / self._study.rows
-        self._bar.draw(share, text + (f"; early: {ended}" if ended else ""))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_ros.host.output import write_into
 from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
-from sst_ros.sweeps.chunk_task import correlate, correlate_early_ends, list_outputs
+from sst_ros.sweeps.chunk_task import correlate, list_outputs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,7 +36,7 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     figures = {"distributions": draw_distributions(complete, table.attrs["units"])}
     if ended.any():
         counts = table["reason"].astype(str).value_counts()
-        figures["early_ends"] = draw_early_ends(correlate_early_ends(table), counts)
+        figures["early_ends"] = draw_early_ends(correlate(table), counts)
     score, title = _score(table)
     if shown := correlate(table, score).index[:MOST_INPUTS].tolist():
         worst = np.argsort(score.to_numpy())[-MOST_RUNS:]

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import spearmanr
 
 from sst_ros.cli.commands import run_command
-from sst_ros.sweeps.chunk_task import correlate_early_ends, read_sweep
+from sst_ros.sweeps.chunk_task import correlate, read_sweep
 
 for module in ("numba", "pandas", "pyarrow", "matplotlib"):
     pytest.importorskip(module, reason="the command needs it")
@@ -41,7 +41,7 @@ def test_its_summary_names_reasons_and_causes(folder, capsys):
 
 def test_correlations_are_spearmans(folder):
     table = read_sweep(folder / "out")
-    found = correlate_early_ends(table)
+    found = correlate(table)
     for name in table.attrs["inputs"]:
         assert found[name] == pytest.approx(spearmanr(table[name], table["status"] != 0).statistic)
     assert list(found.abs()) == sorted(found.abs(), reverse=True)
