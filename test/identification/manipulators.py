@@ -87,9 +87,8 @@ def wrong(scene, seed=0, share=0.2):
     factors = iter(1.0 + share * rng.choice([-1.0, 1.0], 20) * rng.uniform(0.5, 1.0, 20))
 
     def scaled(body, factor):
-        inertia = body.inertia and type(body.inertia)(
-            **{k: factor * v for k, v in dataclasses.asdict(body.inertia).items()}
-        )
+        parts = body.inertia and dataclasses.asdict(body.inertia)
+        inertia = parts and type(body.inertia)(**{k: factor * v for k, v in parts.items()})
         return dataclasses.replace(body, inertia=inertia, mass=factor * body.mass)
 
     links = {}

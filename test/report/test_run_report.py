@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a recorded run: numbers, verdict, tables, pictures; and lies in the recording."""
+"""The report of a recorded run: numbers, verdict, tables, pictures, tracking; lies in it."""
 
 import base64
 import dataclasses
@@ -13,8 +13,9 @@ from matplotlib import image
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.integration.propagator import TickPropagator
+from sst_ros.mechanism.frames import angle_between
 from sst_ros.recording import recording
-from sst_ros.report import overview, reference, timing
+from sst_ros.report import overview, reference, timing, tracking
 from sst_ros.report.results import render
 from sst_ros.report.run import evaluate_run, summary_table, summary_text, write_run_report
 from sst_ros.scene import scene
@@ -410,3 +411,62 @@ def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
     one, other = (found[0].error.gamma[:201].to_numpy() for found in (plain, compiled))
     assert one == pytest.approx(other, abs=1e-15)
     assert plain[1][:201] == pytest.approx(compiled[1][:201], abs=1e-13)
+
+
+HOME = np.array(scene.load("example2").initial.gamma)
+OFF = np.array([0.01, -0.02, 0.03])
+STILL = np.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def followed(bags):
+    plain = bags.simulated(scene.load("example2"), 0.1)
+    return bags.tracked(plain, lambda _: (HOME + OFF, STILL))
+
+
+def test_the_track_is_what_was_written(followed, written):
+    bag = written(followed)
+    found = tracking.read_tracking(bag)
+    run, track = recording.read(bag), found.track
+    assert len(track.time) == 51 and track.time[-1] == pytest.approx(0.1)
+    assert track.gamma == pytest.approx(np.tile(HOME + OFF, (51, 1)))
+    assert track.gamma - track.error == pytest.approx(run.gamma)
+    # The torque of a sample is that of the tick that begins there; after the last there is none.
+    begins = np.isin(run.ticks.start_ns, run.time_ns)
+    assert np.array_equal(track.torque[:-1], run.ticks.torque[begins])
+    assert not track.torque[-1].any()
+    largest = np.abs(HOME + OFF - run.gamma).max(axis=0)
+    assert found.metrics.largest == pytest.approx(largest)
+
+
+def test_the_error_of_the_orientation_is_the_angle_to_the_reference(bags, followed, written):
+    plain = bags.without(followed, bags.DESIRED, bags.ERROR)
+    found = tracking.read_tracking(written(bags.tracked(plain, lambda _: (HOME, STILL))))
+    q = found.recording.quaternion
+    assert found.orientation_error.max() > 1e-3
+    assert found.orientation_error == pytest.approx(angle_between(q, q[0]), abs=1e-12)
+
+
+def test_the_last_report_says_how_often_a_torque_was_limited(bags, followed, written):
+    said = bags.diagnostics_entry(followed[-1].received_ns + 1, samples_limited=7)
+    said.content.status[0].name = "/sst_inverse_dynamics: control"
+    assert tracking.read_tracking(written([*followed, said])).metrics.limited == 7
+
+
+def test_the_report_writes_a_table_and_a_picture(followed, written, tmp_path):
+    told = tracking.write_tracking_report(written(followed), tmp_path)
+    assert (tmp_path / "tracking.txt").read_text(encoding="utf-8") == told
+    assert "error, largest" in told and "nan" not in told
+    for name in ("tracking", "tracking_error", "control_torques"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+def test_a_recording_without_a_reference_or_of_other_joints_is_refused(
+    bags, followed, written, tmp_path
+):
+    with pytest.raises(InputError, match="reference"):
+        tracking.write_tracking_report(written(bags.without(followed, bags.DESIRED)), tmp_path)
+    names = {"name": ["a", "b", "c"]}
+    renamed = bags.edited(followed, bags.ERROR, 3, lambda one: dataclasses.replace(one, **names))
+    with pytest.raises(InputError, match="tracking_error"):
+        tracking.read_tracking(written(renamed))

@@ -67,7 +67,7 @@ def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
     assert np.nanmax(run.orientation_error) < 1e-3 * travel
     assert metrics.feedforward == pytest.approx(1.0) and not metrics.feedback.any()
     assert metrics.settling == 0.0 and metrics.limited == 0
-    assert "nan" not in (twice[0] / "tracking.txt").read_text()  # see test_tracking_report.py
+    assert "nan" not in (twice[0] / "tracking.txt").read_text()  # see test_run_report.py
     assert (twice[0] / "tracking.png").stat().st_size > 10_000
 
 
