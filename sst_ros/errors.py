@@ -18,6 +18,10 @@ SHOWN_PROBLEMS = 20
 class SstError(Exception):
     """Base of all errors that this package raises on purpose."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Go to another process as it is: `__init__` takes other arguments than its text."""
+        return Exception.__new__, (type(self), *self.args), vars(self)
+
 
 @dataclass(frozen=True)
 class Problem:

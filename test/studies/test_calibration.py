@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studies of the error estimate and of orders: a case of each class, a method of each order."""
 
+import pickle
+
 import pytest
 
+from sst_ros.errors import InputError, Problem, RunStopped, SingularConfiguration
 from sst_ros.report.results import data_frame
 from studies.estimate import CLASSES, measure
 from studies.orders import ORDER, measure_steps, measure_tolerance, order_table
@@ -34,3 +37,16 @@ def test_events_and_samples_have_errors_below_the_tolerance():
         rows = measure_tolerance((name, "dop853", 1e-7))
         assert rows and all(row.known < row.error < 1e-7 for row in rows)
     assert measure_tolerance(("contact", "gauss", 1e-7)) == []
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        InputError("a", [Problem("k", 1, "no")]),
+        RunStopped("r", 0.1, None),
+        SingularConfiguration("m", 1.0),
+    ],
+)
+def test_an_error_goes_from_a_worker_to_its_parent(error):
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error) and str(again) == str(error) and vars(again) == vars(error)
