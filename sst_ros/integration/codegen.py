@@ -39,25 +39,28 @@ from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
 import numba
 import numpy as np
 
-jit = numba.njit(cache={cache}, error_model="numpy", nogil={nogil}{more})
-jit_inline = numba.njit(cache={cache}, error_model="numpy", nogil={nogil}{more}, forceinline=True)
+options = dict(cache={cache}, error_model="numpy", nogil={nogil}{more}, no_cfunc_wrapper=True)
+jit = numba.njit(**options)
+jit_inner = numba.njit(**options, no_cpython_wrapper=True)
 
-@jit
+@jit_inner
 def vector(n):
     return np.zeros(n)
 
-@jit
+@jit_inner
 def square(n):
     return np.zeros((n, n))
 
-@jit
+@jit_inner
 def rows(m, n):
     return np.zeros((m, n))
 """
 
-# A call hands on each array as seven words on the stack and counts its readers by two atomic
-# operations. As a call, the step cost RK4 7 % of its time in `step_fixed`, 13 % in `step_many`.
-_INLINE = ("step",)
+# Compiled functions alone call these. What Python would need to call them - which without it is a
+# segmentation fault - takes a fifth of the time to compile.
+_INNER = (
+    "angles_and_rates joints_of normalise all_far attempt evaluate linearise factorise substitute"
+)
 
 _FREE_ROUNDING = ', fastmath={"arcp", "contract"}'
 
@@ -99,7 +102,30 @@ def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
 
     """
     y, d = _names("y", size), [*_names("d", drive), *more]
-    lines = [f"def step({', '.join(['t', 'h', *y, *d])}):"]
+    lines = [f"def step({', '.join(['t', 'h', *y, *d])}):", *_stages(tableau, size, d)]
+    results = ", ".join([*_names("n", size), *_names("e", size)])
+    lines.append(f"    return ({results},)")
+    return "\n".join(lines) + "\n"
+
+
+def attempt_explicitly(tableau: Tableau, size: int, drive: int, *more: str) -> str:
+    """Source of the same step on arrays, as `step_loops` has them: attempt(t, h, y, ..)."""
+    places = [*_names("new_y", size, "[{}]"), *_names("error", size, "[{}]")]
+    results = [*_names("n", size), *_names("e", size)]
+    d = [*_names("d", drive), *more]
+    lines = [
+        "def attempt(t, h, y, near, d, p, new_y, error):",
+        *(f"    y{i} = y[{i}]" for i in range(size)),
+        *(f"    d{i} = d[{i}]" for i in range(drive)),
+        *_stages(tableau, size, d),
+        *(f"    {place} = {result}" for place, result in zip(places, results, strict=True)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _stages(tableau: Tableau, size: int, d: list[str]) -> list[str]:
+    """Lines of a step from y0, .. to the new state n0, .. and its error estimate e0, .."""
+    y, lines = _names("y", size), []
     for stage, row in enumerate(tableau.a):
         for j in range(size) if stage else ():
             lines.append(f"    s{j} = y{j} + h * ({_combination(row, j)})")
@@ -119,9 +145,7 @@ def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
             lines.append(f"    coarse = {_combination(tableau.damping, j)}")
             lines.append("    both = fine * fine + 0.01 * (coarse * coarse)")
             lines.append(f"    e{j} = h * fine * abs(fine) / sqrt(both) if both > 0.0 else 0.0")
-    results = ", ".join([*_names("n", size), *_names("e", size)])
-    lines.append(f"    return ({results},)")
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def combination(weights: Sequence[float], word: Callable[[int], str]) -> str:
@@ -134,8 +158,8 @@ def _combination(weights: Sequence[float], j: int) -> str:
     return combination(weights, lambda i: f"k{i}_{j}")
 
 
-def _names(letter: str, count: int) -> list[str]:
-    return [f"{letter}{i}" for i in range(count)]
+def _names(letter: str, count: int, place: str = "{}") -> list[str]:
+    return [letter + place.format(i) for i in range(count)]
 
 
 @dataclass(frozen=True)
@@ -237,7 +261,7 @@ def _for_numba(
 
 
 def _decorator(text: str) -> str:
-    return "@jit_inline" if _function_name(text) in _INLINE else "@jit"
+    return "@jit_inner" if _function_name(text) in _INNER.split() else "@jit"
 
 
 def _function_name(text: str) -> str:

@@ -302,10 +302,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
     ]
     texts: list[str] = []
     if isinstance(method, Tableau):
-        new = [f"new_y[{i}]" for i in range(size)] + [f"error[{i}]" for i in range(size)]
-        step = _assign(new, f"step({', '.join(['t', 'h', *y, *d, *p])})")
-        texts.append(codegen.explicit_step(method, size, len(d), *p))
-        texts.append(f"def attempt(t, h, y, near, d, p, new_y, error):\n{step}")
+        texts.append(codegen.attempt_explicitly(method, size, len(d), *p))
     else:
         constants |= method.constants
         slope = [f"slope[{i}]" for i in range(size)]
