@@ -33,11 +33,11 @@ def wheels(distribution: str) -> list[str]:
 EXTRAS = {
     "ros": wheels("kilted"),
     "record": ["mcap>=1.6", "rosbags>=0.11", "pandas>=2", "pyarrow>=14"],
-    "plot": ["jinja2>=3", "matplotlib>=3.5", "pandas>=2"],
+    "plot": ["matplotlib>=3.5", "pandas>=2"],
     "fast": ["numba>=0.57"],
     "sweep": ["numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "cluster": ["dask[distributed]>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
-    "view": ["jinja2>=3", "viser>=1.1,<2"],
+    "view": ["viser>=1.1,<2"],
 }
 EXTRAS["all"] = ["argcomplete", "mpmath", "xarray", *chain.from_iterable(EXTRAS.values())]
 EXTRAS |= {
@@ -112,7 +112,7 @@ setup(
         # `ros2 run` looks here; pip would put the node executables into bin/.
         (f"lib/{NAME}", files("executables/*")),
     ],
-    install_requires=["numpy>=1.21", "scipy>=1.8", "PyYAML>=5.4"],
+    install_requires=["numpy>=1.21", "scipy>=1.8", "PyYAML>=5.4", "jinja2>=3"],
     extras_require=EXTRAS,
     entry_points={"console_scripts": [f"sst-ros = {NAME}.__main__:main"]},
     zip_safe=True,

@@ -10,7 +10,6 @@ from sst_ros.errors import SstError
 
 EXTRAS = {
     "distributed": "cluster",
-    "jinja2": "plot",
     "lz4": "record",
     "matplotlib": "plot",
     "mcap": "record",

@@ -163,7 +163,8 @@ def check_with_paper(recording: Recording, count: int = STATES) -> tuple[float |
     return compare_with_paper(recording.scene, zip(states, acting, strict=True))
 
 
-QUANTITIES = ("gamma", "gamma_dot", "orientation")
+QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
+"""What is compared, and its unit in names."""
 
 
 class Comparison(NamedTuple):
@@ -301,7 +302,9 @@ def _compare(
 def _unknown(recording: Recording) -> DataFrame:
     """Return the errors of samples of which none is compared yet."""
     count = len(recording.time_ns)
-    table: DataFrame = require("pandas").DataFrame(np.full((count, 3), np.nan), columns=QUANTITIES)
+    table: DataFrame = require("pandas").DataFrame(
+        np.full((count, 3), np.nan), columns=[*QUANTITIES]
+    )
     return table
 
 

@@ -17,7 +17,6 @@ import jinja2
 from sst_ros.extras import require
 from sst_ros.host.output import write_into
 from sst_ros.integration.codegen import numba_version
-from sst_ros.plot.style import save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,6 +86,8 @@ def publish(
         InputError: `out` cannot be written.
 
     """
+    from sst_ros.plot.style import save_figure  # needs matplotlib, which a summary does not
+
     whole = {**document, "report": made_on()}
     text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
     with write_into(out, name):

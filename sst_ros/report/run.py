@@ -23,7 +23,7 @@ from sst_ros.plot.style import save_figure
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.report import overview, reference, timing, tracking
-from sst_ros.report.reference import Comparison, begins
+from sst_ros.report.reference import QUANTITIES, Comparison, begins
 from sst_ros.report.results import made_on, provenance, render
 from sst_ros.report.timing import Timing
 from sst_ros.state import NANOSECONDS
@@ -41,8 +41,6 @@ ERROR_LIMIT_RAD = 1e-9
 ANSWERED_PERCENT = 90.0
 """Share of samples that a controller at the sample rate answers."""
 FORMULATION_LIMIT = 1e-9
-
-QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
 
 
 class RunEvaluation(NamedTuple):

@@ -120,11 +120,6 @@ class WorkPrecision:
         return ABOVE_REFERENCE * self.reference.own.orientation
 
     @property
-    def failed(self) -> int:
-        """Number of settings that failed."""
-        return int((self.rows.failure != "").sum())
-
-    @property
     def rests(self) -> bool:
         """Whether nothing moves, so that every setting is right to rounding.
 
