@@ -192,21 +192,21 @@ class PreparedSweep:
     ) -> tuple[BatchResult, Columns]:
         """Return results of rows by a number of steps, and their extremes or tracking figures."""
         batch = self.batch.with_parameters(scenarios)
-        if self.controlled is not None:
-            return self.controlled.run(batch, starts, rows, steps, kept)
-        initial = self.study.scene.initial
-        gamma = starts.get("initial.gamma", np.array(initial.gamma))
-        rate = starts.get("initial.gamma_dot", np.array(initial.gamma_dot))
-        if scenarios.count is None:
-            gamma = np.broadcast_to(gamma, (len(rows), 3))
         every = kept or (-(-steps // PARTS) if "extremes" in self.study.outputs else 0)
-        step = self.study.length / steps
-        result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
-        if kept or result.kept is None:
-            return result, {}
-        extremes = extremes_of(result.kept)
-        result.kept = None
-        return result, extremes
+        if self.controlled is not None:
+            result, more = self.controlled.run(batch, starts, rows, steps, every)
+        else:
+            initial, more = self.study.scene.initial, {}
+            gamma = starts.get("initial.gamma", np.array(initial.gamma))
+            rate = starts.get("initial.gamma_dot", np.array(initial.gamma_dot))
+            if scenarios.count is None:
+                gamma = np.broadcast_to(gamma, (len(rows), 3))
+            step = self.study.length / steps
+            result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
+        if result.kept is not None and not kept:
+            more |= extremes_of(result.kept)
+            result.kept = None
+        return result, more
 
     def _trajectory(
         self, values: dict[str, Array], rows: NDArray[np.int64], samples: int

@@ -150,9 +150,11 @@ def test_the_time_at_which_a_controlled_run_leaves_does_not_depend_on_its_steps(
     rates = [[rate, 0.0, 0.0] for rate in (0.0, 12.0, 20.0, -20.0)]
     control = {"mode": "gravity_pd", "bandwidth": 5.0, "period": 0.01, "delay": 1}
     coarse, fine = (
-        sweep("reach", {"initial.gamma_dot": rates}, duration=0.1, control=control, steps=steps)
+        sweep("reach", {"initial.gamma_dot": rates}, duration=0.1, control=control, steps=steps,
+              outputs=("gamma", "extremes"))
         for steps in (40, 160)
-    )
+    )  # fmt: skip
+    assert np.all(coarse["gamma_max_1"] >= coarse["gamma_1"])
     assert coarse["reason"].tolist() == fine["reason"].tolist()
     assert coarse["status"].tolist() == [0, 1, 1, 1]
     np.testing.assert_allclose(coarse["fault_time"], fine["fault_time"], rtol=0.0, atol=1e-8)
