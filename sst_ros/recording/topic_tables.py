@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.recording.bag_reader import Topic, refusal
+from sst_ros.scene.loads import JOINTS
 from sst_ros.state import Array, is_idle, nanoseconds
 
-KINDS = ("gamma", "mu", "beta")
-JOINTS = tuple(f"{kind}_{leg}" for kind in KINDS for leg in (1, 2, 3))
 ACTUATED = JOINTS[:3]
 MOMENTS = ("moment_x", "moment_y", "moment_z")
 
@@ -277,8 +276,8 @@ JOINT_STATES = _table(
     "joint_states",
     _JOINT_STATE,
     _joints(JOINTS),
-    *((_legs(kind), "rad", f"joint angle {kind}") for kind in KINDS),
-    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in KINDS),
+    *((_legs(kind), "rad", f"joint angle {kind}") for kind in ("gamma", "mu", "beta")),
+    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in ("gamma", "mu", "beta")),
     (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
 )
 ORIENTATION = _table(
