@@ -8,7 +8,6 @@ Example 2 at 1e-9 rad by collocation, compiled; the command is `sst-ros scene li
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
@@ -16,8 +15,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 from statistics import median
-
-import numpy as np
 
 from benchmark.measure import divide, time_in_turn
 from sst_ros import load_scene, prepare, simulate
@@ -42,9 +39,8 @@ def used_by_children() -> float:
 
 def main() -> None:
     scene = load_scene("example2_heavy")
-    task = Task(
-        scene, profile_of(scene.torque), 10**9, None, "gauss", 1e-9, np.empty(0), math.inf, None
-    )
+    profile = profile_of(scene.torque)
+    task = Task(scene, profile, 10**9, None, "gauss", 1e-9, profile.kinks(), 1.0, None)
     whole = partial(simulate, scene, method="gauss", tolerance=1e-9)
     calls: dict[str, Callable[[], object]] = {
         "integration": CollocatedMotion(task).compute,
