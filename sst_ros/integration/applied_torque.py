@@ -177,8 +177,9 @@ class AppliedTorque:
         slope[:] = found[:size]
         rows = np.array(found[2 * size :]).reshape(size + 3, size).T
         by_state, by_torque = rows[:, :size], rows[:, size:]
-        earlier, later = (self.at(torque, time + x, y) for x in (-_TIME_STEP, _TIME_STEP))
-        rate = (np.array(later) - earlier) / (2.0 * _TIME_STEP)
+        # Forward: a step may begin at a kink, behind which the torque has another rate.
+        near, far = (np.array(self.at(torque, time + k * _TIME_STEP, y)) for k in (1, 2))
+        rate = (4.0 * near - far - 3.0 * np.array(now)) / (2.0 * _TIME_STEP)
         by_time[:] = (np.array(found[size : 2 * size]) + by_torque @ rate).tolist()
         if isinstance(torque, StateFeedback):
             turns = np.zeros((3, size))

@@ -6,9 +6,10 @@ import pickle
 import pytest
 
 from sst_ros.errors import InputError, Problem, RunStopped, SingularConfiguration
+from sst_ros.mechanism.frames import angle_between
 from sst_ros.report.results import data_frame
 from studies.estimate import CLASSES, measure
-from studies.orders import ORDER, measure_steps, measure_tolerance, order_table
+from studies.orders import MOTIONS, ORDER, measure_steps, measure_tolerance, order_table, truth
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -30,6 +31,14 @@ def test_a_method_has_its_order_on_a_smooth_motion(method):
     table = order_table(data_frame(row._asdict() for row in measure_steps(("lag", method))))
     found = float(table["order, shortest steps"][0])
     assert ORDER[method] - 0.2 < found < 1.4 * ORDER[method]
+
+
+def test_the_implicit_method_keeps_its_order_where_a_limit_cuts_the_torque():
+    """A step begins at each kink; the rate of the torque is that behind it."""
+    exact, motion = truth("clamp")[0], MOTIONS["clamp"]
+    runs = [motion.run("rodas5p", 1e3, max_step=0.4 / steps) for steps in (8, 16, 32)]
+    errors = [angle_between(run.quaternion[-1], exact.quaternion[-1]) for run in runs]
+    assert errors[0] / errors[1] > 20.0 < errors[1] / errors[2]
 
 
 def test_events_and_samples_have_errors_below_the_tolerance():
