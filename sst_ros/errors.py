@@ -49,6 +49,13 @@ class InputError(SstError):
         super().__init__("\n".join(map(printable, lines)))
 
 
+def refuse_unless(origin: str, *checks: tuple[str, object, bool, str]) -> None:
+    """Raise InputError for each argument that is not good: (name, value, good, what is allowed)."""
+    problems = [Problem(name, value, allowed) for name, value, good, allowed in checks if not good]
+    if problems:
+        raise InputError(origin, problems)
+
+
 class MotionRefused(InputError):
     """A desired motion leaves what the manipulator or its actuators can do."""
 

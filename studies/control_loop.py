@@ -24,7 +24,7 @@ from sst_ros.control.law import ControlChannel
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.tracking import TrackingRecord
 from sst_ros.errors import RunStopped
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.generic_math import ZERO, axpy
 from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
 from sst_ros.runtime.tick_loop import TickLoop

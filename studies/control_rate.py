@@ -22,8 +22,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import slices
-from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, styled

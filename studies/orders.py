@@ -21,7 +21,8 @@ from sst_ros import Simulation, SineTorque, Trajectory, simulate
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
+from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import angle_between
@@ -29,7 +30,6 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.plot.style import GREY, INK, MARKERS, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish
 from sst_ros.simulation.simulate_gauss import GAUSS, NODES
-from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET
 from studies import DOCS, run, run_jobs
 from studies.extreme_scenes import FREE, Changes, bouncing, changed
 from studies.sampled_data import slope

@@ -13,7 +13,8 @@ import pytest
 from bags import bags, example2, example2_bag, read, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
-from sst_ros.integration import batch, batch_source, codegen
+from sst_ros.host import compiled_module
+from sst_ros.integration import batch, batch_source
 
 # By its default an example of 0.2 s is a failure: on a loaded machine any may take that long.
 hypothesis.settings.register_profile("untimed", deadline=None)
@@ -45,11 +46,11 @@ def interpret_batches(monkeypatch):
     from sst_ros.sweeps import controlled_batch
 
     def load(texts, constants, **_):
-        return codegen.load(["import numpy as np", *texts], constants, numba=False)
+        return compiled_module.load(["import numpy as np", *texts], constants, numba=False)
 
-    plain = SimpleNamespace(load=load, numba_version=codegen.numba_version)
+    plain = SimpleNamespace(load=load, numba_version=compiled_module.numba_version)
     for module in (batch, controlled_batch):
-        monkeypatch.setattr(module, "codegen", plain)
+        monkeypatch.setattr(module, "compiled_module", plain)
     for module in (batch, batch_source, controlled_batch):
         monkeypatch.setattr(module, "SIMD_WIDTH", 4)
 

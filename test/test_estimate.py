@@ -127,7 +127,7 @@ def test_nine_samples_cost_little_more_than_none():
         simulate("example2_heavy", method="dop853", t_eval=times, tolerance=1e-8).evaluations
         for times in ([1.0], np.linspace(0.0, 1.0, 9))
     ]
-    assert counts[1] <= counts[0]
+    assert counts[1] <= counts[0] + 9 * 12  # a step for each, which is counted
 
 
 def test_the_longest_step_is_obeyed():

@@ -36,7 +36,7 @@ import sys
 from sst_ros import Simulation
 from sst_ros.errors import RunStopped
 simulation = Simulation("{scene}", compiled=False)
-simulation.load_code(1_000_000)
+simulation.load_code()
 before = set(sys.modules)
 try:
     simulation.steps(({torque}, 0.0, 0.0), 1_000_000, 2000)

@@ -13,13 +13,13 @@ from scipy.integrate import solve_ivp
 from sst_ros import TorqueTable, prepare
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.propagator import Propagator
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump, plain
-from sst_ros.simulation import simulate_gauss, simulate_steps
+from sst_ros.simulation import simulate_gauss, stepped_motion
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 
@@ -296,8 +296,8 @@ def test_a_run_that_goes_on_in_compiled_code_has_the_same_digits(
 ):
     how = {"duration": 0.6, "method": method, "tolerance": 1e-9}
     plain = simulate(scene, torque, **how)
-    monkeypatch.setattr(simulate_steps, "_WORTH_LOADING", 50)
-    monkeypatch.setattr(simulate_steps, "_WORTH_COMPILING", 100)
+    monkeypatch.setattr(stepped_motion, "_WORTH_LOADING", 50)
+    monkeypatch.setattr(stepped_motion, "_WORTH_COMPILING", 100)
     compiled = []
     monkeypatch.setattr(
         Propagator, "compile", lambda self, do=Propagator.compile: compiled.append(do(self))

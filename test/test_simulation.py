@@ -23,7 +23,7 @@ from sst_ros.errors import (
     StrokeExceeded,
     WorkspaceLeft,
 )
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.scene.scene import Actuators, Initial, Workspace, load
 from sst_ros.simulation.simulation import Simulation
@@ -230,7 +230,7 @@ def test_a_torque_moves_as_its_function_does(scene, torque, within):
     other.steps(getattr(torque, "at", lambda t: torque), 10 * MILLISECOND, 50)
     assert one.state.torque == pytest.approx(other.state.torque, abs=1e-13)
     assert one.state.quaternion == pytest.approx(other.state.quaternion, abs=within, rel=0.0)
-    assert one.error_estimate < 1e-8
+    assert one.error_estimate < (1e-7 if scene is LIMITED else 1e-8)  # it has kinks inside steps
     if within == 0.0:
         assert one.state == other.state
     middle = one.time_ns - 4 * MILLISECOND

@@ -18,7 +18,7 @@ from benchmark.peers import results
 from benchmark.peers.floor import find_floor
 from benchmark.peers.study import TARGETS, Series, run_study, solve_task
 from benchmark.peers.task import Task
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 
 MODULES = {
     "ours": "numba",

@@ -18,11 +18,11 @@ import numpy as np
 from sst_ros.cli.commands import free_out, function, refuse, refuse_unknown
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.extras import require
-from sst_ros.host import child_process
+from sst_ros.host import child_process, compiled_module
 from sst_ros.host.cache_folder import cache_folder, configured_folder
 from sst_ros.host.output import require_free, results_folder
 from sst_ros.host.table_file import SUFFIXES
-from sst_ros.integration import codegen, compiled_method
+from sst_ros.integration import compiled_method
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.scene_summary import summary
@@ -96,7 +96,7 @@ def implausible(scene: Scene) -> str:
 def compile_code(options: argparse.Namespace) -> None:
     """Compile the code of a scene into the cache."""
     refuse_unknown(options, "--integrator", options.integrator, INTEGRATORS)
-    if codegen.numba_version() is None:
+    if compiled_module.numba_version() is None:
         require("numba")
         raise SstError("numba is switched off by SST_ROS_NUMBA=0")
     if (folder := cache_folder()) != configured_folder():

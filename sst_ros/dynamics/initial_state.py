@@ -9,11 +9,12 @@ Eq. 90 for gamma_ddot and takes omega_dot from Eq. 40.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import InputError, Problem, SingularConfiguration
+from sst_ros.errors import InputError, Problem, SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import quaternion_rate
@@ -99,6 +100,23 @@ def initial_states(
         g = (w - a * geometry.e) / (1.0 - a * a)
         y[4:7, rows] = np.linalg.solve(g, gamma_dot[rows][..., None])[..., 0].T
     return y, code
+
+
+@lru_cache(maxsize=64)
+def start_of(scene: Scene) -> tuple[float, ...]:
+    """Return the initial state of a scene in which a run can begin.
+
+    Raises:
+        InputError: the initial gamma lies outside the stroke.
+        AssemblyError, SingularConfiguration: as `initial_state`.
+
+    """
+    gamma, geometry = np.array(scene.initial.gamma), Geometry.of(scene)
+    inside = scene.stroke.at_end != "stop" or bool(np.all((gamma >= 0) & (gamma <= geometry.arc)))
+    ends = ", ".join(f"{arc:.6f}" for arc in geometry.arc)
+    allowed = f"must lie in the stroke, 0 to ({ends}) rad"
+    refuse_unless(scene.name, ("initial.gamma", scene.initial.gamma, inside, allowed))
+    return initial_state(scene, geometry)
 
 
 def accelerate_by_paper(

@@ -18,7 +18,8 @@ from sst_ros.dynamics.expression import (
     with_derivative_along,
     with_jacobian,
 )
-from sst_ros.mechanism.generic_math import positive, rotation_rows, sin
+from sst_ros.dynamics.model import Leg, Limit
+from sst_ros.mechanism.generic_math import Scalar, dot3, positive, rotation_rows, sin
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
@@ -201,11 +202,12 @@ class ODE:
 
         """
         size = len(self.state)
-        flat = np.array(self._linearised(t, *y, *d)[2 * size :])
+        flat = np.array(self.linearised(t, *y, *d)[2 * size :])
         return np.asarray(np.linalg.eigvals(flat.reshape(size, size).T))
 
     @cached_property
-    def _linearised(self) -> Function:
+    def linearised(self) -> Function:
+        """The program of `jacobian` as a function."""
         return compile_program(self.jacobian)
 
     @cached_property
@@ -268,3 +270,39 @@ def ode_with_work(dynamics: Dynamics) -> ODE:
 def ode_under(dynamics: Dynamics, torque: SineTorque, limit: float | None) -> ODE:
     """Give the system under a sine whose phases are its drive, which counts work."""
     return ODE(dynamics, torque, limit=limit, work=True, phases=True)
+
+
+def limit_distances(
+    limits: Sequence[Limit],
+    ends: Sequence[tuple[Scalar, Scalar]],
+    model: kernel.Model,
+    state: Sequence[Any],
+) -> tuple[Scalar, ...]:
+    """Return a number for each limit, positive inside, then the rate of each.
+
+    They hold for angles less than pi away from the limit. `ends` has cosine and sine of the end of
+    each limit; the state is quaternion and body rate.
+    """
+    x, y, z, w, *rate = state
+    rows = rotation_rows((x, y, z, w))
+    legs = [kernel.leg_motion(leg, rows, (rate[0], rate[1], rate[2])) for leg in model.legs]
+    pairs = [
+        _distance(limit, *end, legs[limit.joint % 3], model.legs[limit.joint % 3])
+        for limit, end in zip(limits, ends, strict=True)
+    ]
+    return tuple(pair[0] for pair in pairs) + tuple(pair[1] for pair in pairs)
+
+
+def _distance(
+    limit: Limit, cosine: Scalar, sine: Scalar, at: kernel.LegMotion, leg: Leg
+) -> tuple[Scalar, Scalar]:
+    """sqrt(u) sin(sign * (angle - end)) and its rate; of mu sin(mu)^2 - sin(end)^2."""
+    if limit.joint < 3:
+        along, across, rate = dot3(at.outward, leg.v), dot3(at.outward, leg.across), at.gamma_dot
+    elif limit.joint < 6:
+        return at.u - sine * sine, -2.0 * at.a * at.a_dot
+    else:
+        along, across, rate = at.p[2], at.p[0] * leg.e1 - at.p[1] * leg.e0, at.beta_dot
+    distance = limit.sign * (across * cosine - along * sine)
+    turning = limit.sign * (along * cosine + across * sine) * rate
+    return distance, turning - distance * at.a * at.a_dot / at.u

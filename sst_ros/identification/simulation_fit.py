@@ -23,7 +23,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -35,12 +35,13 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_program, mark_present, with_jacobian
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
+from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, scales
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
 from sst_ros.identification.parameters import STANDARD, Identification, value_of
+from sst_ros.integration.applied_torque import torque_at
 from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
@@ -233,10 +234,11 @@ class Sensitivities:
         rows[t <= 0.0] = y
         for end in np.unique(np.append(inside, t[-1])).tolist():
             here = (t > begin) & (t <= end)
+            acting = torque.acting(begin, end, Dynamics.of(self.scene))
             try:
                 run = solve_ivp(
                     rates, (begin, end), y, "DOP853", np.union1d(t[here], end),
-                    rtol=tolerance, atol=tolerance * least, args=(torque.between(begin, end),),
+                    rtol=tolerance, atol=tolerance * least, args=(partial(torque_at, acting),),
                 )  # fmt: skip
             except (ArithmeticError, ValueError):
                 run = None

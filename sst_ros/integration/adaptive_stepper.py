@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error-controlled steps through one period, with the method that suits the motion."""
+"""Error-controlled steps through one period, with the method that suits the motion.
+
+A second solution goes through each step by two of half the length: its distance is the error. No
+order is assumed, as none holds where a torque jumps, a clamp or a contact bends the motion, or
+friction is sharp. Where the method has its order, the second solution is nearly exact, and the
+distance is the error; where each step loses its order, the error halves, and the distance is half
+of the error.
+"""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +23,10 @@ from sst_ros.integration.compiled_method import (
     CompiledMethod,
     JointRanges,
     Method,
-    Point,
+    Place,
     Vector,
 )
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P, Rosenbrock
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS5P, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 
 GROW = 5.0
@@ -69,6 +76,10 @@ class BudgetSpent(CannotStep):
     """The evaluations that a period may take are used up."""
 
 
+WHOLE_MOTION_BUDGET = 10_000_000
+"""Evaluations where a period may be a whole motion, offline: minutes in plain Python."""
+
+
 class EvaluationBudget:
     """Evaluations of the right-hand side that a period may take; `spent` counts those of a run.
 
@@ -102,17 +113,8 @@ class EvaluationBudget:
 _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3
 
-
-class Step(NamedTuple):
-    """An accepted step, or the part of it before an event."""
-
-    t: float  # when it begins [s], as `method` takes it
-    h: float  # its length [s]
-    begin: Point
-    end: Point
-    drive: Vector  # what acts
-    method: CompiledMethod  # what has taken it
-    last: bool  # whether it ends with the period
+_MARGIN, _FLOOR = 2.0, 8 * 2.220446049250313e-16
+"""Of the distance: an error that halves with the steps is twice as large; of rounding, a step."""
 
 
 class MethodChange(NamedTuple):
@@ -123,11 +125,57 @@ class MethodChange(NamedTuple):
     reason: str
 
 
-StepperCheckpoint = tuple[CompiledMethod, float, int, int]
+class Point(NamedTuple):
+    """Where a run stands: all that its next step depends on."""
+
+    y: list[float]  # the solution
+    z: list[float]  # the second one, by steps of half the length
+    joints: tuple[float, ...]  # nine angles and nine rates of y
+    method: Method
+    h: float = math.inf  # longest next step [s]
+    attempts: int = 0  # since the method was chosen
+    steps: int = 0  # accepted since the start
+    changes: tuple[MethodChange, ...] = ()
+
+    @property
+    def error(self) -> float:
+        """Estimated global error of the orientation [rad]."""
+        return max(_MARGIN * orientation_distance(self.y, self.z), self._floor)
+
+    @property
+    def rate_error(self) -> float:
+        """Estimated global error of the body rate [rad/s]."""
+        floor = self._floor * max(1.0, math.hypot(*self.y[4:7]))
+        return max(_MARGIN * math.dist(self.y[4:7], self.z[4:7]), floor)
+
+    @property
+    def _floor(self) -> float:
+        return _FLOOR * math.sqrt(self.steps + 1.0)
+
+
+def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
+    """Angle between the orientations of two states that are near [rad]; q and -q are the same."""
+    return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
+
+
+class Step(NamedTuple):
+    """An accepted step, or the part of it before an event."""
+
+    t: float  # when it begins [s], as `machine` takes it
+    h: float  # its length [s]
+    begin: Point
+    end: Point
+    drive: Vector  # what acts
+    machine: CompiledMethod  # what has taken it
+    last: bool  # whether it ends with the period
+
+    def state(self, x: float) -> list[float]:
+        """Return the state x [s] after its begin, by one shorter step."""
+        return self.machine.step_fixed(self.t, x, 1, self.begin.y, self.drive)
 
 
 class AdaptiveStepper:
-    """Chooses methods and step sizes for an ODE.
+    """Chooses methods and step sizes for an ODE, by what is in a point and nothing else.
 
     Args:
         method: name of a method in `methods.METHODS`, or auto.
@@ -137,12 +185,9 @@ class AdaptiveStepper:
         law: a torque function, whose derivatives take the place of those of the ODE.
         ranges: see `CompiledMethod`.
         joints: nine angles and nine rates of a state's first seven numbers, for the ends of steps.
-        doubling: control the steps of RK4, too, by the distance of a pair from one step.
 
     Attributes:
-        history: changes of method.
         budget: as given; `budget.spent` counts evaluations.
-        origin: time [s] of the run at which the times of `accepted_steps` are zero.
 
     """
 
@@ -158,60 +203,42 @@ class AdaptiveStepper:
         ranges: JointRanges = (),
         joints: Function = lambda *_: (),
         budget: EvaluationBudget | None = None,
-        max_step: float = float("inf"),
-        doubling: bool = False,
+        max_step: float = math.inf,
     ) -> None:
         self.tolerance = tolerance
-        self.history: list[MethodChange] = []
         self.budget = budget or EvaluationBudget()
-        self.origin = 0.0
         self._ode, self._law, self._max_step = ode, law, max_step
         self._auto, self._compiled = method == "auto", compiled
+        self._first = DORMAND_PRINCE if self._auto else METHODS[method]
         self._derivative = derivative if law is None else law.derivative
         self._linearise = None if law is None or not law.is_traced else law.linearise
-        self._doubling = doubling and method == RK4.name
         self._ranges, self._joints = ranges, joints
-        self._methods: dict[str, CompiledMethod] = {}
-        self._current = self._method_of(DORMAND_PRINCE if self._auto else METHODS[method])
-        self._h = float("inf")
-        self._since_choice = 0
+        self._machines: dict[str, CompiledMethod] = {}
 
-    @property
-    def method(self) -> Method:
-        """The method in use."""
-        return self._current.method
+    def begin(self, y: list[float]) -> Point:
+        """Return the point at which a run begins; numbers that y lacks at its end are zero."""
+        full = [*y, *(0.0,) * (len(self._ode.state) - len(y))]
+        return Point(full, list(full), self._joints(*full[:7]), self._first)
 
-    def load(self, h: float, at: Point, d: Vector) -> None:
-        """Have the code of all methods that a run may turn to loaded; nothing else changes."""
+    def load(self) -> None:
+        """Have the code of all methods that a run may turn to loaded, or made."""
         if self._derivative is not None:
             return  # plain Python, and an explicit method to the end
-        methods = (DORMAND_PRINCE, DOP853, RODAS5P) if self._auto else (self.method,)
-        for method in methods:
-            loaded = self._method_of(method)
-            loaded.step_pair(0.0, h, at.y, at.z, d)
-            loaded.step_many(h, 1, self.tolerance, at, d)
+        for method in (DORMAND_PRINCE, DOP853, RODAS5P) if self._auto else (self._first,):
+            self._machine(method).load()
         if self._auto:
-            with contextlib.suppress(ArithmeticError, ValueError):  # no finite Jacobian here
-                self._ode.eigenvalues(0.0, at.y, d)
+            _ = self._ode.linearised
 
     def compile(self) -> None:
         """Take compiled steps from now on, which have the same bits; those of a function stay."""
         if self._derivative is None and not self._compiled:
             self._compiled = True
-            self._methods.clear()
-            self._current = self._method_of(self.method)
+            self._machines.clear()
 
-    def checkpoint(self) -> StepperCheckpoint:
-        """Return what the next steps depend on, to go back to."""
-        return self._current, self._h, self._since_choice, len(self.history)
-
-    def restore(self, checkpoint: StepperCheckpoint) -> None:
-        """Forget what has happened since `checkpoint`."""
-        self._current, self._h, self._since_choice, changes = checkpoint
-        del self.history[changes:]
-
-    def accepted_steps(self, t: float, end: float, at: Point, d: Vector) -> Iterator[Step]:
-        """Step from t to end.
+    def accepted_steps(
+        self, t: float, end: float, at: Point, d: Vector, origin: float = 0.0
+    ) -> Iterator[Step]:
+        """Step from t to end; `origin` is the time of the run at which these are zero [s].
 
         Raises:
             CannotStep: steps shrink below the rounding of time.
@@ -221,40 +248,36 @@ class AdaptiveStepper:
         rejected, stops = 0, list[float]()
         while True:
             left = end - t
-            h = min(self._h, self._max_step, left)
+            h = min(at.h, self._max_step, left)
             if left - h < 1e-3 * h:
                 h = left
             if stops:  # a step ends before a jump, the next one steps over it
                 h = min(h, stops[0] - t)
-            machine = self._current
-            z = at.coarse(machine.method.order)
-            self.budget.charge(machine.pair_cost)
-            y, new_z, size = machine.step_pair(t, h, at.y, z, d)
-            if self._doubling and size < float("inf"):
-                size = machine.doubling_error(h, (at.y, z), (y, new_z))
-            factor = self._factor(size)
+            machine = self._machine(at.method)
+            self.budget.charge(3 * machine.cost)
+            y, z, size = machine.step_pair(t, h, at.y, at.z, d)
+            factor = self._factor(at, size)
             if size > self.tolerance:
-                stops = self._jump_in(t, h, at.y)
+                stops = self._jump_in(t, h, at.y, origin)
                 if stops:
-                    self._h = h
+                    at = at._replace(h=h)
                     continue
-                self._h = h * min(factor, 1.0)
-                if self._h < 1e-15 * max(abs(t), end - t) or self._h < 1e-200:
-                    raise CannotStep(f"steps of {self._h:.1e} s do not resolve it")
+                at = at._replace(h=h * min(factor, 1.0))
+                if at.h < 1e-15 * max(abs(t), end - t) or at.h < 1e-200:
+                    raise CannotStep(f"steps of {at.h:.1e} s do not resolve it")
                 rejected += 1
-                self._choose_method(t, h, at.y, d, rejected)
+                at = self._choose_method(t, h, at, d, origin, rejected)
                 continue
             rejected = 0
             stopped = bool(stops) and h == stops[0] - t
-            if stopped or h == left:
-                if factor < 1.0 or self._h < float("inf"):
-                    self._h = max(self._h, h * factor)
-            else:
-                self._h = h * factor
-            begin, at = at, Point(y, new_z, self._joints(*y[:7]), machine.method.order)
+            longest = h * factor
+            if stopped or h == left:  # too short to say that the next must be short
+                longest = max(at.h, longest) if factor < 1.0 or at.h < math.inf else at.h
+            begin = at
+            at = at._replace(y=y, z=z, joints=self._joints(*y[:7]), h=longest, steps=at.steps + 1)
+            if h < left or isinstance(at.method, Rosenbrock):
+                at = self._choose_method(t + h, h, at, d, origin)
             yield Step(t, h, begin, at, d, machine, h == left)
-            if h < left or isinstance(self.method, Rosenbrock):
-                self._choose_method(t + h, h, y, d)
             if h == left:
                 return
             t = stops.pop(0) if stopped else t + h
@@ -266,82 +289,85 @@ class AdaptiveStepper:
         another method, or leave `ranges`. The bits are those of `accepted_steps`. One call takes at
         most the evaluations of one period's budget.
         """
-        if min(self._h, self._max_step) < h or self._derivative is not None:
+        if min(at.h, self._max_step) < h or self._derivative is not None:
             return 0, at
-        machine = self._current
-        method, cost = machine.method, machine.pair_cost
+        machine = self._machine(at.method)
         if self.budget.per_period is not None:
-            count = min(count, max(self.budget.per_period // cost, 1))
-        implicit = isinstance(method, Rosenbrock)
+            count = min(count, max(self.budget.per_period // (3 * machine.cost), 1))
+        implicit = isinstance(at.method, Rosenbrock)
         if implicit and self._auto:
-            count = min(count, _CHOOSE_EVERY - 1 - self._since_choice)
-        if at.order != method.order:
-            at = at._replace(z=at.coarse(method.order), order=method.order)
-        done, end = machine.step_many(h, count, self.tolerance, at, d)
-        self.budget.spent += done * cost
-        if self._h < GROW * h:
+            count = min(count, _CHOOSE_EVERY - 1 - at.attempts)
+        done, place = machine.step_many(h, count, self.tolerance, Place(*at[:3]), d)
+        if not done:
+            return 0, at
+        self.budget.spent += 3 * done * machine.cost
+        longest = at.h
+        if longest < GROW * h:
             for size in machine.sizes[:done]:
-                self._h = max(self._h, h * self._factor(float(size)))
-        if implicit:
-            self._since_choice += done
+                longest = max(longest, h * self._factor(at, float(size)))
+        attempts = at.attempts + (done if implicit else 0)
+        end = at._replace(
+            y=place.y, z=place.z, joints=place.joints,
+            h=longest, attempts=attempts, steps=at.steps + done,
+        )  # fmt: skip
         return done, end
 
     def step_sequence(
         self, first: int, periods: tuple[Any, Any, Any], at: Point, reached: Any
     ) -> tuple[int, Point]:
-        """Advance through periods that take one pair of steps each, from the first on.
+        """Advance through periods that take one step each, from the first on.
 
         Arguments and results are those of `CompiledMethod.step_sequence`.
         """
-        done, end = self._current.step_sequence(first, periods, self.tolerance, at, reached)
-        self.budget.spent += (done - first) * self._current.pair_cost
-        return done, end
+        machine, last = self._machine(at.method), len(periods[0])
+        done, end = machine.step_sequence(
+            first, last, periods, Place(*at[:3]), self.tolerance, reached
+        )
+        self.budget.spent += 3 * (done - first) * machine.cost
+        return done, at._replace(y=end.y, z=end.z, joints=end.joints)
 
     def part(self, step: Step, x: float) -> Point:
-        """Repeat a part x [s] of an accepted step."""
-        machine, y = step.method, step.begin.y
-        z = step.begin.coarse(machine.method.order)
-        if x:
-            self.budget.charge(machine.pair_cost)
-            y, z, _ = machine.step_pair(step.t, x, y, z, step.drive)
-        return Point(y, z, self._joints(*y[:7]), machine.method.order)
+        """Return the point x [s] after the begin of an accepted step, by a shorter one."""
+        self.budget.charge(3 * step.machine.cost)
+        y, z, _ = step.machine.step_pair(step.t, x, step.begin.y, step.begin.z, step.drive)
+        return step.end._replace(y=y, z=z, joints=self._joints(*y[:7]))
 
-    def _factor(self, size: float) -> float:
-        order = self.method.order if self._doubling else self.method.error_order
-        return step_factor(size / self.tolerance, order)
+    def _factor(self, at: Point, size: float) -> float:
+        return step_factor(size / self.tolerance, at.method.error_order)
 
-    def _choose_method(self, t: float, h: float, y: Vector, d: Vector, rejected: int = 0) -> None:
+    def _choose_method(
+        self, t: float, h: float, at: Point, d: Vector, origin: float, rejected: int = 0
+    ) -> Point:
         """Change the method if, by the eigenvalues of the Jacobian, another takes longer steps.
 
         After every 16 attempts, and after 3 rejections in a row: a Coulomb torque that changes sign
         sharply would otherwise shrink explicit steps below its time constant before it is seen.
         """
-        self._since_choice += 1
-        early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(self.method, Rosenbrock)
+        at = at._replace(attempts=at.attempts + 1)
+        early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(at.method, Rosenbrock)
         if not self._auto or (self._derivative is not None and self._linearise is None):
-            return
-        if self._since_choice < _CHOOSE_EVERY and not early:
-            return
+            return at
+        if at.attempts < _CHOOSE_EVERY and not early:
+            return at
         if not early:
-            self._since_choice = 0
+            at = at._replace(attempts=0)
         self.budget.charge(JACOBIAN_COST)
         try:
-            eigenvalues = self._eigenvalues(t, y, d)
+            eigenvalues = self._eigenvalues(t, at.y, d)
         except (ArithmeticError, ValueError):
-            return  # no finite Jacobian here; the step size has to do
-        method, reason = better_method(
-            self.method, self.tolerance, h * eigenvalues, only_stiff=early
-        )
-        if method is not self.method:
-            self._current = self._method_of(method)
-            self.history.append(MethodChange(self.origin + t, method.name, reason))
+            return at  # no finite Jacobian here; the step size has to do
+        method, reason = better_method(at.method, self.tolerance, h * eigenvalues, only_stiff=early)
+        if method is at.method:
+            return at
+        change = MethodChange(origin + t, method.name, reason)
+        return at._replace(method=method, changes=(*at.changes, change))
 
-    def _jump_in(self, t: float, h: float, y: Vector) -> list[float]:
+    def _jump_in(self, t: float, h: float, y: Vector, origin: float) -> list[float]:
         """Return times just before and after a jump of the derivative in a step, if any."""
         found = self._law.jump(t, t + h, y) if self._law is not None else None
-        if found is None or h < 1e-13 * max(abs(self.origin + t), h):
+        if found is None or h < 1e-13 * max(abs(origin + t), h):
             return []
-        margin = 4e-16 * max(abs(self.origin + found[1]), h)
+        margin = 4e-16 * max(abs(origin + found[1]), h)
         return [time for time in (found[0] - margin, found[1] + margin) if time > t]
 
     def _eigenvalues(self, t: float, y: Vector, d: Vector) -> Array:
@@ -352,9 +378,9 @@ class AdaptiveStepper:
         self._linearise(t, y, d, (), [0.0] * size, [0.0] * size, matrix)
         return np.asarray(np.linalg.eigvals(np.array(matrix)))
 
-    def _method_of(self, method: Method) -> CompiledMethod:
-        if method.name not in self._methods:
-            self._methods[method.name] = CompiledMethod(
+    def _machine(self, method: Method) -> CompiledMethod:
+        if method.name not in self._machines:
+            self._machines[method.name] = CompiledMethod(
                 self._ode,
                 method,
                 compiled=self._compiled,
@@ -362,4 +388,4 @@ class AdaptiveStepper:
                 linearise=self._linearise,
                 ranges=self._ranges,
             )
-        return self._methods[method.name]
+        return self._machines[method.name]

@@ -58,6 +58,15 @@ class StateFeedback:
 Torque = Vector3 | SineTorque | TorqueFunction | StateFeedback
 
 
+def torque_at(torque: Torque, time: float, y: Sequence[float] = ()) -> Vector3:
+    """Torques [N m] at a time [s] and a state y, which only feedback looks at."""
+    if isinstance(torque, StateFeedback):
+        return torque(time, y)
+    if isinstance(torque, SineTorque):
+        return torque.at(time)
+    return torque(time) if callable(torque) else torque
+
+
 class AppliedTorque:
     """Derivative of the state under a torque function, and the clamp of the actuators.
 
@@ -115,11 +124,7 @@ class AppliedTorque:
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m]."""
-        if isinstance(torque, StateFeedback):
-            torque = torque(time, y)
-        elif isinstance(torque, SineTorque):
-            torque = torque.at(time)
-        return clamp(torque(time) if callable(torque) else torque, self.limit)
+        return clamp(torque_at(torque, time, y), self.limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""

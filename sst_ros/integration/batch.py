@@ -21,8 +21,8 @@ from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
+from sst_ros.host import compiled_module
 from sst_ros.host.output import slices
-from sst_ros.integration import codegen
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.integration.parametric_model import ParameterColumns, ParametricModel
@@ -93,7 +93,7 @@ class Batch:
         profile: bool = False,
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        if codegen.numba_version() is None:
+        if compiled_module.numba_version() is None:
             require("numba")
             raise InputError(scene.name, [Problem("SST_ROS_NUMBA", "0", "must not be set to 0")])
         unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
@@ -255,7 +255,7 @@ class Batch:
         """The compiled function `batch`, see `batch_source`."""
         model, method = self.model, self._method
         text = batch_source(model.program, model.limit_distances, method, len(model.ode.state))
-        return codegen.load([text], {"NODES": method.c}, numba=True, nogil=True)
+        return compiled_module.load([text], {"NODES": method.c}, numba=True, nogil=True)
 
 
 def whole_steps(time: Array, step: float) -> Array:

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import fcntl
 import inspect
-import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from operator import is_
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -20,8 +18,9 @@ import numpy as np
 
 from sst_ros.dynamics.expression import Slots
 from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, ode_with_work
+from sst_ros.host import compiled_module
 from sst_ros.host.cache_folder import cache_folder
-from sst_ros.integration import codegen, step_loops
+from sst_ros.integration import step_loops
 from sst_ros.integration.methods import (
     DOP853,
     DORMAND_PRINCE,
@@ -50,25 +49,16 @@ _LOOPS = (
     step_loops.step_pair,
     step_loops.step_fixed,
     step_loops.step_many,
-    step_loops.step_sequence,
 )
 _IMPLICIT = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
 
 
-class Point(NamedTuple):
-    """Solution y, coarse solution z by a method of that order, nine angles and nine rates."""
+class Place(NamedTuple):
+    """Solution y, second solution z, nine angles and nine rates of y."""
 
     y: list[float]
     z: list[float]
     joints: tuple[float, ...]
-    order: int
-
-    def coarse(self, order: int) -> list[float]:
-        """Return z moved so that with a method of that order it means the same error."""
-        if order == self.order:
-            return self.z
-        grow = (2.0**order - 1.0) / (2.0**self.order - 1.0)
-        return [a + grow * (b - a) for a, b in zip(self.y, self.z, strict=True)]
 
 
 class _MethodSource(NamedTuple):
@@ -77,7 +67,7 @@ class _MethodSource(NamedTuple):
     `base` has what the modules of all methods have in common.
     """
 
-    base: codegen.SharedFunctions
+    base: compiled_module.SharedFunctions
     texts: list[str]
     constants: dict[str, Any]
     numbers: list[float]
@@ -96,7 +86,7 @@ class CompiledMethod:
 
     Attributes:
         system, method, compiled: as given.
-        pair_cost: evaluations of `step_pair`, which takes three steps.
+        cost: evaluations of a step; `step_pair` takes three.
         sizes: local error estimates of the periods of the last `step_many`.
 
     """
@@ -113,13 +103,13 @@ class CompiledMethod:
     ) -> None:
         self.system = system
         self.method = method
-        self.compiled = compiled = compiled and codegen.numba_version() is not None
+        self.compiled = compiled = compiled and compiled_module.numba_version() is not None
         implicit = isinstance(method, Rosenbrock)
-        self.pair_cost = 3 * (len(method.a) + (JACOBIAN_COST if implicit else 0))
+        self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
         if derivative is not None and (compiled or (implicit and linearise is None)):
             raise ValueError("a derivative of its own needs plain Python and, if implicit, its own")
         source = _source(system, method, by_structure=compiled)
-        self._module: ModuleType = codegen.load(
+        self._module: ModuleType = compiled_module.load(
             source.texts, source.constants, numba=compiled, base=source.base
         )
         if derivative is not None:
@@ -129,17 +119,30 @@ class CompiledMethod:
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
         self._listed: Callable[[Any], list[float]] = np.ndarray.tolist if compiled else list
         self._numbers = self._vector(source.numbers)
-        self._error = self._vector([0.0] * len(system.state))
+        self._extra = (self._numbers,) if compiled else ()
+        # At each wake in real time the processor's caches are cold: to make an array takes 8 us, a
+        # tenth of a step's call.
+        size, drive = len(system.state), len(system.drive)
+        self._place = [self._vector([0.0] * n) for n in (size, size, 18)]
+        self._error = self._vector([0.0] * size)
         self.sizes: Any = self._vector([])
-        self._at = Point([], [], (), method.order)
-        self._place: list[Any] = []
-        self._drive: tuple[Vector, Any] = (), None
+        self._length: Any = self._vector([0.0])
+        self._drive: Any = np.zeros((1, drive)) if compiled else [[0.0] * drive]
+        self._no_start: Any = np.empty((0, size)) if compiled else []
+        self._not_kept: Any = np.empty((0, 2, size)) if compiled else []
         self._ranges = np.array(ranges, dtype=float).reshape(-1, 3) if compiled else ranges
+
+    def load(self) -> None:
+        """Have the code that a run calls loaded, or made where it is not there."""
+        size, drive = len(self.system.state), (0.0,) * len(self.system.drive)
+        y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
+        self.step_pair(0.0, 1e-3, y, y, drive)
+        self.step_many(1e-3, 1, 1.0, Place(y, y, (0.0,) * 18), drive)
 
     def step_pair(
         self, t: float, h: float, y: Vector, z: Vector, d: Vector
     ) -> tuple[list[float], list[float], float]:
-        """Two steps of h / 2 for y, one of h for its coarse solution z.
+        """Advance the solution y by one step of h, a second solution z by two of h / 2.
 
         Returns:
             New y, new z, and the local error estimate of y in units of the tolerance; infinite
@@ -156,97 +159,63 @@ class CompiledMethod:
             return list(y), list(z), float("inf")
         return self._listed(new_y), self._listed(new_z), float(size)
 
-    def doubling_error(
-        self, h: float, begin: tuple[Vector, Vector], end: tuple[Vector, Vector]
-    ) -> float:
-        """Local error estimate of a pair of steps by its distance from the one step of z.
-
-        Args:
-            h: length of the pair [s].
-            begin: y and z before it.
-            end: y and z after it.
-
-        Returns:
-            As `step_pair`, whose estimate is zero for a method that has none.
-
-        """
-        share = 1.0 / (2.0**self.method.order - 1.0)
-        rows = zip(*begin, *end, strict=True)
-        error = self._vector([share * ((p - y) - (q - z)) for y, z, p, q in rows])
-        return float(self._module.size_of(error, self._vector(begin[0]), self._vector(end[0]), h))
+    def slope(self, t: float, y: Vector, d: Vector) -> tuple[float, ...]:
+        """Return the derivative of the state."""
+        found: tuple[float, ...] = self._module.rhs(t, *y, *d, *self._extra)
+        return found
 
     def step_many(
-        self, h: float, count: int, tolerance: float, at: Point, d: Vector
-    ) -> tuple[int, Point]:
-        """Advance by up to `count` periods of h, a pair of steps each, as long as that suffices.
+        self, h: float, count: int, tolerance: float, at: Place, d: Vector
+    ) -> tuple[int, Place]:
+        """Advance by up to `count` periods of h [s], a step each, as long as that suffices.
 
-        Args:
-            h: length of a period [s].
-            count: how many, at most.
-            tolerance: largest local error estimate of a period.
-            at: where it begins, its coarse solution by this method.
-            d: drive.
-
-        Returns:
-            How many were done, and where the last one ended. `sizes` has the local error estimate
-            of each.
-
+        Returns how many were done, and where the last one ended.
         """
-        if not all(map(is_, at, self._at)):  # otherwise the numbers are there already
-            self._place = [self._vector(part) for part in at[:3]]
-        if len(self.sizes) < count or not self.compiled:
+        self._length[0], self._drive[0][:] = h, d
+        if len(self.sizes) < count:
             self.sizes = self._vector([-1.0] * count)
-        # At each wake in real time the processor's caches are cold: to make an array takes 8 us, a
-        # tenth of the call. A list may have other numbers now.
-        if d is not self._drive[0] or type(d) is not tuple:
-            self._drive = d, self._vector(d)
-        y, z, joints = self._place
-        try:
-            done = self._module.step_many(
-                count, h, tolerance, y, z, self._drive[1], self._numbers, self._ranges,
-                joints, self.sizes,
-            )  # fmt: skip
-        except (ArithmeticError, ValueError):
-            done = sum(size >= 0.0 for size in self.sizes)
-        self._at = self._point(y, z, joints)
-        return done, self._at
+        return self.step_sequence(
+            0, count, (self._length, self._drive, self._no_start), at, tolerance, self._not_kept
+        )
 
     def step_sequence(
         self,
         first: int,
+        end: int,
         periods: tuple[Any, Any, Any],
+        at: Place,
         tolerance: float,
-        at: Point,
         reached: Any,
-    ) -> tuple[int, Point]:
-        """Advance from period `first` by a pair of steps a period; stop before one that needs more.
+    ) -> tuple[int, Place]:
+        """Advance from period `first` to `end`, a step each; stop before one that needs more.
 
         Args:
             first: number of the period that begins.
+            end: number of the last one, and one.
             periods: of n periods the lengths [s], shape (n,), the drives, (n, m), and the states
                 (n, size) at which they begin, NaN where they continue; lists in plain Python.
+            at: where the first one begins.
             tolerance: largest local error estimate of a period.
-            at: where the period begins.
-            reached: takes solution and coarse solution at the ends, shape (n, 2, size).
+            reached: takes both solutions at the ends, shape (n, 2, size).
 
         Returns:
-            The first period that was not done, and where it begins.
+            The first period that was not done, and where it begins. `sizes` has the local error
+            estimate of each.
 
         """
-        y, z, joints = (self._vector(part) for part in at[:3])
-        lengths, drives, starts = periods
+        if len(self.sizes) < end or not self.compiled:
+            self.sizes = self._vector([-1.0] * end)
+        y, z, joints = self._place
+        y[:], z[:], joints[:] = at
         try:
-            done = self._module.step_sequence(
-                first, lengths, drives, self._numbers, tolerance, starts, y, z, self._ranges,
-                joints, reached,
+            done = self._module.step_many(
+                first, end, *periods, self._numbers, tolerance, y, z, self._ranges, joints,
+                self.sizes, reached,
             )  # fmt: skip
         except (ArithmeticError, ValueError):  # plain Python, of a number without a value
-            done = next(k for k in range(first, len(lengths)) if math.isnan(reached[k][0][0]))
-        return done, self._point(y, z, joints)
-
-    def _point(self, y: Any, z: Any, joints: Any) -> Point:
-        order = self.method.order
-        return Point(self._listed(y), self._listed(z), tuple(self._listed(joints)), order)
+            done = first + sum(size >= 0.0 for size in self.sizes[first:end])
+        listed = self._listed
+        return done, Place(listed(y), listed(z), tuple(listed(joints)))
 
     def step_fixed(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
         """Advance by `count` steps of h, errors unseen.
@@ -266,14 +235,14 @@ def has_step_code(
 ) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
     source = _source(system, method, by_structure=True)
-    return codegen.has_code(source.texts, source.constants, functions, base=source.base)
+    return compiled_module.has_code(source.texts, source.constants, functions, base=source.base)
 
 
 def compile_derivative(system: ODE) -> Function:
     """Return the derivative of a system in machine code, with the digits of plain Python."""
     source = _source(system, DORMAND_PRINCE, by_structure=True)
     base, numbers = source.base, np.array(source.numbers)
-    rhs: Function = codegen.load(list(base.texts), base.constants, numba=True).rhs
+    rhs: Function = compiled_module.load(list(base.texts), base.constants, numba=True).rhs
     return lambda *inputs: rhs(*inputs, numbers)
 
 
@@ -289,7 +258,8 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
     p = ["p"] if by_structure else []
     lag = 3 if set(LAG) <= set(system.state) else 0
     common = {"SIZE": size, "LAG": lag}
-    constants: dict[str, Any] = {"SIZE": size, "SHARE": 0.5**method.error_order}
+    doubling = isinstance(method, Tableau) and not method.error
+    constants: dict[str, Any] = {"SIZE": size, "DOUBLING": doubling}
     inputs = ", ".join(["t", *y, *d, *p])
     joints = _assign(
         [f"joints[{i}]" for i in range(18)], f"angles_and_rates({', '.join(y[:7] + p)})"
@@ -302,7 +272,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
     ]
     texts: list[str] = []
     if isinstance(method, Tableau):
-        texts.append(codegen.attempt_explicitly(method, size, len(d), *p))
+        texts.append(step_loops.attempt_explicitly(method, size, len(d), *p))
     else:
         constants |= method.constants
         slope = [f"slope[{i}]" for i in range(size)]
@@ -318,7 +288,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
             for function in _IMPLICIT
         ]
     texts += [inspect.getsource(function) for function in _LOOPS]
-    base = codegen.SharedFunctions(tuple(shared), common)
+    base = compiled_module.SharedFunctions(tuple(shared), common)
     return _MethodSource(base, texts, constants, slots.values if slots else [])
 
 
@@ -377,7 +347,7 @@ def _assign(places: list[str], call: str) -> str:
 
 def code_is_there(scene: Scene, integrator: str) -> bool:
     """Return whether all code of a run of the scene is there, for each method it may use."""
-    if codegen.numba_version() is None:
+    if compiled_module.numba_version() is None:
         return False
     system = ode_with_work(Dynamics.of(scene))
     return all(has_step_code(system, method) for method in _methods(integrator))
@@ -397,12 +367,7 @@ def make_code(scene: Scene, integrator: str) -> Iterator[str]:
             return
         for method in _methods(integrator):
             if not has_step_code(system, method):
-                size, drive = len(system.state), (0.0,) * len(system.drive)
-                y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
-                machine = CompiledMethod(system, method, compiled=True)
-                # What comes out is of no interest: the calls have the code made.
-                machine.step_pair(0.0, 1e-3, y, y, drive)
-                machine.step_many(1e-3, 1, 1.0, Point(y, y, (0.0,) * 18, method.order), drive)
+                CompiledMethod(system, method, compiled=True).load()
             yield method.name
 
 

@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Events inside a step: when a joint reaches a limit, or meets or leaves an elastic stop.
 
-The force of an elastic stop has a kink where contact begins and ends, so steps end there. Batches
-and collocation look at distances that are traced, without an inverse tangent.
+The force of an elastic stop has a kink where contact begins and ends, so steps end there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
 
-from sst_ros.dynamics.kernel import Leg, LegMotion, Model, leg_motion
 from sst_ros.dynamics.model import Limit
-from sst_ros.mechanism.generic_math import Scalar, dot3, rotation_rows
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 
@@ -115,39 +111,3 @@ def _root(signal: Signal, begin: float, end: float) -> float:
     from scipy.optimize import brentq  # see above: many runs have no event
 
     return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))
-
-
-def limit_distances(
-    limits: Sequence[Limit],
-    ends: Sequence[tuple[Scalar, Scalar]],
-    model: Model,
-    state: Sequence[Any],
-) -> tuple[Scalar, ...]:
-    """Return a number for each limit, positive inside, then the rate of each.
-
-    They hold for angles less than pi away from the limit. `ends` has cosine and sine of the end of
-    each limit; the state is quaternion and body rate.
-    """
-    x, y, z, w, *rate = state
-    rows = rotation_rows((x, y, z, w))
-    legs = [leg_motion(leg, rows, (rate[0], rate[1], rate[2])) for leg in model.legs]
-    pairs = [
-        _distance(limit, *end, legs[limit.joint % 3], model.legs[limit.joint % 3])
-        for limit, end in zip(limits, ends, strict=True)
-    ]
-    return tuple(pair[0] for pair in pairs) + tuple(pair[1] for pair in pairs)
-
-
-def _distance(
-    limit: Limit, cosine: Scalar, sine: Scalar, at: LegMotion, leg: Leg
-) -> tuple[Scalar, Scalar]:
-    """sqrt(u) sin(sign * (angle - end)) and its rate; of mu sin(mu)^2 - sin(end)^2."""
-    if limit.joint < 3:
-        along, across, rate = dot3(at.outward, leg.v), dot3(at.outward, leg.across), at.gamma_dot
-    elif limit.joint < 6:
-        return at.u - sine * sine, -2.0 * at.a * at.a_dot
-    else:
-        along, across, rate = at.p[2], at.p[0] * leg.e1 - at.p[1] * leg.e0, at.beta_dot
-    distance = limit.sign * (across * cosine - along * sine)
-    turning = limit.sign * (along * cosine + across * sine) * rate
-    return distance, turning - distance * at.a * at.a_dot / at.u

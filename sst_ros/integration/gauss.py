@@ -24,7 +24,7 @@ from numpy.polynomial import legendre
 
 from sst_ros.dynamics.expression import Program, Slots
 from sst_ros.dynamics.traced_dynamics import ODE
-from sst_ros.integration import codegen
+from sst_ros.host import compiled_module
 from sst_ros.integration.simd_source import (
     Layout,
     evaluate_lanes,
@@ -63,12 +63,12 @@ class Collocation:
     ) -> None:
         self.size, self.inputs = len(ode.state), len(ode.program.inputs)
         self._texts, self.layout, self.numbers = source(ode, nodes, limits)
-        known = compiled is not False and codegen.numba_version() is not None
+        known = compiled is not False and compiled_module.numba_version() is not None
         self._ask_at = _WORTH_LOADING if known and compiled is None else math.inf
         self.code: Code | None = (
             _compile(self._texts, rounding=False) if known and compiled else None
         )
-        self.plain: Code = codegen.load(self._texts, {}, numba=False).integrate
+        self.plain: Code = compiled_module.load(self._texts, {}, numba=False).integrate
 
     def charge(self, evaluations: int) -> None:
         """Count evaluations in plain Python, and take machine code if that is worth it by now."""
@@ -76,7 +76,9 @@ class Collocation:
         spent = _EVALUATIONS[self._texts[-1]]
         if spent > self._ask_at:
             self._ask_at = 2 * spent
-            if spent > _WORTH_COMPILING or codegen.has_code(self._texts, {}, ("integrate",)):
+            if spent > _WORTH_COMPILING or compiled_module.has_code(
+                self._texts, {}, ("integrate",)
+            ):
                 self.code = _compile(self._texts, rounding=True)
 
 
@@ -141,7 +143,7 @@ def _compile(texts: list[str], *, rounding: bool) -> Any:
     """Compile for two arrays: numba then need not look at the arguments in each call."""
     import numba
 
-    integrate = codegen.load(texts, {}, numba=True, rounding=rounding).integrate
+    integrate = compiled_module.load(texts, {}, numba=True, rounding=rounding).integrate
     array = numba.types.Array(numba.float64, 1, "C")
     integrate.compile((array, array))
     return integrate.get_overload((array, array))

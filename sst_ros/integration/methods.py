@@ -22,7 +22,7 @@ class Tableau:
     a: tuple[tuple[float, ...], ...]  # lower triangle, row i has i entries
     b: tuple[float, ...]  # weights of the solution
     c: tuple[float, ...]  # nodes
-    error: tuple[float, ...] = ()  # weights of the error estimate, where the method has one
+    error: tuple[float, ...] = ()  # weights of the error estimate; none for half steps
     error_order: int = 0  # p of the estimate, which shrinks like h^(p+1)
     damping: tuple[float, ...] = ()  # weights of a second estimate that scales the first (DOP853)
 
@@ -37,6 +37,7 @@ RK4 = Tableau(
     a=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
     b=_row("1/6 1/3 1/3 1/6"),
     c=(0.0, 0.5, 0.5, 1.0),
+    error_order=4,
 )
 
 DORMAND_PRINCE = Tableau(

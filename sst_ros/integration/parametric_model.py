@@ -26,9 +26,8 @@ from sst_ros.dynamics.expression import (
     trace,
 )
 from sst_ros.dynamics.model import Limit, limits_of
-from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, limit_distances
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration.events import limit_distances
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scenarios

@@ -1,32 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, name-defined"
-"""Loops around a step, as text: `compiled_method` puts them behind the functions of a scene.
+"""Steps, and loops around them, as text that `compiled_method` puts behind a scene's functions.
 
 They run on lists as plain Python and on arrays under numba. Names that are not defined here come
-from the module that `codegen` writes.
+from the module that `compiled_module` writes.
 """
 # ruff: noqa: F821
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
+from sst_ros.integration.methods import Tableau
+
 
 def step_pair(t, h, y, z, d, p, new_y, new_z, error):
-    """Advance y by two steps of h / 2 and the coarse solution z by one of h (Richardson).
+    """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
 
     Returns the size of the local error estimate of y, relative to a tolerance of 1.
     """
     middle = vector(SIZE)
     other = vector(SIZE)
-    attempt(t, 0.5 * h, y, y, d, p, middle, error)
-    first = size_of(error, y, middle, h)
-    attempt(t + 0.5 * h, 0.5 * h, middle, middle, d, p, new_y, error)
-    second = size_of(error, middle, new_y, h)
-    attempt(t, h, z, y, d, p, new_z, other)
-    # In proportion, so that it counts only where the longer step is unstable.
-    coarse = size_of(other, z, new_z, h) * SHARE
+    attempt(t, h, y, y, d, p, new_y, error)
+    attempt(t, 0.5 * h, z, y, d, p, middle, other)
+    attempt(t + 0.5 * h, 0.5 * h, middle, middle, d, p, new_z, other)
+    if DOUBLING:  # the method has no estimate of its own
+        for i in range(SIZE):
+            error[i] = (new_z[i] - z[i]) - (new_y[i] - y[i])
+    size = size_of(error, y, new_y, h)
+    second = size_of(other, middle, new_z, h)
     normalise(new_y)
     normalise(new_z)
-    return max(first + second, coarse)
+    return size if second < INFINITE else INFINITE
 
 
 def size_of(error, old, new, h):
@@ -71,18 +76,29 @@ def step_fixed(t, h, count, y, d, p, new_y):
         normalise(new_y)
 
 
-def step_many(count, h, tolerance, y, z, d, p, ranges, joints, sizes):
-    """Go on by up to `count` periods of h, a pair of steps each; return how many were done.
+def step_many(
+    first, end, lengths, drives, starts, p, tolerance, y, z, ranges, joints, sizes, reached
+):
+    """Go on from period `first` to `end`, a step each; return the first that was not done.
 
-    Stops before a period that asks for more than that: one whose error is beyond the tolerance, or
-    in which a limit may be met. y, z and joints (nine angles, nine rates) become those at the end
-    of the last period that was done; sizes[k] is the local error estimate of period k.
+    That is one that asks for more: whose error is beyond the tolerance, or in which a limit may be
+    met. One row of `lengths` and `drives` is for all periods. Where starts[k] has numbers and not
+    NaN, period k begins there. y, z and joints (nine angles, nine rates) become those at the end of
+    the last period that was done; reached[k] the solutions at the end of period k, and sizes[k] its
+    local error estimate.
     """
     new_y = vector(SIZE)
     new_z = vector(SIZE)
     error = vector(SIZE)
     found = vector(18)
-    for k in range(count):
+    for k in range(first, end):
+        h = lengths[k % len(lengths)]
+        d = drives[k % len(drives)]
+        if len(starts) > 0 and starts[k][0] == starts[k][0]:
+            for i in range(SIZE):
+                y[i] = starts[k][i]
+                z[i] = starts[k][i]
+            joints_of(y, p, joints)
         size = step_pair(0.0, h, y, z, d, p, new_y, new_z, error)
         if not size <= tolerance:
             return k
@@ -95,28 +111,11 @@ def step_many(count, h, tolerance, y, z, d, p, ranges, joints, sizes):
         for i in range(18):
             joints[i] = found[i]
         sizes[k] = size
-    return count
-
-
-def step_sequence(first, lengths, drives, p, tolerance, starts, y, z, ranges, joints, reached):
-    """Do what `step_many` does for periods of their own lengths and drives, from the first on.
-
-    Where starts[k] has numbers and not NaN, period k begins there. reached[k] becomes the solution
-    and the coarse solution at its end. Returns the period that asks for more than a pair of steps.
-    """
-    size = vector(1)
-    for k in range(first, len(lengths)):
-        if starts[k][0] == starts[k][0]:
+        if len(reached) > 0:
             for i in range(SIZE):
-                y[i] = starts[k][i]
-                z[i] = starts[k][i]
-            joints_of(y, p, joints)
-        if step_many(1, lengths[k], tolerance, y, z, drives[k], p, ranges, joints, size) == 0:
-            return k
-        for i in range(SIZE):
-            reached[k][0][i] = y[i]
-            reached[k][1][i] = z[i]
-    return len(lengths)
+                reached[k][0][i] = y[i]
+                reached[k][1][i] = z[i]
+    return end
 
 
 def all_far(ranges, begin, end, h):
@@ -141,8 +140,8 @@ def attempt_linearly_implicit(t, h, y, near, d, p, new_y, error):
     """One step of a Rosenbrock method (Hairer & Wanner, Solving ODEs II, section IV.7).
 
     The last stage is what the solution adds to the embedded one. The Jacobian is exact, and that
-    at `near`: y itself, or for the coarse solution the fine one, which is near. Beside a kink of a
-    force the two may lie on different sides; the Jacobian is that of the fine one.
+    at `near`: y itself, or for the second solution the first one, which is near. Beside a kink of a
+    force the two may lie on different sides; the Jacobian is that of the first one.
     """
     matrix = square(SIZE)
     slope = vector(SIZE)
@@ -215,3 +214,89 @@ def substitute(a, pivot, b):
         for j in range(k + 1, SIZE):
             b[k] -= a[k][j] * b[j]
         b[k] /= a[k][k]
+
+
+def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
+    """Source of `step(t, h, y0, .., d0, ..)` of an explicit Runge-Kutta method, for scalars.
+
+    It calls `rhs(t, y0, .., d0, ..)` of the state y and of the drive d, which is constant over the
+    step, and returns the new state and the local error estimate of each number of the state, zero
+    where the method has none.
+
+    Args:
+        tableau: coefficients of the method.
+        size: numbers in the state.
+        drive: numbers in the drive.
+        more: further arguments, which `rhs` has as well.
+
+    Of RK4, three of its lines a stage and the last ones:
+
+        def step(t, h, y0, y1, ..., d0, d1, d2, p):
+            k0_0, k0_1, ... = rhs(t, y0, y1, ..., d0, d1, d2, p)
+            s0 = y0 + h * (0.5 * k0_0)
+            s1 = y1 + h * (0.5 * k0_1)
+            k1_0, k1_1, ... = rhs(t + 0.5 * h, s0, s1, ..., d0, d1, d2, p)
+            n0 = y0 + h * (0.16666666666666666 * k0_0 + 0.3333333333333333 * k1_0 + ...)
+            e0 = 0.0
+            return (n0, n1, ..., e0, e1, ...,)
+
+    """
+    y, d = _names("y", size), [*_names("d", drive), *more]
+    lines = [f"def step({', '.join(['t', 'h', *y, *d])}):", *_stages(tableau, size, d)]
+    results = ", ".join([*_names("n", size), *_names("e", size)])
+    lines.append(f"    return ({results},)")
+    return "\n".join(lines) + "\n"
+
+
+def attempt_explicitly(tableau: Tableau, size: int, drive: int, *more: str) -> str:
+    """Source of the same step on arrays, as `step_loops` has them: attempt(t, h, y, ..)."""
+    places = [*_names("new_y", size, "[{}]"), *_names("error", size, "[{}]")]
+    results = [*_names("n", size), *_names("e", size)]
+    d = [*_names("d", drive), *more]
+    lines = [
+        "def attempt(t, h, y, near, d, p, new_y, error):",
+        *(f"    y{i} = y[{i}]" for i in range(size)),
+        *(f"    d{i} = d[{i}]" for i in range(drive)),
+        *_stages(tableau, size, d),
+        *(f"    {place} = {result}" for place, result in zip(places, results, strict=True)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _stages(tableau: Tableau, size: int, d: list[str]) -> list[str]:
+    """Lines of a step from y0, .. to the new state n0, .. and its error estimate e0, .."""
+    y, lines = _names("y", size), []
+    for stage, row in enumerate(tableau.a):
+        for j in range(size) if stage else ():
+            lines.append(f"    s{j} = y{j} + h * ({_combination(row, j)})")
+        inputs = _names("s", size) if stage else y
+        time = f"t + {tableau.c[stage]!r} * h" if tableau.c[stage] else "t"
+        outputs = ", ".join(f"k{stage}_{j}" for j in range(size))
+        lines.append(f"    {outputs} = rhs({', '.join([time, *inputs, *d])})")
+    for j in range(size):
+        lines.append(f"    n{j} = y{j} + h * ({_combination(tableau.b, j)})")
+        if not tableau.error:
+            lines.append(f"    e{j} = 0.0")
+        elif not tableau.damping:
+            lines.append(f"    e{j} = h * ({_combination(tableau.error, j)})")
+        else:
+            # Hairer's estimate for DOP853, each number of the state for itself.
+            lines.append(f"    fine = {_combination(tableau.error, j)}")
+            lines.append(f"    coarse = {_combination(tableau.damping, j)}")
+            lines.append("    both = fine * fine + 0.01 * (coarse * coarse)")
+            lines.append(f"    e{j} = h * fine * abs(fine) / sqrt(both) if both > 0.0 else 0.0")
+    return lines
+
+
+def combination(weights: Sequence[float], word: Callable[[int], str]) -> str:
+    """Sum of weights times words, without the zeros; "" where there is nothing else."""
+    terms = [f"{w!r} * {word(i)}" for i, w in enumerate(weights) if w]
+    return " + ".join(terms).replace("+ -", "- ")
+
+
+def _combination(weights: Sequence[float], j: int) -> str:
+    return combination(weights, lambda i: f"k{i}_{j}")
+
+
+def _names(letter: str, count: int, place: str = "{}") -> list[str]:
+    return [letter + place.format(i) for i in range(count)]

@@ -20,9 +20,9 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, SstError
-from sst_ros.host import scheduling
+from sst_ros.host import compiled_module, scheduling
 from sst_ros.host.cache_folder import cache_folder
-from sst_ros.integration import codegen, compiled_method
+from sst_ros.integration import compiled_method
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, simulation_interfaces, topics
 from sst_ros.nodes.process import every
@@ -260,7 +260,7 @@ class CodeCompiler:
         self._timer: Timer | None = None
         self.available = False
         log = node.get_logger()
-        if codegen.numba_version() is None:
+        if compiled_module.numba_version() is None:
             log.info("plain Python: numba is not installed (or SST_ROS_NUMBA=0)")
         elif compiled_method.code_is_there(scene, given.integrator):
             self.available = True

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.plot.style import INK, MARKERS, Looks, legend, note, styled
 from sst_ros.report.reference_solution import EXTENDED
 from sst_ros.report.results import (

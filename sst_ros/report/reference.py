@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Integration error of a recorded run: its states against a reference integrated anew.
 
-The reference is propagated by DOP853 with a tight tolerance, two or more steps a tick. Its distance
-from a coarse solution of steps twice as long bounds its own error. Long runs are compiled; without
+The reference is propagated by DOP853 with a tight tolerance, a step a tick or more. Its distance
+from a second solution by steps of half the length is its own error. Long runs are compiled; without
 numba only their first minute or so is compared, and `Comparison.reasons` reports that.
 
 Actuators that lag are part of the state, and torques are held to the scene's limit. A moment from a
@@ -242,7 +242,7 @@ def _compare(
     *,
     restart: bool,
 ) -> Comparison:
-    """Propagate a run with a coarse solution, and compare both at its samples.
+    """Propagate a run with a second solution, and compare both at its samples.
 
     Args:
         recording: what is compared.
@@ -263,10 +263,10 @@ def _compare(
         reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
 
     def note(rows: Integers, reached: Array) -> None:
-        """Write down how far samples are from the solution, and the coarse one, (n, 2, m)."""
-        fine, coarse = (outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
+        """Write down how far samples are from the solution, and the second one, (n, 2, m)."""
+        first, second = (outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
         sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
-        error.iloc[rows], own.iloc[rows] = _measure(sampled, fine), _measure(coarse, fine)
+        error.iloc[rows], own.iloc[rows] = _measure(sampled, first), _measure(second, first)
 
     if start is not None:
         note(np.array([0]), np.array([[start, start]]))
@@ -295,7 +295,7 @@ def _compare(
         start = tuple(reached[-1, 0].tolist()) if whole and first < end else None
         bar.draw(min(first / count, 1.0))
     error[np.isin(recording.time_ns, restarts)] = np.nan
-    steps = 2 * -(-tick_ns // LONGEST_TICK_NS)
+    steps = -(-tick_ns // LONGEST_TICK_NS)
     return Comparison(error, own, tuple(restarts), steps, tuple(reasons))
 
 

@@ -24,10 +24,12 @@ from numpy.typing import NDArray
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.integration import codegen
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host import compiled_module
+from sst_ros.host.compiled_module import numba_version
+from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
+from sst_ros.integration.step_loops import explicit_step
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -35,7 +37,7 @@ from sst_ros.report.reference import initial, joint_columns
 from sst_ros.report.results import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.simulation import WHOLE_MOTION_BUDGET, Simulation
+from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
 
 LongArray: TypeAlias = NDArray[np.longdouble]
@@ -269,8 +271,8 @@ class ExtendedSolver:
             functions = {each: getattr(context, each) for each in (*names, "atan2")}
             self._number = context.mpf
         self._problem = problem
-        step = codegen.explicit_step(EXACT, len(problem.start), len(problem.drive))
-        self._code: Any = codegen.load(
+        step = explicit_step(EXACT, len(problem.start), len(problem.drive))
+        self._code: Any = compiled_module.load(
             [problem.system.program.source("rhs"), step], {}, numba=False
         )
         vars(self._code).update(functions)

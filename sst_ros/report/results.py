@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import jinja2
 
 from sst_ros.extras import require
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import write_into
-from sst_ros.integration.codegen import numba_version
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

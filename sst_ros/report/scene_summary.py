@@ -26,7 +26,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, SstError
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import DORMAND_PRINCE, RK4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry

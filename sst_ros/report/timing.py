@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.extras import require
+from sst_ros.host import compiled_module
 from sst_ros.host.output import slices
-from sst_ros.integration import codegen
 from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.recording.recording import Recording
@@ -258,7 +258,7 @@ def energy_residual(recording: Recording, missing: list[str]) -> Array:
         return stored
     ticks = ticks_of(recording)
     many = len(ticks.start_ns) > COMPILED_FROM
-    if many and codegen.numba_version() is None:
+    if many and compiled_module.numba_version() is None:
         count = int(np.searchsorted(recording.time_ns, ticks.end_ns[PLAIN_TICKS - 1])) + 1
         until = recording.seconds[count - 1]
         missing.append(f"energy after {until:g} s: there is no numba to balance it")

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sst_ros.errors import SstError
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import slices
-from sst_ros.integration.codegen import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array

@@ -220,7 +220,7 @@ class TickLoop:
 
         Later steps take no longer, also where they change the method.
         """
-        self.simulation.load_code(self._period_ns)  # may take a second, and is no step
+        self.simulation.load_code()  # may take a second, and is no step
         self.step_since = time.perf_counter()
         with contextlib.suppress(RunStopped):
             self.simulation.step(ZERO, self._period_ns)

@@ -20,7 +20,6 @@ from sst_ros.simulation.simulate_steps import MOST_PERIODS, Task, integrate
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS
 from sst_ros.simulation.torque_profile import (
     FeedbackFunction,
-    FeedbackTorque,
     FunctionTorque,
     TorqueFunction,
     TorqueProfile,
@@ -188,7 +187,7 @@ def _nanoseconds(name: str, value: Any) -> int:
 def _check_period(period: float | None, profile: TorqueProfile, span: int) -> int | None:
     if period is None:
         return None
-    if not isinstance(profile, (FunctionTorque, FeedbackTorque)):
+    if not isinstance(profile, FunctionTorque):
         _refuse("control_period", period, "is for a function; give none for numbers and profiles")
     found = _nanoseconds("control_period", period)
     if span > MOST_PERIODS * found:

@@ -12,15 +12,15 @@ from functools import lru_cache, partial
 import numpy as np
 
 from sst_ros.dynamics.expression import number_constants, trace
+from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
-from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics
-from sst_ros.integration.events import first_event, limit_distances
+from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, limit_distances
+from sst_ros.integration.adaptive_stepper import orientation_distance
+from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import Collocation, PreparedMotion
-from sst_ros.integration.propagator import orientation_distance
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.simulate_steps import UNMET, Task
-from sst_ros.simulation.simulation import start_of
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, clamp

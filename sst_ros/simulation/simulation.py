@@ -4,27 +4,27 @@
 from __future__ import annotations
 
 import operator
+import sys
 import warnings
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.initial_state import VirtualWorkDerivative, initial_state
+from sst_ros.dynamics.initial_state import VirtualWorkDerivative, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, ode_with_work
-from sst_ros.errors import Diverged, InputError, Problem, StepBudgetExceeded
+from sst_ros.errors import Diverged, StepBudgetExceeded, refuse_unless
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import (
     BudgetSpent,
     CannotStep,
     EvaluationBudget,
     MethodChange,
+    Point,
 )
 from sst_ros.integration.applied_torque import Torque
-from sst_ros.integration.codegen import numba_version
-from sst_ros.integration.compiled_method import Point
-from sst_ros.integration.methods import METHODS, Rosenbrock
+from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import rotation_matrix
@@ -38,9 +38,6 @@ INTEGRATORS = (AUTO, *METHODS)
 
 EQUATIONS = ("quaternion", "virtual_work")
 """Equations of motion: in the quaternion and the body rate, or the paper's Eqs. 1 to 92."""
-
-WHOLE_MOTION_BUDGET = 10_000_000
-"""`step_budget` where a step may be a whole motion, offline: minutes in plain Python."""
 
 _PLAIN_BUDGET = 3_000_000
 """Operations a step in plain Python may take: 0.12 s at 37 ns each, on a 3 GHz core."""
@@ -59,50 +56,6 @@ def default_budget(dynamics: Dynamics, equations: str, *, compiled: bool) -> int
     if compiled:
         return _COMPILED_BUDGET
     return _PLAIN_BUDGET // (len(ode_with_work(dynamics).program.steps) + _STAGE_OPERATIONS)
-
-
-def refuse_bad_options(
-    integrator: str, tolerance: float, equations: str, step_budget: int | None, *, compiled: bool
-) -> None:
-    """Raise InputError for the first option of a `Simulation` that is not allowed."""
-    explicit = not (compiled or isinstance(METHODS.get(integrator), Rosenbrock))
-    for name, value, good, allowed in (
-        ("integrator", integrator, integrator in INTEGRATORS, _one_of(INTEGRATORS)),
-        ("tolerance", tolerance, tolerance > 0.0, "must be > 0"),
-        ("step_budget", step_budget, step_budget is None or step_budget > 0, "must be > 0"),
-        ("equations", equations, equations in EQUATIONS, _one_of(EQUATIONS)),
-        ("equations", equations, explicit or equations != "virtual_work",
-         "needs an explicit integrator and compiled = False"),
-    ):  # fmt: skip
-        if not good:
-            raise InputError("simulation", [Problem(name, value, allowed)])
-
-
-def refuse_bad_step(torque: Any, dt_ns: Any, count: Any, moment: Any) -> tuple[int, int]:
-    """Return the length [ns] and the number of steps, or name each argument that is not allowed.
-
-    Raises:
-        InputError: one is not allowed.
-
-    """
-    length, number = _whole(dt_ns), _whole(count)
-    if length > 0 and number > 0 and finite_vector(torque) and finite_vector(moment):
-        return length, number
-    given = callable(torque) or isinstance(torque, SineTorque) or finite_vector(torque)
-    three = "must be three finite numbers [N m]"
-    problems = [
-        Problem(name, value, allowed)
-        for name, value, good, allowed in (
-            ("torque", torque, given, f"{three}, a SineTorque or a function of t [s]"),
-            ("moment", moment, finite_vector(moment), three),
-            ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
-            ("count", count, number > 0, "must be > 0, a whole number"),
-        )
-        if not good
-    ]
-    if problems:
-        raise InputError("step", problems)
-    return length, number
 
 
 def _whole(value: Any) -> int:
@@ -134,7 +87,7 @@ class Simulation:
             the keys of a scene.
         integrator: auto, or a method of `integration.methods.METHODS`.
         tolerance: largest local error of a step: of the quaternion, and of the rate relative to
-            its length. RK4 has no error estimate; it takes one pair of steps a call.
+            its length. RK4 has no error estimate; it takes one step a call.
         compiled: run under numba; the digits are the same, the first step of a new scene takes
             seconds. Without numba a RuntimeWarning is raised and plain Python runs. Torque
             functions, and sines that the actuators clamp, run in plain Python, with one
@@ -170,7 +123,16 @@ class Simulation:
         equations: str = "quaternion",
         step_budget: int | None = None,
     ) -> None:
-        refuse_bad_options(integrator, tolerance, equations, step_budget, compiled=compiled)
+        explicit = not (compiled or isinstance(METHODS.get(integrator), Rosenbrock))
+        refuse_unless(
+            "simulation",
+            ("integrator", integrator, integrator in INTEGRATORS, _one_of(INTEGRATORS)),
+            ("tolerance", tolerance, tolerance > 0.0, "must be > 0"),
+            ("step_budget", step_budget, step_budget is None or step_budget > 0, "must be > 0"),
+            ("equations", equations, equations in EQUATIONS, _one_of(EQUATIONS)),
+            ("equations", equations, explicit or equations != "virtual_work",
+             "needs an explicit integrator and compiled = False"),
+        )  # fmt: skip
         self.scene = scene = scene_of(scene)
         derivative = VirtualWorkDerivative(scene) if equations == "virtual_work" else None
         self.geometry = Geometry.of(scene)
@@ -185,7 +147,8 @@ class Simulation:
         self._propagator = Propagator(
             scene,
             integrator,
-            tolerance,
+            # A call of RK4 is one step, whatever its error.
+            sys.float_info.max if integrator == RK4.name else tolerance,
             compiled=self.compiled,
             budget=EvaluationBudget(self.step_budget),
             derivative=derivative,
@@ -227,13 +190,23 @@ class Simulation:
             as `step`: the state is then that after the last step before, at `time_ns`.
 
         """
-        dt_ns, count = refuse_bad_step(torque, dt_ns, count, moment)
+        length, number = _whole(dt_ns), _whole(count)
+        if not (length > 0 and number > 0 and finite_vector(torque) and finite_vector(moment)):
+            known = callable(torque) or isinstance(torque, SineTorque) or finite_vector(torque)
+            three = "must be three finite numbers [N m]"
+            refuse_unless(
+                "step",
+                ("torque", torque, bool(known), f"{three}, a SineTorque or a function of t [s]"),
+                ("moment", moment, finite_vector(moment) is not None, three),
+                ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
+                ("count", count, number > 0, "must be > 0, a whole number"),
+            )
         torque = self.acting(torque)
         if callable(torque) and not self._warned:
             self._warned = True
             text = "a torque function runs in plain Python, slower than compiled=True; same digits"
             warnings.warn(text, RuntimeWarning, stacklevel=3)
-        self.advance(torque, dt_ns, count, moment)
+        self.advance(torque, length, number, moment)
 
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
@@ -253,7 +226,8 @@ class Simulation:
                 raise reached.limit.error(reached.limit.reason, reached.time, self.state) from None
             except (CannotStep, ArithmeticError, ValueError) as error:
                 kind = StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
-                reason = unresolved(error, self.geometry, self.state)
+                near = describe_conditioning(self.geometry, self.state)
+                reason = f"{error or 'not finite'} ({near})"
                 raise kind(reason, start, self.state) from None
             self._before = at
             self._now = _Instant(at.time_ns + done * dt_ns, point, torque, held)
@@ -269,32 +243,29 @@ class Simulation:
 
         """
         began, end = self._before.time_ns, self._now.time_ns
-        if not began <= time_ns <= end:
-            allowed = f"must lie in the last step, {began} to {end} ns"
-            raise InputError("within", [Problem("time_ns", time_ns, allowed)])
+        allowed = f"must lie in the last step, {began} to {end} ns"
+        refuse_unless("within", ("time_ns", time_ns, began <= time_ns <= end, allowed))
         if time_ns == began:
             return self._as_state(self._before)
         start, h = began / NANOSECONDS, (time_ns - began) / NANOSECONDS
         _, _, torque, moment = self._now
-        point = self._propagator.within(self._before.point, start, h, torque, moment)
+        point, _ = self._propagator.advance(self._before.point, start, h, 1, torque, moment)
         return self._as_state(_Instant(time_ns, point, torque, moment))
 
     def reset(self) -> State:
         """Go back to the initial state at time zero."""
-        self._propagator.reset()
         self._now = self._before = _Instant(0, self._start)
         self._shown = self._now, self._as_state(self._now)
         self._energy = self.dynamics.total_energy(self._start.y)
         return self.state
 
-    def load_code(self, dt_ns: int) -> None:
-        """Have the code of all methods loaded that steps of dt_ns may turn to.
+    def load_code(self) -> None:
+        """Have the code of all methods loaded that steps under constant torques may turn to.
 
         Otherwise the step that changes the method loads it, which takes tenths of a second, or
         compiles it, which takes seconds. The state does not change.
         """
-        moment = (0.0, 0.0, 0.0) if self.dynamics.has_moment_topic else ()
-        self._propagator.load(self._now.point, dt_ns / NANOSECONDS, moment)
+        self._propagator.load()
 
     @property
     def state(self) -> State:
@@ -318,17 +289,17 @@ class Simulation:
     @property
     def method(self) -> str:
         """Name of the method in use."""
-        return self._propagator.method
+        return self._now.point.method.name
 
     @property
     def changes(self) -> list[MethodChange]:
         """Changes of method that auto has made: time [s], method, reason."""
-        return list(self._propagator.changes)
+        return list(self._now.point.changes)
 
     @property
     def accepted_steps(self) -> int:
         """Number of accepted steps of the integrator since the start."""
-        return self._propagator.accepted_steps
+        return self._now.point.steps
 
     @property
     def evaluations(self) -> int:
@@ -339,15 +310,15 @@ class Simulation:
     def error_estimate(self) -> float:
         """Estimated global error of the orientation [rad].
 
-        A coarse solution takes steps of twice the length; its distance, over 2^order - 1, is the
-        error of the run, rounding included where the distance consists of it.
+        Twice the distance of a second solution, which takes steps of half the length: it holds
+        where the error only halves with the steps, too. Not less than rounding.
         """
-        return self._propagator.errors(self._now.point)[0]
+        return self._now.point.error
 
     @property
     def rate_error_estimate(self) -> float:
         """Estimated global error of the body rate [rad/s]."""
-        return self._propagator.errors(self._now.point)[1]
+        return self._now.point.rate_error
 
     @property
     def energy_residual(self) -> float:
@@ -376,23 +347,6 @@ class Simulation:
         return self._propagator.acting(at.torque, at.time_ns / NANOSECONDS, at.point)
 
 
-@lru_cache(maxsize=64)
-def start_of(scene: Scene) -> tuple[float, ...]:
-    """Return quaternion and body rate [rad/s] with which a scene begins, seven numbers.
-
-    Raises:
-        AssemblyError, SingularConfiguration, InputError: as `Simulation`.
-
-    """
-    gamma, geometry = np.array(scene.initial.gamma), Geometry.of(scene)
-    outside = np.any((gamma < 0) | (gamma > geometry.arc))
-    if scene.stroke.at_end == "stop" and outside:
-        ends = ", ".join(f"{arc:.6f}" for arc in geometry.arc)
-        allowed = f"must lie in the stroke, 0 to ({ends}) rad"
-        raise InputError(scene.name, [Problem("initial.gamma", scene.initial.gamma, allowed)])
-    return initial_state(scene, geometry)
-
-
 def conditioning(geometry: Geometry, state: State) -> dict[str, float]:
     """Return the least sin(mu_k), zero at a serial singularity, and det J2, at a parallel one."""
     r = kinematics.carriage_directions(geometry, state.joints.gamma)
@@ -401,7 +355,6 @@ def conditioning(geometry: Geometry, state: State) -> dict[str, float]:
     return {"sin_mu": float(np.sin(state.joints.mu).min()), "det_j2": float(determinant)}
 
 
-def unresolved(error: Exception, geometry: Geometry, state: State) -> str:
-    """Say why no step goes on from a state, and how near it is to a singularity."""
-    numbers = ", ".join(f"{name} = {x:.3g}" for name, x in conditioning(geometry, state).items())
-    return f"{error or 'not finite'} ({numbers})"
+def describe_conditioning(geometry: Geometry, state: State) -> str:
+    """Say how near a state is to a singularity."""
+    return ", ".join(f"{name} = {x:.3g}" for name, x in conditioning(geometry, state).items())

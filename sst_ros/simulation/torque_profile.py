@@ -7,6 +7,7 @@ import contextlib
 import csv
 import inspect
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,12 +31,14 @@ _MOST_CROSSINGS = 1e5
 """Radians of a sine beyond which its clamping is not computed in advance."""
 
 
-class TorqueProfile:
-    """Base of the torques that are known as a function of time alone."""
+class TorqueProfile(ABC):
+    """Torques that act over a motion; most are known as a function of time alone."""
 
+    feedback = False
+
+    @abstractmethod
     def values(self, t: Array) -> Array:
         """Torques [N m] at times [s], shape (n,) -> (n, 3)."""
-        raise NotImplementedError
 
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """Return the times [s] at which torques, or their derivatives, jump or pass a limit [N m].
@@ -44,16 +47,9 @@ class TorqueProfile:
         """
         return np.empty(0)
 
-    def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
-        """Torques [N m] on [begin, end], between which no kink lies; ends belong to it."""
-        return self
-
     def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
-        """Return what acts there as a `Propagator` takes it, by the dynamics of the scene."""
-        piece = self.between(begin, end)
-        if isinstance(piece, ConstantTorque):
-            return piece.torque
-        return piece.sine if isinstance(piece, SineProfile) else piece
+        """Return what acts on [begin, end], in which no kink lies, as a `Propagator` takes it."""
+        return self
 
     def record(self) -> dict[str, Any]:
         """Numbers from which `profile_from` builds the same profile."""
@@ -75,8 +71,8 @@ class ConstantTorque(TorqueProfile):
         """See `TorqueProfile`."""
         return np.tile(self.torque, (len(t), 1))
 
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
+    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+        """See `TorqueProfile`."""
         return self.torque
 
     def record(self) -> dict[str, Any]:
@@ -111,13 +107,13 @@ class SineProfile(TorqueProfile):
         times = np.unique(np.concatenate(found))
         return np.asarray(times[(times > 0.0) & (times < end)])
 
+    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+        """See `TorqueProfile`."""
+        return self.sine
+
     def record(self) -> dict[str, Any]:
         """See `TorqueProfile`."""
         return {"kind": "sine", **vars(self.sine)}
-
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s], by the sine of the C library."""
-        return self.sine.at(t)
 
 
 class PolynomialTorque(TorqueProfile):
@@ -145,39 +141,33 @@ class PolynomialTorque(TorqueProfile):
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
-        piece = np.clip(np.searchsorted(self.x, t, side="right") - 1, 0, self.c.shape[1] - 1)
-        total: Array = np.zeros((len(t), 3))
-        for factors in self.c[:, piece]:
-            total = total * (t - self.x[piece])[:, None] + factors
-        total[(t < self.x[0]) | (t > self.x[-1])] = 0.0
-        return total
+        from scipy.interpolate import PPoly  # takes 0.3 s; most runs have no polynomial
+
+        return np.asarray(np.nan_to_num(PPoly(self.c, self.x, extrapolate=False)(t)))
 
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
-        found, bounds = [self.x], () if limit is None else (limit, -limit)
-        for piece, length in enumerate(np.diff(self.x)):
-            for coefficients in self.c[:, piece].T:
-                for bound in bounds:
-                    roots = np.roots([*coefficients[:-1], coefficients[-1] - bound])
-                    real = roots.real[abs(roots.imag) <= 1e-9 * length]
-                    found.append(self.x[piece] + real[(real > 0.0) & (real < length)])
-        return np.unique(np.concatenate(found))
+        from scipy.interpolate import PPoly
 
-    def between(self, begin: float, end: float) -> Callable[[float], Vector3]:
+        legs = [PPoly(c, self.x) for c in np.moveaxis(self.c, 2, 0)]
+        bounds = () if limit is None else (limit, -limit)
+        roots = [leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds]
+        return np.unique([x for x in np.concatenate([self.x, *roots]) if np.isfinite(x)])
+
+    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
         """See `TorqueProfile`."""
         piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
         if not 0 <= piece < self.c.shape[1]:
-            return ConstantTorque((0.0, 0.0, 0.0))
-        start = float(self.x[piece])
-        first, second, third = self.c[:, piece].T.tolist()
+            return (0.0, 0.0, 0.0)
+        start, rows = float(self.x[piece]), self.c[:, piece].tolist()
 
-        def value(c: list[float], t: float) -> float:
-            total = 0.0
-            for factor in c:
-                total = total * (t - start) + factor
+        def torque(t: float) -> Vector3:
+            x, total = t - start, (0.0, 0.0, 0.0)
+            for a, b, c in rows:
+                total = total[0] * x + a, total[1] * x + b, total[2] * x + c
             return total
 
-        return lambda t: (value(first, t), value(second, t), value(third, t))
+        return torque
 
     def record(self) -> dict[str, Any]:
         """See `TorqueProfile`."""
@@ -185,33 +175,30 @@ class PolynomialTorque(TorqueProfile):
 
 
 class FunctionTorque(TorqueProfile):
-    """A function f(t) [s] -> three torques [N m]."""
+    """A function f(t) of the time [s], or f(t, state) of it and the `State` -> three torques [N m].
 
-    def __init__(self, function: TorqueFunction) -> None:
-        self._function = function
+    Attributes:
+        feedback: whether the state is an argument.
 
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
-        return three(self._function(t), f"torque({t:g})")
+    """
+
+    def __init__(self, function: TorqueFunction | FeedbackFunction, *, feedback: bool) -> None:
+        self._function: Callable[..., Sequence[float]] = function
+        self.feedback = feedback
+
+    def __call__(self, t: float, *state: State) -> Vector3:
+        """Torques [N m] at a time [s], and a state where it is an argument."""
+        return three(self._function(t, *state), f"torque({t:g})")
 
     def values(self, t: Array) -> Array:
-        """See `TorqueProfile`."""
+        """See `TorqueProfile`; nan for a function of the state."""
+        if self.feedback:
+            return np.full((len(t), 3), np.nan)
         return np.array([self(float(time)) for time in t]).reshape(-1, 3)
-
-
-class FeedbackTorque(TorqueProfile):
-    """A function f(t, state) of the time [s] and the `State` -> three torques [N m]."""
-
-    def __init__(self, function: FeedbackFunction) -> None:
-        self._function = function
-
-    def __call__(self, t: float, state: Any = None) -> Vector3:
-        """Torques [N m] at a time [s] and a state."""
-        return three(self._function(t, state), f"torque({t:g})")
 
     def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
         """See `TorqueProfile`."""
-        return StateFeedback(self, dynamics)
+        return StateFeedback(self, dynamics) if self.feedback else self
 
 
 class LostTorque(TorqueProfile):
@@ -273,33 +260,30 @@ class TorqueTable(TorqueProfile):
         try:
             with Path(path).open(newline="", encoding="utf-8") as file:
                 reader = csv.reader(file)
-                found = next(reader, None)
+                names = [name.strip() for name in next(reader, [])]
                 lines = [(reader.line_num, row) for row in reader]
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             problem = Problem("csv", origin, f"must be readable ({error})")
             raise InputError(origin, [problem]) from None
-        names = None if found is None else [name.strip() for name in found]
         if names != header:
-            raise InputError(origin, [Problem("header", names, "must be " + ", ".join(header), 1)])
-        rows: list[list[float]] = []
+            allowed = "must be " + ", ".join(header)
+            raise InputError(origin, [Problem("header", names or None, allowed, 1)])
+        rows: list[tuple[float, Vector3]] = []
         problems: list[Problem] = []
-        for line, entries in lines:
-            try:
-                row = [float(entry) for entry in entries]
-            except ValueError:
-                row = []
-            if len(row) != 4 or not np.all(np.isfinite(row)):
-                problems.append(Problem("row", entries, "must be four finite numbers", line))
-            elif rows and row[0] <= rows[-1][0]:
+        for line, row in lines:
+            time, torque = finite_vector([*row[:1], 0, 0]), finite_vector(row[1:])
+            if time is None or torque is None:
+                problems.append(Problem("row", row, "must be four finite numbers", line))
+            elif rows and time[0] <= rows[-1][0]:
                 allowed = f"must be > {rows[-1][0]:g} s, the last"
-                problems.append(Problem("time", row[0], allowed, line))
+                problems.append(Problem("time", time[0], allowed, line))
             else:
-                rows.append(row)
+                rows.append((time[0], torque))
         if not (problems or rows):
             problems.append(Problem("rows", 0, "must be one or more"))
         if problems:
             raise InputError(origin, problems)
-        return cls([row[0] for row in rows], [row[1:] for row in rows])
+        return cls(*zip(*rows, strict=True))
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -310,9 +294,9 @@ class TorqueTable(TorqueProfile):
         """See `TorqueProfile`."""
         return self.times
 
-    def between(self, begin: float, end: float) -> ConstantTorque:
+    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
         """See `TorqueProfile`."""
-        return ConstantTorque(self(0.5 * (begin + end)))
+        return self(0.5 * (begin + end))
 
     def record(self) -> dict[str, Any]:
         """See `TorqueProfile`."""
@@ -333,7 +317,7 @@ def profile_of(torque: Any) -> TorqueProfile:
     if hasattr(torque, "c") and hasattr(torque, "x") and callable(torque):
         return PolynomialTorque(torque.c, torque.x)  # scipy.interpolate.PPoly, CubicSpline
     if callable(torque):
-        return FeedbackTorque(torque) if _arguments(torque) == 2 else FunctionTorque(torque)
+        return FunctionTorque(torque, feedback=_arguments(torque) == 2)
     return ConstantTorque(three(torque, "torque"))
 
 

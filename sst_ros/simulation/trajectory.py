@@ -12,7 +12,6 @@ import io
 import json
 from collections.abc import Callable
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,18 +20,23 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import Diverged, InputError, Problem
 from sst_ros.extras import MissingDependency, require
 from sst_ros.host.table_file import SUFFIXES, load_table, write_table
-from sst_ros.integration.adaptive_stepper import EvaluationBudget
-from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.propagator import Propagator
 from sst_ros.mechanism import frames, kinematics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.simulation.torque_profile import LostTorque, TorqueProfile, profile_from, profile_of
+from sst_ros.simulation.stepped_motion import SteppedMotion
+from sst_ros.simulation.torque_profile import (
+    ConstantTorque,
+    LostTorque,
+    TorqueProfile,
+    profile_from,
+    profile_of,
+    three,
+)
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
 
 if TYPE_CHECKING:
@@ -369,30 +373,19 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
             return states
         limit = trajectory.scene.torque_limit or np.inf
         return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
-    t, law, size = trajectory.t, trajectory.law, len(trajectory._dynamics.state)
+    t, size = trajectory.t, len(trajectory._dynamics.state)
     samples = np.hstack([trajectory.quaternion, trajectory.body_rate, trajectory.torque])
     before = np.searchsorted(t, times, side="right") - 1
-    found, kinks = samples[before], np.empty(0)
-    if law is not None:
-        kinks = np.unique(law.kinks(trajectory.scene.torque_limit, float(t[-1])))
-    propagator = Propagator(
-        trajectory.scene, DOP853.name, _ACCURACY,
-        compiled=False, budget=EvaluationBudget(), limits=False,
-    )  # fmt: skip
-    moment = (0.0,) * (len(propagator.dynamics.drive) - 3)
+    found = samples[before]
     for k in np.unique(before[times > t[before]]):
         rows = np.flatnonzero((before == k) & (times > t[k]))
-        asked, reached = np.unique(times[rows]), dict[float, tuple[float, ...]]()
-        at, now, last = propagator.begin(samples[k, :size].tolist()), float(t[k]), asked[-1]
-        inside = kinks[(kinks > now) & (kinks < last)].tolist()
-        for begin, end in pairwise([now, *inside, float(last)]):
-            torque: Torque = tuple(trajectory.torque[k + 1].tolist())
-            if law is not None:
-                torque = law.acting(begin, end, propagator.dynamics)
-            torque = propagator.torque.acting(torque)
-            for time in (*asked[(asked > begin) & (asked < end)].tolist(), end):
-                at, _ = propagator.advance(at, now, time - now, 1, torque, moment)
-                now = time
-                reached[time] = (*at.y[:7], *propagator.acting(torque, time, at))
-        found[rows] = [reached[time] for time in times[rows].tolist()]
+        asked, places = np.unique(times[rows], return_inverse=True)
+        law = trajectory.law or ConstantTorque(three(trajectory.torque[k + 1], "torque"))
+        motion = SteppedMotion(
+            trajectory.scene, law, (float(t[k]), float(asked[-1])), samples[k, :size], asked,
+            method=DOP853.name, tolerance=_ACCURACY, limits=False,
+        ).run()  # fmt: skip
+        if motion.status:
+            raise Diverged(motion.message, motion.time, motion.state())
+        found[rows] = np.array(motion.rows)[places, 1:11]
     return found

@@ -33,7 +33,7 @@ from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.errors import InputError, Problem
-from sst_ros.integration import codegen
+from sst_ros.host import compiled_module
 from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.integration.batch_source import SIMD_WIDTH, load_lanes, over_blocks, replace_valid
 from sst_ros.integration.simd_source import Layout, evaluate_lanes, indent, loop
@@ -220,7 +220,7 @@ class ControlledBatch:
 
         program = trace(command, [f"i{j}" for j in range(sum(sizes.values()))])
         texts = [*NOISE, control_source(program, sizes)]
-        return codegen.load(texts, {}, numba=True, nogil=True)
+        return compiled_module.load(texts, {}, numba=True, nogil=True)
 
     def run(
         self,

@@ -13,14 +13,14 @@ from programs import python
 
 from sst_ros.host import cache_folder as module
 from sst_ros.host.cache_folder import cache_folder
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 
 OTHER_USER = 65534
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root to act as a second user")
 with_numba = pytest.mark.skipif(numba_version() is None, reason="numba is missing")
 
 PROGRAM = """
-from sst_ros.integration.codegen import load
+from sst_ros.host.compiled_module import load
 text = "def twice(x):\\n    return 2.0 * x\\n"
 print(load([text], {}, numba=True).twice(21.0))
 """

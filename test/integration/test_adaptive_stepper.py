@@ -12,7 +12,7 @@ import pytest
 from loaded_scenes import IGNORE, REST, loaded, run, viscous
 
 from sst_ros.errors import Diverged, InputError, RunStopped, StepBudgetExceeded, StrokeExceeded
-from sst_ros.integration.codegen import numba_version
+from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.scene.bodies import Inertia, Link

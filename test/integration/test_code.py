@@ -15,7 +15,8 @@ import pytest
 from loaded_scenes import IGNORE
 from programs import python
 
-from sst_ros.integration import codegen, gauss
+from sst_ros.host import compiled_module
+from sst_ros.integration import gauss
 from sst_ros.integration.compiled_method import code_is_there, make_code
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import Initial
@@ -31,7 +32,7 @@ from sst_ros.simulation.simulation import Simulation
 simulation = Simulation(load("example1"), "rk4", compiled=True)
 print(simulation.step((1.0, 2.0, 3.0), 1_000_000).quaternion, simulation.compiled)
 """
-needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
+needs_numba = pytest.mark.skipif(compiled_module.numba_version() is None, reason="numba is missing")
 
 
 EXAMPLE1, EXAMPLE2 = load("example1"), replace(load("example2_heavy"), **IGNORE)
@@ -166,7 +167,7 @@ def test_without_numba_plain_python_runs_and_says_so_to_who_asked(missing, monke
         monkeypatch.setenv("SST_ROS_NUMBA", "0")
     else:
         monkeypatch.setitem(sys.modules, "numba", None)
-    assert codegen.numba_version() is None
+    assert compiled_module.numba_version() is None
     assert not code_is_there(EXAMPLE1, "rk4")
     said = "no numba(.|\n)*running plain Python, slower, the same digits"
     with pytest.warns(RuntimeWarning, match=said):

@@ -20,7 +20,8 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Slots, number_constants, trace
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, ode_with_work
-from sst_ros.integration import codegen, gauss
+from sst_ros.host import compiled_module
+from sst_ros.integration import gauss
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
 from sst_ros.scene.loads import Friction, JointFriction
@@ -36,7 +37,7 @@ def system_of(scene, torque=None, work=False):
     return ODE(Dynamics.of(scene), torque, work=work)
 
 
-needs_numba = pytest.mark.skipif(codegen.numba_version() is None, reason="numba is missing")
+needs_numba = pytest.mark.skipif(compiled_module.numba_version() is None, reason="numba is missing")
 
 
 SINE = (replace(EXAMPLE2, **IGNORE), 0.4, EXAMPLE2.torque)

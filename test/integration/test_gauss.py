@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.integration import codegen
+from sst_ros.host import compiled_module
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation, PreparedMotion, tables
 from sst_ros.integration.methods import DOP853
@@ -100,7 +100,7 @@ def test_numba_has_the_digits_of_plain_python(methods):
     assert one[0] == pytest.approx(plain[0], rel=1e-9)
     assert other == plain
     coded = [method.code is not None for method in methods.values()]
-    assert coded == [codegen.numba_version() is not None, False, coded[0]]
+    assert coded == [compiled_module.numba_version() is not None, False, coded[0]]
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -19,7 +19,8 @@ import pytest
 from loaded_scenes import start_of
 
 from sst_ros.dynamics import kernel
-from sst_ros.integration import codegen, step_loops
+from sst_ros.host import compiled_module
+from sst_ros.integration import step_loops
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS5P, Tableau
 from sst_ros.scene.scene import load
 
@@ -133,7 +134,7 @@ def rates(t, *y):
 def stepper(tableau):
     """One step by the text that runs: the new state, and its error estimate by number."""
     names = {"rhs": rates, "sqrt": math.sqrt}
-    exec(codegen.explicit_step(tableau, 7, 0), names)
+    exec(step_loops.explicit_step(tableau, 7, 0), names)
 
     def step(t, h, y):
         found = names["step"](t, h, *y)
@@ -228,7 +229,7 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
 
     parts = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
     known = {"SIZE": 1, **RODAS5P.constants}
-    module = codegen.load([inspect.getsource(part) for part in parts], known, numba=False)
+    module = compiled_module.load([inspect.getsource(part) for part in parts], known, numba=False)
     vars(module).update(linearise=linearise, evaluate=evaluate)
     y, new, error = [y0], [0.0], [0.0]
     for k in range(count):

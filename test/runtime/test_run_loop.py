@@ -11,7 +11,7 @@ import pytest
 from runtime.bench import Bench, HandClock, plain, run_here, stamped
 
 from sst_ros.errors import RunStopped
-from sst_ros.integration import codegen
+from sst_ros.host import compiled_module
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime import tick_loop
 from sst_ros.runtime.diagnostics import OK, WARN, RunDiagnostics
@@ -113,14 +113,14 @@ def test_a_free_run_passes_over_samples_that_nothing_receives(at_once):
 
 
 def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):
-    begun, load = [], codegen.load
+    begun, load = [], compiled_module.load
 
     def loading(*args, **named):
         begun.append(bench.loop.begun)
         return load(*args, **named)
 
     bench = Bench(scene="stiff", duration=0.1)
-    monkeypatch.setattr(codegen, "load", loading)
+    monkeypatch.setattr(compiled_module, "load", loading)
     bench.loop.run()
     assert bench.loop.phase is Phase.FINISHED and bench.loop.simulation.changes
     assert begun and not any(begun)

@@ -75,14 +75,6 @@ def named(name):
     return next(case for case in CASES if case.name == name)
 
 
-@pytest.mark.parametrize("case", [case.name for case in CASES if case.loose == 1e-7])
-def test_a_tolerance_of_its_own_is_needed_where_it_is_given(case):
-    """At LOOSE the estimate is off by more than the factor, as the reason states."""
-    case = named(case)
-    at_loose = replace(case, loose=LOOSE)
-    assert not estimate_check(at_loose, run_case(case)).holds
-
-
 def test_forty_contacts_multiply_differences():
     """The reason why their error estimate is not checked: 5e5 times in half of the run."""
     changes = bouncing_thrice(1e4, 20.0)

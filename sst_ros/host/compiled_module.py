@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Source of explicit steps, and functions as an interpreted or compiled module.
+"""Functions, given as text, as an interpreted or compiled module.
 
 The text is the same for the interpreter and for numba, so both take the same operations in the
 same order. Under numba it is written to a cache folder whose file names are digests of the text
@@ -12,14 +12,13 @@ import hashlib
 import os
 import platform
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from types import CodeType, ModuleType
 from typing import Any
 
 from sst_ros.host.cache_folder import cache_folder, import_text
-from sst_ros.integration.methods import Tableau
 
 _PLAIN = """\
 from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
@@ -74,92 +73,6 @@ def numba_version() -> str | None:
     except ImportError:
         return None
     return str(numba.__version__)
-
-
-def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
-    """Source of `step(t, h, y0, .., d0, ..)` of an explicit Runge-Kutta method, for scalars.
-
-    It calls `rhs(t, y0, .., d0, ..)` of the state y and of the drive d, which is constant over the
-    step, and returns the new state and the local error estimate of each number of the state, zero
-    where the method has none.
-
-    Args:
-        tableau: coefficients of the method.
-        size: numbers in the state.
-        drive: numbers in the drive.
-        more: further arguments, which `rhs` has as well.
-
-    Of RK4, three of its lines a stage and the last ones:
-
-        def step(t, h, y0, y1, ..., d0, d1, d2, p):
-            k0_0, k0_1, ... = rhs(t, y0, y1, ..., d0, d1, d2, p)
-            s0 = y0 + h * (0.5 * k0_0)
-            s1 = y1 + h * (0.5 * k0_1)
-            k1_0, k1_1, ... = rhs(t + 0.5 * h, s0, s1, ..., d0, d1, d2, p)
-            n0 = y0 + h * (0.16666666666666666 * k0_0 + 0.3333333333333333 * k1_0 + ...)
-            e0 = 0.0
-            return (n0, n1, ..., e0, e1, ...,)
-
-    """
-    y, d = _names("y", size), [*_names("d", drive), *more]
-    lines = [f"def step({', '.join(['t', 'h', *y, *d])}):", *_stages(tableau, size, d)]
-    results = ", ".join([*_names("n", size), *_names("e", size)])
-    lines.append(f"    return ({results},)")
-    return "\n".join(lines) + "\n"
-
-
-def attempt_explicitly(tableau: Tableau, size: int, drive: int, *more: str) -> str:
-    """Source of the same step on arrays, as `step_loops` has them: attempt(t, h, y, ..)."""
-    places = [*_names("new_y", size, "[{}]"), *_names("error", size, "[{}]")]
-    results = [*_names("n", size), *_names("e", size)]
-    d = [*_names("d", drive), *more]
-    lines = [
-        "def attempt(t, h, y, near, d, p, new_y, error):",
-        *(f"    y{i} = y[{i}]" for i in range(size)),
-        *(f"    d{i} = d[{i}]" for i in range(drive)),
-        *_stages(tableau, size, d),
-        *(f"    {place} = {result}" for place, result in zip(places, results, strict=True)),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _stages(tableau: Tableau, size: int, d: list[str]) -> list[str]:
-    """Lines of a step from y0, .. to the new state n0, .. and its error estimate e0, .."""
-    y, lines = _names("y", size), []
-    for stage, row in enumerate(tableau.a):
-        for j in range(size) if stage else ():
-            lines.append(f"    s{j} = y{j} + h * ({_combination(row, j)})")
-        inputs = _names("s", size) if stage else y
-        time = f"t + {tableau.c[stage]!r} * h" if tableau.c[stage] else "t"
-        outputs = ", ".join(f"k{stage}_{j}" for j in range(size))
-        lines.append(f"    {outputs} = rhs({', '.join([time, *inputs, *d])})")
-    for j in range(size):
-        lines.append(f"    n{j} = y{j} + h * ({_combination(tableau.b, j)})")
-        if not tableau.error:
-            lines.append(f"    e{j} = 0.0")
-        elif not tableau.damping:
-            lines.append(f"    e{j} = h * ({_combination(tableau.error, j)})")
-        else:
-            # Hairer's estimate for DOP853, each number of the state for itself.
-            lines.append(f"    fine = {_combination(tableau.error, j)}")
-            lines.append(f"    coarse = {_combination(tableau.damping, j)}")
-            lines.append("    both = fine * fine + 0.01 * (coarse * coarse)")
-            lines.append(f"    e{j} = h * fine * abs(fine) / sqrt(both) if both > 0.0 else 0.0")
-    return lines
-
-
-def combination(weights: Sequence[float], word: Callable[[int], str]) -> str:
-    """Sum of weights times words, without the zeros; "" where there is nothing else."""
-    terms = [f"{w!r} * {word(i)}" for i, w in enumerate(weights) if w]
-    return " + ".join(terms).replace("+ -", "- ")
-
-
-def _combination(weights: Sequence[float], j: int) -> str:
-    return combination(weights, lambda i: f"k{i}_{j}")
-
-
-def _names(letter: str, count: int, place: str = "{}") -> list[str]:
-    return [letter + place.format(i) for i in range(count)]
 
 
 @dataclass(frozen=True)
