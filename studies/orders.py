@@ -105,7 +105,7 @@ TIGHTEST = 1e-13
 STEPS = tuple(dict.fromkeys(round(2 ** (k / 2)) for k in range(21)))
 """Numbers of steps of a whole motion."""
 TOLERANCES = tuple(10.0**-k for k in range(3, 12))
-PERIOD_NS, UNIT = 10_000_000, 0.1  # of the energy's run [ns]; step of error constants [s]
+PERIOD_NS, UNIT = 5_000_000, 0.1  # of the energy's run [ns]; step of error constants [s]
 
 
 @cache
@@ -203,7 +203,7 @@ def order_table(rows: DataFrame) -> DataFrame:
     """Return the orders found over the shortest steps and over all, and the error constant."""
     found = []
     for (name, method), each in rows[rows.of == "step"].groupby(["scene", "method"], sort=False):
-        resolved = each[(each.error > 30.0 * each.known) & (each.error < 1e-2)].sort_values("x")
+        resolved = each[(each.error > 30.0 * each.known) & (each.error < 1e-3)].sort_values("x")
         resolved = resolved.drop_duplicates("error")  # steps longer than a piece are the piece
         if len(resolved) < 3:
             continue
@@ -265,8 +265,7 @@ can be trusted is on [another page](estimate.md), the methods are [here](methods
 ## Error over the step
 
 `simulate(..., max_step=h)` with a tolerance that no step exceeds; collocation with a number of
-steps and twenty iterations. One of the other steps is a pair of half the length. Errors above
-0.05 rad, as of unstable steps, are not drawn.
+steps and twenty iterations. Errors above 0.05 rad, as of unstable steps, are not drawn.
 
 ![Error over the length of a step](orders.png)
 
@@ -295,7 +294,7 @@ if the contact is located. The table has the largest error over the tolerance, w
 
 ## Energy over {seconds:g} s of motion
 
-`Simulation("swing", method, compiled=True)` by periods of 10 ms, without friction or torque; the
+`Simulation("swing", method, compiled=True)` by periods of 5 ms, without friction or torque; the
 energy is {energy:.3g} J. A residual of independent rounding errors grows as sqrt(t), a truncation
 error of one sign as t.
 
