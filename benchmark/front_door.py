@@ -19,7 +19,7 @@ from statistics import median
 from benchmark.measure import divide, time_in_turn
 from sst_ros import load_scene, prepare, simulate
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
-from sst_ros.simulation.simulate_steps import Task
+from sst_ros.simulation.task import Task
 from sst_ros.simulation.torque_profile import profile_of
 
 ROUNDS, STARTS = 50, 9

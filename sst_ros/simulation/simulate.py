@@ -12,23 +12,35 @@ from typing import Any, NoReturn, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sst_ros.dynamics.initial_state import start_of
 from sst_ros.errors import InputError, Problem
+from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
+from sst_ros.integration.methods import DORMAND_PRINCE
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
-from sst_ros.simulation.simulate_steps import MOST_PERIODS, Task, integrate
-from sst_ros.simulation.simulation import AUTO, INTEGRATORS
+from sst_ros.simulation.simulation import AUTO, INTEGRATORS, describe_conditioning
+from sst_ros.simulation.stepped_motion import SteppedMotion
+from sst_ros.simulation.task import Task
 from sst_ros.simulation.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
     TorqueFunction,
     TorqueProfile,
+    TorqueTable,
     profile_of,
 )
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, Array
 
 METHODS = (*INTEGRATORS, GAUSS)
+
+_MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
+"""Control periods that the budget of a motion reaches: a step and its check are three steps."""
+
+_ATTEMPTS, _FINEST = 4, 1e-14
+"""Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
 
 TorqueInput: TypeAlias = (
     Sequence[float] | SineTorque | TorqueProfile | TorqueFunction | FeedbackFunction | None
@@ -153,7 +165,7 @@ def prepare(
             if method == GAUSS:
                 _refuse("method", method, str(error))
             reason = f" (auto: {error})"
-    return PreparedRun(partial(integrate, task, reason))
+    return PreparedRun(partial(_integrate, task, reason))
 
 
 class PreparedRun:
@@ -168,6 +180,45 @@ class PreparedRun:
     def run(self, *, progress: bool = False) -> Trajectory:
         """Compute the motion; the trajectory has arrays of its own."""
         return self._run(progress)
+
+
+def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:
+    """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
+
+    A function whose torques are held is called once a period and may have a memory: one run.
+    `reason` says why this method was chosen, "" where the caller chose it.
+    """
+    local, spent = task.tolerance, 0
+    for _ in range(_ATTEMPTS):
+        motion = SteppedMotion(
+            task.scene, task.torque, (0.0, task.span / NANOSECONDS), start_of(task.scene),
+            task.sample_times(), method=task.method, tolerance=local, period=task.period,
+            breaks=task.breaks, max_step=task.max_step, spent=spent, progress=progress,
+        ).run()  # fmt: skip
+        spent += motion.evaluations
+        excess = motion.at.error / task.tolerance
+        if task.period is not None or motion.status < 0 or not excess > 1.0:
+            break
+        local = max(local / (5.0 * excess), _FINEST)
+    message, point = motion.message, motion.at
+    if motion.status < 0:
+        numbers = describe_conditioning(Geometry.of(task.scene), motion.state())
+        message = f"{message} ({numbers})"
+    status, message = task.compare(point.error, motion.status, message)
+    rows = np.array(motion.rows).reshape(-1, 29)
+    changes = [f"{to} from {at:g} s ({why})" for at, to, why in point.changes]
+    energy = motion.propagator.dynamics.total_energy
+    return Trajectory(
+        task.scene, rows[:, 0], rows[:, 1:5], rows[:, 5:8], rows[:, 8:11], joints=rows[:, 11:],
+        status=status,
+        message=message,
+        method=", then ".join([motion.start.method.name, *changes]) + reason,
+        error_estimate=point.error,
+        energy_residual=energy(point.y) - energy(motion.start.y) - point.y[-1],
+        evaluations=spent,
+        step=motion.time / max(point.steps, 1),
+        law=TorqueTable(*zip(*motion.held, strict=True)) if motion.held else task.torque,
+    )  # fmt: skip
 
 
 def _refuse(name: str, value: object, allowed: str) -> NoReturn:
@@ -190,8 +241,8 @@ def _check_period(period: float | None, profile: TorqueProfile, span: int) -> in
     if not isinstance(profile, FunctionTorque):
         _refuse("control_period", period, "is for a function; give none for numbers and profiles")
     found = _nanoseconds("control_period", period)
-    if span > MOST_PERIODS * found:
-        least = span / NANOSECONDS / MOST_PERIODS
+    if span > _MOST_PERIODS * found:
+        least = span / NANOSECONDS / _MOST_PERIODS
         _refuse("control_period", period, f"must be at least {least:.3g} s for this duration")
     return found
 

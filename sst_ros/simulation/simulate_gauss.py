@@ -20,7 +20,7 @@ from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
-from sst_ros.simulation.simulate_steps import UNMET, Task
+from sst_ros.simulation.task import Task
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, clamp
@@ -127,9 +127,7 @@ class CollocatedMotion:
         task, status, message = self._task, 0, "reached the end"
         if self._met:
             status, message = 1, f"stopped at t = {self._end:.12f} s: {self._met.reason}"
-        if self._error > task.tolerance:
-            unmet = f"the error estimate {self._error:.1e} rad exceeds the tolerance"
-            status, message = status or UNMET, f"{message}; {unmet} {task.tolerance:g} rad"
+        status, message = task.compare(self._error, status, message)
         most = task.scene.torque_limit or math.inf
         return Trajectory(
             task.scene,
