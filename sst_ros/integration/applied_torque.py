@@ -12,7 +12,6 @@ import numpy as np
 
 from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function
-from sst_ros.integration.compiled_method import compile_derivative
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamp
 
@@ -80,7 +79,7 @@ class AppliedTorque:
 
     def __init__(self, ode: ODE, limit: float | None, rhs: Function | None = None) -> None:
         self._ode, self.limit, self._rhs = ode, limit, rhs
-        self.is_traced, self._compiled = rhs is None, False
+        self.is_traced = rhs is None
         self._torque: TorqueFunction | StateFeedback | None = None
         self._start = 0.0
 
@@ -117,10 +116,9 @@ class AppliedTorque:
         self._torque, self._start = torque, start
         return (0.0, 0.0, 0.0)
 
-    def compile(self) -> None:
-        """Evaluate the derivative in machine code from now on; the digits are the same."""
-        if self.is_traced and not self._compiled:
-            self._compiled, self._rhs = True, None
+    def evaluate_by(self, rhs: Function) -> None:
+        """Take another form of the same derivative from now on, in machine code."""
+        self._rhs = rhs
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m]."""
@@ -129,8 +127,7 @@ class AppliedTorque:
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""
         if self._rhs is None:
-            ode = self._ode
-            self._rhs = compile_derivative(ode) if self._compiled else compile_program(ode.program)
+            self._rhs = compile_program(self._ode.program)
         assert self._torque is not None
         size = len(self._ode.state)
         torque = self.at(self._torque, self._start + t, inputs[:size])

@@ -26,6 +26,7 @@ from sst_ros.integration.adaptive_stepper import (
     Step,
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
+from sst_ros.integration.compiled_method import compile_derivative
 from sst_ros.integration.events import (
     contact_events_of,
     first_event,
@@ -195,7 +196,8 @@ class Propagator:
     def compile(self) -> None:
         """Take compiled steps from now on; the bits are the same."""
         self._new_stepper.keywords["compiled"] = True
-        self.torque.compile()
+        if None in self._others and self.torque.is_traced:
+            self.torque.evaluate_by(compile_derivative(self.ode))
         for stepper in (self._constant, *self._others.values()):
             stepper.compile()
 
