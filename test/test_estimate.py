@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from sst_ros import TorqueTable, load_scene, simulate
+from sst_ros.integration.compiled_method import JACOBIAN_COST
+from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.torque_profile import PolynomialTorque
@@ -128,6 +130,18 @@ def test_nine_samples_cost_little_more_than_none():
         for times in ([1.0], np.linspace(0.0, 1.0, 9))
     ]
     assert counts[1] <= counts[0] + 9 * 12  # a step for each, which is counted
+
+
+@pytest.mark.parametrize("method", STEPPED)
+def test_many_samples_are_as_good_as_the_end_and_cost_less_than_a_step_each(method):
+    many, finer = (
+        simulate(EXAMPLE2, method=how, t_eval=np.linspace(0.0, 1.0, 4001), tolerance=tolerance)
+        for how, tolerance in ((method, 1e-7), ("gauss", 1e-12))
+    )
+    assert max(map(angle_between, many.quaternion, finer.quaternion)) < 1e-7
+    few = simulate(EXAMPLE2, method=method, t_eval=[1.0], tolerance=1e-7)
+    step = len(METHODS[method].a) + (JACOBIAN_COST if method == "rodas5p" else 0)
+    assert many.evaluations - few.evaluations < 0.6 * step * 4001
 
 
 def test_the_longest_step_is_obeyed():
