@@ -222,8 +222,8 @@ those of compiled runs compilation too; "compiled only" would take hours in plai
 The error estimate must lie within a factor {FACTOR:g} of the true error, or the column "estimate"
 gives the reason why there is nothing to compare. The case is run at the tolerance {LOOSE:g}, or at
 {LOOSER:g} where an error is resolved only there, with steps as long as that allows, and compared
-with its run at the default tolerance, 1e-10; a case that needs a finer one gives the reason. An
-estimate of an error that is not resolved must not be above {FACTOR:g} times what is resolved.
+with its run at the default tolerance, 1e-10. An estimate of an error that is not resolved must not
+be above {FACTOR:g} times what is resolved.
 """
 
 
