@@ -68,7 +68,7 @@ def markdown(frame: DataFrame) -> str:
 def render(template: str, **values: Any) -> str:
     """Fill in a template of this folder; no line ends with blanks."""
     lines = _templates.get_template(template).render(values)
-    return "\n".join(line.rstrip() for line in lines.splitlines()) + "\n"
+    return "".join(f"{line.rstrip()}\n" for line in lines.splitlines())
 
 
 def publish(

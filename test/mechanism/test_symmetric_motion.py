@@ -74,7 +74,7 @@ def test_three_contacts_at_once_stay_symmetric_and_bounce_as_one_freedom_does(
     how = {"stiffness": stiffness, "restitution": restitution, "impact_rate": 1.0}
     simulation = bounced(**how)
     joints, c = simulation.state.joints, damping_of(Stroke(at_end="elastic", **how))
-    assert np.ptp(joints.gamma) < 1e-12 and np.ptp(joints.gamma_dot) < 1e-12
+    assert np.ptp(joints.gamma) < 3e-12 and np.ptp(joints.gamma_dot) < 3e-12  # rounding, grown
 
     def acceleration(t, y):
         x, v = y

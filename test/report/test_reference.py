@@ -42,7 +42,7 @@ def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_it
             assert values.shape == (151,) and np.all(values < 1e-11)
     assert integration.own.gamma.max() > 0.0
     assert (integration.compared, integration.restarts_ns) == (151, ())
-    assert integration.steps >= 2
+    assert integration.steps >= 1
 
 
 def test_the_reference_agrees_with_scipy(run):
@@ -113,7 +113,7 @@ def test_long_ticks_are_cut_into_short_steps(run):
         run.ticks.start_ns[::10], run.ticks.end_ns[9::10], run.ticks.torque[::10]
     )
     found = reference.integration(altered(run, ticks=ticks))
-    assert found.steps >= 20 and found.own.gamma[np.isfinite(found.own.gamma)].max() < 1e-12
+    assert found.steps >= 10 and found.own.gamma[np.isfinite(found.own.gamma)].max() < 1e-12
 
 
 def test_a_wrong_kernel_is_seen_by_the_papers_equations_and_by_the_integration(run, wrong_kernel):

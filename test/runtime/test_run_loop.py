@@ -259,7 +259,7 @@ def test_set_state_is_checked(start):
     joints = bench.loop.simulation.state.joints
     assert joints.gamma == pytest.approx(given[0], abs=1e-12)
     assert joints.gamma_dot == pytest.approx(given[1], abs=1e-12)
-    assert "stroke" in bench.ask("set_state", (9.0, 0.7, 0.8), ZERO).message
+    assert "stroke" in bench.ask("set_state", (3.0, 0.7, 0.8), ZERO).message
     assert bench.loop.simulation.state.joints == joints
     assert bench.ask("reset").success
     assert bench.loop.simulation.state.joints.gamma != pytest.approx(given[0], abs=1e-3)
