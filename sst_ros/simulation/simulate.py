@@ -22,7 +22,6 @@ from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, describe_conditioning
 from sst_ros.simulation.stepped_motion import SteppedMotion
-from sst_ros.simulation.task import Task
 from sst_ros.simulation.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
@@ -31,7 +30,7 @@ from sst_ros.simulation.torque_profile import (
     TorqueTable,
     profile_of,
 )
-from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.simulation.trajectory import Task, Trajectory
 from sst_ros.state import NANOSECONDS, Array
 
 METHODS = (*INTEGRATORS, GAUSS)

@@ -20,9 +20,8 @@ from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
-from sst_ros.simulation.task import Task
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
-from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.simulation.trajectory import Task, Trajectory
 from sst_ros.state import NANOSECONDS, clamp
 
 GAUSS = "gauss"
