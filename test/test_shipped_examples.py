@@ -125,7 +125,7 @@ def test_torques_of_the_inverse_dynamics_bring_the_motion_back():
         rates = np.array(at.gamma_dot), np.array(at.gamma_ddot)
         return tuple(virtual_work.inverse_dynamics(mechanism, posture, *rates).tolist())
 
-    simulation, start = Simulation(scene), motion.at(0.0).quaternion
+    simulation, start = Simulation(scene, "dop853"), motion.at(0.0).quaternion
     worst, travelled = 0.0, 0.0
     for _ in range(250):
         state = simulation.step(torque, 4 * MILLISECOND)

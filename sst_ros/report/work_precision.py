@@ -23,7 +23,7 @@ from sst_ros.errors import SstError
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import slices
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.methods import METHODS
+from sst_ros.integration.methods import METHODS, RK4
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report.reference import compare_with_paper
 from sst_ros.report.reference_solution import (
@@ -252,7 +252,7 @@ def solver_grid(problem: InitialValueProblem) -> list[Iterator[SolverSetting]]:
             compiled = numba_version() is not None
             machine = CompiledMethod(problem.system, method, compiled=compiled)
             found.append(map(partial(_fix_steps, problem, machine), _STEPS_PER_INTERVAL))
-        if method.error_order:
+        if method is not RK4:  # its steps in a run are fixed
             found.append(map(partial(_adapt_steps, problem, method.name), _TOLERANCES))
     if not problem.kinked:
         found += [_list_collocation(problem, kind) for kind in (FIXED, TOLERANCE)]

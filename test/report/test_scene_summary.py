@@ -175,7 +175,7 @@ def test_a_stiff_scene_is_advised_the_implicit_method_and_the_rate_is_named():
 
 
 def test_a_scene_that_cannot_start_has_none():
-    away = dataclasses.replace(load("example2"), initial=Initial(gamma=(9.0, 0.5, 0.5)))
+    away = dataclasses.replace(load("example2"), initial=Initial(gamma=(3.0, 0.5, 0.5)))
     assert step_advice(away).text.startswith("none, the scene cannot start: ")
     assert math.isnan(step_advice(away).step)
 

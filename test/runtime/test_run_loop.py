@@ -128,7 +128,7 @@ def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):
 
 def test_code_that_takes_long_to_load_is_no_fault(start):
     class Slow(Simulation):
-        def load_code(self, dt_ns):
+        def load_code(self):
             end = time.thread_time() + 0.6
             while time.thread_time() < end:
                 pass
