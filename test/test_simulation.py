@@ -25,7 +25,7 @@ from sst_ros.errors import (
 )
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.scene.scene import Actuators, Initial, Workspace, load
+from sst_ros.scene.scene import Actuators, Initial, Moment, Workspace, load
 from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
@@ -86,6 +86,18 @@ def test_time_is_counted_in_whole_nanoseconds():
     simulation.steps(REST, np.int32(2_000_000), np.int8(100))  # their product overflows
     assert simulation.state.time_ns == 20 * sum(steps) + 200_000_000
     assert isinstance(simulation.state.time_ns, int)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int64, int])
+def test_torques_and_moments_of_any_type_act_as_floats(kind):
+    """In plain Python those of float32 would make float32 of the state."""
+    scene = replace(EXAMPLE2, moment=Moment(topic=True))
+    given, floats = (kind(1), kind(0), kind(-2)), (1.0, 0.0, -2.0)
+    one, other = Simulation(scene), Simulation(scene)
+    for torque, expected in ((given, floats), (lambda _: given, lambda _: floats)):
+        found = one.step(torque, MILLISECOND, given)
+        assert found == other.step(expected, MILLISECOND, floats)
+        assert {type(x) for x in (*found.quaternion, *found.torque)} == {float}
 
 
 def test_a_torque_that_is_a_function_of_time_is_asked_at_simulated_times():

@@ -93,7 +93,7 @@ class AppliedTorque:
             return torque if self.is_traced and self.limit_of(torque) is None else torque.at
         if callable(torque):
             return torque
-        first, second, third = torque
+        first, second, third = map(float, torque)
         return clamp((first, second, third), self.limit)
 
     def limit_of(self, torque: SineTorque) -> float | None:
@@ -122,7 +122,8 @@ class AppliedTorque:
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m]."""
-        return clamp(torque_at(torque, time, y), self.limit)
+        found: Any = tuple(map(float, torque_at(torque, time, y)))
+        return clamp(found, self.limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""

@@ -215,7 +215,7 @@ class Simulation:
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""
         propagator, h = self._propagator, dt_ns / NANOSECONDS
-        held = tuple(moment) if self.dynamics.has_moment_topic else ()
+        held = tuple(map(float, moment)) if self.dynamics.has_moment_topic else ()
         while count > 0:
             at = self._now
             start = at.time_ns / NANOSECONDS
