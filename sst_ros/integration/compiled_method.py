@@ -82,7 +82,7 @@ class CompiledMethod:
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
         derivative: rhs(t, state.., drive..) to use instead of the ODE's, in plain Python.
         linearise: the derivatives of `derivative`, which a Rosenbrock method needs.
-        ranges: joints that `step_many` looks at, see `limits.ranges_of`.
+        ranges: joints that `step_many` looks at, see `ranges_of`.
 
     Attributes:
         system, method, compiled: as given.

@@ -96,7 +96,7 @@ class Simulation:
             "virtual_work", the paper's Eqs. 1 to 92: the same motion, about 20 times slower, by
             explicit methods in plain Python, without the terms that the paper does not have.
         step_budget: evaluations of the right-hand side that one `step` may take. The default keeps
-            a step below about 0.2 s, see `options.default_budget`. Long steps of a stiff or fast
+            a step below about 0.2 s, see `default_budget`. Long steps of a stiff or fast
             motion may need more. A Jacobian counts as 30 evaluations.
 
     Attributes:
@@ -163,7 +163,7 @@ class Simulation:
 
         Args:
             torque: commanded torques [N m], held constant; a `SineTorque`; or a function of
-                t [s], for which explicit methods in plain Python are used.
+                t [s], for which plain Python is used.
             dt_ns: length [ns], > 0.
             moment: external moment on the star in {B} [N m], used where the scene takes it from
                 a topic.
