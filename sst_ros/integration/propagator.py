@@ -175,7 +175,7 @@ class Propagator:
         x, event = 0.0, None
         while x < h:
             for step in stepper.accepted_steps(x, h, at, drive, start):
-                ends = step.begin.joints, step.end.joints
+                event, ends = None, (step.begin.joints, step.end.joints)
                 if not step_loops.all_far(self._ranges, *ends, step.h):  # type: ignore[no-untyped-call]
                     step, event = self._until_first(stepper, step)
                 yield step
@@ -226,7 +226,7 @@ class Propagator:
         if event.error is None:
             x = just_beyond(event, x, joints(x), step.h)
         end = step.begin if x == 0.0 else stepper.part(step, x) if x < step.h else step.end
-        return step._replace(h=x, end=end, last=False), event
+        return step._replace(h=x, end=end, last=step.last and x == step.h), event
 
 
 LONGEST_TICK_NS = 1_000_000
