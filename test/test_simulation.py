@@ -80,9 +80,8 @@ def test_the_start_is_the_one_of_the_scene_outside_an_ignored_stroke_too(gamma, 
 def test_time_is_counted_in_whole_nanoseconds():
     simulation = Simulation(replace(EXAMPLE2, **IGNORE))
     steps = [333_333, 1, 999_999_7, 7, 1_234_567]
-    for _ in range(20):
-        for dt_ns in steps:
-            simulation.step(REST, dt_ns)
+    for dt_ns in 20 * steps:
+        simulation.step(REST, dt_ns)
     simulation.steps(REST, np.int32(2_000_000), np.int8(100))  # their product overflows
     assert simulation.state.time_ns == 20 * sum(steps) + 200_000_000
     assert isinstance(simulation.state.time_ns, int)
@@ -93,23 +92,16 @@ def test_torques_and_moments_of_any_type_act_as_floats(kind):
     """In plain Python those of float32 would make float32 of the state."""
     scene = replace(EXAMPLE2, moment=Moment(topic=True))
     given, floats = (kind(1), kind(0), kind(-2)), (1.0, 0.0, -2.0)
-    one, other = Simulation(scene), Simulation(scene)
     for torque, expected in ((given, floats), (lambda _: given, lambda _: floats)):
-        found = one.step(torque, MILLISECOND, given)
-        assert found == other.step(expected, MILLISECOND, floats)
+        found = Simulation(scene).step(torque, MILLISECOND, given)
+        assert found == Simulation(scene).step(expected, MILLISECOND, floats)
         assert {type(x) for x in (*found.quaternion, *found.torque)} == {float}
 
 
 def test_a_torque_that_is_a_function_of_time_is_asked_at_simulated_times():
-    asked = []
-
-    def torque(t):
-        asked.append(t)
-        return REST
-
-    simulation = Simulation(EXAMPLE2)
+    simulation, asked = Simulation(EXAMPLE2), []
     for _ in range(3):
-        simulation.step(torque, MILLISECOND)
+        simulation.step(lambda t: asked.append(t) or REST, MILLISECOND)
     assert min(asked) == 0.0
     assert max(asked) == pytest.approx(0.003, abs=1e-15)
 
@@ -172,9 +164,8 @@ def test_a_state_within_the_last_step_is_the_state_of_a_shorter_step(name):
     scene = load(name)
     torque = scene.torque.at
     simulation, other = Simulation(scene), Simulation(scene)
-    for _ in range(9):
-        simulation.step(torque, 100 * MILLISECOND)
-        other.step(torque, 100 * MILLISECOND)
+    for one in (simulation, other):
+        one.steps(torque, 100 * MILLISECOND, 9)
     simulation.step(torque, 100 * MILLISECOND)
     end, estimate = simulation.state, simulation.error_estimate
     found = simulation.within(930 * MILLISECOND)
@@ -217,12 +208,10 @@ def test_a_torque_function_in_a_compiled_simulation_warns_once_and_a_sine_never(
             one.steps(EXAMPLE2.torque, 10 * MILLISECOND, 50)
     assert simulation.state == plain.state
     assert simulation.error_estimate == plain.error_estimate
-    with pytest.warns(RuntimeWarning, match="a torque function runs in plain Python"):
-        simulation.step(lambda t: (t, 0.0, 1.0), MILLISECOND)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        simulation.step(lambda t: (t, 0.0, 1.0), MILLISECOND)
-        plain.steps(lambda t: (t, 0.0, 1.0), MILLISECOND, 2)
+    with pytest.warns(RuntimeWarning, match="a torque function runs in plain Python") as caught:
+        for one in (simulation, simulation, plain, plain):
+            one.step(lambda t: (t, 0.0, 1.0), MILLISECOND)
+    assert len(caught) == 1
     assert simulation.state == plain.state
 
 
