@@ -172,12 +172,19 @@ class Propagator:
     ) -> Iterator[Step]:
         """Step through a period; steps end where contact with a stop begins or ends."""
         self.budget.begin()
-        x, event = 0.0, None
+        x = 0.0
         while x < h:
+            event = None
             for step in stepper.accepted_steps(x, h, at, drive, start):
                 event, ends = None, (step.begin.joints, step.end.joints)
                 if not step_loops.all_far(self._ranges, *ends, step.h):  # type: ignore[no-untyped-call]
-                    step, event = self._until_first(stepper, step)
+                    try:
+                        step, event = self._until_first(stepper, step)
+                    except CannotStep:
+                        raise
+                    except (ArithmeticError, ValueError):  # it has leapt over a singularity
+                        x, at = step.t, step.begin._replace(h=0.5 * step.h)
+                        break
                 yield step
                 at = step.end
                 if event is not None:
@@ -185,7 +192,7 @@ class Propagator:
                     break
             else:
                 return
-            if event.error is not None:
+            if event is not None and event.error is not None:
                 raise LimitReached(event, start + x)
 
     def load(self) -> None:
