@@ -3,7 +3,7 @@
 
 Sources: RK4, Kutta 1901. Dormand-Prince 5(4), J. Comput. Appl. Math. 6 (1980) 19-26. DOP853,
 Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 2nd ed., section II.10.
-Rodas5P, Steinebach, BIT Numer. Math. 63 (2023) 27.
+Rodas5P, Steinebach, BIT Numerical Mathematics 63 (2023) 27.
 """
 
 from __future__ import annotations
