@@ -140,17 +140,18 @@ class Point(NamedTuple):
     @property
     def error(self) -> float:
         """Estimated global error of the orientation [rad]."""
-        return max(_MARGIN * orientation_distance(self.y, self.z), self._floor)
+        return estimate_error(orientation_distance(self.y, self.z), self.steps)
 
     @property
     def rate_error(self) -> float:
         """Estimated global error of the body rate [rad/s]."""
-        floor = self._floor * max(1.0, math.hypot(*self.y[4:7]))
-        return max(_MARGIN * math.dist(self.y[4:7], self.z[4:7]), floor)
+        speed = max(1.0, math.hypot(*self.y[4:7]))
+        return speed * estimate_error(math.dist(self.y[4:7], self.z[4:7]) / speed, self.steps)
 
-    @property
-    def _floor(self) -> float:
-        return _FLOOR * math.sqrt(self.steps + 1.0)
+
+def estimate_error(distance: float, steps: int) -> float:
+    """Estimate the error of a solution by that of a second one, by steps of half the length."""
+    return max(_MARGIN * distance, _FLOOR * math.sqrt(steps + 1.0))
 
 
 def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:

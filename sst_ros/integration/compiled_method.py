@@ -172,8 +172,6 @@ class CompiledMethod:
         Returns how many were done, and where the last one ended.
         """
         self._length[0], self._drive[0][:] = h, d
-        if len(self.sizes) < count:
-            self.sizes = self._vector([-1.0] * count)
         return self.step_sequence(
             0, count, (self._length, self._drive, self._no_start), at, tolerance, self._not_kept
         )

@@ -15,7 +15,7 @@ from sst_ros.dynamics.expression import number_constants, trace
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, limit_distances
-from sst_ros.integration.adaptive_stepper import orientation_distance
+from sst_ros.integration.adaptive_stepper import estimate_error, orientation_distance
 from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -38,8 +38,8 @@ smooth motions gain far more, those with kinks a factor of two."""
 _FINEST_PER_SECOND, _FINEST = 1024, 4096
 """Steps a second beyond which `auto` turns to methods with error control, and the most of all."""
 _ITERATIONS, _MOST_ITERATIONS = (5, 6, 8), 10
-_ROUNDING, _FLOOR = 1e-14, 8 * 2.220446049250313e-16
-"""Least distance in the search; least error estimate of a step."""
+_ROUNDING = 1e-14
+"""Least distance in the search."""
 
 
 class NotSmooth(ArithmeticError):
@@ -171,7 +171,7 @@ class CollocatedMotion:
             if 4 * count > most or (slow and not self._asked):
                 break
             count, y, z = 2 * count, z, self._solve(4 * count)
-        error = max(2.0 * orientation_distance(y, z), _FLOOR * math.sqrt(count + 1.0))
+        error = estimate_error(orientation_distance(y, z), count)
         if error <= tolerance or (self._asked and error < math.inf):
             return count, iterations, error
         raise NotSmooth(f"{count} steps of collocation do not reach {tolerance:g} rad")
