@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 from scipy.integrate import simpson
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.reference import Peak, Reference, ReferenceMotion, maximum, minimum
+from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
@@ -42,6 +42,53 @@ SLOWEST = 1e-4
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 """Of the peaks of an `ActuatorDemand`."""
 _GRID, _HALVINGS, _DOUBLINGS = 120, 45, 40
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A value and the time at which it is taken [s]."""
+
+    value: float
+    time: float
+
+
+def maximum(
+    function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
+) -> Peak:
+    """Return the maximum of a function of which samples are known.
+
+    Every sample that no neighbour exceeds is a local maximum. It is refined between its neighbours
+    if the function could exceed the best sample there: extrapolated by its change to the lower
+    neighbour.
+
+    Args:
+        function: of time.
+        times: of the samples, rising [s], shape (n,).
+        values: the function there, shape (n,).
+        floor: maxima that are certainly below it are not refined.
+
+    """
+    top = int(np.argmax(values))
+    best = Peak(float(values[top]), float(times[top]))
+    left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
+    below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
+    high = 2.0 * values - below > max(best.value + 1e-13 * abs(best.value), floor)
+    summits = (values >= left) & (values >= right) & high
+    for index in np.flatnonzero(summits):
+        bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
+        options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
+        found = minimize_scalar(
+            lambda time: -function(time), bounds=bounds, method="bounded", options=options
+        )
+        if -found.fun > best.value + 1e-13 * abs(best.value):
+            best = Peak(float(-found.fun), float(found.x))
+    return best
+
+
+def minimum(function: Callable[[float], float], times: Array, values: Array) -> Peak:
+    """Return the minimum; see `maximum`."""
+    found = maximum(lambda time: -function(time), times, -values)
+    return Peak(-found.value, found.time)
 
 
 @dataclass(frozen=True)

@@ -1,36 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference motion of a scene; those of the star, which the actuators follow, are here too."""
+"""The reference motion of a scene: of the star, or of the actuators, which the star follows.
+
+Through waypoints, and through the samples of a recording, goes one quintic a segment: position,
+velocity and acceleration at both ends make it. Where a velocity or an acceleration is left open,
+all open ones together minimise the integral of the jerk squared: with positions alone that is the
+quintic spline with four continuous derivatives.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any, TypeAlias, cast
 
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import BPoly, PPoly
+from scipy.linalg import hilbert
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.actuator_motions import (
-    ActuatorMotion,
-    straight_path,
-    sweep_path,
-    through_points,
-    through_samples,
-)
 from sst_ros.control.actuator_space import ActuatorSpaceMap, follow_assembly
-from sst_ros.control.reference import (
-    PIECES,
-    Reference,
-    ReferenceMotion,
-    equal_pieces,
-    minimum_jerk_over,
-)
+from sst_ros.control.reference import Reference, ReferenceMotion, equal_pieces
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, Problem, SingularConfiguration
-from sst_ros.mechanism.generic_math import axpy, multiply, quaternion_product, triple
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.loads import Spiral
+from sst_ros.mechanism import continuation, kinematics
+from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
+from sst_ros.mechanism.generic_math import ZERO, axpy, multiply, quaternion_product, triple
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.loads import Spiral, Sweep, ToAngles
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3
+
+PIECES = 8
+"""Pieces of a minimum-jerk motion, and of a quarter of a turn."""
+SAMPLES_A_PIECE = 8
+"""Of a recording, whose samples lie much denser than the motion turns."""
+STEP = 0.03
+"""Distance in gamma [rad] between orientations that are kept."""
+LONGEST = 100.0
+"""Longest path in gamma [rad] within a piece of a motion."""
+NEAR = 0.1
+"""Largest distance of a first point at time 0 from the start [rad]."""
+_SAMPLES = 16
+
+StarPath: TypeAlias = Callable[[float], tuple[Quaternion, Vector3, Vector3]]
+"""Share of the way to the turn from the start, a quaternion, and to W and W_dot per share."""
+ActuatorPath: TypeAlias = Callable[[float], tuple[Vector3, Vector3, Vector3]]
+"""Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2]."""
+OpenPoints: TypeAlias = Sequence[Sequence[float] | None]
 
 
 def reference_motion(
@@ -78,103 +99,375 @@ def reference_motion(
         centre = motion.sweep.centre or gamma
         if centre != gamma:
             start = follow_assembly(geometry, start, gamma, centre)
-        path, pieces = sweep_path(motion.sweep, centre)
-    else:
-        assert motion.to_angles is not None
-        path = straight_path(gamma, motion.to_angles)
-        pieces = equal_pieces(motion.to_angles.duration, 2 * PIECES)
-    return ActuatorMotion(geometry, path, pieces, start)
+        return move_actuators(geometry, *sweep_path(motion.sweep, centre), start)
+    assert motion.to_angles is not None
+    pieces = equal_pieces(motion.to_angles.duration, 2 * PIECES)
+    return move_actuators(geometry, straight_path(gamma, motion.to_angles), pieces, start)
 
 
-StarState = tuple[Quaternion, Vector3, Vector3]
+def minimum_jerk(u: float) -> tuple[float, float, float]:
+    """s(u) from 0 to 1 for u in [0, 1], at rest at both ends, with its two derivatives by u."""
+    rest = 1.0 - u
+    square = u * u
+    return (
+        square * u * (10.0 + u * (6.0 * u - 15.0)),
+        30.0 * square * rest * rest,
+        60.0 * u * rest * (rest - u),
+    )
 
 
-class StarMotion(ReferenceMotion):
-    """A motion of the star.
+def minimum_jerk_over(time: float, duration: float) -> tuple[float, float, float]:
+    """Minimum jerk from 0 to 1 over a duration, with derivatives by time."""
+    s, rate, acceleration = minimum_jerk(time / duration)
+    return s, rate / duration, acceleration / (duration * duration)
 
-    Args:
-        geometry: base triangle and star.
-        star: quaternion, W and W_dot at a time [s] between 0 and the duration.
-        duration: [s].
-        turn: by which the star turns in all [rad].
 
-    """
+def move_star(
+    geometry: Geometry, start: Quaternion, path: StarPath, duration: float, turn: float
+) -> ReferenceMotion:
+    """Return a motion of the star along a path, with minimum jerk; it turns by `turn` [rad]."""
+    space, (x, y, z, w), length = ActuatorSpaceMap(geometry), start, math.hypot(*start)
+    begin = x / length, y / length, z / length, w / length
 
-    def __init__(
-        self, geometry: Geometry, star: Callable[[float], StarState], duration: float, turn: float
-    ) -> None:
-        count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
-        super().__init__(duration, equal_pieces(duration, count))
-        self._star, self._coordinates = star, ActuatorSpaceMap(geometry)
+    def inside(time: float) -> Reference:
+        s, rate, acceleration = minimum_jerk_over(time, duration)
+        turned, u, slope = path(s)
+        body_acceleration = axpy(acceleration, u, rate * rate, slope)
+        return space.of_star(
+            quaternion_product(begin, turned), multiply(rate, u), body_acceleration
+        )
 
-    def _inside(self, time: float) -> Reference:
-        try:
-            return self._coordinates.of_star(*self._star(time))
-        except ArithmeticError:
-            said = f"serial singularity at t = {time:.9g} s, sin(mu)"
-            raise SingularConfiguration(said, 0.0) from None
+    count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
+    return ReferenceMotion(inside, equal_pieces(duration, count))
 
 
 def geodesic_motion(
     geometry: Geometry, start: Quaternion, end: Quaternion, duration: float
-) -> StarMotion:
+) -> ReferenceMotion:
     """From one orientation to another about one axis (the geodesic of SO(3)), minimum jerk.
 
     Quaternions (x, y, z, w) may have any length > 0; the shorter rotation is taken.
     """
     # The axis is the same in {B} and in {E}.
     turn = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
-    vector, begin = triple(turn.tolist()), _unit(start)
+    vector = triple(turn.tolist())
     angle = math.hypot(*vector)
 
-    def star(time: float) -> StarState:
-        s, rate, acceleration = minimum_jerk_over(time, duration)
+    def path(s: float) -> tuple[Quaternion, Vector3, Vector3]:
         half = 0.5 * s * angle
         part = math.sin(half) / angle if angle else 0.0
-        q = quaternion_product(begin, (*multiply(part, vector), math.cos(half)))
-        return q, multiply(rate, vector), multiply(acceleration, vector)
+        return (*multiply(part, vector), math.cos(half)), vector, ZERO
 
-    return StarMotion(geometry, star, duration, angle)
+    return move_star(geometry, start, path, duration, angle)
 
 
-def spiral_motion(geometry: Geometry, start: Quaternion, spiral: Spiral) -> StarMotion:
+def spiral_motion(geometry: Geometry, start: Quaternion, spiral: Spiral) -> ReferenceMotion:
     """R(0) Rz(theta) Ry(phi) Rz(psi - theta), the three angles [rad] grown by minimum jerk.
 
     Tilt, its direction and torsion: at phi = 0 the star only turns by psi about E, so the motion
     is smooth where ZYZ angles are not.
     """
-    begin, duration = _unit(start), spiral.duration
-    theta, phi, third = spiral.theta, spiral.phi, spiral.psi - spiral.theta
+    theta, phi, psi = spiral.theta, spiral.phi, spiral.psi
+    third = psi - theta
 
-    def star(time: float) -> StarState:
-        s, rate, acceleration = minimum_jerk_over(time, duration)
-        a, b, c = s * theta, s * phi, s * third
-        q = quaternion_product(
-            quaternion_product(_about_z(a), (0.0, math.sin(0.5 * b), 0.0, math.cos(0.5 * b))),
-            _about_z(c),
-        )
-        # W = u rate with u = (theta part, phi part, third angle's part) by the angles a, b, c.
+    def path(s: float) -> tuple[Quaternion, Vector3, Vector3]:
+        b, c, difference, total = s * phi, s * third, 0.5 * s * (third - theta), 0.5 * s * psi
+        sine, cosine = math.sin(0.5 * b), math.cos(0.5 * b)
+        x, y = sine * math.sin(difference), sine * math.cos(difference)
+        q = x, y, cosine * math.sin(total), cosine * math.cos(total)
+        # W by s, and its derivative.
         sb, cb, sc, cc = math.sin(b), math.cos(b), math.sin(c), math.cos(c)
         u = (-theta * sb * cc + phi * sc, theta * sb * sc + phi * cc, theta * cb + third)
-        # Its derivatives by s; the angles are linear in s.
         slope = (
             -theta * (phi * cb * cc - third * sb * sc) + phi * third * cc,
             theta * (phi * cb * sc + third * sb * cc) - phi * third * sc,
             -theta * phi * sb,
         )
-        turning = axpy(acceleration, u, rate * rate, slope)
-        return quaternion_product(begin, q), multiply(rate, u), turning
+        return q, u, slope
 
-    turn = abs(theta) + abs(phi) + abs(spiral.psi)
-    return StarMotion(geometry, star, duration, turn)
+    return move_star(geometry, start, path, spiral.duration, abs(theta) + abs(phi) + abs(psi))
 
 
-def _about_z(angle: float) -> Quaternion:
-    """Quaternion of a turn about z."""
-    return (0.0, 0.0, math.sin(0.5 * angle), math.cos(0.5 * angle))
+def move_actuators(
+    geometry: Geometry, path: ActuatorPath, pieces: tuple[float, ...], start: Quaternion
+) -> ReferenceMotion:
+    """Return a motion of the actuators, with the orientation of one assembly mode along it.
+
+    Orientations are computed once along the path, by `continuation` in steps that cannot leave the
+    assembly mode; any other orientation is computed from the nearest of these. The motion therefore
+    does not depend on what was asked before.
+
+    Args:
+        geometry: base triangle and star.
+        path: gamma and its two derivatives between time 0 and the duration.
+        pieces: see `ReferenceMotion`.
+        start: quaternion (x, y, z, w) of {E} in {B} at time 0.
+
+    Raises:
+        SingularConfiguration: the path meets a parallel singularity; the message has the time.
+        InputError: a piece of the path is longer than LONGEST.
+        AssemblyError: start is not an orientation of the manipulator at the begin of the path.
+
+    """
+    space, times = ActuatorSpaceMap(geometry), _space(path, pieces)
+    gammas = [path(time)[0] for time in times]
+    try:
+        branch = continuation.follow(geometry, gammas, rotation_matrix(start))
+    except continuation.BranchEnds as error:
+        said = f"parallel singularity before t = {times[error.row]:.9g} s"
+        raise SingularConfiguration(f"{said}, least singular value of J2", error.measure) from error
+    reach = (continuation.SAFE * branch.sigma**2).tolist()
+    known = _align(quaternion_of(branch.rotation), start)
+
+    def inside(time: float) -> Reference:
+        gamma, gamma_dot, gamma_ddot = path(time)
+        index = max(bisect_right(times, time) - 1, 0)
+        near = known[index]
+        if math.dist(gamma, gammas[index]) > reach[index]:
+            there = follow_assembly(geometry, near, gammas[index], gamma)
+            (near,) = _align(np.array([there]), near)
+        return space.of_actuators(near, gamma, gamma_dot, gamma_ddot)
+
+    return ReferenceMotion(inside, pieces)
 
 
-def _unit(q: Quaternion) -> Quaternion:
-    """Quaternion of length 1."""
-    length = math.hypot(*q)
-    return (q[0] / length, q[1] / length, q[2] / length, q[3] / length)
+def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
+    """Return times from the first to the last between which gamma moves by no more than STEP."""
+    times = [np.zeros(1)]
+    for begin, end in pairwise(pieces):
+        rough = [path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()]
+        length = sum(math.dist(a, b) for a, b in pairwise(rough))
+        if not length < LONGEST:
+            allowed = f"must be less than {LONGEST:g} rad between {begin:.9g} s and {end:.9g} s"
+            raise InputError("motion", [Problem("path length of gamma", length, allowed)])
+        count = max(_SAMPLES, math.ceil(4.0 * length / STEP))
+        times.append(np.linspace(begin, end, count + 1)[1:])
+    fine = np.concatenate(times)
+    gammas = np.array([path(time)[0] for time in fine.tolist()])
+    way = np.cumsum(np.linalg.norm(np.diff(gammas, axis=0), axis=1))
+    # The first of each half a STEP of the way.
+    _, kept = np.unique(np.append(0.0, way) // (0.5 * STEP), return_index=True)
+    return [*fine[kept].tolist(), pieces[-1]]
+
+
+def _align(quaternions: Array, before: Quaternion) -> list[Quaternion]:
+    """Return quaternions, shape (n, 4), with signs that change as little as they can."""
+    rows = np.vstack([before, quaternions])
+    flips = np.where(np.sum(rows[1:] * rows[:-1], axis=1) < 0.0, -1.0, 1.0)
+    return list(map(tuple, (np.cumprod(flips)[:, None] * quaternions).tolist()))
+
+
+def straight_path(start: Vector3, goal: ToAngles) -> ActuatorPath:
+    """From one gamma straight to another, with minimum jerk."""
+    span = axpy(1.0, goal.gamma, -1.0, start)
+
+    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
+        s, rate, acceleration = minimum_jerk_over(time, goal.duration)
+        return axpy(1.0, start, s, span), multiply(rate, span), multiply(acceleration, span)
+
+    return path
+
+
+def sweep_path(sweep: Sweep, centre: Vector3) -> tuple[ActuatorPath, tuple[float, ...]]:
+    """Sines that fade in and out, and pieces of a quarter of a period or less."""
+    last, fade, duration = sweep.last_frequency or sweep.frequency, sweep.fade, sweep.duration
+    slopes = [(b - a) / duration for a, b in zip(sweep.frequency, last, strict=True)]
+    rows = list(zip(centre, sweep.amplitude, sweep.frequency, slopes, strict=True))
+
+    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
+        e, e1, e2 = 1.0, 0.0, 0.0  # the fading, and its derivatives by time
+        if not fade <= time <= duration - fade:
+            e, e1, e2 = minimum_jerk_over(min(time, duration - time), fade)
+            e1 = e1 if time < fade else -e1
+        p, v, a = [], [], []
+        for middle, amplitude, first, slope in rows:
+            angle, frequency = time * (first + 0.5 * slope * time), first + slope * time
+            s, c = math.sin(angle), math.cos(angle)
+            s1, s2 = frequency * c, slope * c - frequency * frequency * s
+            p.append(middle + amplitude * e * s)
+            v.append(amplitude * (e1 * s + e * s1))
+            a.append(amplitude * (e2 * s + 2.0 * e1 * s1 + e * s2))
+        return triple(p), triple(v), triple(a)
+
+    fastest = max(map(abs, (*sweep.frequency, *last)))
+    quarters = math.ceil(fastest * duration / (0.5 * math.pi))
+    pieces = {*equal_pieces(duration, max(quarters, 2 * PIECES)), fade, duration - fade}
+    return path, tuple(sorted(pieces))
+
+
+def through_points(
+    geometry: Geometry,
+    start: Quaternion,
+    times: Sequence[float],
+    positions: Sequence[Sequence[float]],
+    velocities: OpenPoints | None = None,
+    accelerations: OpenPoints | None = None,
+    begin: tuple[Vector3, Vector3] = (ZERO, ZERO),
+) -> ReferenceMotion:
+    """Return the motion of the actuators through points, quintic between them.
+
+    The fields of trajectory_msgs/JointTrajectory, rows in the order of the legs. A first point
+    after time 0 is reached from the start; one at time 0 is the start itself, at rest. The motion
+    ends at rest. Rates and accelerations that are not given (no rows, or None or nothing in place
+    of a row) are zero at the ends and chosen for minimum jerk between them.
+
+    Args:
+        geometry: base triangle and star.
+        start: quaternion (x, y, z, w) of {E} in {B} from which the motion begins.
+        times: of the points [s], n >= 1.
+        positions: gamma [rad], n rows of three.
+        velocities: gamma_dot [rad/s], n rows.
+        accelerations: gamma_ddot [rad/s^2], n rows.
+        begin: gamma_dot and gamma_ddot at the start, where the first point comes after time 0.
+
+    Raises:
+        InputError: no points, wrong shapes, numbers that are not finite, times that do not rise,
+            a beginning or an end that moves, a first point that is not where the motion starts.
+        SingularConfiguration: the motion meets a parallel singularity.
+
+    """
+    count = len(times)
+    problems = [] if count else [Problem("points", 0, "must be one or more")]
+    rows = [
+        _read_rows("times", [[time] for time in times], count, problems),
+        _read_rows("positions", positions, count, problems),
+        _read_rows("velocities", velocities, count, problems),
+        _read_rows("accelerations", accelerations, count, problems),
+    ]
+    if not problems:
+        at, gamma, rates, seconds = map(np.array, rows)
+        at = at.ravel()
+        problems += _faults(at, rates)
+    if problems:
+        raise InputError("trajectory", problems)
+    here = kinematics.inverse(geometry, rotation_matrix(start))[0]
+    if at[0] > 0.0:
+        at, gamma = np.append(0.0, at), np.vstack([here, gamma])
+        rates, seconds = np.vstack([begin[0], rates]), np.vstack([begin[1], seconds])
+    elif np.abs(gamma[0] - here).max() > NEAR:
+        said = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
+        problem = Problem("positions[0]", gamma[0].tolist(), said.format(NEAR, *here))
+        raise InputError("trajectory", [problem])
+    for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
+        ends[np.isnan(ends)] = 0.0
+    begun = follow_assembly(geometry, start, here, gamma[0])
+    return move_actuators(geometry, _follow(at, gamma, rates, seconds), tuple(at.tolist()), begun)
+
+
+def through_samples(
+    geometry: Geometry, start: Quaternion, times: Array, positions: Array, velocities: Array
+) -> ReferenceMotion:
+    """Return the motion through dense samples, quintic between them; it may begin and end moving.
+
+    Args:
+        geometry: base triangle and star.
+        start: quaternion (x, y, z, w) of {E} in {B} at the first sample.
+        times: of the samples, rising [s], shape (n,); the motion begins with the first.
+        positions: gamma [rad], shape (n, 3).
+        velocities: gamma_dot [rad/s], shape (n, 3).
+
+    Raises:
+        AssemblyError: the samples are of another manipulator.
+        SingularConfiguration: the motion meets a parallel singularity.
+
+    """
+    times, gamma = times - times[0], np.unwrap(positions, axis=0)
+    pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
+    path = _follow(times, gamma, velocities, np.full_like(gamma, np.nan))
+    return move_actuators(geometry, path, pieces, start)
+
+
+def _read_rows(
+    name: str, rows: OpenPoints | None, count: int, problems: list[Problem]
+) -> list[list[float]]:
+    """Read rows of numbers; one that is open becomes NaN. What is wrong joins the problems."""
+    size, may_be_open = 1 if name == "times" else 3, name in ("velocities", "accelerations")
+    rows = [None] * count if rows is None else rows
+    if len(rows) != count:
+        problems.append(Problem(name, len(rows), f"must have a row for each of {count} points"))
+    found = []
+    for index, row in enumerate(rows):
+        numbers = [] if row is None else [float(number) for number in row]
+        if not numbers and may_be_open:
+            numbers = [math.nan] * size
+        elif len(numbers) != size or not all(map(math.isfinite, numbers)):
+            allowed = f"must be {size} finite numbers" if size > 1 else "must be finite"
+            problems.append(Problem(f"{name}[{index}]", numbers, allowed))
+        found.append(numbers)
+    return found
+
+
+def _faults(at: Array, rates: Array) -> Iterator[Problem]:
+    """Yield what is wrong with points of finite numbers."""
+    for index in np.flatnonzero(at[1:] <= at[:-1]) + 1:
+        allowed = f"must be > {at[index - 1]:g} s, that of the point before"
+        yield Problem(f"times[{index}]", float(at[index]), allowed)
+    if at[0] < 0.0 or (at[0] == 0.0 and len(at) == 1):
+        yield Problem("times[0]", float(at[0]), "must be >= 0 s, that of a single point > 0 s")
+    for end in {0, len(at) - 1} if at[0] == 0.0 else {len(at) - 1}:
+        if np.nan_to_num(rates[end]).any():
+            allowed = "must be zero: a motion begins and ends at rest"
+            yield Problem(f"velocities[{end}]", rates[end].tolist(), allowed)
+
+
+def _follow(times: Array, *nodes: Array) -> ActuatorPath:
+    """Return `quintic` of the actuators as a path."""
+    curve = quintic(times, *nodes)
+    return lambda time: cast(
+        "tuple[Vector3, Vector3, Vector3]", (*map(tuple, curve(time).tolist()),)
+    )
+
+
+_UNIT = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))
+"""The quintics on [0, 1] that have one of (p0, v0, a0, p1, v1, a1) and no other."""
+
+
+def quintic(
+    times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, accelerations: ArrayLike
+) -> PPoly:
+    """Return a path of m numbers with its derivatives, quintic between points.
+
+    Args:
+        times: of the points, rising [s], shape (n,), n >= 2.
+        positions: shape (n, m).
+        velocities: shape (n, m); NaN where they are left open.
+        accelerations: the same.
+
+    Returns:
+        Position, velocity and acceleration, shape (3, m), as a function of time.
+
+    """
+    at = np.asarray(times, dtype=float)
+    nodes = np.stack([positions, velocities, accelerations], axis=1).astype(float)
+    lengths = np.diff(at)
+    _complete(nodes, lengths)
+    powers = lengths[:, None] ** np.arange(6)  # derivatives by the time of a segment, from 0 to 1
+    ends = np.concatenate([nodes[:-1], nodes[1:]], axis=1) * powers[:, [0, 1, 2] * 2, None]
+    unit = PPoly.from_bernstein_basis(_UNIT).c[:, 0]
+    path = PPoly(np.einsum("ij,njm->inm", unit, ends) / powers.T[::-1, :, None], at)
+    parts = [path.derivative(order).c for order in range(3)]
+    padded = [np.pad(c, ((6 - len(c), 0), (0, 0), (0, 0))) for c in parts]
+    return PPoly(np.stack(padded, axis=2), at)
+
+
+def _complete(nodes: Array, lengths: Array) -> None:
+    """Fill in what is open in nodes, shape (n, 3, m), in place: the least integral of jerk^2."""
+    usual = float(np.median(lengths))
+    # A velocity times the usual length has the size of a position: the system stays well scaled.
+    scale = np.array([1.0, usual, usual * usual])[:, None]
+    jerk = PPoly.from_bernstein_basis(_UNIT.derivative(3)).c[::-1, 0]
+    h = (lengths / usual)[:, None, None]
+    powers = h ** np.array([0, 1, 2] * 2)
+    # The integral of the jerk squared, as a form in the six numbers at the ends of each segment.
+    forms = np.swapaxes(powers, 1, 2) * (jerk.T @ hilbert(3) @ jerk) * powers / h**5
+    places = 3 * np.arange(len(lengths))[:, None] + np.arange(6)  # of these numbers among all
+    rows, columns = np.broadcast_arrays(places[:, :, None], places[:, None])
+    hessian = csc_array((forms.ravel(), (rows.ravel(), columns.ravel())))
+    for column in range(nodes.shape[2]):
+        x = (nodes[:, :, column] * scale.T).ravel()
+        missing = np.isnan(x)
+        if missing.any():
+            x[missing] = 0.0
+            open_rows = hessian[missing]
+            x[missing] = splu(open_rows[:, missing]).solve(-(open_rows @ x))
+            nodes[:, :, column] = x.reshape(-1, 3) / scale.T

@@ -16,13 +16,12 @@ from collections.abc import Iterable, Iterator
 from enum import Enum, IntEnum
 from typing import Any, NamedTuple
 
-from sst_ros.control.actuator_motions import through_points
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import Controller, Measurement
 from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
-from sst_ros.control.reference import Reference, ReferenceMotion, StoppingMotion
-from sst_ros.control.reference_motions import reference_motion
+from sst_ros.control.reference import Reference, ReferenceMotion, slow_down
+from sst_ros.control.reference_motions import reference_motion, through_points
 from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, TrackingSums
 from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
 from sst_ros.mechanism import kinematics
@@ -308,7 +307,7 @@ class TrajectoryFollower:
         if self.stage is Stage.READY:
             self.restart()
         elif self.stage is Stage.FOLLOWING and self._start_ns is not None:
-            motion = StoppingMotion(self._motion, self.time, self._settings.stop_time)
+            motion = slow_down(self._motion, self.time, self._settings.stop_time)
             self._controller.follow(motion)
             self._begin(motion, self._last_ns)
 

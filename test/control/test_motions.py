@@ -13,14 +13,14 @@ from numpy.polynomial import chebyshev
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.actuator_motions import (
-    Quintic,
+from sst_ros.control.reference import slow_down
+from sst_ros.control.reference_motions import (
     minimum_jerk,
+    quintic,
+    reference_motion,
     through_points,
     through_samples,
 )
-from sst_ros.control.reference import StoppingMotion
-from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
@@ -306,7 +306,7 @@ def test_sections_that_say_no_motion_are_refused(named, build):
 
 def test_a_stop_begins_with_the_motion_and_ends_at_rest_on_its_path():
     motion, begin, duration = reference_motion(load("reach")), 0.4, 0.25
-    stopping = StoppingMotion(motion, begin, duration)
+    stopping = slow_down(motion, begin, duration)
     last, end = stopping.at(duration), motion.at(begin + 0.5 * duration)
     assert stopping.at(0.0) == motion.at(begin)
     assert last.gamma == pytest.approx(end.gamma, abs=1e-15)
@@ -317,7 +317,7 @@ def test_a_stop_begins_with_the_motion_and_ends_at_rest_on_its_path():
     for time in np.linspace(0.025, duration - 0.025, 7):
         check_derivatives(stopping, time)
     # What ends during the stop rests at its end.
-    late = StoppingMotion(motion, motion.duration - 0.05, duration)
+    late = slow_down(motion, motion.duration - 0.05, duration)
     assert late.at(duration).gamma == motion.at(motion.duration).gamma
     assert late.at(0.2).gamma_dot == HALT
 
@@ -330,19 +330,15 @@ def points(seed, count=9):
     return np.cumsum(rng.uniform(0.2, 1.0, count)), *rng.normal(size=(3, count, 2))
 
 
-def sampled(quintic, times, part):
-    return np.array([quintic.at(time)[part] for time in times.tolist()])
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_a_quintic_between_points_is_hermites_polynomial(seed):
     """What is open between them has a test of its own."""
     times, *nodes = points(seed)
     truth = BPoly.from_derivatives(times, np.stack(nodes, axis=1))
-    found, fine = Quintic(times, *nodes), np.linspace(times[0], times[-1], 200)
+    found, fine = quintic(times, *nodes), np.linspace(times[0], times[-1], 200)
     for part in range(3):
         expected = truth.derivative(part)(fine) if part else truth(fine)
-        error = np.abs(sampled(found, fine, part) - expected).max()
+        error = np.abs(found(fine)[:, part] - expected).max()
         assert error <= 1e-12 * np.abs(expected).max()
 
 
@@ -363,8 +359,8 @@ def test_what_is_open_has_the_least_jerk(seed):
     rng = np.random.default_rng(seed)
     open_ = rng.random(nodes.shape) < 0.6
     open_[:, 0], open_[[0, -1]] = False, False
-    found = Quintic(times, *np.where(open_, OPEN, nodes).transpose(1, 0, 2))
-    filled = np.stack([sampled(found, times, part) for part in range(3)], axis=1)
+    found = quintic(times, *np.where(open_, OPEN, nodes).transpose(1, 0, 2))
+    filled = found(times)
     assert filled[~open_] == pytest.approx(nodes[~open_], abs=1e-10)
     assert open_.sum() > 5
     least = jerk_squared(times, filled)
@@ -380,6 +376,6 @@ def test_thousands_of_samples_are_completed_at_once():
     """A recording of 20 s at 1 kHz: the band is solved in one go."""
     times = np.arange(20_001) * 1e-3
     positions, velocities = (f(3.0 * times)[:, None] for f in (np.sin, lambda x: 3.0 * np.cos(x)))
-    found = Quintic(times, positions, velocities, np.full_like(positions, OPEN))
+    found = quintic(times, positions, velocities, np.full_like(positions, OPEN))
     fine = np.linspace(1.0, 19.0, 501)
-    assert sampled(found, fine, 2)[:, 0] == pytest.approx(-9.0 * np.sin(3.0 * fine), abs=1e-6)
+    assert found(fine)[:, 2, 0] == pytest.approx(-9.0 * np.sin(3.0 * fine), abs=1e-6)

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from symmetric_motion import inertia, inertia_slope
 
 from sst_ros import __main__ as cli
-from sst_ros.control.plan import check_motion, examine_motion, time_scaling
-from sst_ros.control.reference import maximum, minimum
+from sst_ros.control.plan import check_motion, examine_motion, maximum, minimum, time_scaling
 from sst_ros.control.reference_motions import geodesic_motion, reference_motion
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics
