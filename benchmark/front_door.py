@@ -19,8 +19,8 @@ from statistics import median
 from benchmark.measure import divide, time_in_turn
 from sst_ros import load_scene, prepare, simulate
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
+from sst_ros.simulation.stepped_motion import Task
 from sst_ros.simulation.torque_profile import profile_of
-from sst_ros.simulation.trajectory import Task
 
 ROUNDS, STARTS = 50, 9
 LIST, NUMPY = ("-m", "sst_ros", "scene", "list"), ("-c", "import numpy")
@@ -40,7 +40,7 @@ def used_by_children() -> float:
 def main() -> None:
     scene = load_scene("example2_heavy")
     profile = profile_of(scene.torque)
-    task = Task(scene, profile, 10**9, None, "gauss", 1e-9, profile.kinks(), 1.0, None)
+    task = Task(scene, profile, (0.0, 1.0), None, "gauss", 1e-9)
     whole = partial(simulate, scene, method="gauss", tolerance=1e-9)
     calls: dict[str, Callable[[], object]] = {
         "integration": CollocatedMotion(task).compute,

@@ -159,6 +159,16 @@ def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
     return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
 
 
+def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
+    """Distance of orientations [rad], or that of the rest relative to the rate if it is larger.
+
+    Rates below 1 rad/s count as 1 rad/s; infinite where a number is not finite.
+    """
+    speed = max(1.0, math.hypot(*z[4:7]))
+    distance = max(orientation_distance(y, z), math.dist(y[4:], z[4:]) / speed)
+    return distance if math.isfinite(distance) else math.inf
+
+
 class Step(NamedTuple):
     """An accepted step, or the part of it before an event."""
 

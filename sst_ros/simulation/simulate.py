@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
@@ -21,7 +22,7 @@ from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, describe_conditioning
-from sst_ros.simulation.stepped_motion import SteppedMotion
+from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
@@ -30,7 +31,7 @@ from sst_ros.simulation.torque_profile import (
     TorqueTable,
     profile_of,
 )
-from sst_ros.simulation.trajectory import Task, Trajectory
+from sst_ros.simulation.trajectory import Trajectory, judge
 from sst_ros.state import NANOSECONDS, Array
 
 METHODS = (*INTEGRATORS, GAUSS)
@@ -140,22 +141,22 @@ def prepare(
     length = given.duration if duration is None else duration
     if length is None:
         _refuse("duration", None, "must be given: the scene has none")
-    span = _nanoseconds("duration", length)
-    period = _check_period(control_period, profile, span)
-    times = _times(t_eval, span)
+    span_ns = _nanoseconds("duration", length)
+    longest = math.inf if max_step is None else max_step
     if method not in METHODS:
         _refuse("method", method, "must be one of " + ", ".join(METHODS))
-    if not (isinstance(tolerance, (int, float)) and 0.0 < tolerance < math.inf):
+    if not (_is_positive(tolerance) and tolerance < math.inf):
         _refuse("tolerance", tolerance, "must be a number > 0 [rad]")
-    jumps = _ascending(breaks)
-    if jumps is None:
-        _refuse("breaks", breaks, "must be ascending times [s]")
-    numeric = isinstance(max_step, (int, float)) and not isinstance(max_step, bool)
-    if max_step is not None and not (numeric and max_step > 0.0):
+    if not _is_positive(longest):
         _refuse("max_step", max_step, "must be a number > 0 [s]")
-    inside = jumps[(jumps > 0.0) & (jumps < span / NANOSECONDS)]
-    longest = math.inf if max_step is None else float(max_step)
-    task = Task(given, profile, span, period, method, tolerance, inside, longest, times)
+    if (jumps := _ascending(breaks)) is None:
+        _refuse("breaks", breaks, "must be ascending times [s]")
+    period, end = _check_period(control_period, profile, span_ns), span_ns / NANOSECONDS
+    inside = jumps[(jumps > 0.0) & (jumps < end)]
+    times = _times(t_eval, span_ns)
+    task = Task(
+        given, profile, (0.0, end), times, method, tolerance, period, inside, float(longest)
+    )
     reason = ""
     if method in (AUTO, GAUSS):
         try:
@@ -189,11 +190,8 @@ def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:
     """
     local, spent = task.tolerance, 0
     for _ in range(_ATTEMPTS):
-        motion = SteppedMotion(
-            task.scene, task.torque, (0.0, task.span / NANOSECONDS), start_of(task.scene),
-            task.sample_times(), method=task.method, tolerance=local, period=task.period,
-            breaks=task.breaks, max_step=task.max_step, spent=spent, progress=progress,
-        ).run()  # fmt: skip
+        attempt = replace(task, tolerance=local)
+        motion = SteppedMotion(attempt, start_of(task.scene), spent=spent, progress=progress).run()
         spent += motion.evaluations
         excess = motion.at.error / task.tolerance
         if task.period is not None or motion.status < 0 or not excess > 1.0:
@@ -203,7 +201,7 @@ def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:
     if motion.status < 0:
         numbers = describe_conditioning(Geometry.of(task.scene), motion.state())
         message = f"{message} ({numbers})"
-    status, message = task.compare(point.error, motion.status, message)
+    status, message = judge(point.error, task.tolerance, motion.status, message)
     rows = np.array(motion.rows).reshape(-1, 29)
     changes = [f"{to} from {at:g} s ({why})" for at, to, why in point.changes]
     energy = motion.propagator.dynamics.total_energy
@@ -222,6 +220,10 @@ def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:
 
 def _refuse(name: str, value: object, allowed: str) -> NoReturn:
     raise InputError("simulate", [Problem(name, value, allowed)]) from None
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0.0
 
 
 def _nanoseconds(name: str, value: Any) -> int:
@@ -256,14 +258,14 @@ def _ascending(values: ArrayLike) -> Array | None:
     return numbers if fits else None
 
 
-def _times(t_eval: ArrayLike | None, span: int) -> np.ndarray | None:
-    """Return the times of the samples [ns]."""
+def _times(t_eval: ArrayLike | None, span_ns: int) -> Array | None:
+    """Return the times of the samples [s], rounded to nanoseconds."""
     if t_eval is None:
         return None
     times = _ascending(t_eval)
     if times is not None and len(times):
-        rounded = np.rint(times * NANOSECONDS).astype(np.int64)
-        if rounded[0] >= 0 and rounded[-1] <= span and np.all(np.diff(rounded) > 0):
-            return rounded
-    allowed = f"must be ascending times from 0 to {span / NANOSECONDS:g} s, a nanosecond apart"
+        rounded = np.rint(times * NANOSECONDS)
+        if rounded[0] >= 0 and rounded[-1] <= span_ns and np.all(np.diff(rounded) > 0):
+            return np.asarray(rounded / NANOSECONDS)
+    allowed = f"must be ascending times from 0 to {span_ns / NANOSECONDS:g} s, a nanosecond apart"
     _refuse("t_eval", t_eval, allowed)

@@ -15,14 +15,19 @@ from sst_ros.dynamics.expression import number_constants, trace
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, limit_distances
-from sst_ros.integration.adaptive_stepper import estimate_error, orientation_distance
+from sst_ros.integration.adaptive_stepper import (
+    estimate_error,
+    orientation_distance,
+    state_distance,
+)
 from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
+from sst_ros.simulation.stepped_motion import Task
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
-from sst_ros.simulation.trajectory import Task, Trajectory
-from sst_ros.state import NANOSECONDS, clamp
+from sst_ros.simulation.trajectory import Trajectory, judge
+from sst_ros.state import clamp
 
 GAUSS = "gauss"
 
@@ -66,7 +71,7 @@ class CollocatedMotion:
         self._method = _collocation(self._dynamics, self._sine, self._limits, self._asked or None)
         self._start = [*start_of(scene), *(0.0 for _ in self._dynamics.state[7:])]
         self._drive = [*held, *(0.0 for _ in self._dynamics.drive[3:])]
-        self._end = task.span / NANOSECONDS
+        self._end = task.span[1]
         self._count, self._iterations, self._error = self._choose_steps(task.tolerance)
         self._h = self._end / self._count
         self._grid: Array = np.append(np.arange(float(self._count)) * self._h, self._end)
@@ -89,7 +94,7 @@ class CollocatedMotion:
             y = self.compute()
             y.flags.writeable = False
             return self._whole.with_states(y)
-        t: Array = self._grid if times is None else times / NANOSECONDS
+        t = self._grid if times is None else times
         if self._met:
             t = np.append(t[t < self._end], self._end)
         return self._trajectory(t, self.at(t))
@@ -126,7 +131,7 @@ class CollocatedMotion:
         task, status, message = self._task, 0, "reached the end"
         if self._met:
             status, message = 1, f"stopped at t = {self._end:.12f} s: {self._met.reason}"
-        status, message = task.compare(self._error, status, message)
+        status, message = judge(self._error, task.tolerance, status, message)
         most = task.scene.torque_limit or math.inf
         return Trajectory(
             task.scene,
@@ -161,7 +166,7 @@ class CollocatedMotion:
         count, iterations, distance = 1, _MOST_ITERATIONS, math.inf
         y, z = self._solve(1), self._solve(2)
         while True:
-            last, distance = distance, _apart(y, z)
+            last, distance = distance, state_distance(y, z)
             if distance < max(_ROUNDING, 0.01 * tolerance):
                 near = max(0.45 * tolerance, _ROUNDING)
                 count, iterations = self._save(2 * count, z, near)
@@ -183,7 +188,7 @@ class CollocatedMotion:
             ladder.insert(0, min(ladder[0] - 1, int(0.82 * ladder[0])))
 
         def reaches(steps: int, iterations: int) -> bool:
-            return _apart(self._solve(steps, iterations), end) <= near
+            return state_distance(self._solve(steps, iterations), end) <= near
 
         for iterations in _ITERATIONS:
             cheaper = [steps for steps in ladder if steps * iterations < cost]
@@ -193,26 +198,19 @@ class CollocatedMotion:
         return best
 
     def _solve(self, count: int, iterations: int = _MOST_ITERATIONS) -> list[float]:
-        """Return the end by so many steps and iterations, infinite where it is not finite."""
+        """Return quaternion and body rate at the end, infinite where they are not finite."""
         motion = self._prepare(self._method, count, iterations)
         try:
             change = motion.run()
         except (ArithmeticError, ValueError):
             change = math.inf
-        return motion.states[-1].tolist() if math.isfinite(change) else [math.inf] * 7
+        return motion.states[-1, :7].tolist() if math.isfinite(change) else [math.inf] * 7
 
     def _prepare(self, method: Collocation, count: int, iterations: int) -> PreparedMotion:
         y = [*self._start, *(0.0 for _ in range(len(self._start), method.size))]
         motion = PreparedMotion(method, count, iterations)
         motion.begin(0.0, self._end / count, y, self._drive)
         return motion
-
-
-def _apart(one: Sequence[float], other: Sequence[float]) -> float:
-    """Angle between two orientations, or the distance of the body rates where it is larger."""
-    speed = max(1.0, math.hypot(*other[4:7]))
-    distance = max(orientation_distance(one, other), math.dist(one[4:7], other[4:7]) / speed)
-    return distance if math.isfinite(distance) else math.inf
 
 
 @lru_cache(maxsize=32)
@@ -233,7 +231,7 @@ def _collocation(
 def _choose_torque(task: Task) -> tuple[SineTorque | None, tuple[float, ...]]:
     """Return the sine that is traced into the code, and the torques that are constant."""
     law, stroke, limit = task.torque, task.scene.stroke.at_end, task.scene.torque_limit
-    if len(task.breaks) or task.max_step < task.span / NANOSECONDS:
+    if len(task.breaks) or task.max_step < task.span[1]:
         raise NotSmooth("collocation takes no breaks and no max_step")
     if task.period is not None or not isinstance(law, (SineProfile, ConstantTorque)):
         raise NotSmooth("collocation takes constant torques and sines only")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +17,7 @@ from sst_ros.integration.adaptive_stepper import (
     CannotStep,
     EvaluationBudget,
     Step,
-    orientation_distance,
+    state_distance,
 )
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.compiled_method import CompiledMethod, has_step_code
@@ -30,24 +31,46 @@ _WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000
 """Evaluations after which a run goes on with compiled code that is there, and makes it: in plain
 Python they take one second and five; to compile the steps of a method takes four."""
 
+_SAMPLES = 200
+"""Intervals of a motion without times of samples."""
+
 _MANY, _WORST = 8, 0.07
 """Samples in a step from which on a polynomial costs less than a step for each; the share of the
 step at which its error is largest."""
 
 
+@dataclass(frozen=True)
+class Task:
+    """What is simulated. Times are in seconds, from that at which the scene begins."""
+
+    scene: Scene
+    torque: TorqueProfile
+    span: tuple[float, float]  # begin and end
+    times: Array | None  # of the samples, ascending; None for those that suit the method
+    method: str  # name, or auto
+    tolerance: float  # largest error estimate at the end [rad]
+    period: int | None = None  # of control [ns], from time zero; None where torques are not held
+    breaks: Sequence[float] | Array = ()  # further times at which the torques jump, ascending
+    max_step: float = math.inf  # longest step
+
+    def sample_times(self) -> Array:
+        """Return the times of the samples of a motion by steps."""
+        if self.times is not None:
+            return self.times
+        last = round(self.span[1] * NANOSECONDS)
+        if self.period is not None:
+            found = np.append(np.arange(0, last, self.period, dtype=np.int64), last)
+        else:
+            found = np.unique(np.rint(np.linspace(0, last, _SAMPLES + 1)))
+        return np.asarray(found / NANOSECONDS)
+
+
 class SteppedMotion:
-    """One run of a motion.
+    """One run of a task by steps whose local error is at most its tolerance.
 
     Args:
-        scene: what moves.
-        law: torques that act.
-        span: time at which the motion begins and ends [s].
+        task: what is simulated.
         y: state at the begin; numbers that it lacks at its end are zero.
-        times: of the samples [s], ascending, within the span.
-        method, tolerance: as of `Propagator`.
-        period: of control [ns], from time zero; None where torques are not held.
-        breaks: further times at which the torques jump [s], ascending.
-        max_step: longest step [s].
         limits: whether the limits of the scene end the motion.
         spent: evaluations of earlier runs of the same motion.
         progress: draw a bar on a terminal.
@@ -63,36 +86,27 @@ class SteppedMotion:
 
     def __init__(
         self,
-        scene: Scene,
-        law: TorqueProfile,
-        span: tuple[float, float],
+        task: Task,
         y: Sequence[float] | Array,
-        times: Array,
         *,
-        method: str,
-        tolerance: float,
-        period: int | None = None,
-        breaks: Sequence[float] | Array = (),
-        max_step: float = math.inf,
         limits: bool = True,
         spent: int = 0,
         progress: bool = False,
     ) -> None:
-        self._scene, self._law, self._span, self._period = scene, law, span, period
-        self._breaks, self._tolerance, self._spent = breaks, tolerance, spent
+        self._task, self._spent = task, spent
         self._budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
         self.propagator = Propagator(
-            scene, method, tolerance, compiled=False, budget=self._budget, limits=limits,
-            max_step=max_step,
+            task.scene, task.method, task.tolerance, compiled=False, budget=self._budget,
+            limits=limits, max_step=task.max_step,
         )  # fmt: skip
         self.start = self.at = self.propagator.begin(list(y))
-        self.time, self.status, self.message = span[0], 0, "reached the end"
+        self.time, self.status, self.message = task.span[0], 0, "reached the end"
         self.held: list[tuple[float, Vector3]] = []
         self.rows: list[tuple[float, ...]] = []
-        self._wanted: list[float] = times[::-1].tolist()
+        self._wanted: list[float] = task.sample_times()[::-1].tolist()
         self._torque: Torque = (0.0, 0.0, 0.0)
-        self._segment = span
-        self._bar = Bar(f"{scene.name}, simulating", progress)
+        self._segment = task.span
+        self._bar = Bar(f"{task.scene.name}, simulating", progress)
         self._compile_after = _WORTH_LOADING if numba_version() else math.inf
 
     @property
@@ -129,22 +143,22 @@ class SteppedMotion:
 
     def _segments(self) -> Iterator[tuple[float, float, float, Torque]]:
         """Yield begin, length and end of segments [s], and the torque, smooth in each."""
-        begin, end = self._span
-        if self._period is not None:
+        task, (begin, end) = self._task, self._task.span
+        if task.period is not None:
             last = round(end * NANOSECONDS)
-            for start in range(0, last, self._period):
+            for start in range(0, last, task.period):
                 time = start / NANOSECONDS
                 self._take_if_wanted(time, self.at.y)
-                given = (self.state(),) if self._law.feedback else ()
-                held = self._law(time, *given)
+                held = task.torque(time, *((self.state(),) if task.torque.feedback else ()))
                 self.held.append((time, held))
-                stop = min(start + self._period, last)
+                stop = min(start + task.period, last)
                 yield time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held
             return
-        kinks = np.union1d(self._breaks, self._law.kinks(self._scene.torque_limit, end))
+        kinks = np.union1d(task.breaks, task.torque.kinks(task.scene.torque_limit, end))
         inside = kinks[(kinks > begin) & (kinks < end)].tolist()
         for start, stop in pairwise([begin, *inside, end]):
-            yield start, stop - start, stop, self._law.acting(start, stop, self.propagator.dynamics)
+            acting = task.torque.acting(start, stop, self.propagator.dynamics)
+            yield start, stop - start, stop, acting
 
     def _pass(self, step: Step) -> None:
         """Take samples in an accepted step."""
@@ -161,7 +175,8 @@ class SteppedMotion:
             self._take(time, y)
         self.time, self.at = end, step.end
         self._take_if_wanted(end, step.end.y)
-        self._bar.draw((end - self._span[0]) / (self._span[1] - self._span[0]))
+        begin, last = self._task.span
+        self._bar.draw((end - begin) / (last - begin))
 
     def _compile(self, machine: CompiledMethod) -> None:
         """Take compiled steps from now on, if their code is there or the run is long.
@@ -194,10 +209,8 @@ class SteppedMotion:
         polynomial = KroghInterpolator(np.repeat(times, 2), data)
         worst = _WORST * step.h
         found, exact = polynomial(worst).tolist(), step.state(worst)
-        speed = max(1.0, math.hypot(*exact[4:7]))
-        missed = orientation_distance(found, exact), math.dist(found[4:], exact[4:]) / speed
         self._budget.charge(4 * step.machine.cost + len(times))
-        return polynomial if max(missed) <= self._tolerance else None
+        return polynomial if state_distance(found, exact) <= self._task.tolerance else None
 
     def _take_if_wanted(self, time: float, y: Sequence[float]) -> None:
         if self._wanted and self._wanted[-1] == time:

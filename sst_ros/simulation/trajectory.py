@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is simulated, and a motion of a scene as a table over time, simulated or recorded.
+"""A motion of a scene as a table over time, simulated or recorded.
 
 Between its samples states are propagated from the sample before, under the torques that act there.
 """
@@ -11,7 +11,6 @@ import html
 import io
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +28,7 @@ from sst_ros.mechanism import frames, kinematics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.simulation.stepped_motion import SteppedMotion
+from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.torque_profile import (
     ConstantTorque,
     LostTorque,
@@ -38,7 +37,7 @@ from sst_ros.simulation.torque_profile import (
     profile_of,
     three,
 )
-from sst_ros.state import DIMENSIONS, NANOSECONDS, QUANTITIES, UNITS, Array, arrays_of, columns_of
+from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,42 +58,16 @@ _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
 
-SAMPLES = 200
-"""Intervals of a motion without `t_eval`."""
-
-UNMET = 2
+_UNMET = 2
 """Status of a motion that reached its end with an error estimate above the tolerance."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """What is simulated."""
-
-    scene: Scene
-    torque: TorqueProfile
-    span: int  # length of the motion [ns]
-    period: int | None  # of control [ns]; None where torques are not held
-    method: str  # name, or auto
-    tolerance: float  # largest error estimate at the end [rad]
-    breaks: Array  # further times at which the torques jump [s], ascending
-    max_step: float  # longest step [s]
-    times: np.ndarray | None  # of the samples [ns]; None for those that suit the method
-
-    def sample_times(self) -> Array:
-        """Return the times of the samples of a motion by steps [s]."""
-        if self.times is not None:
-            return np.asarray(self.times / NANOSECONDS)
-        if self.period is not None:
-            periods = np.arange(0, self.span, self.period, dtype=np.int64)
-            return np.append(periods, self.span) / NANOSECONDS
-        return np.unique(np.rint(np.linspace(0, self.span, SAMPLES + 1))) / NANOSECONDS
-
-    def compare(self, error: float, status: int, message: str) -> tuple[int, str]:
-        """Return status and message of a motion with an error estimate at its end [rad]."""
-        if not error > self.tolerance:
-            return status, message
-        unmet = f"the error estimate {error:.1e} rad exceeds the tolerance {self.tolerance:g} rad"
-        return status or UNMET, f"{message}; {unmet}"
+def judge(error: float, tolerance: float, status: int, message: str) -> tuple[int, str]:
+    """Return status and message of a motion with an error estimate at its end [rad]."""
+    if not error > tolerance:
+        return status, message
+    unmet = f"the error estimate {error:.1e} rad exceeds the tolerance {tolerance:g} rad"
+    return status or _UNMET, f"{message}; {unmet}"
 
 
 def _joint(first: int, meaning: str) -> cached_property[Array]:
@@ -420,10 +393,9 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
         rows = np.flatnonzero((before == k) & (times > t[k]))
         asked, places = np.unique(times[rows], return_inverse=True)
         law = trajectory.law or ConstantTorque(three(trajectory.torque[k + 1], "torque"))
-        motion = SteppedMotion(
-            trajectory.scene, law, (float(t[k]), float(asked[-1])), samples[k, :size], asked,
-            method=DOP853.name, tolerance=_ACCURACY, limits=False,
-        ).run()  # fmt: skip
+        span = float(t[k]), float(asked[-1])
+        task = Task(trajectory.scene, law, span, asked, DOP853.name, _ACCURACY)
+        motion = SteppedMotion(task, samples[k, :size], limits=False).run()
         if motion.status:
             raise Diverged(motion.message, motion.time, motion.state())
         found[rows] = np.array(motion.rows)[places, 1:11]
