@@ -25,11 +25,10 @@ import numpy as np
 
 from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros.host.output import slices
-from sst_ros.integration.propagator import TickPropagator, TickSequence
 from sst_ros.mechanism.geometry import Array
 from sst_ros.nodes.publications import StateMessages, TorqueLog, stamp
 from sst_ros.recording.bag_writer import BagWriter
-from sst_ros.report.reference import initial, joint_columns
+from sst_ros.report.reference import TickPropagator, initial, joint_columns
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import Friction, JointFriction, Spring
@@ -113,12 +112,10 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array
         ticks = np.arange((rows.start - 1) * TICKS_A_SAMPLE, (rows.stop - 1) * TICKS_A_SAMPLE)
         run = ticks >= 0
         start = ticks[run] * TICK_NS
-        ticks_of_part = TickSequence(
-            start, start + TICK_NS, np.repeat(held, TICKS_A_SAMPLE, axis=0)[run]
-        )
+        drives = np.repeat(held, TICKS_A_SAMPLE, axis=0)[run]
         starts = np.full((len(start), len(y)), np.nan)
         starts[:1] = y
-        reached = motion.follow(ticks_of_part, starts)[:, 0, :-1]
+        reached = motion.follow(start, start + TICK_NS, drives, starts)[:, 0, :-1]
         state = reached[TICKS_A_SAMPLE - 1 :: TICKS_A_SAMPLE]
         if not rows.start:
             state = np.vstack([y, state])

@@ -1,22 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Propagation of a scene's state through periods: steps, limits, contact at elastic stops.
-
-The ticks of a recorded run are propagated again by `TickPropagator`, all in one call.
-"""
+"""Propagation of a scene's state through periods: steps, limits, contact at elastic stops."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from functools import cache, partial
-from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_ros.dynamics.model import Limit, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_with_work
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AdaptiveStepper,
@@ -35,11 +29,10 @@ from sst_ros.integration.events import (
     load_root_finder,
     may_occur,
 )
-from sst_ros.integration.methods import DOP853
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
-from sst_ros.state import NANOSECONDS, Vector3
+from sst_ros.state import Vector3
 
 
 class LimitReached(Exception):
@@ -234,90 +227,3 @@ class Propagator:
             x = just_beyond(event, x, joints(x), step.h)
         end = step.begin if x == 0.0 else stepper.part(step, x) if x < step.h else step.end
         return step._replace(h=x, end=end, last=step.last and x == step.h), event
-
-
-LONGEST_TICK_NS = 1_000_000
-"""Longer ticks are divided [ns]."""
-
-_TICK_TOLERANCE, _TICK_BUDGET = 1e-13, 3600
-"""Largest local error estimate of a step; evaluations that a tick may take: a hundred steps."""
-
-
-class TickSequence(NamedTuple):
-    """Ticks in order of time."""
-
-    start_ns: NDArray[np.int64]  # relative to the start of the run [ns], shape (m,)
-    end_ns: NDArray[np.int64]
-    drives: Array  # held over a tick: torques [N m], a moment on the star in {B} [N m] or nothing
-
-    def part(self, ticks: slice) -> TickSequence:
-        """Return some of the ticks."""
-        return TickSequence(self.start_ns[ticks], self.end_ns[ticks], self.drives[ticks])
-
-
-class TickPropagator(Propagator):
-    """Propagates a scene by DOP853 through ticks, all of one call in compiled code.
-
-    Limits of the scene do not end the motion. Torques over time are within the limit of the
-    actuators; without them they are those of each tick.
-    """
-
-    def __init__(self, scene: Scene, torque: SineTorque | None, *, compiled: bool) -> None:
-        self.compiled = compiled and numba_version() is not None
-        budget = EvaluationBudget(_TICK_BUDGET)
-        super().__init__(
-            scene, DOP853.name, _TICK_TOLERANCE, compiled=self.compiled, budget=budget, limits=False
-        )
-        self._sine = torque
-
-    def follow(self, ticks: TickSequence, starts: Array) -> Array:
-        """Propagate through ticks.
-
-        Args:
-            ticks: m ticks.
-            starts: states (quaternion, body rate, lagged torques) at which ticks begin, shape
-                (m, 7 or 10); NaN where a tick goes on from the one before.
-
-        Returns:
-            Solution and second solution at the end of each tick, with the work since the start
-            [J], shape (m, 2, 8 or 11); NaN from a tick that no step resolves to the next start.
-
-        """
-        length_ns = ticks.end_ns - ticks.start_ns
-        parts = np.maximum(1, -(-length_ns // LONGEST_TICK_NS))
-        first = np.cumsum(parts) - parts
-        length = np.repeat(length_ns / NANOSECONDS / parts, parts)
-        begin = np.repeat(ticks.start_ns / NANOSECONDS, parts)
-        begin += length * (np.arange(len(length)) - np.repeat(first, parts))
-        begins = np.full((len(length), len(self.ode.state)), np.nan)
-        begins[first] = np.hstack([starts, 0.0 * starts[:, :1]])
-        if self._sine is not None:  # phases of sines, or torques within the limit
-            drives = np.fmod(np.outer(begin, self._sine.frequency) + self._sine.phase, 2.0 * np.pi)
-        else:
-            drives = np.repeat(ticks.drives, parts, axis=0)
-            limit = np.inf if self.torque.limit is None else self.torque.limit
-            drives[:, :3] = np.clip(drives[:, :3], -limit, limit)
-        reached = self._follow_parts(begin, length, drives, begins)
-        return np.asarray(reached[first + parts - 1])
-
-    def _follow_parts(self, begin: Array, length: Array, drives: Array, starts: Array) -> Array:
-        reached: Any = np.full((len(length), 2, len(self.ode.state)), np.nan)
-        given: Any = (length, drives, starts)
-        if not self.compiled:
-            reached, given = reached.tolist(), tuple(array.tolist() for array in given)
-        stepper, _ = self._begin_period(self._sine or (0.0, 0.0, 0.0), 0.0, ())
-        at, k = stepper.begin(starts[0, :-1].tolist()), 0
-        while k < len(length):
-            k, at = stepper.step_sequence(k, given, at, reached)
-            if k == len(length):
-                break
-            held = tuple(drives[k].tolist())
-            torque = self._sine or (held[0], held[1], held[2])
-            try:
-                at, _ = self.advance(at, float(begin[k]), float(length[k]), 1, torque, held[3:])
-                reached[k][0][:], reached[k][1][:] = at.y, at.z
-                k += 1
-            except (LimitReached, CannotStep, ArithmeticError, ValueError):
-                later = np.flatnonzero(np.isfinite(starts[k + 1 :, 0]))
-                k = k + 1 + int(later[0]) if len(later) else len(length)
-        return np.asarray(reached)

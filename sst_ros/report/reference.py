@@ -3,7 +3,7 @@
 
 The reference is propagated by DOP853 with a tight tolerance, a step a tick or more. Its distance
 from a second solution by steps of half the length is its own error. Long runs are compiled; without
-numba only their first minute or so is compared, and `Comparison.reasons` reports that.
+numba only their first minute or so is compared, and the reasons that are returned say so.
 
 Actuators that lag are part of the state, and torques are held to the scene's limit. A moment from a
 topic must be recorded; without it there is nothing to compare with.
@@ -15,31 +15,36 @@ mechanism of the paper: loads that a scene may have beside it are left out on bo
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import accelerate_by_paper, initial_state
-from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import SingularConfiguration
 from sst_ros.extras import require
-from sst_ros.host.output import Bar
-from sst_ros.integration.propagator import LONGEST_TICK_NS, TickPropagator, TickSequence
+from sst_ros.host.compiled_module import numba_version
+from sst_ros.host.output import Bar, slices
+from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
+from sst_ros.integration.methods import DOP853
+from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
+from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Places: TypeAlias = "slice | list[int] | Integers"
-
+LONGEST_TICK_NS = 1_000_000
+"""Longer ticks are divided [ns]."""
+TICK_TOLERANCE, TICK_BUDGET = 1e-13, 3600
+"""Largest local error estimate of a step; evaluations that a tick may take: a hundred steps."""
 COMPILED_FROM = 10_000
 """From this number of ticks on compilation costs less than it saves."""
 PLAIN_TICKS = 60_000
@@ -51,12 +56,83 @@ SAME_START = 1e-9
 where samples are lost and the first one may belong to a later time."""
 
 
-def ticks_of(recording: Recording) -> TickSequence:
-    """Return the recorded ticks."""
-    ticks, torque = recording.ticks, recording.ticks.torque
-    if Dynamics.of(recording.scene).has_moment_topic and ticks.moment is not None:
-        torque = np.hstack([torque, ticks.moment])
-    return TickSequence(ticks.start_ns, ticks.end_ns, torque)
+class TickPropagator(Propagator):
+    """Propagates a scene by DOP853 through ticks, all of one call in compiled code.
+
+    Limits of the scene do not end the motion. Torques over time are within the limit of the
+    actuators; without them they are those of each tick.
+    """
+
+    def __init__(self, scene: Scene, torque: SineTorque | None, *, compiled: bool) -> None:
+        self.compiled, self._sine = compiled and numba_version() is not None, torque
+        super().__init__(
+            scene, DOP853.name, TICK_TOLERANCE, compiled=self.compiled,
+            budget=EvaluationBudget(TICK_BUDGET), limits=False,
+        )  # fmt: skip
+
+    def follow(self, start_ns: Integers, end_ns: Integers, drives: Array, starts: Array) -> Array:
+        """Propagate through m ticks.
+
+        Args:
+            start_ns: begin of each tick, relative to the start of the run [ns], shape (m,).
+            end_ns: its end [ns], shape (m,).
+            drives: held over a tick: torques, and a moment on the star in {B} where the scene takes
+                one [N m], shape (m, 3 or 6).
+            starts: states (quaternion, body rate, lagged torques) at which ticks begin, shape
+                (m, 7 or 10); NaN where a tick goes on from the one before, and before the first.
+
+        Returns:
+            Solution and second solution at the end of each tick, with the work since the start
+            [J], shape (m, 2, 8 or 11); NaN from a tick that no step resolves to the next start.
+
+        """
+        parts = np.maximum(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
+        first = np.cumsum(parts) - parts
+        length = np.repeat((end_ns - start_ns) / NANOSECONDS / parts, parts)
+        begin = np.repeat(start_ns / NANOSECONDS, parts)
+        begin += length * (np.arange(len(length)) - np.repeat(first, parts))
+        begins = np.full((len(length), len(self.ode.state)), np.nan)
+        begins[first] = np.hstack([starts, 0.0 * starts[:, :1]])
+        if self._sine is not None:  # phases of sines, or torques within the limit
+            held = np.fmod(np.outer(begin, self._sine.frequency) + self._sine.phase, 2.0 * np.pi)
+        else:
+            held = np.repeat(drives, parts, axis=0)
+            limit = np.inf if self.torque.limit is None else self.torque.limit
+            held[:, :3] = np.clip(held[:, :3], -limit, limit)
+        reached: Any = np.full((len(length), 2, len(self.ode.state)), np.nan)
+        given: Any = (length, held, begins)
+        if not self.compiled:
+            reached, given = reached.tolist(), tuple(array.tolist() for array in given)
+        stepper, _ = self._begin_period(self._sine or (0.0, 0.0, 0.0), 0.0, ())
+        k = int(np.flatnonzero(np.isfinite(begins[:, 0]))[0])
+        at = stepper.begin(begins[k, :-1].tolist())
+        while k < len(length):
+            k, at = stepper.step_sequence(k, given, at, reached)
+            if k == len(length):
+                break
+            torque = self._sine or (float(held[k, 0]), float(held[k, 1]), float(held[k, 2]))
+            moment = tuple(held[k, 3:].tolist())
+            try:
+                at, _ = self.advance(at, float(begin[k]), float(length[k]), 1, torque, moment)
+                reached[k][0][:], reached[k][1][:] = at.y, at.z
+                k += 1
+            except (LimitReached, CannotStep, ArithmeticError, ValueError):
+                later = np.flatnonzero(np.isfinite(begins[k + 1 :, 0]))
+                k = k + 1 + int(later[0]) if len(later) else len(length)
+        return np.asarray(np.asarray(reached)[first + parts - 1])
+
+
+def takes_moment(scene: Scene) -> bool:
+    """Return whether the moment on the star of a scene comes from a topic."""
+    return scene.moment is not None and scene.moment.topic
+
+
+def drives_of(recording: Recording) -> Array:
+    """Torques of the recorded ticks, and their moments where they come from a topic [N m]."""
+    torque, moment = recording.ticks.torque, recording.ticks.moment
+    if moment is None or not takes_moment(recording.scene):
+        return torque
+    return np.hstack([torque, moment])
 
 
 def initial(scene: Scene) -> tuple[float, ...]:
@@ -68,18 +144,19 @@ def initial(scene: Scene) -> tuple[float, ...]:
         AssemblyError: the initial gamma has no unique admissible assembly.
 
     """
-    lagged = (0.0,) * (scene.lags * 3)
-    return (*initial_state(scene, Geometry.of(scene)), *lagged)
+    return (*initial_state(scene, Geometry.of(scene)), *(0.0,) * (scene.lags * 3))
 
 
-def of_samples(geometry: Geometry, recording: Recording, samples: Places) -> Array:
+def of_samples(recording: Recording, samples: slice | Integers) -> Array:
     """States at samples, shape (n, 7 or 10); nan where the orientation was lost.
 
     Torques that lag are the efforts.
     """
     quaternion = recording.quaternion[samples]
     rates = (recording.gamma_dot, recording.mu_dot, recording.beta_dot)
-    rate = body_rates(geometry, quaternion, *(joint[samples] for joint in rates))
+    rate = body_rates(
+        Geometry.of(recording.scene), quaternion, *(joint[samples] for joint in rates)
+    )
     lagged = [recording.effort[samples]] if recording.scene.lags else []
     return np.hstack([quaternion, rate, *lagged])
 
@@ -92,8 +169,7 @@ def begins(recording: Recording) -> bool:
     """
     if recording.time_ns[0] != 0 or recording.diagnostics.get("states_set", "0") != "0":
         return False
-    published = recording.diagnostics.get("samples_published", "")
-    if published.isdecimal() and int(published) == len(recording.time_ns):
+    if recording.diagnostics.get("samples_published") == str(len(recording.time_ns)):
         return True
     start = recording.scene.initial
     off = np.abs(recording.gamma[0] - start.gamma), np.abs(recording.gamma_dot[0] - start.gamma_dot)
@@ -109,15 +185,6 @@ def joint_columns(model: kernel.Model, states: Array) -> Array:
         found = kernel.joints(model, tuple(states[:, :7].T))
     return np.stack([column for triple in found for column in triple], axis=1)
 
-
-def outputs(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
-    """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of n states."""
-    quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
-    joints = joint_columns(model, states)
-    return quaternion, joints[:, :3], joints[:, 9:12]
-
-
-STATES = 20
 
 PAPER = ("name", "description", "base", "star", "actuated_links", "intermediate_links", "initial")
 """Sections of a scene that the paper has."""
@@ -146,21 +213,18 @@ def compare_with_paper(
         ours = np.array(kernel.derivative(model, state, (first, second, third))[4:7])
         differences.append(float(np.linalg.norm(ours - paper)))
         sizes.append(float(np.linalg.norm(paper)))
-    if not sizes:
-        return None, 0
-    scale = max(sizes)
-    return max(differences) / (scale if scale > 0.0 else 1.0), len(sizes)
+    return (max(differences) / (max(sizes) or 1.0) if sizes else None), len(sizes)
 
 
-def check_with_paper(recording: Recording, count: int = STATES) -> tuple[float | None, int]:
+def check_with_paper(recording: Recording, count: int = 20) -> tuple[float | None, int]:
     """Compare at samples spread over the run, under the torques recorded there."""
     whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
     chosen = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
-    samples = whole[chosen] if len(whole) else np.empty(0, dtype=int)
-    states = of_samples(Geometry.of(recording.scene), recording, samples)
+    samples = whole[chosen] if len(whole) else whole
     # The torque that acts, lagged or not.
     acting = recording.effort[samples].tolist()
-    return compare_with_paper(recording.scene, zip(states, acting, strict=True))
+    given = zip(of_samples(recording, samples), acting, strict=True)
+    return compare_with_paper(recording.scene, given)
 
 
 QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
@@ -204,14 +268,13 @@ def integration(recording: Recording) -> Comparison:
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    moment = recording.scene.moment
-    if moment is not None and moment.topic and recording.ticks.moment is None:
+    ticks = recording.ticks
+    if takes_moment(recording.scene) and ticks.moment is None:
         reason = "the moment on the star came from a topic and is not recorded: nothing is compared"
-        return Comparison(_unknown(recording), _unknown(recording), reasons=(reason,))
-    start = initial(recording.scene) if begins(recording) else None
-    ticks = ticks_of(recording)
-    motion = TickPropagator(recording.scene, None, compiled=len(ticks.start_ns) > COMPILED_FROM)
-    return _compare(recording, motion, ticks, start, restart=True)
+        nothing = _frame(np.full((len(recording.time_ns), 3), np.nan))
+        return Comparison(nothing, nothing, reasons=(reason,))
+    held = ticks.start_ns, ticks.end_ns, drives_of(recording)
+    return _compare(recording, None, *held, known=begins(recording))
 
 
 def ideal(recording: Recording) -> Comparison | None:
@@ -224,101 +287,90 @@ def ideal(recording: Recording) -> Comparison | None:
         AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
-    torque, moment = recording.scene.torque, recording.scene.moment
-    if torque is None or (moment and moment.topic) or not begins(recording):
+    torque, time = recording.scene.torque, recording.time_ns
+    if torque is None or takes_moment(recording.scene) or not begins(recording):
         return None
-    time = recording.time_ns
-    between = TickSequence(time[:-1], time[1:], np.empty((len(time) - 1, 0)))
-    many = len(recording.ticks.start_ns) > COMPILED_FROM
-    motion = TickPropagator(recording.scene, torque, compiled=many)
-    return _compare(recording, motion, between, initial(recording.scene), restart=False)
+    return _compare(recording, torque, time[:-1], time[1:], np.empty((len(time) - 1, 0)))
 
 
 def _compare(
     recording: Recording,
-    motion: TickPropagator,
-    ticks: TickSequence,
-    start: tuple[float, ...] | None,
+    torque: SineTorque | None,
+    start_ns: Integers,
+    end_ns: Integers,
+    drives: Array,
     *,
-    restart: bool,
+    known: bool = True,
 ) -> Comparison:
     """Propagate a run with a second solution, and compare both at its samples.
 
-    Args:
-        recording: what is compared.
-        motion: propagates it.
-        ticks: what acts, tick by tick.
-        start: state at time zero; None where it is not known.
-        restart: begin again at a recorded sample after lost torques; else the end is there.
-
+    Arguments are those of `TickPropagator`. The state at time zero is `known` or not. Under
+    recorded torques, which may have gaps, the reference begins again at a sample after each.
     """
-    error, own = _unknown(recording), _unknown(recording)
-    reasons, restarts, count = [], [], len(ticks.start_ns)
-    tick_ns = recording.ticks.period_ns
+    compiled = len(recording.ticks.start_ns) > COMPILED_FROM
+    motion = TickPropagator(recording.scene, torque, compiled=compiled)
+    tick_ns, count, reasons, restarts = recording.ticks.period_ns, len(start_ns), [], []
     if not motion.compiled:
-        longest = PLAIN_TICKS * tick_ns // np.median(ticks.end_ns - ticks.start_ns)
+        longest = PLAIN_TICKS * tick_ns // np.median(end_ns - start_ns)
         count = min(count, int(longest))
-    if count < len(ticks.start_ns):
-        until = ticks.end_ns[count - 1] / NANOSECONDS
+    if count < len(start_ns):
+        until = end_ns[count - 1] / NANOSECONDS
         reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
+    samples = recording.quaternion, recording.gamma, recording.gamma_dot
+    distances = np.full((2, len(recording.time_ns), 3), np.nan)
 
     def note(rows: Integers, reached: Array) -> None:
         """Write down how far samples are from the solution, and the second one, (n, 2, m)."""
-        first, second = (outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
-        sampled = recording.quaternion[rows], recording.gamma[rows], recording.gamma_dot[rows]
-        error.iloc[rows], own.iloc[rows] = _measure(sampled, first), _measure(second, first)
+        first, second = (_outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
+        distances[0, rows] = _measure([values[rows] for values in samples], first)
+        distances[1, rows] = _measure(second, first)
 
-    if start is not None:
-        note(np.array([0]), np.array([[start, start]]))
-        if ticks.start_ns[0] != 0:
-            start = None
-    gaps = 1 + np.flatnonzero(ticks.start_ns[1:] != ticks.end_ns[:-1])
+    start: Array | None = None
+    if known:
+        state = np.array(initial(recording.scene))
+        note(np.array([0]), np.stack([state, state])[None])
+        start = state if start_ns[0] == 0 else None
+    at = places(recording.time_ns, start_ns)
+    usable = np.flatnonzero((at >= 0) & np.isfinite(recording.quaternion[at, 0]))
+    gaps = 1 + np.flatnonzero(start_ns[1:] != end_ns[:-1])
     ends = np.append(gaps[gaps < count], count)
     bar, first = Bar("reference", count > CHUNK), 0
     while first < count:
         if start is None:
-            again = _find_restart(recording, ticks, first, count) if restart else None
-            if again is None:
+            later = usable[(first <= usable) & (usable < count)]
+            if torque is not None or not len(later):
                 break
-            first, start = again
-            restarts.append(int(ticks.start_ns[first]))
+            first = int(later[0])
+            start = of_samples(recording, at[[first]])[0]
+            restarts.append(int(start_ns[first]))
         end = int(ends[np.searchsorted(ends, first, side="right")])
-        some = ticks.part(slice(first, min(first + CHUNK, end)))
-        starts = np.full((len(some.start_ns), len(start)), np.nan)
+        some = slice(first, min(first + CHUNK, end))
+        starts = np.full((some.stop - first, len(start)), np.nan)
         starts[0] = start
-        reached = motion.follow(some, starts)[..., :-1]
+        reached = motion.follow(start_ns[some], end_ns[some], drives[some], starts)[..., :-1]
         done = int(np.isfinite(reached[:, 0, 0]).sum())
-        rows = places(recording.time_ns, some.end_ns[:done])
+        rows = places(recording.time_ns, end_ns[some][:done])
         note(rows[rows >= 0], reached[:done][rows >= 0])
         whole = done == len(starts)  # else no step resolves the next tick
         first += done if whole else done + 1
-        start = tuple(reached[-1, 0].tolist()) if whole and first < end else None
+        start = reached[-1, 0] if whole and first < end else None
         bar.draw(min(first / count, 1.0))
-    error[np.isin(recording.time_ns, restarts)] = np.nan
+    distances[0, np.isin(recording.time_ns, restarts)] = np.nan
+    error, own = map(_frame, distances)
     steps = -(-tick_ns // LONGEST_TICK_NS)
     return Comparison(error, own, tuple(restarts), steps, tuple(reasons))
 
 
-def _unknown(recording: Recording) -> DataFrame:
-    """Return the errors of samples of which none is compared yet."""
-    count = len(recording.time_ns)
-    table: DataFrame = require("pandas").DataFrame(
-        np.full((count, 3), np.nan), columns=[*QUANTITIES]
-    )
-    return table
+def _frame(distances: Array) -> DataFrame:
+    found: DataFrame = require("pandas").DataFrame(distances, columns=[*QUANTITIES])
+    return found
 
 
-def _find_restart(
-    recording: Recording, ticks: TickSequence, first: int, stop: int
-) -> tuple[int, tuple[float, ...]] | None:
-    """Find the next tick that begins at a sample, and the state of that sample."""
-    at = places(recording.time_ns, ticks.start_ns[first:stop])
-    usable = np.flatnonzero((at >= 0) & np.isfinite(recording.quaternion[at, 0]))
-    if not len(usable):
-        return None
-    tick = int(usable[0])
-    state = of_samples(Geometry.of(recording.scene), recording, [int(at[tick])])[0]
-    return first + tick, tuple(state.tolist())
+def _outputs(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
+    """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of n states."""
+    quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
+    joints = joint_columns(model, states)
+    return quaternion, joints[:, :3], joints[:, 9:12]
 
 
 def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
@@ -328,3 +380,54 @@ def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
     gamma = np.abs(difference - turn * np.round(difference / turn)).max(axis=1)
     rate = np.abs(one[2] - other[2]).max(axis=1)
     return np.stack([gamma, rate, angle_between(one[0], other[0])], axis=1)
+
+
+def energy_residual(recording: Recording) -> tuple[Array, str]:
+    """Return the balance of energy: what the samples have, less the work put in between.
+
+    Returns:
+        Residual since the start [J], shape (n,), nan where it is not known: where ticks are lost,
+        the balance goes on without them. And the reason why it ends or is not there, "" if neither.
+
+    """
+    count, ticks, reason = len(recording.time_ns), recording.ticks, ""
+    stored, work = np.full((2, count), np.nan)
+    if takes_moment(recording.scene) and ticks.moment is None:
+        return stored, "the moment on the star is not recorded: no energy residual"
+    many = len(ticks.start_ns) > COMPILED_FROM
+    motion = TickPropagator(recording.scene, None, compiled=many)
+    held = ticks.start_ns, ticks.end_ns, drives_of(recording)
+    if many and not motion.compiled:
+        count = int(np.searchsorted(recording.time_ns, ticks.end_ns[PLAIN_TICKS - 1])) + 1
+        until = recording.seconds[count - 1]
+        reason = f"energy after {until:g} s: there is no numba to balance it"
+    model = motion.dynamics.model
+    for part in slices(count, CHUNK, "energy", shown=False):
+        rows = slice(part.start, min(part.stop + 1, count))
+        state = of_samples(recording, rows)
+        columns = tuple(state.T)
+        kinetic = kernel.kinetic_energy(model, columns)
+        stored[rows] = kinetic + kernel.potential_energy(model, columns)
+        work[rows.start : rows.stop - 1] = _work(motion, held, state, recording.time_ns[rows])
+    change = np.diff(stored, prepend=stored[0]) - np.append(0.0, work[:-1])
+    change[~np.isfinite(change)] = 0.0
+    return np.where(np.isfinite(stored), np.cumsum(change), np.nan), reason
+
+
+def _work(
+    motion: TickPropagator, held: tuple[Integers, Integers, Array], state: Array, time: Integers
+) -> Array:
+    """Work from each of n samples to the next [J], shape (n - 1,); nan where something is lost."""
+    some = slice(*np.searchsorted(held[0], time[[0, -1]]).tolist())
+    start_ns, end_ns = held[0][some], held[1][some]
+    first, last = places(start_ns, time[:-1]), places(end_ns, time[1:])
+    # The ticks of a sample are all there if they last as long as it is to the next.
+    whole = (first >= 0) & (last >= first) & np.isfinite(state[:-1]).all(axis=1)
+    passed = np.append(0, np.cumsum(end_ns - start_ns))
+    whole &= passed[last + 1] - passed[first] == np.diff(time)
+    if not whole.any():
+        return np.full(len(whole), np.nan)
+    starts = np.full((len(start_ns), state.shape[1]), np.nan)
+    starts[first[whole]] = state[:-1][whole]
+    reached = motion.follow(start_ns, end_ns, held[2][some], starts)[:, 0, -1]
+    return np.where(whole, reached[last], np.nan)

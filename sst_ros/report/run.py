@@ -9,21 +9,26 @@ from __future__ import annotations
 
 import base64
 import json
-import math
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
+from sst_ros.extras import require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot import pictures
-from sst_ros.plot.style import save_figure
+from sst_ros.plot import pictures, style
+from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, Looks, few, hide_zeros
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import overview, reference, timing, tracking
-from sst_ros.report.reference import QUANTITIES, Comparison, begins
+from sst_ros.report import reference, timing, tracking
+from sst_ros.report.reference import QUANTITIES, Comparison
 from sst_ros.report.results import made_on, provenance, render
 from sst_ros.report.timing import Timing
 from sst_ros.state import NANOSECONDS
@@ -44,9 +49,10 @@ FORMULATION_LIMIT = 1e-9
 
 
 class RunEvaluation(NamedTuple):
-    """A run in numbers: timing, the two comparisons, and the summary of it all."""
+    """A run in numbers: timing, energy residual [J] by sample, two comparisons, and the summary."""
 
     timing: Timing
+    energy: Array
     integration: Comparison
     ideal: Comparison | None
     summary: dict[str, Any]
@@ -60,15 +66,22 @@ def evaluate_run(run: Recording) -> RunEvaluation:
 
     """
     measured = timing.measure(run)
+    energy, missing = reference.energy_residual(run)
     # Compiled loops release the interpreter lock: the two comparisons run in parallel.
     with ThreadPoolExecutor(1) as pool:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
-    result = summarise(run, integration, ideal, reference.check_with_paper(run))
-    result |= measured.numbers()
-    found = reasons(result)
-    result = {"verdict": "WARNING" if found else "OK", "reasons": found} | result
-    return RunEvaluation(measured, integration, ideal, result)
+    numbers = {
+        **summarise(run, integration, ideal, reference.check_with_paper(run)),
+        **measured.numbers(),
+        "energy_residual_max_J": largest(np.abs(energy)),
+        "unknown": [*measured.missing, *filter(None, [missing])],
+    }
+    # What is wrong, in order of weight.
+    limits = {"answered_percent": ANSWERED_PERCENT, "formulation": FORMULATION_LIMIT}
+    found = render("run_reasons.txt", s=numbers, **limits).splitlines()
+    summary = {"verdict": "WARNING" if found else "OK", "reasons": found} | numbers
+    return RunEvaluation(measured, energy, integration, ideal, summary)
 
 
 def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
@@ -89,15 +102,17 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
     """
     run = recording.read(bag, damaged=damaged)
     with write_into(out, "report"):
-        measured, integration, ideal, result = evaluate_run(run)
-        errors = {"(a) integration error, against the same torques": integration}
-        if ideal is not None:
-            errors["(b) sample-and-hold error, against continuous torques"] = ideal
+        found = evaluate_run(run)
+        result, errors = (
+            found.summary,
+            {"(a) integration error, against the same torques": found[2]},
+        )
+        if found.ideal is not None:
+            errors["(b) sample-and-hold error, against continuous torques"] = found.ideal
         drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
-        figure = overview.draw_errors(run.seconds, errors)
         title = f"Error against run time, {run.scene.name}"
-        drawn += pictures.save(figure, title, out, "error", ["png"])
-        save_figure(overview.draw_overview(run, integration, measured, result), out / PAGE)
+        drawn += pictures.save(draw_errors(run.seconds, errors), title, out, "error", ["png"])
+        style.save_figure(draw_overview(run, found), out / PAGE)
         result["pictures"] = [path.name for path in drawn]
         result["page"] = [PAGE, HTML]
         page = render(
@@ -128,26 +143,29 @@ def summary_table(summary: dict[str, Any]) -> str:
     return render("run_table.txt", s=summary, made=provenance(summary["report"]))
 
 
-def reasons(summary: dict[str, Any]) -> list[str]:
-    """Say what is wrong with a run, in order of weight; nothing where nothing is."""
-    limits = {"answered_percent": ANSWERED_PERCENT, "formulation": FORMULATION_LIMIT}
-    return render("run_reasons.txt", s=summary, **limits).splitlines()
-
-
 def summarise(
     run: Recording,
     integration: Comparison,
     ideal: Comparison | None,
     formulation: tuple[float | None, int],
 ) -> dict[str, Any]:
-    """Collect all figures of the report but those of `timing`."""
+    """Collect all figures of the report but those of timing and energy."""
     tracked = tracking.of(run)
     found = tracked and tracked.metrics
-    summary = {
+    ideals: dict[str, Any] = {}
+    if ideal:
+        ideals = {
+            **_largest("ideal_difference", ideal.error, run.seconds),
+            **_largest("ideal_reference_error", ideal.own),
+            "hold_order": hold_order(run),
+        }
+    effort = run.effort_difference
+    off = largest(effort)
+    given = {"run": run, "integration": integration, "ideal": ideal}
+    return {
         "scene": run.scene.name,
         "bag": str(run.path),
-        **_read_diagnostics(run),
-        **_loss(run),
+        **_count(run),
         "torque_peak_N_m": np.abs(run.ticks.torque).max(axis=0).tolist(),
         "tracking_error_rms_rad": found and found.rms.tolist(),
         "tracking_error_max_rad": found and found.largest.tolist(),
@@ -157,14 +175,7 @@ def summarise(
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,
         "restarts_at_s": [time / NANOSECONDS for time in integration.restarts_ns],
-    }
-    if ideal:
-        summary |= _largest("ideal_difference", ideal.error, run.seconds)
-        summary |= _largest("ideal_reference_error", ideal.own)
-        summary["hold_order"] = hold_order(run)
-    effort = run.effort_difference
-    off = float(np.nanmax(effort)) if np.isfinite(effort).any() else None
-    return summary | {
+        **ideals,
         "formulation_difference_relative": formulation[0],
         "formulation_states": formulation[1],
         "effort_difference_max_N_m": off,
@@ -172,37 +183,32 @@ def summarise(
         "actuators_lag": run.scene.lags,
         "topics_missing": list(run.missing),
         "damage": list(run.signals.bag.damage),
-        "notes": render(
-            "run_notes.txt", run=run, integration=integration, ideal=ideal, begins=begins(run)
-        ).splitlines(),
+        "notes": render("run_notes.txt", begins=reference.begins(run), **given).splitlines(),
         "report": made_on(),
     }
 
 
-def _read_diagnostics(run: Recording) -> dict[str, Any]:
-    """Take numbers and texts from the last diagnostics of the simulator."""
-    reported = run.diagnostics
-    counts = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
-    numbers = ("simulated_time_s", "wall_time_s", "real_time_factor", "step_mean_us", "step_max_us")
-    return {
-        **{key: reported.get(key) for key in ("phase", "fault", "integrator")},
-        **{key: _count(reported, key) for key in counts},
-        **{key: _number(reported, key) for key in numbers},
-        "simulator_error_estimate": _number(reported, "error_estimate"),
-        "error_limit_rad": _number(reported, "tolerance") or ERROR_LIMIT_RAD,
-        "duration_s": float(run.seconds[-1]),
-        "commands_recorded": len(run.commands.torque),
-    }
-
-
-def _loss(run: Recording) -> dict[str, Any]:
-    recorded, period = len(run.time_ns), run.period_ns
+def _count(run: Recording) -> dict[str, Any]:
+    """Numbers and texts of the last diagnostics of the simulator; samples and ticks, and losses."""
+    pandas, period, recorded = require("pandas"), run.period_ns, len(run.time_ns)
+    said = pandas.Series(run.diagnostics, dtype=object)
+    numbers = {k: x for k, x in pandas.to_numeric(said, errors="coerce").items() if np.isfinite(x)}
+    counts = {key: round(value) for key, value in numbers.items()}
     spacing = np.diff(run.time_ns)
     between = int(np.sum(np.maximum(np.rint(spacing / period).astype(int) - 1, 0)))
-    published = _count(run.diagnostics, "samples_published")
+    published = counts.get("samples_published")
     # Diagnostics that end before the run does know of fewer samples than the bag holds.
-    lost = max(between, 0 if published is None else published - recorded)
+    lost = max(between, (published or 0) - recorded)
+    whole = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
+    times = ("simulated_time_s", "wall_time_s", "real_time_factor", "step_mean_us", "step_max_us")
     return {
+        **{key: run.diagnostics.get(key) for key in ("phase", "fault", "integrator")},
+        **{key: counts.get(key) for key in whole},
+        **{key: numbers.get(key) for key in times},
+        "simulator_error_estimate": numbers.get("error_estimate"),
+        "error_limit_rad": numbers.get("tolerance") or ERROR_LIMIT_RAD,
+        "duration_s": float(run.seconds[-1]),
+        "commands_recorded": len(run.commands.torque),
         "samples_published": published,
         "samples_recorded": recorded,
         "samples_lost": lost,
@@ -220,17 +226,18 @@ def _loss(run: Recording) -> dict[str, Any]:
     }
 
 
+def largest(values: Array) -> float | None:
+    """Return the largest known value; None where none is known."""
+    return float(np.nanmax(values)) if np.isfinite(values).any() else None
+
+
 def _largest(name: str, table: DataFrame, seconds: Array | None = None) -> dict[str, Any]:
     """Largest value of each column, and when that of gamma was; None where nothing is known."""
-    found = {
-        f"{name}_{key}_{unit}": float(table[key].max()) if table[key].count() else None
-        for key, unit in QUANTITIES.items()
-    }
+    found = {f"{name}_{key}_{unit}": largest(table[key]) for key, unit in QUANTITIES.items()}
     if seconds is not None:
         known = table.gamma.count() > 0
-        found[f"{name}_gamma_largest_at_s"] = (
-            float(seconds[table.gamma.argmax()]) if known else None
-        )
+        at = float(seconds[table.gamma.argmax()]) if known else None
+        found[f"{name}_gamma_largest_at_s"] = at
     return found
 
 
@@ -250,14 +257,190 @@ def hold_order(run: Recording) -> int | None:
     return 2 if np.median(off) <= 1e-9 * np.abs(profile.amplitude).max() else 1
 
 
-def _number(reported: dict[str, str], key: str) -> float | None:
-    try:
-        value = float(reported.get(key, "nan"))
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+@style.styled
+def draw_errors(seconds: Array, panels: Mapping[str, Comparison]) -> Figure:
+    """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
+    figure, grid = style.stack(["largest difference"] * len(panels), 3.1)
+    for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
+        _draw_comparison(axes, seconds, comparison, legend=axes is grid[0])
+        axes.set_title(title)
+    style.span(grid, seconds)
+    return figure
 
 
-def _count(reported: dict[str, str], key: str) -> int | None:
-    value = _number(reported, key)
-    return None if value is None else round(value)
+def _draw_comparison(
+    axes: Axes, seconds: Array, comparison: Comparison, *, legend: bool = True
+) -> None:
+    """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
+    times, floor = few(seconds, comparison.own.max(axis=1).to_numpy())
+    least = style.SMALLEST_SHOWN
+    band: Looks = {"color": GREY, "alpha": 0.3, "linewidth": 0.0, "label": "error of the reference"}
+    axes.fill_between(times, least, np.fmax(floor, least), **band)
+    names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
+    for values, name, looks in zip(comparison.error.to_numpy().T, names, LINES, strict=False):
+        axes.plot(*few(seconds, hide_zeros(values)), label=name, **looks)
+    axes.set(yscale="log", ylabel="largest difference")
+    axes.set_ylim(bottom=least)
+    if legend and comparison.compared:
+        axes.legend(fontsize=8, ncol=2, loc="lower right")
+
+
+class Panel(NamedTuple):
+    """A panel of the overview; `missing` is the reason why it is left out, or empty."""
+
+    title: str
+    draw: Callable[[Axes], None]
+    missing: str = ""
+    over_time: bool = True
+
+
+@style.styled
+def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
+    """Draw a run on one page; the footnote names what has no data."""
+    panels = [*_panels(run, found)]
+    shown = [panel for panel in panels if not panel.missing]
+    rows = -(-len(shown) // 2)
+    figure = Figure(figsize=(12.0, 3.3 * rows + 0.5))
+    grid = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axes, panel in zip(grid, shown, strict=False):
+        axes.set_title(panel.title)
+        panel.draw(axes)
+        if panel.over_time:
+            axes.set_xlabel("time t [s]")
+            axes.set_xlim(0.0, run.seconds[-1])
+    for axes in grid[len(shown) :]:
+        axes.set_axis_off()
+    title = f"Run of {run.scene.name}: {run.seconds[-1]:g} s, {len(run.time_ns)} samples"
+    figure.suptitle(title, fontsize=13)
+    absent = " ".join(f"{panel.title}: {panel.missing}." for panel in panels if panel.missing)
+    footnote = f"{absent}\n{provenance(found.summary['report'])}".strip()
+    figure.supxlabel(footnote, fontsize=8, color="#555555")
+    return figure
+
+
+def _panels(run: Recording, found: RunEvaluation) -> Iterator[Panel]:
+    seconds, measured, commands = run.seconds, found.timing, found.timing.commands
+    reported, error = measured.reported, found.integration
+    compared = "" if error.compared else "nothing could be compared"
+    title = "Integration error, against the same torques"
+    yield Panel(title, lambda axes: _draw_comparison(axes, seconds, error), compared)
+    yield _curve("Energy residual", "energy residual [J]", seconds, found.energy)
+    looks: Looks = {"around": 1.0, "marker": ".", "linewidth": 1.2}
+    times, pace = measured.pace.index.to_numpy(), measured.pace.to_numpy()
+    yield _curve("Real-time factor (recorder clock)", "real-time factor", times, pace, **looks)
+    title, periods = "Period between received samples", measured.period_us
+    draw = partial(_draw_periods, period_us=periods, nominal_us=measured.nominal_us)
+    yield Panel(title, draw, _missing(periods), over_time=False)
+    yield Panel("Cumulative losses", lambda axes: _draw_losses(axes, measured, seconds[-1]))
+    title = "Latency: reception of a command to the step that applies it"
+    dots: Looks = {"around": 0.0, "linestyle": "none", "marker": ".", "markersize": 3}
+    yield _curve(title, "latency [µs]", commands.time_s, commands.received_us, **dots)
+    late = measured.late_us / 1e3
+    yield _curve("Delay of samples", "delay, less the shortest [ms]", seconds, late)
+    title, effort = "Effort of joint_states against applied torque", run.effort_difference
+    same = _missing(effort) or ("" if np.nanmax(effort) else "no difference")
+    yield _curve(title, "largest difference [N m]", seconds, effort)._replace(missing=same)
+    used = (1e-6 * reported.ticks * reported.step_mean_us).to_numpy()
+    # Reports come once a second: between them, and from the start, the steps cost the same.
+    at_samples = np.interp(seconds, [0.0, *reported.time_s], [0.0, *used])
+    so_far = np.fmax.accumulate(error.error.orientation.to_numpy())
+    estimates = {
+        "integration error": (at_samples if len(used) else np.full(len(seconds), np.nan), so_far),
+        "its estimate by the simulator": (used, reported.error_estimate.to_numpy()),
+        "hold error if torques are those of the start": (
+            used,
+            reported.hold_error_start.to_numpy(),
+        ),
+        "the same, of the middle": (used, reported.hold_error_middle.to_numpy()),
+    }
+    drawn = any((np.isfinite(hide_zeros(y)) & np.isfinite(x)).any() for x, y in estimates.values())
+    title, missing = (
+        "Error against computing time used, over the run",
+        "" if drawn else NOT_RECORDED,
+    )
+    yield Panel(title, partial(_draw_used, estimates=estimates), missing, over_time=False)
+    title = "Computing time of a step, mean since the start"
+    timed = reported[reported.step_mean_us > 0.0]
+    yield _curve(title, "time [µs]", timed.time_s, timed.step_mean_us, marker="o")
+
+
+NOT_RECORDED = "not recorded"
+
+
+def _missing(values: Array) -> str:
+    """Return why a panel of values is left out; empty where some of them are known."""
+    return "" if np.isfinite(values).any() else NOT_RECORDED
+
+
+def _curve(
+    title: str, label: str, x: Any, y: Any, around: float | None = None, **looks: Any
+) -> Panel:
+    """Return a panel of one curve; small values in a power of ten, or around a line."""
+    seconds, values = np.asarray(x), np.asarray(y)
+
+    def draw(axes: Axes) -> None:
+        shown, unit = (values, "") if around is not None else style.scale_down(values)
+        axes.set_ylabel(label.replace("[", f"[{unit}"))
+        axes.plot(*few(seconds, shown), color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
+        if around is not None:
+            axes.axhline(around, color=GREY, linewidth=0.9, linestyle="--")
+            style.widen(axes, np.append(shown, around), 0.04)
+
+    return Panel(title, draw, _missing(values))
+
+
+def _draw_used(axes: Axes, estimates: Mapping[str, tuple[Array, Array]]) -> None:
+    """Draw errors [rad] over computing time [s] by name; what was reported is marked."""
+    axes.set_xlabel("computing time of all steps [ms]")
+    axes.set_ylabel("error of the orientation [rad]")
+    for (name, (used, values)), looks in zip(estimates.items(), LINES, strict=False):
+        marker = "" if name == "integration error" else "o"
+        axes.plot(1e3 * used, hide_zeros(values), label=name, marker=marker, markersize=4, **looks)
+    axes.set_yscale("log")
+    axes.legend(fontsize=8, loc="best")
+
+
+def _draw_periods(axes: Axes, period_us: Array, nominal_us: float) -> None:
+    """Draw the histogram of periods between received samples around the nominal one [us]."""
+    axes.set_xlabel("deviation from the nominal period [µs]")
+    axes.set_ylabel("samples")
+    off = period_us - nominal_us
+    reach = max(1.0, 1.05 * float(np.abs(off).max()))
+    axes.hist(off, bins=np.linspace(-reach, reach, 81).tolist(), color=BLUE, log=True)
+    axes.set_ylim(bottom=0.5)
+    numbers = {"nominal": nominal_us, "min": period_us.min(), "mean": period_us.mean()}
+    numbers["max"] = period_us.max()
+    for share, colour, line in ((99.0, VERMILION, "--"), (99.9, GREEN, ":")):
+        name = f"p{share:g}"
+        numbers[name] = np.percentile(period_us, share)
+        place = numbers[name] - nominal_us
+        axes.axvline(place, color=colour, linestyle=line, linewidth=1.5, label=name)
+    text = "\n".join(f"{name} {value:.1f} µs" for name, value in numbers.items())
+    axes.text(0.02, 0.96, text, transform=axes.transAxes, va="top", fontsize=8.5)
+    axes.legend(fontsize=8, loc="upper right")
+
+
+def _draw_losses(axes: Axes, measured: Timing, end: float) -> None:
+    """Draw running counts of losses over time [s]."""
+    axes.set_ylabel("count")
+    missed = measured.reported.dropna(subset="ticks_missed")
+    losses = {
+        name: (np.sort(times), np.arange(1.0, len(times) + 1.0))
+        for name, times in {
+            "samples lost": measured.lost_s,
+            "gaps between applied torques": measured.gaps_s,
+        }.items()
+    } | {"ticks missed": (missed.time_s, missed.ticks_missed)}
+    most = 0.0
+    for (name, loss), looks in zip(losses.items(), LINES, strict=False):
+        if name == "ticks missed" and missed.empty:
+            axes.plot([], [], " ", label=f"{name}: not recorded")
+            continue
+        times, counts = (np.append(0.0, numbers) for numbers in loss)
+        times, counts = np.append(times, end), np.append(counts, counts[-1])
+        label = f"{name}: {counts[-1]:.0f}"
+        axes.step(*few(times, counts), where="post", label=label, **looks)
+        most = max(most, counts[-1])
+    axes.set_ylim(0.0, max(1.0, 1.6 * most))
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.legend(fontsize=8, loc="upper left")

@@ -28,7 +28,7 @@ from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, places
 from sst_ros.state import NANOSECONDS
 
-PICTURES, TABLE = ("tracking", "tracking_error", "control_torques"), "tracking.txt"
+PICTURES = ("tracking", "tracking_error", "control_torques")
 KEYS = (REFERENCE.key, TRACKING_ERROR.key)
 
 
@@ -66,17 +66,15 @@ class TrackedRun:
         """
         run, gamma = self.recording, self.track.gamma
         geometry, measured = Geometry.of(run.scene), run.quaternion[self.rows]
-        unknown = np.full(len(gamma), np.nan)
-        if not np.isfinite(measured[0]).all():
-            return unknown
         try:
-            start = continuation.advance(
-                geometry, rotation_matrix(measured[0]), run.gamma[self.rows[0]], gamma[0]
-            )
-            branch = continuation.follow(geometry, gamma, start)
+            if np.isfinite(measured[0]).all():
+                first = rotation_matrix(measured[0])
+                start = continuation.advance(geometry, first, run.gamma[self.rows[0]], gamma[0])
+                branch = continuation.follow(geometry, gamma, start)
+                return angle_between(quaternion_of(branch.rotation), measured)
         except SingularConfiguration:
-            return unknown
-        return angle_between(quaternion_of(branch.rotation), measured)
+            pass
+        return np.full(len(gamma), np.nan)
 
 
 def read_tracking(path: Path) -> TrackedRun:
@@ -102,7 +100,7 @@ def of(run: Recording) -> TrackedRun | None:
         return None
     series = [run.signals.topic_series[key] for key in KEYS]
     at = [places(one.stamp_ns, run.time_ns + run.start_ns) for one in series]
-    rows = np.flatnonzero((at[0] >= 0) & (at[1] >= 0))
+    rows = np.flatnonzero(np.min(at, axis=0) >= 0)
     if len(rows) < 2:
         return None
     reference, error = (one.values[place[rows]] for one, place in zip(series, at, strict=True))
@@ -133,6 +131,6 @@ def write_tracking_report(bag: Path, out: Path) -> str:
         lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
     text = "\n".join(lines)
     with write_into(out, "report"):
-        (out / TABLE).write_text(text, encoding="utf-8")
+        (out / "tracking.txt").write_text(text, encoding="utf-8")
     pictures.draw_run(tracked.recording.signals, out, PICTURES, ["png"])
     return text

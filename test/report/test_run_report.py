@@ -12,12 +12,18 @@ from matplotlib import image
 
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
-from sst_ros.integration.propagator import TickPropagator
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.recording import recording
-from sst_ros.report import overview, reference, timing, tracking
+from sst_ros.report import reference, timing, tracking
+from sst_ros.report.reference import TickPropagator
 from sst_ros.report.results import render
-from sst_ros.report.run import evaluate_run, summary_table, summary_text, write_run_report
+from sst_ros.report.run import (
+    draw_overview,
+    evaluate_run,
+    summary_table,
+    summary_text,
+    write_run_report,
+)
 from sst_ros.scene import scene
 
 LATENCY_NS = 400_000
@@ -272,8 +278,8 @@ def test_periods_and_latency_are_what_they_were_made_by_any_clock(read, lively, 
     assert numbers["command_latency_mean_us"] == pytest.approx(403.0, abs=0.1)
     assert numbers["command_stamp_to_tick_mean_us"] is None
     assert found.pace.to_numpy() == pytest.approx(np.ones(len(found.pace)), abs=0.02)
-    assert numbers["energy_residual_max_J"] < 1e-12
-    assert not len(found.lost_s) and not len(found.gaps_s) and numbers["unknown"] == []
+    assert not len(found.lost_s) and not len(found.gaps_s) and found.missing == []
+    assert np.abs(reference.energy_residual(read(entries))[0]).max() < 1e-12
 
 
 def test_a_dropped_tick_shows(read, bags, example2):
@@ -293,7 +299,7 @@ def test_an_altered_torque_shows_when_it_was(read, bags, example2):
     error = reference.integration(run).error.gamma_dot
     assert np.flatnonzero(error > 1e-9)[0] == 75 and run.seconds[75] == 0.15
     assert error[:75].max() < 1e-11 and error[75:].min() > 1e-8
-    energy = timing.measure(run).samples.energy_J.abs()
+    energy = np.abs(reference.energy_residual(run)[0])
     assert np.flatnonzero(energy > 1e-9)[0] == 75
 
 
@@ -318,8 +324,7 @@ def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(read, bag
 
 def panel_of(run, title):
     """A panel of the overview."""
-    found = evaluate_run(run)
-    drawn = overview.draw_overview(run, found.integration, found.timing, found.summary)
+    drawn = draw_overview(run, evaluate_run(run))
     return next(axes for axes in drawn.axes if axes.get_title("left").startswith(title))
 
 
@@ -367,9 +372,7 @@ def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
     at, missed = found.reported[["time_s", "ticks_missed"]].to_numpy().T
     assert at == pytest.approx(list(reports), abs=1e-9)
     assert missed.tolist() == list(reports.values())
-    assert found.samples.late_us.to_numpy() == pytest.approx(
-        np.where(np.arange(151) > 50, 7000.0, 0.0)
-    )
+    assert found.late_us == pytest.approx(np.where(np.arange(151) > 50, 7000.0, 0.0))
     assert not len(found.lost_s)
     assert evaluate_run(run).summary["ticks_missed"] == 7
 
@@ -388,7 +391,7 @@ def test_a_long_run_is_reported_whole_and_integrated_compiled(long_run, monkeypa
     """The work that a report does for it, which is what its time and memory come from."""
     follow, calls = TickPropagator.follow, []
     monkeypatch.setattr(TickPropagator, "follow", lambda *given: calls.append(0) or follow(*given))
-    integration, ideal, summary = evaluate_run(long_run)[1:]
+    integration, ideal, summary = evaluate_run(long_run)[2:]
     assert len(calls) == 3  # both references and the energy, in one call each
     assert summary["samples_recorded"] == summary["samples_compared"] == 10_001
     assert (summary["ticks_recorded"], summary["commands_followed"]) == (20_000, 10_000)
@@ -399,15 +402,13 @@ def test_a_long_run_is_reported_whole_and_integrated_compiled(long_run, monkeypa
 
 @pytest.mark.slow
 def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
-    compiled = reference.integration(long_run), timing.energy_residual(long_run, [])
+    compiled = reference.integration(long_run), reference.energy_residual(long_run)[0]
     monkeypatch.setenv("SST_ROS_NUMBA", "0")
     monkeypatch.setattr(reference, "PLAIN_TICKS", 400)
-    monkeypatch.setattr(timing, "PLAIN_TICKS", 400)
-    missing = []
-    plain = reference.integration(long_run), timing.energy_residual(long_run, missing)
+    plain = reference.integration(long_run), *reference.energy_residual(long_run)
     assert plain[0].compared == 201
     assert plain[0].reasons == ("only the first 0.4 s are compared: there is no numba for more",)
-    assert "there is no numba" in missing[0] and np.isfinite(plain[1]).sum() == 201
+    assert "there is no numba" in plain[2] and np.isfinite(plain[1]).sum() == 201
     one, other = (found[0].error.gamma[:201].to_numpy() for found in (plain, compiled))
     assert one == pytest.approx(other, abs=1e-15)
     assert plain[1][:201] == pytest.approx(compiled[1][:201], abs=1e-13)
