@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sst_ros.control.controller import Controller, ControlStopped, Measurement
 from sst_ros.control.law import ControlChannel
 from sst_ros.control.reference import Reference, ReferenceMotion
-from sst_ros.control.tracking import TrackingRecord
+from sst_ros.control.tracking import Track, track_of
 from sst_ros.errors import RunStopped
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.generic_math import ZERO, axpy
@@ -189,7 +189,7 @@ class ControlLoop:
         return round(self.settings.period * NANOSECONDS)
 
 
-def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]:
+def run_loop(loop: ControlLoop) -> tuple[Track, NDArray[np.bool_], str]:
     """Run a loop to its end.
 
     Returns:
@@ -223,7 +223,7 @@ def run_loop(loop: ControlLoop) -> tuple[TrackingRecord, NDArray[np.bool_], str]
         torque(simulation)  # of the end, which is a sample, too
     except (RunStopped, ControlStopped) as error:
         failure = str(error)
-    return TrackingRecord.of_rows(rows), np.array(limited, dtype=bool), failure
+    return track_of(rows), np.array(limited, dtype=bool), failure
 
 
 def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scene:

@@ -32,7 +32,7 @@ from matplotlib.lines import Line2D
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import INSTANTS, MODES
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.control.tracking import evaluate_tracking
+from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.plot.style import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records
 from sst_ros.scene.scene import Scene, load
@@ -182,7 +182,7 @@ def _track(plan: FeedforwardPlan, job: tuple[ModelError, SampledControl]) -> dic
     track, limited, failure = run_loop(loop)
     if failure:
         return named | {"failure": failure}
-    found = evaluate_tracking(track, int(limited.sum()))
+    found = TrackingMetrics(track, int(limited.sum()))
     late = track.time >= motion.duration + 0.5 * REST_S
     swing, saturated = float(np.ptp(track.error[late], axis=0).max()), limited[late].any()
     if not open_loop and (saturated or not swing <= found.band):
@@ -191,7 +191,7 @@ def _track(plan: FeedforwardPlan, job: tuple[ModelError, SampledControl]) -> dic
     power = found.torque_rms**2
     shares = [
         float(np.nansum(share * power) / power.sum()) if power.any() else None
-        for share in (found.feedforward, found.feedback)
+        for share in found.shares
     ]
     numbers = (
         float(np.sqrt(np.mean(found.rms**2))), float(found.largest.max()), found.settling,

@@ -8,7 +8,6 @@ limits are tested on the dynamics themselves, not scaled.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -37,11 +36,12 @@ SAMPLES = 16
 """Parts of a piece of the motion; even, for Simpson's rule."""
 SINGULAR_J2 = 1e-6
 """det J2 within which a motion counts as singular."""
-SLOWEST = 1e-4
-"""Slower than this part of the highest factor of speed is not looked for."""
+SLOWEST, FASTEST = 1e-4, 1e8
+"""Factors of speed between which the ends of what is feasible are looked for."""
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 """Of the peaks of an `ActuatorDemand`."""
-_GRID, _HALVINGS, _DOUBLINGS = 120, 45, 40
+_GRID, _HALVINGS = 360, 45
+_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True)
@@ -52,55 +52,12 @@ class Peak:
     time: float
 
 
-def maximum(
-    function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
-) -> Peak:
-    """Return the maximum of a function of which samples are known.
-
-    Every sample that no neighbour exceeds is a local maximum. It is refined between its neighbours
-    if the function could exceed the best sample there: extrapolated by its change to the lower
-    neighbour.
-
-    Args:
-        function: of time.
-        times: of the samples, rising [s], shape (n,).
-        values: the function there, shape (n,).
-        floor: maxima that are certainly below it are not refined.
-
-    """
-    top = int(np.argmax(values))
-    best = Peak(float(values[top]), float(times[top]))
-    left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
-    below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
-    high = 2.0 * values - below > max(best.value + 1e-13 * abs(best.value), floor)
-    summits = (values >= left) & (values >= right) & high
-    for index in np.flatnonzero(summits):
-        bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
-        options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
-        found = minimize_scalar(
-            lambda time: -function(time), bounds=bounds, method="bounded", options=options
-        )
-        if -found.fun > best.value + 1e-13 * abs(best.value):
-            best = Peak(float(-found.fun), float(found.x))
-    return best
-
-
-def minimum(function: Callable[[float], float], times: Array, values: Array) -> Peak:
-    """Return the minimum; see `maximum`."""
-    found = maximum(lambda time: -function(time), times, -values)
-    return Peak(-found.value, found.time)
-
-
 @dataclass(frozen=True)
 class ActuatorDemand:
     """Demand of a motion on one actuator; values of the largest magnitude, with their signs.
 
-    Attributes:
-        torque: [N m].
-        torque_rms: root of the mean square over the duration [N m].
-        power: torque times rate [W]; negative where the actuator brakes.
-        velocity, acceleration: [rad/s], [rad/s^2].
-
+    Units are those of UNITS; power is negative where the actuator brakes. `torque_rms` is the root
+    of the mean square over the duration.
     """
 
     torque: Peak
@@ -202,81 +159,112 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     desired = tuple(map(motion.at, times.tolist()))
     distances = tuple(_distances(motion, scene, times, desired))
     inverse = InverseDynamics(scene)
-    asked: dict[str, Callable[[Reference], Sequence[float]]] = {
-        "torque": inverse.reference_torque,
-        "power": lambda at: np.multiply(inverse.reference_torque(at), at.gamma_dot).tolist(),
-        "velocity": lambda at: at.gamma_dot,
-        "acceleration": lambda at: at.gamma_ddot,
-    }
-    samples = {name: np.array(list(map(of, desired))) for name, of in asked.items()}
+
+    def measure(at: Reference) -> tuple[float, ...]:
+        """Quantities of UNITS, each of three actuators."""
+        torque = inverse.reference_torque(at)
+        power = (x * rate for x, rate in zip(torque, at.gamma_dot, strict=True))
+        return (*torque, *power, *at.gamma_dot, *at.gamma_ddot)
+
+    peaks = [
+        max(high, low, key=lambda peak: abs(peak.value))
+        for low, high in _extremes(motion, measure, times, desired)
+    ]
+    torques = np.array(list(map(inverse.reference_torque, desired)))
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
-    demands = []
-    for leg in range(3):
-        peaks = {}
-        for name, of in asked.items():
-            given = _component(motion, of, leg), times, samples[name][:, leg]
-            peaks[name] = max(maximum(*given), minimum(*given), key=lambda peak: abs(peak.value))
-        squares = simpson(samples["torque"][pieces, leg] ** 2, x=times[pieces], axis=1)
-        rms = math.sqrt(squares.sum() / times[-1])
-        demands.append(ActuatorDemand(torque_rms=rms, **peaks))
-    problems = (*_faults(distances, demands, limits(scene.actuators)),)
-    return MotionPlan(
-        motion, scene, times, desired, samples["torque"], tuple(demands), distances, problems
+    squares = simpson(torques[pieces] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
+    roots = np.sqrt(squares / times[-1]).tolist()
+    demands = tuple(
+        ActuatorDemand(torque_rms=roots[leg], **dict(zip(UNITS, peaks[leg::3], strict=True)))
+        for leg in range(3)
     )
+    problems = (*_faults(distances, demands, limits(scene.actuators)),)
+    return MotionPlan(motion, scene, times, desired, torques, demands, distances, problems)
 
 
-def _component(
-    motion: ReferenceMotion, of: Callable[[Reference], Sequence[float]], index: int
-) -> Callable[[float], float]:
-    """Return one of the numbers of a reference as a function of time."""
-    return lambda time: of(motion.at(time))[index]
+def _extremes(
+    motion: ReferenceMotion,
+    measure: Callable[[Reference], tuple[float, ...]],
+    times: Array,
+    desired: Sequence[Reference],
+) -> Iterator[tuple[Peak, Peak]]:
+    """Yield the lowest and the highest of each number that is measured at a reference."""
+    for index, values in enumerate(np.array([measure(at) for at in desired]).T):
+
+        def sample(sign: float, time: float, index: int = index) -> float:
+            return sign * measure(motion.at(time))[index]
+
+        low = maximum(partial(sample, -1.0), times, -values)
+        yield Peak(-low.value, low.time), maximum(partial(sample, 1.0), times, values)
+
+
+def maximum(
+    function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
+) -> Peak:
+    """Return the maximum of a function of time of which samples are known.
+
+    Every sample that no neighbour exceeds is a local maximum. It is refined between its neighbours
+    if the function could exceed the best sample, and `floor`, there: extrapolated by its change to
+    the lower neighbour. Times rise [s], shape (n,); values are those of the function there.
+    """
+    top = int(np.argmax(values))
+    best = Peak(float(values[top]), float(times[top]))
+    left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
+    below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
+    high = 2.0 * values - below > max(best.value + _ROUNDING * abs(best.value), floor)
+    for index in np.flatnonzero((values >= left) & (values >= right) & high):
+        bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
+        options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
+        found = minimize_scalar(
+            lambda time: -function(time), bounds=bounds, method="bounded", options=options
+        )
+        if -found.fun > best.value + _ROUNDING * abs(best.value):
+            best = Peak(float(-found.fun), float(found.x))
+    return best
 
 
 def _distances(
-    motion: ReferenceMotion, scene: Scene, times: Array, desired: tuple[Reference, ...]
+    motion: ReferenceMotion, scene: Scene, times: Array, desired: Sequence[Reference]
 ) -> Iterator[LimitDistance]:
     geometry = Geometry.of(scene)
-    coordinates = ActuatorSpaceMap(geometry)
+    space = ActuatorSpaceMap(geometry)
 
     def measure(at: Reference) -> tuple[float, ...]:
-        """Gamma, sin(mu), beta and det J2, ten numbers."""
-        return (*at.gamma, *_posture(coordinates, at))
+        """Gamma, sin(mu), beta and det J2, ten numbers; sin(mu) < 0 beyond a serial singularity."""
+        posture = list(space.posture(at.quaternion))
+        turned = space.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
+        for leg in range(3):
+            # On the other branch of the leg r_k has the opposite direction: gamma differs by pi.
+            if math.cos(at.gamma[leg] - turned[leg]) < 0.0:
+                posture[leg] = -posture[leg]
+        return (*at.gamma, *posture)
 
-    values = np.array([measure(at) for at in desired]).T
-    given = [(_component(motion, measure, i), times, row) for i, row in enumerate(values)]
+    extremes = list(_extremes(motion, measure, times, desired))
     ranges = (
-        ("gamma", 0, geometry.arc.tolist(), scene.stroke.at_end != "ignore"),
-        ("beta", 6, [geometry.beta_max] * 3, scene.workspace.at_edge != "ignore"),
+        ("gamma", extremes[:3], geometry.arc.tolist(), scene.stroke.at_end != "ignore"),
+        ("beta", extremes[6:9], [geometry.beta_max] * 3, scene.workspace.at_edge != "ignore"),
     )
-    for name, first, ends, held in ranges:
-        for leg, end in enumerate(ends):
-            key, course = f"{name}_{leg + 1}", given[first + leg]
-            yield LimitDistance(key, 0.0, 1.0, "rad", minimum(*course), held)
-            yield LimitDistance(key, end, -1.0, "rad", maximum(*course), held)
-    for leg in range(3):
-        low = minimum(*given[3 + leg])
+    for name, reached, ends, held in ranges:
+        for leg, ((low, high), end) in enumerate(zip(reached, ends, strict=True), start=1):
+            yield LimitDistance(f"{name}_{leg}", 0.0, 1.0, "rad", low, held)
+            yield LimitDistance(f"{name}_{leg}", end, -1.0, "rad", high, held)
+    for leg, (low, _) in enumerate(extremes[3:6], start=1):
         if low.value < SINGULAR_MU:
-            said = f"serial singularity of leg {leg + 1} at t = {low.time:.9g} s, sin(mu)"
+            said = f"serial singularity of leg {leg} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(said, low.value)
-        yield LimitDistance(f"sin(mu_{leg + 1})", 0.0, 1.0, "1", low, True)
-    determinant, sign = given[9][0], 1.0 if values[9, 0] > 0.0 else -1.0
-    low = minimum(lambda time: sign * determinant(time), times, sign * values[9])
-    if low.value < SINGULAR_J2:
-        end = low.time if low.value > 0.0 else brentq(determinant, 0.0, low.time)
-        said = f"parallel singularity at t = {end:.9g} s, det J2"
-        raise SingularConfiguration(said, determinant(end))
-    yield LimitDistance("det J2", 0.0, sign, "1", Peak(sign * low.value, low.time), True)
+        yield LimitDistance(f"sin(mu_{leg})", 0.0, 1.0, "1", low, True)
 
+    def determinant(time: float) -> float:
+        return measure(motion.at(time))[9]
 
-def _posture(coordinates: ActuatorSpaceMap, at: Reference) -> tuple[float, ...]:
-    """See `ActuatorSpaceMap.posture`; beyond a serial singularity the leg's sine is negative."""
-    found = list(coordinates.posture(at.quaternion))
-    turned = coordinates.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
-    for leg in range(3):
-        # On the other branch of the leg r_k has the opposite direction: gamma differs by pi.
-        if math.cos(at.gamma[leg] - turned[leg]) < 0.0:
-            found[leg] = -found[leg]
-    return tuple(found)
+    sign = math.copysign(1.0, determinant(0.0))
+    nearest = extremes[9][0 if sign > 0.0 else 1]
+    if sign * nearest.value < SINGULAR_J2:
+        crosses = sign * nearest.value <= 0.0
+        time = brentq(determinant, 0.0, nearest.time) if crosses else nearest.time
+        said = f"parallel singularity at t = {time:.9g} s, det J2"
+        raise SingularConfiguration(said, determinant(time))
+    yield LimitDistance("det J2", 0.0, sign, "1", nearest, True)
 
 
 def _faults(
@@ -287,12 +275,11 @@ def _faults(
             allowed = f"must stay {distance.side} {distance.end:.9g} {distance.unit}"
             said = f"{allowed} (t = {distance.reached.time:.9g} s)"
             yield Problem(distance.key, distance.reached.value, said)
-    for name, limit in most.items():
-        for leg, demand in enumerate(demands):
-            peak: Peak = getattr(demand, name)
-            if abs(peak.value) > limit:
-                allowed = f"exceeds the limit {limit:g} {UNITS[name]} at t = {peak.time:.9g} s"
-                yield Problem(f"{name}_{leg + 1}", peak.value, allowed)
+    for (name, limit), (leg, demand) in product(most.items(), enumerate(demands, start=1)):
+        peak: Peak = getattr(demand, name)
+        if abs(peak.value) > limit:
+            allowed = f"exceeds the limit {limit:g} {UNITS[name]} at t = {peak.time:.9g} s"
+            yield Problem(f"{name}_{leg}", peak.value, allowed)
 
 
 def limits(actuators: Actuators | None) -> dict[str, float]:
@@ -335,121 +322,85 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     cap = caps[binding]
     if torque_limit is None:
         return TimeScaling(cap, 0.0, binding if math.isfinite(cap) else "")
-    torques = _Torques(plan, torque_limit)
+    fits = _torque_test(plan, torque_limit)
 
-    def bisect(fits: float, fails: float) -> float:
+    def bisect(good: float, bad: float) -> float:
         """Return the feasible end of a change between two factors."""
         for _ in range(_HALVINGS):
-            middle = 0.5 * (fits + fails)
-            fits, fails = (middle, fails) if torques.fit(middle) else (fits, middle)
-        return fits
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if fits(middle) else (good, middle)
+        return good
 
-    top = min(cap, torques.top())
-    grid = np.geomspace(SLOWEST * top, top, _GRID)
-    fits = np.array([torques.fit(factor) for factor in grid.tolist()])
-    if not fits.any():
+    grid = np.geomspace(SLOWEST * min(cap, 1.0), min(cap, FASTEST), _GRID).tolist()
+    good = np.array(list(map(fits, grid)))
+    if not good.any():
         return TimeScaling(None, 0.0, "torque")
-    last = int(np.flatnonzero(fits)[-1])
-    highest = float(grid[last])
-    if last < len(grid) - 1:
-        highest, binding = bisect(highest, float(grid[last + 1])), "torque"
+    last = int(np.flatnonzero(good)[-1])
+    highest = grid[last]
+    if last < _GRID - 1:
+        highest, binding = bisect(highest, grid[last + 1]), "torque"
     elif math.isinf(cap):
         highest, binding = math.inf, ""
-    slow = np.flatnonzero(~fits[:last])
+    slow = np.flatnonzero(~good[:last])
     if len(slow):
-        lowest = bisect(float(grid[slow[-1] + 1]), float(grid[slow[-1]]))
-    else:
-        lowest = 0.0 if torques.fit(0.0) else float(grid[0])
-    return TimeScaling(highest, lowest, binding)
+        return TimeScaling(highest, bisect(grid[slow[-1] + 1], grid[slow[-1]]), binding)
+    return TimeScaling(highest, 0.0 if fits(0.0) else grid[0], binding)
 
 
-class _Torques:
-    """Torques of a motion at any speed against their limit."""
+def _torque_test(plan: MotionPlan, limit: float) -> Callable[[float], bool]:
+    """Return whether no torque exceeds the limit, between samples too, by the factor of speed."""
+    model, inverse = kernel.model_of(plan.scene), InverseDynamics(plan.scene)
+    star = [(at.quaternion, at.body_rate, at.body_acceleration) for at in plan.references]
+    quaternion, rate, acceleration = (np.array(part).T for part in zip(*star, strict=True))
 
-    def __init__(self, plan: MotionPlan, limit: float) -> None:
-        self._plan, self._limit = plan, limit
-        self._model, self._inverse = kernel.model_of(plan.scene), InverseDynamics(plan.scene)
-        self._quaternion, self._rate, self._acceleration = (
-            np.array([getattr(at, name) for at in plan.references]).T
-            for name in ("quaternion", "body_rate", "body_acceleration")
-        )
+    def torque(factor: float, leg: int, sign: float, time: float) -> float:
+        at = plan.motion.at(time)
+        moving = multiply(factor, at.body_rate), multiply(factor * factor, at.body_acceleration)
+        return sign * inverse.torque(at.quaternion, *moving)[leg]
 
-    def fit(self, factor: float) -> bool:
-        """Whether no torque exceeds the limit, at samples or between them."""
-        times, sampled = self._plan.times, self._at_samples(factor)
-        if np.abs(sampled).max() > self._limit:
+    def fits(factor: float) -> bool:
+        moving: Any = [tuple(factor * rate), tuple(factor * factor * acceleration)]
+        rows, _ = kernel.actuator_torque(model, tuple(quaternion), *moving)
+        sampled = np.stack(np.broadcast_arrays(*rows))
+        if np.abs(sampled).max() > limit:
             return False
         peaks = (
-            maximum(partial(self._at, factor, leg, sign), times, sign * sampled[leg], self._limit)
+            maximum(partial(torque, factor, leg, sign), plan.times, sign * sampled[leg], limit)
             for leg, sign in product(range(3), (1.0, -1.0))
         )
-        return all(peak.value <= self._limit for peak in peaks)
+        return all(peak.value <= limit for peak in peaks)
 
-    def top(self) -> float:
-        """Return a factor beyond which nothing is looked for: three doublings above infeasible."""
-        factor, beyond = 1.0, 0
-        for _ in range(_DOUBLINGS):
-            if beyond == 3:
-                break
-            exceeded = np.abs(self._at_samples(factor)).max() > self._limit
-            beyond = beyond + 1 if exceeded else 0
-            factor *= 2.0
-        return factor
-
-    def _at_samples(self, factor: float) -> Array:
-        """Torques [N m], shape (3, n)."""
-        motion = self._quaternion, factor * self._rate, factor * factor * self._acceleration
-        star: Any = [tuple(rows) for rows in motion]
-        found, _ = kernel.actuator_torque(self._model, *star)
-        return np.stack(np.broadcast_arrays(*found))
-
-    def _at(self, factor: float, leg: int, sign: float, time: float) -> float:
-        """Torque [N m] of a leg, times the sign, at a time [s] of the motion as it is planned."""
-        at = self._plan.motion.at(time)
-        rate = multiply(factor, at.body_rate)
-        acceleration = multiply(factor * factor, at.body_acceleration)
-        return sign * self._inverse.torque(at.quaternion, rate, acceleration)[leg]
+    return fits
 
 
 def plan_table(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for people."""
-    lines = [
-        f"{plan.scene.name}: {plan.motion.duration:g} s, {len(plan.times)} samples and the "
-        "extremes between them",
-        "",
-        _row("", ["actuator 1", "actuator 2", "actuator 3"], "limit"),
-        *_demands(plan),
-        "",
-        _row("distance to an end", ["least", "at t [s]"]),
-        *map(_distance, plan.distances),
-        "",
-        *_verdict(plan, fastest),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _demands(plan: MotionPlan) -> Iterator[str]:
+    said = f"{plan.motion.duration:g} s, {len(plan.times)} samples and the extremes between them"
+    heads = ["actuator 1", "actuator 2", "actuator 3"]
+    lines = [f"{plan.scene.name}: {said}", "", _row("", heads, "limit")]
     known = limits(plan.scene.actuators)
     for name, unit in UNITS.items():
         peaks, limit = [getattr(demand, name) for demand in plan.demands], known.get(name)
         end = "" if limit is None else f"{limit:g}"
-        yield _row(f"peak {name} [{unit}]", [f"{peak.value:.6g}" for peak in peaks], end)
-        yield _row("  at t [s]", [f"{peak.time:.6g}" for peak in peaks])
+        lines.append(_row(f"peak {name} [{unit}]", [f"{peak.value:.6g}" for peak in peaks], end))
+        lines.append(_row("  at t [s]", [f"{peak.time:.6g}" for peak in peaks]))
         if limit is not None:
-            yield _row("  margin", [f"{1.0 - abs(peak.value) / limit:.1%}" for peak in peaks])
+            margins = [f"{1.0 - abs(peak.value) / limit:.1%}" for peak in peaks]
+            lines.append(_row("  margin", margins))
         if name == "torque":
-            yield _row("RMS torque [N m]", [f"{demand.torque_rms:.6g}" for demand in plan.demands])
+            roots = [f"{demand.torque_rms:.6g}" for demand in plan.demands]
+            lines.append(_row("RMS torque [N m]", roots))
+    lines += ["", _row("distance to an end", ["least", "at t [s]"])]
+    for distance in plan.distances:
+        unit = f" [{distance.unit}]" if distance.unit != "1" else ""
+        name = f"{distance.key} {distance.side} {distance.end:.6g}{unit}"
+        row = _row(name, [f"{distance.least:.6g}", f"{distance.reached.time:.6g}"])
+        lines.append(row + ("" if distance.refused else "   ignored"))
+    return "\n".join([*lines, "", *_verdict(plan, fastest)]) + "\n"
 
 
 def _row(name: str, cells: Sequence[str], end: str = "") -> str:
     return f"{name:<28}{''.join(f'{cell:>14}' for cell in cells)}{end:>14}".rstrip()
-
-
-def _distance(distance: LimitDistance) -> str:
-    unit = f" [{distance.unit}]" if distance.unit != "1" else ""
-    name = f"{distance.key} {distance.side} {distance.end:.6g}{unit}"
-    note = "" if distance.refused else "   ignored"
-    return _row(name, [f"{distance.least:.6g}", f"{distance.reached.time:.6g}"]) + note
 
 
 def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
@@ -507,11 +458,8 @@ def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
     """
     inverse, motion = InverseDynamics(plan.scene), plan.motion
     count = math.ceil(motion.duration / period - 1e-9)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["time", "tau_1", "tau_2", "tau_3"])
-        for k in range(count + 1):
-            torque = inverse.reference_torque(
-                motion.at((k + 0.5) * period if k < count else math.inf)
-            )
-            writer.writerow([repr(k * period), *map(repr, torque)])
+    lines = ["time,tau_1,tau_2,tau_3"]
+    for k in range(count + 1):
+        at = motion.at((k + 0.5) * period if k < count else math.inf)
+        lines.append(",".join(map(repr, (k * period, *inverse.reference_torque(at)))))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

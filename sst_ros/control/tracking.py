@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,169 +19,133 @@ ROWS = 10
 _KEPT = 4096
 """Rows of the history of a record that is added in parts: above it every other row goes."""
 
-
-@dataclass(frozen=True)
-class TrackingRecord:
-    """Reference, error and torques, by sample.
-
-    Attributes:
-        time: since the start of the motion or of the run [s], rising, shape (n,).
-        gamma, gamma_dot: desired [rad], [rad/s], shape (n, 3).
-        error, error_rate: desired - measured [rad], [rad/s], shape (n, 3).
-        feedforward, feedback: parts of the controller's command [N m], shape (n, 3).
-        torque: commanded or applied [N m], shape (n, 3).
-
-    """
-
-    time: Array
-    gamma: Array
-    gamma_dot: Array
-    error: Array
-    error_rate: Array
-    feedforward: Array
-    feedback: Array
-    torque: Array
-
-    @classmethod
-    def of_rows(cls, rows: ArrayLike) -> TrackingRecord:
-        """Return a record of rows of its 22 numbers, shape (n, 22) or flat, in the order above."""
-        time, *columns = np.split(np.reshape(rows, (-1, 22)), range(1, 22, 3), axis=1)
-        return cls(time[:, 0], *columns)
+_PARTS = ("gamma", "gamma_dot", "error", "error_rate", "feedforward", "feedback", "torque")
+TRACK = np.dtype([("time", float), *((name, float, 3) for name in _PARTS)])
+"""A sample of a tracking record, 22 numbers: the time since the start of the motion or of the run
+[s], gamma and gamma_dot as desired [rad], [rad/s], desired - measured of both, the two parts of the
+controller's command [N m], and the torque that was commanded or applied [N m]."""
 
 
-@dataclass(frozen=True)
+Track: TypeAlias = "np.recarray[Any, Any]"
+
+
+def track_of(rows: ArrayLike) -> Track:
+    """Return a tracking record, shape (n,) of TRACK, of numbers in its order, (n, 22) or flat."""
+    return np.array(rows, dtype=float).reshape(-1).view(TRACK).view(np.recarray)
+
+
 class TrackingMetrics:
-    """Metrics of a record. Those of joints have shape (3,).
+    """Metrics of a tracking record, which may come part by part. Those of joints have shape (3,).
+
+    Args:
+        track: the record of one sample or more, or its first part; see `track_of`.
+        limited: samples in which a torque was limited; None where that is not known.
 
     Attributes:
         samples: number of samples.
-        seconds: from the first to the last [s].
-        rms, largest, last: error [rad]: root of the mean square, largest, at the end.
-        settling: time after the end of the motion after which the error stays in the band [s];
-            None where it does not settle, or the record ends with the motion.
-        band: settling band [rad], BAND times the largest range of a joint.
-        torque_rms, torque_largest: effort [N m].
-        feedforward, feedback: shares of the torque, mean of (part x torque) over mean of torque^2;
-            what a limit has cut off makes their sum differ from 1. nan where there was no torque.
-        limited: samples in which a torque was limited; None where that is not known.
-        history: rows of time [s], rms and largest error of all joints up to then [rad], (m, 3).
+        largest, last: largest error, and that at the end [rad].
+        torque_largest: effort [N m].
+        limited: as given.
 
     """
 
-    samples: int
-    seconds: float
-    rms: Array
-    largest: Array
-    last: Array
-    settling: float | None
-    band: float
-    torque_rms: Array
-    torque_largest: Array
-    feedforward: Array
-    feedback: Array
-    limited: int | None
-    history: Array
-
-
-class TrackingSums:
-    """Metrics of a record that comes part by part, of which a bounded number of rows is kept."""
-
-    def __init__(self) -> None:
-        self.samples = 0
+    def __init__(self, track: Track | None = None, limited: int | None = None) -> None:
+        self.samples, self.limited = 0, limited
+        self.largest, self.torque_largest, self.last = np.zeros((3, 3))
         self._sums = np.zeros((4, 3))  # of error^2, torque^2, feedforward x torque, feedback x it
-        self._largest = np.zeros((2, 3))  # error, torque
         self._lowest, self._highest = np.full(3, np.inf), np.full(3, -np.inf)
-        self._first = self._last = 0.0
-        self._last_error = np.zeros(3)
-        self._end: float | None = None
+        self._begin = self._end = 0.0
+        self._rested: float | None = None
         self._settled: float | None = None
         self._history, self._newest, self._stride = np.empty((0, 4)), np.empty(4), 1
+        if track is not None:
+            self.add(track)
 
-    @property
-    def rms(self) -> float:
-        """Root of the mean square of all errors [rad]."""
-        return float(np.sqrt(self._sums[0].sum() / (3 * max(self.samples, 1))))
-
-    @property
-    def largest(self) -> float:
-        """Largest error [rad]."""
-        return float(self._largest[0].max())
-
-    def add(self, track: TrackingRecord) -> None:
+    def add(self, track: Track) -> None:
         """Add the next part of the record, of one sample or more."""
-        error, torque = np.abs(track.error), track.torque
+        error, torque, time = np.abs(track.error), track.torque, track.time
         count = self.samples + np.arange(1, len(error) + 1)
         square = self._sums[0].mean() + np.cumsum(np.mean(error**2, axis=1))
-        largest_error = error.max(axis=1)
-        so_far = np.maximum(np.maximum.accumulate(largest_error), self.largest)
-        rows = np.stack([count - 1, track.time, np.sqrt(square / count), so_far], axis=1)
+        largest = error.max(axis=1)
+        so_far = np.maximum(np.maximum.accumulate(largest), self.largest.max())
+        rows = np.stack([count - 1, time, np.sqrt(square / count), so_far], axis=1)
         parts = error**2, torque**2, track.feedforward * torque, track.feedback * torque
         self._sums += [np.sum(part, axis=0) for part in parts]
-        largest = error.max(axis=0), np.abs(torque).max(axis=0)
-        self._largest = np.maximum(self._largest, largest)
+        self.largest = np.maximum(self.largest, error.max(axis=0))
+        self.torque_largest = np.maximum(self.torque_largest, np.abs(torque).max(axis=0))
         self._lowest = np.minimum(self._lowest, track.gamma.min(axis=0))
         self._highest = np.maximum(self._highest, track.gamma.max(axis=0))
-        self._settle(track, largest_error <= self._band())
-        self._first = self._first if self.samples else float(track.time[0])
-        self._last, self._last_error = float(track.time[-1]), error[-1]
+        self._settle(track, largest > self.band)
+        self._begin = self._begin if self.samples else float(time[0])
+        self._end, self.last = float(time[-1]), error[-1]
         while len(self._history) > _KEPT:
             self._history, self._stride = self._history[::2], 2 * self._stride
         self._history = np.vstack([self._history, rows[rows[:, 0] % self._stride == 0.0]])
         self._newest, self.samples = rows[-1], int(count[-1])
 
-    def metrics(self, limited: int | None = None) -> TrackingMetrics:
-        """Return the metrics of what was added; `limited` is passed on."""
-        squares, powers, *shares = self._sums / self.samples
-        with np.errstate(invalid="ignore", divide="ignore"):
-            feedforward, feedback = (share / powers for share in shares)
-        settling = None
-        if self._end is not None and self._settled is not None:
-            settling = self._settled - self._end
-        requested = np.linspace(0, self.samples - 1, ROWS + 1).round()
-        history = np.vstack([self._history, self._newest])
-        shown = np.unique(np.searchsorted(history[:, 0], requested))
-        return TrackingMetrics(
-            samples=self.samples,
-            seconds=self._last - self._first,
-            rms=np.sqrt(squares),
-            largest=self._largest[0],
-            last=self._last_error,
-            settling=settling,
-            band=self._band(),
-            torque_rms=np.sqrt(powers),
-            torque_largest=self._largest[1],
-            feedforward=feedforward,
-            feedback=feedback,
-            limited=limited,
-            history=history[shown, 1:],
-        )
-
-    def _band(self) -> float:
-        return BAND * float(np.max(self._highest - self._lowest))
-
-    def _settle(self, track: TrackingRecord, inside: NDArray[np.bool_]) -> None:
-        """Find the end of the motion, and since when the error has been inside the band."""
+    def _settle(self, track: Track, outside: NDArray[np.bool_]) -> None:
+        """Find when the motion has ended, and since when the error has been inside the band."""
         moving = np.flatnonzero(np.any(track.gamma_dot != 0.0, axis=1))
         rest = int(moving[-1]) + 1 if len(moving) else 0
         if rest:
-            self._end = self._settled = None
-        if rest == len(inside):
+            self._rested = self._settled = None
+        if rest == len(track):
             return
-        if self._end is None:
-            self._end = float(track.time[rest])
-        outside = np.flatnonzero(~inside[rest:])
-        first = rest + (int(outside[-1]) + 1 if len(outside) else 0)
-        if len(outside):
+        if self._rested is None:
+            self._rested = float(track.time[rest])
+        wrong = np.flatnonzero(outside[rest:])
+        first = rest + (int(wrong[-1]) + 1 if len(wrong) else 0)
+        if len(wrong):
             self._settled = None
-        if self._settled is None and first < len(inside):
+        if self._settled is None and first < len(track):
             self._settled = float(track.time[first])
 
+    @property
+    def seconds(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return self._end - self._begin
 
-def evaluate_tracking(track: TrackingRecord, limited: int | None = None) -> TrackingMetrics:
-    """Return the metrics of a record of one sample or more; `limited` is passed on."""
-    sums = TrackingSums()
-    sums.add(track)
-    return sums.metrics(limited)
+    @property
+    def rms(self) -> Array:
+        """Root of the mean square of the error [rad]; 0 without a sample."""
+        return np.asarray(np.sqrt(self._sums[0] / max(self.samples, 1)))
+
+    @property
+    def torque_rms(self) -> Array:
+        """Root of the mean square of the torque [N m]; 0 without a sample."""
+        return np.asarray(np.sqrt(self._sums[1] / max(self.samples, 1)))
+
+    @property
+    def shares(self) -> Array:
+        """Shares of feedforward and feedback in the torque, shape (2, 3); nan without a torque.
+
+        The mean of (part x torque) over the mean of torque^2; what a limit has cut off makes their
+        sum differ from 1.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self._sums[2:] / self._sums[1])
+
+    @property
+    def band(self) -> float:
+        """Settling band [rad], BAND times the largest range of a joint."""
+        return BAND * float(np.max(self._highest - self._lowest))
+
+    @property
+    def settling(self) -> float | None:
+        """Time after the end of the motion after which the error stays in the band [s].
+
+        None where it does not settle, or the record ends with the motion.
+        """
+        if self._rested is None or self._settled is None:
+            return None
+        return self._settled - self._rested
+
+    @property
+    def history(self) -> Array:
+        """Rows of time [s], RMS and largest error of all joints up to then [rad], (m, 3)."""
+        rows = np.vstack([self._history, self._newest])
+        shown = np.linspace(0, self.samples - 1, ROWS + 1).round()
+        return np.asarray(rows[np.unique(np.searchsorted(rows[:, 0], shown)), 1:])
 
 
 def tracking_table(found: TrackingMetrics) -> str:
@@ -199,7 +163,7 @@ def _lines(found: TrackingMetrics) -> Iterator[str]:
         ("torque, largest [N m]", found.torque_largest),
     ):
         yield f"{label:24}" + "".join(f"{value:12.3e}" for value in row)
-    for label, row in (("feedforward", found.feedforward), ("feedback", found.feedback)):
+    for label, row in zip(("feedforward", "feedback"), found.shares, strict=True):
         cells = ("-" if np.isnan(share) else f"{100.0 * share:.2f}" for share in row)
         yield f"{label + ', share [%]':24}" + "".join(f"{cell:>12}" for cell in cells)
     settled = "-" if found.settling is None else f"{found.settling:.4f}"

@@ -10,12 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.tracking import (
-    TrackingMetrics,
-    TrackingRecord,
-    evaluate_tracking,
-    tracking_table,
-)
+from sst_ros.control.tracking import Track, TrackingMetrics, track_of, tracking_table
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import continuation
@@ -44,7 +39,7 @@ class TrackedRun:
     """
 
     recording: Recording
-    track: TrackingRecord
+    track: Track
     rows: np.ndarray[Any, np.dtype[np.intp]]
 
     @property
@@ -56,7 +51,7 @@ class TrackedRun:
             if status.name.endswith(": control")
         )
         limited = next((int(count) for count in counts if count.isdecimal()), None)
-        return evaluate_tracking(self.track, limited)
+        return TrackingMetrics(self.track, limited)
 
     @cached_property
     def orientation_error(self) -> Array:
@@ -112,7 +107,7 @@ def of(run: Recording) -> TrackedRun | None:
     torque[times >= run.ticks.end_ns[-1]] = 0.0
     seconds = times[:, None] / NANOSECONDS
     columns = seconds, reference[:, :6], error[:, :6], feedforward, feedback, torque
-    return TrackedRun(run, TrackingRecord.of_rows(np.hstack(columns)), rows)
+    return TrackedRun(run, track_of(np.hstack(columns)), rows)
 
 
 def write_tracking_report(bag: Path, out: Path) -> str:

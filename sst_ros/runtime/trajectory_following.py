@@ -16,13 +16,15 @@ from collections.abc import Iterable, Iterator
 from enum import Enum, IntEnum
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import Controller, Measurement
 from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference import Reference, ReferenceMotion, slow_down
 from sst_ros.control.reference_motions import reference_motion, through_points
-from sst_ros.control.tracking import TrackingMetrics, TrackingRecord, TrackingSums
+from sst_ros.control.tracking import TrackingMetrics, track_of
 from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
@@ -265,7 +267,7 @@ class TrajectoryFollower:
     def restart(self) -> None:
         """Forget the run, as after a reset of the simulator, and all trajectories."""
         self.stage, self._last_ns = Stage.WAITING, 0
-        self._rows, self._sums = array("d"), TrackingSums()
+        self._rows, self._metrics = array("d"), TrackingMetrics()
         self._last: Command | None = None
         if self._planned is not None:
             self._prepare(self._planned)
@@ -358,7 +360,8 @@ class TrajectoryFollower:
     def tracking(self) -> TrackingMetrics | None:
         """Return the tracking errors of the motion; None before two samples of it."""
         self._add_rows()
-        return self._sums.metrics(self.limited) if self._sums.samples > 1 else None
+        self._metrics.limited = self.limited
+        return self._metrics if self._metrics.samples > 1 else None
 
     @property
     def time(self) -> float:
@@ -369,7 +372,8 @@ class TrajectoryFollower:
     def errors(self) -> tuple[float, float]:
         """Root of the mean square and largest of all errors of the motion up to now [rad]."""
         self._add_rows()
-        return self._sums.rms, self._sums.largest
+        rms, largest = self._metrics.rms, self._metrics.largest
+        return float(np.sqrt(np.mean(rms**2))), float(largest.max())
 
     def _prepare(self, motion: ReferenceMotion) -> None:
         period_s = self._period_ns / NANOSECONDS
@@ -380,7 +384,7 @@ class TrajectoryFollower:
     def _begin(self, motion: ReferenceMotion, start_ns: int | None) -> None:
         """Follow a motion from an instant on; None for the next sample."""
         self._motion, self._start_ns = motion, start_ns
-        self._rows, self._sums = array("d"), TrackingSums()
+        self._rows, self._metrics = array("d"), TrackingMetrics()
         self.limited = 0
 
     def _log(self, time: float, command: Command) -> None:
@@ -395,7 +399,7 @@ class TrajectoryFollower:
     def _add_rows(self) -> None:
         """Add the samples since the last call to the metrics."""
         if self._rows:
-            self._sums.add(TrackingRecord.of_rows(self._rows))
+            self._metrics.add(track_of(self._rows))
             self._rows = array("d")
 
     def _reference_at_rest(self, seen: Measurement | None) -> Reference:

@@ -4,13 +4,7 @@
 import numpy as np
 import pytest
 
-from sst_ros.control.tracking import (
-    BAND,
-    TrackingRecord,
-    TrackingSums,
-    evaluate_tracking,
-    tracking_table,
-)
+from sst_ros.control.tracking import BAND, TRACK, TrackingMetrics, track_of, tracking_table
 
 TIME = np.linspace(0.0, 2.0, 2001)
 
@@ -22,13 +16,12 @@ def track(error, gamma=None, **given):
     columns |= {name: np.zeros_like(TIME) for name in ("error_rate", "feedforward", "feedback")}
     columns |= {"torque": given.get("feedforward", 0.0) + given.get("feedback", 0.0 * TIME)}
     columns |= given
-    return TrackingRecord(
-        TIME, **{name: np.outer(column, [1, 1, 1]) for name, column in columns.items()}
-    )
+    parts = (np.outer(columns[name], [1, 1, 1]) for name in TRACK.names[1:])
+    return track_of(np.column_stack([TIME, *parts]))
 
 
 def test_errors_of_a_sine():
-    found = evaluate_tracking(track(0.3 * np.sin(2.0 * np.pi * TIME)))
+    found = TrackingMetrics(track(0.3 * np.sin(2.0 * np.pi * TIME)))
     assert found.rms == pytest.approx(0.3 / np.sqrt(2.0), rel=1e-3)
     assert found.largest == pytest.approx(0.3, rel=1e-5)
     assert found.last == pytest.approx(0.0, abs=1e-15)
@@ -36,7 +29,7 @@ def test_errors_of_a_sine():
 
 
 def test_error_against_run_time_only_grows_in_its_largest():
-    found = evaluate_tracking(track(TIME))
+    found = TrackingMetrics(track(TIME))
     time, rms, largest = found.history.T
     assert time[0] == 0.0 and time[-1] == 2.0
     assert largest == pytest.approx(time)
@@ -45,16 +38,16 @@ def test_error_against_run_time_only_grows_in_its_largest():
 
 def test_settling_time_of_a_decay_after_the_motion():
     error = 0.5 * np.exp(-np.maximum(TIME - 1.0, 0.0) / 0.1)
-    found = evaluate_tracking(track(error))
+    found = TrackingMetrics(track(error))
     assert found.band == pytest.approx(BAND)  # the way is 1 rad
     assert found.settling == pytest.approx(0.1 * np.log(0.5 / BAND), abs=2e-3)
 
 
 def test_settling_time_is_unknown_where_it_is_not_seen():
-    assert evaluate_tracking(track(np.full_like(TIME, 0.5))).settling is None  # never settles
+    assert TrackingMetrics(track(np.full_like(TIME, 0.5))).settling is None  # never settles
     endless = track(0.0 * TIME, gamma=TIME)  # the motion never ends
-    assert evaluate_tracking(endless).settling is None
-    assert evaluate_tracking(track(0.0 * TIME)).settling == 0.0
+    assert TrackingMetrics(endless).settling is None
+    assert TrackingMetrics(track(0.0 * TIME)).settling == 0.0
 
 
 def test_shares_are_those_of_the_torque_and_sum_to_one():
@@ -63,15 +56,15 @@ def test_shares_are_those_of_the_torque_and_sum_to_one():
     whole = track(
         0.0 * TIME, feedforward=np.append(feedforward, 0.0), feedback=np.append(feedback, 0.0)
     )
-    found = evaluate_tracking(whole)
-    assert found.feedforward == pytest.approx(0.9) and found.feedback == pytest.approx(0.1)
+    found = TrackingMetrics(whole)
+    assert found.shares[0] == pytest.approx(0.9) and found.shares[1] == pytest.approx(0.1)
     assert found.torque_rms == pytest.approx(np.sqrt(5.0), rel=1e-3)
-    nothing = evaluate_tracking(track(0.0 * TIME))
-    assert np.isnan(nothing.feedforward).all()
+    nothing = TrackingMetrics(track(0.0 * TIME))
+    assert np.isnan(nothing.shares).all()
 
 
 def test_the_table_says_what_it_knows():
-    lines = tracking_table(evaluate_tracking(track(0.0 * TIME, gamma=TIME), limited=7))
+    lines = tracking_table(TrackingMetrics(track(0.0 * TIME, gamma=TIME), limited=7))
     assert "nan" not in lines
     assert "7  (of 2001)" in lines
     assert lines.count("\n") == 10 + 2 + 11
@@ -80,10 +73,12 @@ def test_the_table_says_what_it_knows():
 @pytest.mark.parametrize("size", [1, 7, 400, 1500])
 def test_a_record_in_parts_has_the_metrics_of_the_whole(size):
     error = 0.5 * np.exp(-np.maximum(TIME - 1.0, 0.0) / 0.1)
-    whole, sums = track(error, feedforward=np.sin(TIME), feedback=np.cos(TIME)), TrackingSums()
+    whole, found = (
+        track(error, feedforward=np.sin(TIME), feedback=np.cos(TIME)),
+        TrackingMetrics(None, 3),
+    )
     for first in range(0, len(TIME), size):
-        part = {name: column[first : first + size] for name, column in vars(whole).items()}
-        sums.add(TrackingRecord(**part))
-    found, expected = vars(sums.metrics(3)), vars(evaluate_tracking(whole, 3))
-    for name, value in expected.items():
-        assert found[name] == pytest.approx(value, rel=1e-12), name
+        found.add(whole[first : first + size])
+    expected = TrackingMetrics(whole, 3)
+    for name in {name for name in dir(expected) if name[0] != "_"} - {"add"}:
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-12), name
