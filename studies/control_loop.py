@@ -30,7 +30,7 @@ from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
 from sst_ros.runtime.tick_loop import TickLoop
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import build, values_of
+from sst_ros.scene.yaml_document import build, plain
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS, State, Vector3
 from sst_ros.sweeps.sweep_study import SampledControl
@@ -98,7 +98,7 @@ def make_heavier(scene: Scene, factor: float, kinds: Sequence[str] = BODIES) -> 
 
     With all kinds of bodies every torque of inertia and of weight is `factor` times as large.
     """
-    document = values_of(scene)
+    document = plain(scene)
     for found in filter(None, map(document.get, kinds)):
         for body in found if isinstance(found, list) else [found]:
             for name in {"mass", "rotor_inertia"} & body.keys():

@@ -205,7 +205,7 @@ def test_another_start():
         ({"tolerance": 0.0}, "tolerance"),
         ({"control_period": 0.001}, "control_period(.|\n)*is for a function"),
         ({"method": "gauss", "torque": jerk}, "constant torques and sines"),
-        ({"initial": {"gama": 1}}, "must have the key gamma"),
+        ({"initial": {"gama": 1}}, r"gama = 1: unknown key(.|\n)*gamma = None: is missing"),
         ({"torque": lambda t, state: None, "duration": 0.1}, r"torque\(0\) = None: must be three"),
         ({"duration": None}, r"duration(.|\n)*must be given"),
         (

@@ -12,14 +12,14 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import add, mul, sub, truediv
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.scene.schema import Place, Section, make_unchecked
+from sst_ros.scene.schema import Place, leaves, rebuild
 
 Value = Any  # an Expression, a Number or a float
 
@@ -332,39 +332,8 @@ def number_constants(value: Any, origin: Place = ()) -> Any:
 
     Its sections become objects that are not checked.
     """
-
-    def number(place: Place, x: float) -> float:
-        return x if x in (0.0, 1.0, -1.0) else Number(x, (*origin, *place))
-
-    return rebuild(value, number)
-
-
-def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """Yield the place of each number or column of a tree, and what is there."""
-    if isinstance(tree, (float, np.ndarray)):
-        yield place, tree
-    for name, entry in _entries(tree):
-        yield from leaves(entry, (*place, name))
-
-
-def rebuild(tree: Any, change: Callable[[Place, Any], Any], place: Place = ()) -> Any:
-    """Return a tree with other numbers or columns; its sections are not checked.
-
-    `change` gives the new number for a place and what is there.
-    """
-    if isinstance(tree, (float, np.ndarray)):
-        return change(place, tree)
-    parts = {name: rebuild(entry, change, (*place, name)) for name, entry in _entries(tree)}
-    if isinstance(tree, tuple):
-        entries = parts.values()
-        return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
-    return make_unchecked(type(tree), parts) if parts else tree
-
-
-def _entries(tree: Any) -> list[tuple[Any, Any]]:
-    if isinstance(tree, tuple):
-        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
-    return list(vars(tree).items()) if isinstance(tree, Section) else []
+    numbers = {place: x for place, x in leaves(value).items() if abs(x) not in (0.0, 1.0)}
+    return rebuild(value, {place: Number(x, (*origin, *place)) for place, x in numbers.items()})
 
 
 def with_jacobian(

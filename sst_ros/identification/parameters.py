@@ -42,8 +42,8 @@ from sst_ros.scene.yaml_document import (
     build,
     build_unchecked,
     find_fields,
+    plain,
     replace_values,
-    values_of,
 )
 
 JOINT_KINDS = ("gamma", "mu", "beta")
@@ -111,7 +111,7 @@ def with_symbols(scene: Scene, symbols: Mapping[str, Any], *, moments: bool = Fa
         moments: bodies have mass 1, so that "centre" is mass times centre.
 
     """
-    values = values_of(scene)
+    values = plain(scene)
     if moments:
         for body in (values["star"], *values["actuated_links"], *values["intermediate_links"]):
             body["centre"] = [body["mass"] * part for part in body["centre"]]
@@ -142,7 +142,7 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
             changed[f"{body}.centre"] = [h / mass for h in centre] if mass else [0.0] * 3
         elif not name.startswith("offset"):
             changed[name] = number
-    document = replace_values(values_of(scene), changed)
+    document = replace_values(plain(scene), changed)
     for terms in document.get("friction", {}).values():
         for key in Friction.EFFECTS:
             if terms.get(key, 0.0) < NEGLIGIBLE:

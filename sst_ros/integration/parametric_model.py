@@ -20,9 +20,7 @@ from sst_ros.dynamics.expression import (
     Expression,
     Program,
     compile_for_arrays,
-    leaves,
     mark_present,
-    rebuild,
     trace,
 )
 from sst_ros.dynamics.model import Limit, limits_of
@@ -31,7 +29,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scenarios
-from sst_ros.scene.schema import Place
+from sst_ros.scene.schema import Place, leaves, rebuild
 from sst_ros.state import Joints
 
 OUTPUTS = (*Joints._fields, "energy")
@@ -64,7 +62,7 @@ class ParametricModel:
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
         self.scene, self._profile = scenarios.document, profile
         self._tree = self._constants_of(scenarios, *Geometry.of_scenarios(scenarios))
-        numbers = dict(leaves(self._tree))
+        numbers = leaves(self._tree)
         varied = [place for place, value in numbers.items() if np.max(value) != np.min(value)]
         self._varied = {place: f"p{i}" for i, place in enumerate(varied)}
         self._fixed = {place: float(np.ravel(value)[0]) for place, value in numbers.items()}
@@ -83,7 +81,7 @@ class ParametricModel:
         """
         geometries, which = Geometry.of_scenarios(scenarios)
         tree = self._constants_of(scenarios, geometries, which)
-        numbers = dict(leaves(tree))
+        numbers = leaves(tree)
         inputs = np.empty((len(self._varied), len(which)))
         for row, place in zip(inputs, self._varied, strict=True):
             row[:] = numbers[place]
@@ -169,8 +167,7 @@ class ParametricModel:
     def constants(self, inputs: Sequence[Any]) -> Constants:
         """Return the constants, with expressions or columns where they differ."""
         given = dict(zip(self._varied, map(mark_present, inputs), strict=True))
-        numbers: dict[Any, Any] = self._fixed | given
-        tree: Constants = rebuild(self._tree, lambda place, _: numbers[place])
+        tree: Constants = rebuild(self._tree, self._fixed | given)
         return tree
 
     def _constants_of(

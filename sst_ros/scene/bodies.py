@@ -19,8 +19,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import InputError, Problem
-from sst_ros.scene.schema import Rules, Section, choice, number, section
+from sst_ros.errors import Problem, refuse_unless
+from sst_ros.scene.schema import (
+    Rules,
+    Section,
+    choice,
+    coefficient,
+    number,
+    positive,
+    section,
+    vector,
+)
 from sst_ros.state import Vector3
 
 RELATIVE_ROUNDING = 1e-9
@@ -55,24 +64,19 @@ class Inertia(Section):
 
     def rules(self) -> Rules:
         """Refuse what no rigid body has."""
-
-        def refusal(allowed: str) -> Problem:
-            return Problem("", np.linalg.eigvalsh(self.matrix).tolist(), allowed)
-
         tensor = entries_of(self)
         largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
         definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
-        yield (
-            ~definite,
-            lambda: refusal(
+        fits = _is_positive([-part for part in tensor], largest)
+        for broken, allowed in (
+            (
+                ~definite,
                 "principal moments of inertia must be > 0 (positive definite), "
-                f"at least {SMALLEST_MOMENT:g} kg m^2"
+                f"at least {SMALLEST_MOMENT:g} kg m^2",
             ),
-        )
-        yield (
-            definite & ~_is_positive([-part for part in tensor], largest),
-            lambda: refusal("no principal moment may exceed the sum of the other two"),
-        )
+            (definite & ~fits, "no principal moment may exceed the sum of the other two"),
+        ):
+            yield broken, "", lambda: np.linalg.eigvalsh(self.matrix).tolist(), allowed
 
 
 @dataclass(frozen=True)
@@ -94,14 +98,10 @@ class Base(Section):
         most=1e6,
         default=None,
     )
-    arcs_deg: Vector3 | None = number(
-        "lengths of the arcs 1-2, 2-3, 3-1, in place of v",
-        "deg",
-        shape=(3,),
-        least=1e-6,
-        default=None,
+    arcs_deg: Vector3 | None = vector(
+        "lengths of the arcs 1-2, 2-3, 3-1, in place of v", "deg", least=1e-6, default=None
     )
-    radius: float = number("radius of the base sphere", "m", above=0.0)
+    radius: float = positive("radius of the base sphere", "m")
 
     def __post_init__(self) -> None:
         """Check, and replace arcs by directions."""
@@ -139,7 +139,7 @@ class Base(Section):
                 "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points",
             ),
         ):
-            yield broken, partial(Problem, "v", self.v, allowed)
+            yield broken, "v", self.v, allowed
 
 
 def directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3, Vector3]:
@@ -159,11 +159,10 @@ class Link(Section):
     """One rigid link of a leg; without `inertia` it has none, without `mass` no weight."""
 
     inertia: Inertia | None = section("inertia of the link in its own frame", Inertia, default=None)
-    mass: float = number("mass, for gravity", "kg", default=0.0, least=0.0)
-    centre: Vector3 = number(
+    mass: float = coefficient("mass, for gravity", "kg")
+    centre: Vector3 = vector(
         "centre of mass in the frame of the inertia",
         "m",
-        shape=(3,),
         default=(0.0, 0.0, 0.0),
         acts_on=("mass",),
         needs="needs mass > 0 [kg]",
@@ -208,17 +207,17 @@ class Link(Section):
         # Moments about the centre of mass: none exceeds half their sum, but for rounding.
         fits = _is_positive([-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale)
 
-        def contradiction() -> Problem:
+        def allowed() -> str:
             left = _matrix_of(own)
             finite = bool(np.isfinite(left).all())  # the square of a centre may overflow
             moments = np.linalg.eigvalsh(left) if finite else np.diag(left)
-            allowed = (
+            return (
                 f"must fit the inertia about O, which leaves {moments} about this centre "
                 f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
             )
-            return Problem("centre", self.centre, allowed)
 
-        yield np.greater(mass, 0.0) & np.greater(scale, 0.0) & ~fits, contradiction
+        given = np.greater(mass, 0.0) & np.greater(scale, 0.0)
+        yield given & ~fits, "centre", self.centre, allowed
 
 
 @dataclass(frozen=True)
@@ -226,20 +225,15 @@ class Star(Link):
     """The moving spherical star."""
 
     inertia: Inertia = section("inertia of the star in {E}", Inertia)
-    alpha_deg: Vector3 = number(
-        "angles between the planes of arcs 1-2, 2-3, 3-1", "deg", shape=(3,), above=0.0
-    )
-    radius: float = number("radius of the star's sphere, distance O E", "m", above=0.0)
+    alpha_deg: Vector3 = vector("angles between the planes of arcs 1-2, 2-3, 3-1", "deg", above=0.0)
+    radius: float = positive("radius of the star's sphere, distance O E", "m")
 
     def rules(self) -> Rules:
         """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
         total = sum(self.alpha_deg)
-        yield (
-            np.greater(abs(total - 360.0), 360.0 * RELATIVE_ROUNDING),
-            lambda: Problem(
-                "alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total:g}"
-            ),
-        )
+        open_ = np.greater(abs(total - 360.0), 360.0 * RELATIVE_ROUNDING)
+        allowed = partial("must sum to 360 deg; the sum is {:g}".format, total)
+        yield open_, "alpha_deg", self.alpha_deg, allowed
         yield from super().rules()
 
 
@@ -249,8 +243,8 @@ class Payload(Section):
 
     EFFECTS = "mass", "inertia"
 
-    mass: float = number("mass", "kg", above=0.0)
-    centre: Vector3 = number("centre of mass in {E}", "m", shape=(3,))
+    mass: float = positive("mass", "kg")
+    centre: Vector3 = vector("centre of mass in {E}", "m")
     inertia: Inertia | None = section(
         "inertia about the payload's centre of mass, axes of {E}; none for a point",
         Inertia,
@@ -314,20 +308,17 @@ def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) ->
         InputError: mass or radius is not positive, or the directions span no arc.
 
     """
-    problems = [
-        Problem(name, value, f"must be > 0 and finite [{unit}]")
-        for name, value, unit in (("mass", mass, "kg"), ("radius", radius, "m"))
-        if not (value > 0.0 and math.isfinite(value))
-    ]
     first, last = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
-    fits = first.shape == last.shape == (3,) and np.all(np.isfinite([first, last]))
+    fits = first.shape == last.shape == (3,) and bool(np.all(np.isfinite([first, last])))
     normal = np.linalg.norm(np.cross(first, last)) if fits else 0.0
-    lengths = np.linalg.norm(first) * np.linalg.norm(last) if fits else 0.0
-    if not normal > 1e-9 * lengths:
-        allowed = "must be two directions, shape (3,), neither parallel nor opposite"
-        problems.append(Problem("begin, end", (begin, end), allowed))
-    if problems:
-        raise InputError("arc_inertia", problems)
+    spans = fits and bool(normal > 1e-9 * np.linalg.norm(first) * np.linalg.norm(last))
+    directions = "must be two directions, shape (3,), neither parallel nor opposite"
+    refuse_unless(
+        "arc_inertia",
+        ("mass", mass, 0.0 < mass < math.inf, "must be > 0 and finite [kg]"),
+        ("radius", radius, 0.0 < radius < math.inf, "must be > 0 and finite [m]"),
+        ("begin, end", (begin, end), spans, directions),
+    )
     u, v = first / np.linalg.norm(first), last / np.linalg.norm(last)
     half = 0.5 * math.atan2(normal, float(first @ last))
     # Mean of r r^T over the arc: angles from -half to half about its middle.

@@ -16,24 +16,28 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import Problem
 from sst_ros.scene.schema import (
     Rules,
     Section,
     angles,
     choice,
+    coefficient,
     flag,
     number,
+    positive,
     section,
     sections,
     text,
+    vector,
 )
-from sst_ros.state import Vector3
+from sst_ros.state import Quaternion, Vector3
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
 
 NANOSECOND = 1e-9
 """Resolution of time [s]."""
+
+_duration = partial(number, "time that it takes", "s", least=NANOSECOND)
 
 
 @dataclass(frozen=True)
@@ -43,20 +47,20 @@ class Gravity(Section):
     EFFECTS = ("acceleration",)
     IDLE = "acceleration", "must not be zero: leave gravity out"
 
-    acceleration: Vector3 = number("acceleration of free fall in {B}", "m/s^2", shape=(3,))
+    acceleration: Vector3 = vector("acceleration of free fall in {B}", "m/s^2")
 
 
 @dataclass(frozen=True)
 class Moment(Section):
     """An external moment on the star: constant, or received on the topic ~/external_moment."""
 
-    value: Vector3 | None = number("constant moment in {B}", "N m", shape=(3,), default=None)
+    value: Vector3 | None = vector("constant moment in {B}", "N m", default=None)
     topic: bool = flag("take it from the topic ~/external_moment", default=False)
 
     def rules(self) -> Rules:
         """Refuse both and neither."""
-        allowed = "give either value or topic: true"
-        yield self.topic == (self.value is not None), partial(Problem, "", self.value, allowed)
+        both_or_none = self.topic == (self.value is not None)
+        yield both_or_none, "", self.value, "give either value or topic: true"
 
 
 @dataclass(frozen=True)
@@ -69,31 +73,23 @@ class Friction(Section):
     EFFECTS = "viscous", "coulomb", "static"
     IDLE = "viscous", "friction without a coefficient: leave it out"
 
-    viscous: float = number("viscous coefficient", "N m s/rad", default=0.0, least=0.0)
-    coulomb: float = number("Coulomb torque", "N m", default=0.0, least=0.0)
-    smoothing: float = number(
+    viscous: float = coefficient("viscous coefficient", "N m s/rad")
+    coulomb: float = coefficient("Coulomb torque", "N m")
+    smoothing: float = positive(
         "rate over which the Coulomb torque changes sign",
         "rad/s",
         default=1e-2,
-        above=0.0,
         acts_on=("coulomb", "static"),
     )
-    static: float = number("breakaway torque (Stribeck); 0 for none", "N m", default=0.0, least=0.0)
-    stribeck: float = number(
-        "rate at which the breakaway torque has faded",
-        "rad/s",
-        default=0.1,
-        above=0.0,
-        acts_on=("static",),
+    static: float = coefficient("breakaway torque (Stribeck); 0 for none", "N m")
+    stribeck: float = positive(
+        "rate at which the breakaway torque has faded", "rad/s", default=0.1, acts_on=("static",)
     )
 
     def rules(self) -> Rules:
         """Refuse a breakaway torque below the Coulomb torque."""
         below = np.not_equal(self.static, 0.0) & np.less(self.static, self.coulomb)
-        yield (
-            below,
-            lambda: Problem("static", self.static, f"must be >= coulomb = {self.coulomb:g} N m"),
-        )
+        yield below, "static", self.static, lambda: f"must be >= coulomb = {self.coulomb:g} N m"
 
 
 @dataclass(frozen=True)
@@ -115,7 +111,7 @@ class Spring(Section):
     EFFECTS = ("stiffness",)
 
     joint: str = choice("joint", JOINTS)
-    stiffness: float = number("stiffness", "N m/rad", above=0.0)
+    stiffness: float = positive("stiffness", "N m/rad")
     rest: float = number("angle without torque", "rad")
 
 
@@ -133,36 +129,29 @@ class Actuators(Section):
     )  # fmt: skip
     IDLE = "", "changes nothing: leave it out"
 
-    rotor_inertia: float = number("inertia of the motor's rotor", "kg m^2", default=0.0, least=0.0)
-    gear_ratio: float = number(
+    rotor_inertia: float = coefficient("inertia of the motor's rotor", "kg m^2")
+    gear_ratio: float = positive(
         "motor turns per joint turn",
         "1",
         default=1.0,
-        above=0.0,
         acts_on=("rotor_inertia",),
         needs="acts on rotor_inertia only (torques are those at the joint): give it",
     )
-    torque_limit: float | None = number("largest torque", "N m", default=None, above=0.0)
-    time_constant: float | None = number(
-        "time constant of a first-order lag of the torque", "s", default=None, above=0.0
+    torque_limit: float | None = positive("largest torque", "N m", default=None)
+    time_constant: float | None = positive(
+        "time constant of a first-order lag of the torque", "s", default=None
     )
-    idle_damping: float = number(
+    idle_damping: float = coefficient(
         "torque -idle_damping gamma_dot in place of a command that is too old; 0 for no torque",
         "N m s/rad",
-        default=0.0,
-        least=0.0,
     )
-    velocity_limit: float | None = number(
-        "largest rate of a desired motion; a simulation does not hold it",
-        "rad/s",
-        default=None,
-        above=0.0,
+    velocity_limit: float | None = positive(
+        "largest rate of a desired motion; a simulation does not hold it", "rad/s", default=None
     )
-    acceleration_limit: float | None = number(
+    acceleration_limit: float | None = positive(
         "largest acceleration of a desired motion; a simulation does not hold it",
         "rad/s^2",
         default=None,
-        above=0.0,
     )
 
 
@@ -175,18 +164,11 @@ class Stroke(Section):
     """
 
     at_end: str = choice(
-        "what happens at an end of the stroke",
-        ("stop", "ignore", "elastic"),
-        default="stop",
+        "what happens at an end of the stroke", ("stop", "ignore", "elastic"), default="stop"
     )
-    stiffness: float | None = number(
-        "stiffness of elastic stops", "N m/rad", default=None, above=0.0
-    )
-    damping: float = number(
-        "damping of elastic stops: torque = stiffness depth (1 + damping rate inwards)",
-        "s/rad",
-        default=0.0,
-        least=0.0,
+    stiffness: float | None = positive("stiffness of elastic stops", "N m/rad", default=None)
+    damping: float = coefficient(
+        "damping of elastic stops: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
     )
     restitution: float | None = number(
         "rate after an impact / rate before, at impact_rate; in place of damping",
@@ -195,8 +177,8 @@ class Stroke(Section):
         least=0.01,
         most=1.0,
     )
-    impact_rate: float | None = number(
-        "rate of the impacts that have this restitution", "rad/s", default=None, above=0.0
+    impact_rate: float | None = positive(
+        "rate of the impacts that have this restitution", "rad/s", default=None
     )
 
     def rules(self) -> Rules:
@@ -212,19 +194,15 @@ class Stroke(Section):
             ("damping", damped & (not elastic), only),
             ("damping", damped & bounces, "give either damping or restitution"),
         ):
-            yield broken, partial(Problem, name, getattr(self, name), allowed)
+            yield broken, name, getattr(self, name), allowed
 
 
 @dataclass(frozen=True)
 class Workspace(Section):
     """Where E may be: on the base triangle, 0 < beta_k <= beta_max."""
 
-    beta_max_deg: float = number(
-        "largest angle between E and the intermediate link",
-        "deg",
-        default=90.0,
-        above=0.0,
-        most=180.0,
+    beta_max_deg: float = positive(
+        "largest angle between E and the intermediate link", "deg", default=90.0, most=180.0
     )
     at_edge: str = choice(
         "what happens at the edge of the workspace", ("stop", "ignore"), default="stop"
@@ -236,10 +214,8 @@ class Initial(Section):
     """The state at t = 0."""
 
     gamma: Vector3 = angles("actuator angles at t = 0")
-    gamma_dot: Vector3 = number(
-        "actuator rates at t = 0", "rad/s", shape=(3,), default=(0.0, 0.0, 0.0)
-    )
-    orientation: tuple[float, float, float, float] | None = number(
+    gamma_dot: Vector3 = vector("actuator rates at t = 0", "rad/s", default=(0.0, 0.0, 0.0))
+    orientation: Quaternion | None = number(
         "quaternion (x, y, z, w) of {E} in {B} that selects the assembly mode where gamma has "
         "several admissible ones; within 0.1 rad",
         "1",
@@ -252,9 +228,9 @@ class Initial(Section):
 class SineTorque(Section):
     """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
 
-    amplitude: Vector3 = number("amplitudes", "N m", shape=(3,))
-    frequency: Vector3 = number("angular frequencies", "rad/s", shape=(3,), least=0.0)
-    phase: Vector3 = number("phases", "rad", shape=(3,), default=(0.0, 0.0, 0.0))
+    amplitude: Vector3 = vector("amplitudes", "N m")
+    frequency: Vector3 = vector("angular frequencies", "rad/s", least=0.0)
+    phase: Vector3 = vector("phases", "rad", default=(0.0, 0.0, 0.0))
 
     def at(self, time: float) -> Vector3:
         """Torques [N m] at a time [s]."""
@@ -276,25 +252,22 @@ class ToAngles(Section):
     """The actuators go straight from their initial angles to others, with minimum jerk."""
 
     gamma: Vector3 = angles("actuator angles at the end")
-    duration: float = number("time that it takes", "s", least=NANOSECOND)
+    duration: float = _duration()
 
 
 @dataclass(frozen=True)
 class ToOrientation(Section):
     """The star turns about one axis from its initial orientation to another, with minimum jerk."""
 
-    orientation: tuple[float, float, float, float] = number(
+    orientation: Quaternion = number(
         "quaternion (x, y, z, w) of {E} in {B} at the end, of any length", "1", shape=(4,)
     )
-    duration: float = number("time that it takes", "s", least=NANOSECOND)
+    duration: float = _duration()
 
     def rules(self) -> Rules:
         """Refuse a quaternion without direction."""
         square = sum(part * part for part in self.orientation)
-        yield (
-            np.equal(square, 0.0),
-            partial(Problem, "orientation", self.orientation, "must not be zero"),
-        )
+        yield np.equal(square, 0.0), "orientation", self.orientation, "must not be zero"
 
 
 @dataclass(frozen=True)
@@ -307,24 +280,19 @@ class Sweep(Section):
     """
 
     amplitude: Vector3 = angles("amplitudes")
-    frequency: Vector3 = number("angular frequencies at the beginning", "rad/s", shape=(3,))
-    last_frequency: Vector3 | None = number(
-        "angular frequencies at the end; by default those at the beginning",
-        "rad/s",
-        shape=(3,),
-        default=None,
+    frequency: Vector3 = vector("angular frequencies at the beginning", "rad/s")
+    last_frequency: Vector3 | None = vector(
+        "angular frequencies at the end; by default those at the beginning", "rad/s", default=None
     )
     centre: Vector3 | None = angles("centres; by default the initial angles", default=None)
     fade: float = number("time to grow and to fade", "s", least=NANOSECOND)
-    duration: float = number("time that it takes", "s", least=NANOSECOND)
+    duration: float = _duration()
 
     def rules(self) -> Rules:
         """Refuse to fade for longer than there is time."""
         most = 0.5 * self.duration
-        yield (
-            np.greater(self.fade, most),
-            lambda: Problem("fade", self.fade, f"must not exceed half the duration, {most:g} s"),
-        )
+        allowed = partial("must not exceed half the duration, {:g} s".format, most)
+        yield np.greater(self.fade, most), "fade", self.fade, allowed
 
 
 @dataclass(frozen=True)
@@ -337,7 +305,7 @@ class Spiral(Section):
     phi: float = number("tilt at the end", "rad", least=0.0, most=3.141592653589793)
     theta: float = number("how far the direction of the tilt turns", "rad")
     psi: float = number("turn about E at the end", "rad", default=0.0)
-    duration: float = number("time that it takes", "s", least=NANOSECOND)
+    duration: float = _duration()
 
 
 @dataclass(frozen=True)
@@ -346,10 +314,8 @@ class Waypoint(Section):
 
     time: float = number("time since the beginning", "s", least=0.0)
     gamma: Vector3 = angles("actuator angles")
-    gamma_dot: Vector3 | None = number("actuator rates", "rad/s", shape=(3,), default=None)
-    gamma_ddot: Vector3 | None = number(
-        "actuator accelerations", "rad/s^2", shape=(3,), default=None
-    )
+    gamma_dot: Vector3 | None = vector("actuator rates", "rad/s", default=None)
+    gamma_ddot: Vector3 | None = vector("actuator accelerations", "rad/s^2", default=None)
 
 
 @dataclass(frozen=True)
@@ -385,8 +351,6 @@ class DesiredMotion(Section):
         """Refuse points whose times do not rise."""
         for index, (before, here) in enumerate(pairwise(self.waypoints), start=1):
             early = np.less(here.time, before.time + NANOSECOND)
-            yield early, partial(_too_early, f"waypoints[{index}].time", here.time, before.time)
-
-
-def _too_early(key: str, time: float, before: float) -> Problem:
-    return Problem(key, time, f"must be > {before:g} s, that of the point before, by 1e-9 s")
+            allowed = "must be > {:g} s, that of the point before, by 1e-9 s"
+            told = partial(allowed.format, before.time)
+            yield early, f"waypoints[{index}].time", here.time, told

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +38,12 @@ from sst_ros.scene.schema import (
     has_key,
     key_of,
     notes,
-    number,
+    positive,
     section,
     sections,
-    sections_of,
     specs,
     text,
+    walk,
 )
 from sst_ros.scene.yaml_document import (
     NO_NUMBER,
@@ -54,7 +53,6 @@ from sst_ros.scene.yaml_document import (
     plain,
     read,
     replace_values,
-    values_of,
 )
 
 Matrix = NDArray[np.float64]
@@ -62,11 +60,6 @@ Matrix = NDArray[np.float64]
 LARGEST, SMALLEST = 1e9, 1e-12
 """No number of a scene is larger, none that must be positive smaller: it is a slip of units, and
 its powers leave the range of double precision."""
-
-_BODIES = (
-    ("star", None),
-    *((name, k) for name in ("actuated_links", "intermediate_links") for k in range(3)),
-)
 
 
 @dataclass(frozen=True)
@@ -96,7 +89,7 @@ class Scene(Section):
         "torques that torque_player plays", SineTorque, default=None
     )
     motion: DesiredMotion | None = section("desired motion", DesiredMotion, default=None)
-    duration: float | None = number("length of a run", "s", default=None, above=0.0)
+    duration: float | None = positive("length of a run", "s", default=None)
     provenance: tuple[tuple[str, str], ...] = notes("where the values come from, by key")
 
     def with_values(self, values: Mapping[str, Any]) -> Scene:
@@ -111,7 +104,7 @@ class Scene(Section):
 
         """
         try:
-            changed = replace_values(values_of(self), plain(values))
+            changed = replace_values(self, plain(values))
         except KeyError as error:
             key = error.args[0]
             problem = Problem(str(key), values[key], "names nothing in this scene")
@@ -148,12 +141,14 @@ class Scene(Section):
         return np.stack([link.tensor for link in self.intermediate_links])
 
     def check(self) -> Iterator[Problem]:
-        """Refuse what contradicts itself across sections, and numbers of another unit."""
-        for place, part in sections_of(self):
-            for name, spec in specs(type(part)).items():
-                value = getattr(part, name)
-                if spec.kind == "number" and value is not None:
-                    yield from _find_slips(key_of((*place, name)), np.ravel(value), spec)
+        """Refuse numbers of another unit, and what contradicts itself across sections."""
+        for place, value, spec in _numbers(self):
+            for x in np.ravel(value).tolist():
+                allowed = f"must not exceed {LARGEST:g} in size" if abs(x) > LARGEST else ""
+                if spec.above == 0.0 and x < SMALLEST:
+                    allowed = f"must be at least {SMALLEST:g}"
+                if allowed:
+                    yield Problem(key_of(place), x, f"{allowed}: use m, kg, s, rad, N")
         yield from super().check()
         for key, note in self.provenance:
             if not has_key(type(self), key):
@@ -162,34 +157,27 @@ class Scene(Section):
     def rules(self) -> Rules:
         """Refuse a centre of mass far from the bodies, and gravity without a mass."""
         reach = np.maximum(self.base.radius, self.star.radius)
+        bodies = {"star": self.star}
+        for name in ("actuated_links", "intermediate_links"):
+            bodies |= {f"{name}[{k}]": link for k, link in enumerate(getattr(self, name))}
         mass: Any = 0.0 if self.payload is None else self.payload.mass
-        for name, k in _BODIES:
-            body: Link = self.star if k is None else getattr(self, name)[k]
+        for name, body in bodies.items():
             mass = mass + body.mass
             x, y, z = body.centre
-            key = f"{name}.centre" if k is None else f"{name}[{k}].centre"
-            yield np.sqrt(x * x + y * y + z * z) > reach, partial(_far, key, body.centre, reach)
+            far = np.sqrt(x * x + y * y + z * z) > reach
+            yield far, f"{name}.centre", body.centre, lambda: f"must lie within {reach:g} m of O"
         if self.gravity is not None:
             allowed = "acts on nothing: no body has a mass"
-            yield (
-                np.equal(mass, 0.0),
-                partial(Problem, "gravity", self.gravity.acceleration, allowed),
-            )
+            yield np.equal(mass, 0.0), "gravity", self.gravity.acceleration, allowed
 
 
-def _far(key: str, centre: object, reach: float) -> Problem:
-    return Problem(key, centre, f"must lie within {reach:g} m of O")
-
-
-def _find_slips(key: str, values: Matrix, spec: Spec) -> Iterator[Problem]:
-    """Yield the numbers that are so large or small that they must have another unit."""
-    for value in values.tolist():
-        if abs(value) > LARGEST:
-            allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
-            yield Problem(key, value, allowed)
-        elif spec.above == 0.0 and value < SMALLEST:
-            allowed = f"must be at least {SMALLEST:g}: use m, kg, s, rad, N"
-            yield Problem(key, value, allowed)
+def _numbers(scene: Scene) -> Iterator[tuple[Place, Any, Spec]]:
+    """Yield place, value and specification of each number that a scene has."""
+    for place, part in walk(scene):
+        for name, spec in specs(type(part)).items() if isinstance(part, Section) else ():
+            value = getattr(part, name)
+            if spec.kind == "number" and value is not None:
+                yield (*place, name), value, spec
 
 
 def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
@@ -218,19 +206,16 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
     """
     if initial is None:
         return scene
-    if isinstance(initial, Initial):
-        return replace(scene, initial=initial)
-    if not isinstance(initial, Mapping):
+    if not isinstance(initial, (Initial, Mapping)):
         try:
             gamma, gamma_dot = initial
         except (TypeError, ValueError):
             allowed = "must be (gamma, gamma_dot), a mapping or Initial"
             raise InputError("initial", [Problem("initial", initial, allowed)]) from None
         initial = {"gamma": gamma, "gamma_dot": gamma_dot}
-    elif "gamma" not in initial or initial.keys() - {"gamma", "gamma_dot", "orientation"}:
-        allowed = "must have the key gamma, and may have gamma_dot and orientation"
-        raise InputError("initial", [Problem("initial", list(initial), allowed)])
-    return replace(scene, initial=Initial(**{name: plain(x) for name, x in initial.items()}))
+    if isinstance(initial, Mapping):
+        initial = build(Initial, initial, "initial")
+    return replace(scene, initial=initial)
 
 
 def load(name_or_path: str | Path) -> Scene:
@@ -301,7 +286,7 @@ class Scenarios:
     """
 
     def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:
-        self.document, self._values = scene, values_of(scene)
+        self.document, self._values = scene, plain(scene)
         self.count: int | None = None
         self.rows: dict[str, Matrix] = {}
         self._specs: dict[str, Spec] = {}
@@ -359,12 +344,11 @@ class Scenarios:
         for key, values in self.rows.items():
             spec, flat = self._specs[key], values.reshape(len(values), -1)
             least = max(SMALLEST if spec.above == 0.0 else spec.least, -LARGEST)
-            most = min(spec.most, LARGEST)
-            if not (flat.min() >= least and flat.max() <= most):  # a nan is neither
-                doubtful = doubtful | ~np.all((flat >= least) & (flat <= most), axis=1)
+            fits = (flat >= least) & (flat <= min(spec.most, LARGEST))  # a nan is neither
+            doubtful = doubtful | ~fits.all(axis=1)
         with np.errstate(all="ignore"):
-            for _, part in sections_of(self.columns()):
-                for broken, _ in part.rules():
+            for _, part in walk(self.columns()):
+                for broken, *_ in part.rules() if isinstance(part, Section) else ():
                     doubtful = doubtful | broken
         return np.asarray(doubtful)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Documents as frozen dataclasses: every field has a unit and bounds, which are checked.
+"""Documents as trees of frozen dataclasses: every field has a unit and bounds, which are checked.
 
 A class that derives from `Section` is checked whenever it is built, from YAML or from Python.
 Reading a document gives either the object or one `InputError` with every fault and its line. The
@@ -9,11 +9,10 @@ can express (inertias, angles that must sum to 360 deg) is left to reading.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from typing import Any, ClassVar, TypeAlias
 
@@ -28,14 +27,16 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """What a terminal obeys, and halves of characters."""
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
-
 _TEXT = {"type": "string", "pattern": "\\S"}
 
 TURN = 2.0 * math.pi
 """No initial or desired angle of an actuator [rad] is larger: it is in degrees."""
 
+REQUIRED: Any = object()
+"""Default of a field that must be given."""
+
 Place = tuple[str | int, ...]
-"""Names and indices of a leaf from the root on."""
+"""Names and indices of a part of a tree from the root on."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Spec:
     lengths: tuple[int, ...] = ()
     acts_on: tuple[str, ...] = ()
     needs: str = ""
+    default: Any = REQUIRED
 
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
@@ -65,33 +67,30 @@ class Spec:
     def describe(self) -> str:
         """Describe the values that are allowed."""
         unit = f" [{self.unit}]" if self.unit else ""
-        if self.kind == "number":
-            size = " x ".join(map(str, self.shape))
-            what = f"{size} finite numbers" if size else "a finite number"
-            ends = (">", self.above), (">=", self.least), ("<=", self.most)
-            bounds = [f"{sign} {end:g}" for sign, end in ends if math.isfinite(end)]
-            return " ".join(["must be", what, *bounds]) + unit
+        size = " x ".join(map(str, self.shape))
+        what = f"{size} finite numbers" if size else "a finite number"
+        ends = (">", self.above), (">=", self.least), ("<=", self.most)
+        bounds = "".join(f" {sign} {end:g}" for sign, end in ends if math.isfinite(end))
+        counts = " or ".join(map(str, self.lengths)) + " " if self.lengths else ""
         return {
+            "number": f"must be {what}{bounds}{unit}",
             "integer": f"must be a whole number from {self.least} to {self.most}{unit}",
             "flag": "must be true or false",
             "text": "must be text without control characters",
             "texts": "must be a list of text",
             "choice": "must be one of " + ", ".join(self.choices),
             "section": "must be a mapping",
-            "sections": " ".join(
-                ["must be a list of", *" or ".join(map(str, self.lengths)).split(), "mappings"]
-            ),
+            "sections": f"must be a list of {counts}mappings",
             "notes": "must be a mapping from keys to text",
             "anything": "",
         }[self.kind]
 
 
-def _declare(
-    kind: str, doc: str, unit: str = "", *, default: Any = dataclasses.MISSING, **spec: Any
-) -> Any:
+def _declare(kind: str, doc: str, unit: str = "", *, default: Any = REQUIRED, **spec: Any) -> Any:
     """Declare a field of a section; `spec` has more of what `Spec` says."""
-    metadata = {"spec": Spec(kind, doc, unit, **spec)}
-    return dataclasses.field(default=default, metadata=metadata, kw_only=True)
+    metadata = {"spec": Spec(kind, doc, unit, default=default, **spec)}
+    default = MISSING if default is REQUIRED else default
+    return field(default=default, metadata=metadata, kw_only=True)
 
 
 number, integer, flag, text, texts = (
@@ -99,16 +98,16 @@ number, integer, flag, text, texts = (
 )
 notes = partial(_declare, "notes", default=())
 """A mapping from keys of this document to text."""
+vector = partial(number, shape=(3,))
+angles = partial(vector, unit="rad", least=-TURN, most=TURN)
+"""Angles of the three actuators, at most a turn."""
+positive = partial(number, above=0.0)
+coefficient = partial(number, least=0.0, default=0.0)
 
 
 def anything(doc: str, **default: Any) -> Any:
     """Declare what `Section.check` checks; it may be given by its place, too."""
-    return dataclasses.field(metadata={"spec": Spec("anything", doc)}, **default)
-
-
-def angles(doc: str, **default: Any) -> Any:
-    """Declare angles of the three actuators, at most a turn."""
-    return number(doc, "rad", shape=(3,), least=-TURN, most=TURN, **default)
+    return field(metadata={"spec": Spec("anything", doc, default=None)}, **default)
 
 
 def choice(doc: str, choices: Sequence[str], **rest: Any) -> Any:
@@ -129,8 +128,10 @@ def sections(doc: str, cls: type[Section], lengths: Sequence[int] = (), **defaul
     return _declare("sections", doc, section=cls, lengths=tuple(lengths), **default)
 
 
-Rules: TypeAlias = "Iterator[tuple[Any, Callable[[], Problem]]]"
-"""Whether each rule is broken, and the problem that is reported where it is."""
+Rules: TypeAlias = "Iterator[tuple[Any, str, Any, str | Callable[[], str]]]"
+"""Whether each rule is broken; key and value that are at fault, and what is allowed.
+
+The last two may be functions, which are called where the rule is broken."""
 
 
 @dataclass(frozen=True)
@@ -151,14 +152,13 @@ class Section:
 
     def __post_init__(self) -> None:
         problems = []
-        for field in dataclasses.fields(self):
-            name, spec, value = field.name, field.metadata["spec"], getattr(self, field.name)
-            if value is None and field.default is None:
-                continue
-            try:
-                object.__setattr__(self, name, accept(spec, value))
-            except ValueError:
-                problems.append(Problem(name, value, spec.refuse()))
+        for name, spec in specs(type(self)).items():
+            value = getattr(self, name)
+            if value is not None or spec.default is not None:
+                try:
+                    object.__setattr__(self, name, accept(spec, value))
+                except ValueError:
+                    problems.append(Problem(name, value, spec.refuse()))
         problems = problems or [*self._find_idle(), *self.check()]
         if problems:
             raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
@@ -166,12 +166,12 @@ class Section:
     def _find_idle(self) -> Iterator[Problem]:
         """Yield what has no effect, and what is not one of several."""
         acts = True
-        for field in dataclasses.fields(self):
-            spec, value = field.metadata["spec"], getattr(self, field.name)
-            if spec.acts_on and value != field.default and not self._has_any(spec.acts_on):
+        for name, spec in specs(type(self)).items():
+            value = getattr(self, name)
+            if spec.acts_on and value != spec.default and not self._has_any(spec.acts_on):
                 given = "it" if len(spec.acts_on) == 1 else "one"
                 text = spec.needs or f"acts on {' or '.join(spec.acts_on)}: give {given}"
-                yield Problem(field.name, value, text)
+                yield Problem(name, value, text)
                 acts = False
         if self.ONE_OF:
             chosen = [name for name in self.ONE_OF if getattr(self, name)]
@@ -182,13 +182,14 @@ class Section:
             yield Problem(key, getattr(self, key, None), text)
 
     def _has_any(self, names: tuple[str, ...]) -> bool:
-        values = (getattr(self, name) for name in names)
-        return any(any(value) if isinstance(value, tuple) else value for value in values)
+        return any(has_effect(getattr(self, name)) for name in names)
 
     def check(self) -> Iterator[Problem]:
         """Yield the faults that no single field shows; override where rules are not enough."""
         with np.errstate(all="ignore"):
-            yield from (problem() for broken, problem in self.rules() if broken)
+            for broken, key, *found in self.rules():
+                if broken:
+                    yield Problem(key, *(one() if callable(one) else one for one in found))
 
     def rules(self) -> Rules:
         """Yield the rules that numbers of several fields must keep.
@@ -198,9 +199,17 @@ class Section:
         return iter(())
 
 
+def has_effect(value: Any) -> bool:
+    """Return whether a value, or any in a list, is given and not zero."""
+    return any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
+
+
+# The tree: sections and tuples, whose leaves are numbers or columns, words and None.
+
+
 def specs(cls: type[Section]) -> dict[str, Spec]:
     """List the declared fields of a section, in order."""
-    return {field.name: field.metadata["spec"] for field in dataclasses.fields(cls)}
+    return {one.name: one.metadata["spec"] for one in fields(cls)}
 
 
 def make_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
@@ -210,16 +219,33 @@ def make_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
     return found
 
 
-def sections_of(tree: Section, place: Place = ()) -> Iterator[tuple[Place, Section]]:
-    """Yield a section and all below it, each with its place."""
+def parts_of(tree: Any) -> list[tuple[Any, Any]]:
+    """List the parts of a section or tuple by name or index; there are none of anything else."""
+    if isinstance(tree, tuple):
+        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
+    return list(vars(tree).items()) if isinstance(tree, Section) else []
+
+
+def walk(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
+    """Yield the place of a tree and the tree, then those of all that is in it."""
     yield place, tree
-    for name in specs(type(tree)):
-        value = getattr(tree, name)
-        if isinstance(value, Section):
-            yield from sections_of(value, (*place, name))
-        for index, entry in enumerate(value if isinstance(value, tuple) else ()):
-            if isinstance(entry, Section):
-                yield from sections_of(entry, (*place, name, index))
+    for name, part in parts_of(tree):
+        yield from walk(part, (*place, name))
+
+
+def leaves(tree: Any) -> dict[Place, Any]:
+    """Return the numbers and columns of a tree by their places."""
+    return {place: x for place, x in walk(tree) if isinstance(x, (float, np.ndarray))}
+
+
+def rebuild(tree: Any, values: Mapping[Place, Any], place: Place = ()) -> Any:
+    """Return a tree with other values at some places; its sections are not checked."""
+    if place in values:
+        return values[place]
+    parts = {name: rebuild(part, values, (*place, name)) for name, part in parts_of(tree)}
+    if isinstance(tree, tuple):
+        return type(tree)(*parts.values()) if hasattr(tree, "_fields") else tuple(parts.values())
+    return make_unchecked(type(tree), parts) if parts else tree
 
 
 def has_key(cls: type[Section], key: str) -> bool:
@@ -236,56 +262,53 @@ def key_of(place: Place) -> str:
     return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")
 
 
+# What a value may be.
+
+
 def accept(spec: Spec, value: Any) -> Any:
     """Return `value` in its frozen form, or raise ValueError."""
-    kind, is_list = spec.kind, isinstance(value, (list, tuple))
+    kind, is_list, section = spec.kind, isinstance(value, (list, tuple)), spec.section or Section
     if kind == "number":
-        return _numbers(spec, value, spec.shape)
+        try:
+            return _freeze_numbers(spec, value, spec.shape)
+        except (TypeError, OverflowError):
+            raise ValueError from None
     if kind == "text":
-        return frozen_text(value)
+        return freeze_text(value)
     if kind == "texts" and is_list:
-        return tuple(map(frozen_text, value))
+        return tuple(map(freeze_text, value))
     if kind == "notes" and isinstance(value, (dict, tuple)):
-        pairs = value.items() if isinstance(value, dict) else value
-        return tuple((frozen_text(name), frozen_text(note)) for name, note in pairs)
-    if kind == "sections" and spec.section and is_list:
-        repeated = max(spec.lengths) if spec.lengths and len(value) == 1 else 1
-        fits = not spec.lengths or len(value) in spec.lengths
-        if fits and all(isinstance(entry, spec.section) for entry in value):
-            return tuple(value) * repeated
+        return tuple((freeze_text(name), freeze_text(x)) for name, x in dict(value).items())
+    if kind == "sections" and is_list and len(value) in (spec.lengths or [len(value)]):
+        if not all(isinstance(entry, section) for entry in value):
+            raise ValueError
+        return tuple(value) * (max(spec.lengths) if spec.lengths and len(value) == 1 else 1)
     fits = {
         "anything": True,
-        "flag": value is True or value is False,
+        "flag": isinstance(value, bool),
         "integer": type(value) is int and spec.least <= value <= spec.most,
         "choice": value in spec.choices,
-        "section": spec.section is not None and isinstance(value, spec.section),
-    }.get(kind, False)
-    if not fits:
+        "section": isinstance(value, section),
+    }
+    if not fits.get(kind):
         raise ValueError
     return value
 
 
-def _numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
+def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if shape:
-        try:
-            fits = len(value) == shape[0] and not isinstance(value, (str, dict, set))
-        except TypeError:
-            fits = False
-        if not fits:
+        if isinstance(value, (str, dict, set)) or len(value) != shape[0]:
             raise ValueError
-        return tuple(_numbers(spec, entry, shape[1:]) for entry in value)
+        return tuple(_freeze_numbers(spec, entry, shape[1:]) for entry in value)
     if isinstance(value, bool) or (isinstance(value, str) and not _NUMBER.fullmatch(value)):
         raise ValueError
-    try:
-        result = float(value)
-    except (TypeError, OverflowError):
-        raise ValueError from None
+    result = float(value)
     if not math.isfinite(result) or not spec.least <= result <= spec.most or result <= spec.above:
         raise ValueError
     return result
 
 
-def frozen_text(value: Any) -> str:
+def freeze_text(value: Any) -> str:
     """Return text without its outer blanks, or raise ValueError."""
     if not isinstance(value, str) or not value.strip() or _UNPRINTABLE.search(value):
         raise ValueError
@@ -301,43 +324,32 @@ def _object_schema(cls: type[Section]) -> dict[str, Any]:
     described: dict[str, Any] = {"type": "object", "additionalProperties": False}
     if cls.__doc__:
         described["description"] = cls.__doc__.partition("\n")[0]
-    properties, required = {}, []
-    for field in dataclasses.fields(cls):
-        properties[field.name] = _property_schema(field.metadata["spec"])
-        if field.default is dataclasses.MISSING:
-            required.append(field.name)
-        elif isinstance(field.default, (bool, int, float, str)):
-            properties[field.name]["default"] = field.default
     if cls.ONE_OF:
         described["oneOf"] = [{"required": [name]} for name in cls.ONE_OF]
+    known = specs(cls)
+    properties = {name: _property_schema(spec) for name, spec in known.items()}
+    required = [name for name, spec in known.items() if spec.default is REQUIRED]
     return {**described, "properties": properties, "required": required}
 
 
 def _property_schema(spec: Spec) -> dict[str, Any]:
-    unit = f" [{spec.unit}]" if spec.unit else ""
-    described: dict[str, Any] = {"description": spec.doc + unit}
-    if spec.kind == "number":
-        return described | _number_schema(spec, spec.shape)
-    if spec.kind == "integer":
-        return described | {"type": "integer", "minimum": spec.least, "maximum": spec.most}
-    if spec.kind == "choice":
-        return described | {"enum": list(spec.choices)}
-    if spec.kind == "section" and spec.section:
-        return _object_schema(spec.section) | described
-    if spec.kind == "sections" and spec.section:
-        lengths = [{"minItems": length, "maxItems": length} for length in spec.lengths]
-        entries = {"type": "array", "items": _object_schema(spec.section)}
-        return described | entries | ({"anyOf": lengths} if lengths else {})
-    if spec.kind == "notes":
-        return described | {"type": "object", "additionalProperties": _TEXT}
-    if spec.kind == "texts":
-        return described | {"type": "array", "items": _TEXT}
-    return described | ({"type": "boolean"} if spec.kind == "flag" else _TEXT)
-
-
-def _number_schema(spec: Spec, shape: tuple[int, ...]) -> dict[str, Any]:
-    if shape:
-        size = {"minItems": shape[0], "maxItems": shape[0]}
-        return {"type": "array", "items": _number_schema(spec, shape[1:]), **size}
+    described: dict[str, Any] = {"description": spec.doc + (f" [{spec.unit}]" if spec.unit else "")}
+    if isinstance(spec.default, (bool, int, float, str)):
+        described["default"] = spec.default
     bounds = {"exclusiveMinimum": spec.above, "minimum": spec.least, "maximum": spec.most}
-    return {"type": "number"} | {name: x for name, x in bounds.items() if math.isfinite(x)}
+    known: dict[str, dict[str, Any]] = {
+        "number": {"type": "number"} | {name: x for name, x in bounds.items() if math.isfinite(x)},
+        "integer": {"type": "integer", "minimum": spec.least, "maximum": spec.most},
+        "choice": {"enum": list(spec.choices)},
+        "notes": {"type": "object", "additionalProperties": _TEXT},
+        "texts": {"type": "array", "items": _TEXT},
+        "flag": {"type": "boolean"},
+    }
+    own = _object_schema(spec.section) if spec.section else known.get(spec.kind, _TEXT)
+    for size in reversed(spec.shape):
+        own = {"type": "array", "items": own, "minItems": size, "maxItems": size}
+    if spec.kind == "sections":
+        own = {"type": "array", "items": own}
+    if spec.lengths:
+        own["anyOf"] = [{"minItems": length, "maxItems": length} for length in spec.lengths]
+    return own | described

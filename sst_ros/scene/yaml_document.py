@@ -8,16 +8,26 @@ index means all of its entries.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.schema import Place, Section, Spec, accept, frozen_text, make_unchecked, specs
+from sst_ros.scene.schema import (
+    REQUIRED,
+    Place,
+    Section,
+    Spec,
+    accept,
+    freeze_text,
+    has_effect,
+    make_unchecked,
+    specs,
+)
 
 S = TypeVar("S", bound=Section)
 
@@ -29,19 +39,17 @@ and its time grows with the square of the levels."""
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's reader, which ends at the first event that breaks a limit."""
+    """PyYAML's reader, which refuses aliases and ends at the first event that breaks a limit."""
+
+    depth = nodes = 0
 
     def __init__(self, source: str) -> None:
+        if len(source) > LONGEST:
+            allowed = f"no more than {LONGEST} characters are allowed"
+            raise InputError("", [Problem("", f"{len(source)} characters", allowed)])
         super().__init__(source)
-        self.depth = self.nodes = 0
 
     def get_event(self) -> yaml.Event:
-        """Return the next event.
-
-        Raises:
-            InputError: it is an alias, or there is too much in the document.
-
-        """
         event: yaml.Event = super().get_event()  # type: ignore[no-untyped-call]
         self.depth += isinstance(event, yaml.CollectionStartEvent)
         self.depth -= isinstance(event, yaml.CollectionEndEvent)
@@ -69,11 +77,10 @@ def read(cls: type[S], source: str, origin: str) -> S:
         InputError: the text is no YAML or breaks the schema; lists every fault with its line.
 
     """
-    if len(source) > LONGEST:
-        allowed = f"no more than {LONGEST} characters are allowed"
-        raise InputError(origin, [Problem("", f"{len(source)} characters", allowed)])
+    lines: dict[str, int] = {}
+    problems: list[Problem] = []
     try:
-        node = yaml.compose(source, Loader=_Loader)
+        values = _values(yaml.compose(source, Loader=_Loader), "", lines, problems)
     except InputError as refused:
         raise InputError(origin, refused.problems) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -81,28 +88,25 @@ def read(cls: type[S], source: str, origin: str) -> S:
         line = None if mark is None else mark.line + 1
         reason = getattr(error, "problem", None) or str(error)
         raise InputError(origin, [Problem("", reason, "must be YAML", line)]) from None
-    lines: dict[str, int] = {}
-    problems: list[Problem] = []
-    result = _build(cls, _values(node, "", lines, problems), "", problems, of_row=False)
-    if problems or result is None:
-        placed = (
-            one if one.line else dataclasses.replace(one, line=line_at(lines, one.key))
-            for one in problems
-        )
-        raise InputError(origin, sorted(placed, key=lambda problem: problem.line or 0))
+    try:
+        result = build(cls, values, origin)
+    except InputError as refused:
+        problems += (replace(one, line=_line_at(lines, one.key)) for one in refused.problems)
+    if problems:
+        raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
     return result
 
 
 def dump(document: Section) -> str:
     """Write a document as YAML that `read` turns into an equal one."""
-    return str(yaml.safe_dump(values_of(document), sort_keys=False, allow_unicode=True))
+    return str(yaml.safe_dump(plain(document), sort_keys=False, allow_unicode=True))
 
 
 def line_of(source: str, key: str) -> int | None:
     """Line of a key, as in "links[0].centre", or of the deepest part of it that YAML text has."""
     lines: dict[str, int] = {}
     _values(yaml.compose(source, Loader=_Loader), "", lines, [])
-    return line_at(lines, key)
+    return _line_at(lines, key)
 
 
 def _values(
@@ -114,9 +118,7 @@ def _values(
     """
     if node is not None:
         lines.setdefault(path, _line(node))
-    if isinstance(node, yaml.ScalarNode):
-        if node.tag.endswith(":null"):
-            return None
+    if isinstance(node, yaml.ScalarNode) and not node.tag.endswith(":null"):
         return Switch(node.value) if node.tag.endswith(":bool") else node.value
     if isinstance(node, yaml.SequenceNode):
         entries = enumerate(node.value)
@@ -126,7 +128,7 @@ def _values(
     found: dict[str, Any] = {}
     for key_node, value_node in node.value:
         name = str(_values(key_node, "", {}, []))
-        key = f"{path}.{name}" if path else name
+        key = _join(path, name)
         line = lines.setdefault(key, _line(key_node))
         value = _values(value_node, key, lines, problems)
         if name in found:
@@ -137,34 +139,37 @@ def _values(
     return found
 
 
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
 def _line(node: yaml.Node | yaml.Event) -> int:
     return 1 if node.start_mark is None else int(node.start_mark.line) + 1
 
 
+def _line_at(lines: Mapping[str, int], key: str) -> int | None:
+    """Return the line of a key, or of the deepest part of it that has one."""
+    # One entry may stand for all.
+    key = re.sub(r"\[\d+\]", lambda at: at[0] if key[: at.end()] in lines else "[0]", key)
+    while key and key not in lines:
+        key = key[: max(key.rfind("."), key.rfind("["), 0)]
+    return lines.get(key)
+
+
 def plain(value: Any) -> Any:
-    """Turn arrays, NumPy numbers, tuples and mappings into what YAML has."""
+    """Turn sections, arrays, NumPy numbers, tuples and mappings into what YAML has."""
+    if isinstance(value, Section):
+        given = {name: x for name, x in vars(value).items() if x is not None and x != ()}
+        notes = (name for name, spec in specs(type(value)).items() if spec.kind == "notes")
+        return plain(given | {name: dict(given[name]) for name in notes if name in given})
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
-    return value
+    return [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 
 
-def values_of(tree: Any) -> Any:
-    """Return a section as nested dicts and lists, which `build` takes."""
-    if isinstance(tree, Section):
-        pairs = ((name, spec, getattr(tree, name)) for name, spec in specs(type(tree)).items())
-        return {
-            name: dict(value) if spec.kind == "notes" else values_of(value)
-            for name, spec, value in pairs
-            if value is not None and value != ()
-        }
-    return [values_of(entry) for entry in tree] if isinstance(tree, tuple) else tree
-
-
-def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def replace_values(document: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested dicts and lists with other values by key; a single one fills a list.
 
     A section that the document does not have is made; None takes a value or a section away.
@@ -176,7 +181,7 @@ def replace_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> di
     changed: dict[str, Any] = plain(document)
     for key, value in values.items():
         try:
-            _set(changed, split_key(str(key)), value)
+            _set(changed, [_split(word) for word in str(key).split(".")], value)
         except (AttributeError, IndexError, TypeError, ValueError):
             raise KeyError(key) from None
     return changed
@@ -207,16 +212,15 @@ def build_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
     A number that a section must have and these values have not is zero.
     """
 
-    def build_value(inner: type[Section] | None, value: Any) -> Any:
+    def make(inner: type[Section] | None, value: Any) -> Any:
         if isinstance(value, list):
-            return tuple(build_value(inner, entry) for entry in value)
+            return tuple(make(inner, entry) for entry in value)
         return build_unchecked(inner, value) if inner and isinstance(value, dict) else value
 
     found = {}
-    for field in dataclasses.fields(cls):
-        default = 0.0 if field.default is dataclasses.MISSING else field.default
-        value = values.get(field.name, default)
-        found[field.name] = build_value(field.metadata["spec"].section, value)
+    for name, spec in specs(cls).items():
+        default = 0.0 if spec.default is REQUIRED else spec.default
+        found[name] = make(spec.section, values.get(name, default))
     return make_unchecked(cls, found)
 
 
@@ -235,102 +239,89 @@ def build(cls: type[S], values: Any, origin: str, *, path: str = "", of_row: boo
         InputError: lists every fault.
 
     """
-    problems: list[Problem] = []
-    result = _build(cls, plain(values), path, problems, of_row)
-    if problems or result is None:
-        raise InputError(origin, problems)
+    builder = _Builder(of_row, [])
+    result = builder.section(cls, plain(values), path)
+    if builder.problems or result is None:
+        raise InputError(origin, builder.problems)
     return result
 
 
-def line_at(lines: Mapping[str, int], key: str) -> int | None:
-    """Return the line of a key, or of the deepest part of it that has one."""
-    # One entry may stand for all.
-    key = re.sub(r"\[\d+\]", lambda at: at[0] if key[: at.end()] in lines else "[0]", key)
-    while key and key not in lines:
-        key = key[: max(key.rfind("."), key.rfind("["), 0)]
-    return lines.get(key)
+@dataclass
+class _Builder:
+    """Builds sections; what it cannot build is None, and told."""
 
+    of_row: bool
+    problems: list[Problem]
 
-def _build(cls: type[S], values: Any, path: str, problems: list[Problem], of_row: bool) -> S | None:
-    if not isinstance(values, Mapping):
-        allowed = f"must be a mapping with the keys {', '.join(specs(cls))}"
-        problems.append(Problem(path, values, allowed))
-        return None
-    known, before = specs(cls), len(problems)
-    given: dict[str, Any] = {}
-    for name, value in values.items():
-        key = f"{path}.{name}" if path else name
-        if name in known:
-            given[name] = _convert(known[name], value, key, problems, of_row)
-        else:
-            allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(name, known)}"
-            problems.append(Problem(key, value, allowed))
-    for field in dataclasses.fields(cls):
-        if field.default is dataclasses.MISSING and field.name not in given:
-            key = f"{path}.{field.name}" if path else field.name
-            problems.append(Problem(key, None, "is missing; " + known[field.name].describe()))
-    if len(problems) > before:
-        return None
-    if of_row:
-        for name, spec in known.items():
-            if spec.acts_on and not any(_is_some(given.get(cause)) for cause in spec.acts_on):
-                given.pop(name, None)
-        if cls.EFFECTS and not any(_is_some(given.get(name)) for name in cls.EFFECTS):
+    def section(self, cls: type[S], values: Any, path: str) -> S | None:
+        known, before = specs(cls), len(self.problems)
+        if not isinstance(values, Mapping):
+            self._refuse(path, values, f"must be a mapping with the keys {', '.join(known)}")
             return None
-    try:
-        return cls(**given)
-    except InputError as error:
-        for problem in error.problems:
-            key = ".".join(filter(None, [path, problem.key]))
-            problems.append(dataclasses.replace(problem, key=key))
-    return None
+        given: dict[str, Any] = {}
+        for name, value in values.items():
+            if name in known:
+                given[name] = self._value(known[name], value, _join(path, name))
+            else:
+                allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(name, known)}"
+                self._refuse(_join(path, name), value, allowed)
+        for name, spec in known.items():
+            if spec.default is REQUIRED and name not in given:
+                self._refuse(_join(path, name), None, "is missing; " + spec.describe())
+        if len(self.problems) > before:
+            return None
 
+        def acts(names: tuple[str, ...]) -> bool:
+            return not names or any(has_effect(given.get(name)) for name in names)
 
-def _convert(spec: Spec, value: Any, key: str, problems: list[Problem], of_row: bool) -> Any:
-    if spec.kind == "section" and spec.section:
-        return _build(spec.section, value, key, problems, of_row)
-    if spec.kind == "sections" and spec.section and isinstance(value, list):
-        entries = (
-            _build(spec.section, entry, f"{key}[{index}]", problems, of_row)
-            for index, entry in enumerate(value)
-        )
-        return tuple(entry for entry in entries if entry is not None or not of_row)
-    if spec.kind == "notes" and isinstance(value, dict):
-        for name, note in value.items():
-            try:
-                frozen_text(note)
-            except ValueError:
-                problems.append(Problem(f"{key}.{name}", note, "must be text"))
-        return value
-    if spec.kind == "number" and of_row and not _is_some(value):
-        return value  # the section refuses zero, or is left out
-    given = value
-    if spec.kind == "flag" and isinstance(value, Switch):
-        given = {"true": True, "false": False}.get(value.lower(), value)
-    elif spec.kind == "integer" and isinstance(value, str) and re.fullmatch("[-+]?[0-9]+", value):
-        given = int(value)
-    elif spec.kind == "text" and isinstance(value, (int, float)):
-        given = str(value)
-    try:
-        return accept(spec, given)
-    except ValueError:
-        problems.append(Problem(key, value, spec.refuse()))
+        if self.of_row:
+            given = {name: x for name, x in given.items() if acts(known[name].acts_on)}
+            if not acts(cls.EFFECTS):
+                return None
+        try:
+            return cls(**given)
+        except InputError as error:
+            for one in error.problems:
+                self._refuse(".".join(filter(None, [path, one.key])), one.value, one.allowed)
         return None
 
+    def _value(self, spec: Spec, value: Any, key: str) -> Any:
+        if spec.kind == "section" and spec.section:
+            return self.section(spec.section, value, key)
+        if spec.kind == "sections" and spec.section and isinstance(value, list):
+            parts = [self.section(spec.section, x, f"{key}[{i}]") for i, x in enumerate(value)]
+            return tuple(part for part in parts if part is not None or not self.of_row)
+        if spec.kind == "notes" and isinstance(value, dict):
+            for name, note in value.items():
+                try:
+                    freeze_text(note)
+                except ValueError:
+                    self._refuse(f"{key}.{name}", note, "must be text")
+            return value
+        if spec.kind == "number" and self.of_row and not has_effect(value):
+            return value  # the section refuses zero, or is left out
+        given = value
+        if spec.kind == "flag" and isinstance(value, Switch):
+            given = {"true": True, "false": False}.get(value.lower(), value)
+        elif spec.kind == "integer" and re.fullmatch("[-+]?[0-9]+", str(value)):
+            given = int(value)
+        elif spec.kind == "text" and isinstance(value, (int, float)):
+            given = str(value)
+        try:
+            return accept(spec, given)
+        except ValueError:
+            return self._refuse(key, value, spec.refuse())
 
-def _is_some(value: Any) -> bool:
-    return any(map(_is_some, value)) if isinstance(value, (list, tuple)) else bool(value)
+    def _refuse(self, key: str, value: Any, allowed: str) -> None:
+        self.problems.append(Problem(key, value, allowed))
 
 
-def split_key(key: str) -> list[tuple[str, int | None]]:
-    """Return names and indices of a key; raises ValueError where it is none."""
-    found = []
-    for word in key.split("."):
-        parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", word, re.A)
-        if parts is None:
-            raise ValueError(word)
-        found.append((parts[1], None if parts[2] is None else int(parts[2])))
-    return found
+def _split(word: str) -> tuple[str, int | None]:
+    """Return name and index of a word of a key; raises ValueError where it is none."""
+    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", word, re.A)
+    if parts is None:
+        raise ValueError(word)
+    return parts[1], None if parts[2] is None else int(parts[2])
 
 
 def find_fields(
@@ -350,7 +341,7 @@ def find_fields(
     """
     word, _, rest = key.partition(".")
     try:
-        ((name, index),) = split_key(word)
+        name, index = _split(word)
     except ValueError:
         name, index = word, None
     known = specs(type(tree))
@@ -362,7 +353,7 @@ def find_fields(
     elif not rest and components and spec.shape and value is not None:
         if index is None or index >= len(value):
             raise ValueError(NO_NUMBER)
-        yield (*here, index), value[index], dataclasses.replace(spec, shape=spec.shape[1:])
+        yield (*here, index), value[index], replace(spec, shape=spec.shape[1:])
     elif rest and spec.kind == "section" and index is None:
         if value is None:
             raise ValueError(f"the scene has no {name}")

@@ -22,7 +22,7 @@ from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.schema import Section, anything, choice, integer, number, section, specs, texts
-from sst_ros.scene.yaml_document import build, plain, values_of
+from sst_ros.scene.yaml_document import build, plain
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
     LARGEST_HYPERCUBE,
@@ -268,7 +268,7 @@ class SweepStudy(Section):
 
     def document(self) -> dict[str, Any]:
         """Return the study as nested dicts and lists; a table as digests of its columns."""
-        values = {name: values_of(getattr(self, name)) for name in specs(SweepStudy)}
+        values = {name: getattr(self, name) for name in specs(SweepStudy)}
         if self.table is not None:
             digests = {name: make_digest(column.tobytes()) for name, column in self.table.items()}
             values["table"] = digests
