@@ -62,7 +62,7 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     publishers = [topics.SIMULATOR[name].publisher(node, 1000) for name in names]
     inputs = ("commands", "commands_stamped")[:read]
     readers = [Reader(node, topics.SIMULATOR[name]) for name in inputs]
-    messages, log = StateMessages(), TorqueLog(LOG_TICKS, TICK_NS)
+    messages, log = StateMessages(), TorqueLog(TICK_NS)
     numbers = finite(*Simulation("swing").sample)
     states = (messages.joint_states, messages.orientation, messages.euler_zyz)
     wait_for(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)

@@ -71,7 +71,7 @@ def endless() -> Scene:
 def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
     """Write the bag of a run of the endless scene; its folder must not exist."""
     scene, samples = endless(), round(seconds * 1e9 / SAMPLE_NS)
-    writer, messages, log = BagWriter(path), StateMessages(), TorqueLog(TICKS_A_SAMPLE, TICK_NS)
+    writer, messages, log = BagWriter(path), StateMessages(), TorqueLog(TICK_NS)
     connections = {topic: writer.connect(topic, kind)
                    for topic, kind in TOPICS.items()}  # fmt: skip
 

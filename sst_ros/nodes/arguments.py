@@ -80,20 +80,17 @@ def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
     given, _ = _ros_parser().parse_known_args(_split(words)[1])
     rules = [re.fullmatch(r"(?:[^:]*:)?__(node|name|ns):=(.+)", rule) for rule in given.remap]
     renamed = {rule[1].replace("name", "node"): rule[2] for rule in rules if rule}
-    parts = renamed.get("ns", "").strip("/"), renamed.get("node", f"sst_{command}")
-    full = "/" + "/".join(filter(None, parts))
+    space, name = renamed.get("ns", "").strip("/"), renamed.get("node", f"sst_{command}")
+    full = f"/{space}/{name}".replace("//", "/")
     lines = []
     for path in given.params_file:
-        patterns = ["/" + pattern.strip("/") for pattern in _nodes_of(_document(path))]
-        if not any(_matches(pattern, full) for pattern in patterns):
+        patterns = [*_nodes_of(_document(path))]
+        # ** stands for any number of names, * for one.
+        forms = [re.escape(one).replace(r"/\*\*", "(/[^/]+)*") for one in patterns]
+        if not any(re.fullmatch(form.replace(r"/\*", "/[^/]+"), full) for form in forms):
             names = ", ".join(patterns)
             lines.append(f"{path} has no parameters for {full}, only for {names} (/** is any node)")
     return lines
-
-
-def known_anywhere() -> set[str]:
-    """Names of the parameters of all nodes: they may share a parameter file."""
-    return {name for _, parameters in COMMANDS.values() for name in specs(parameters)}
 
 
 def is_foreign(name: str) -> bool:
@@ -196,14 +193,6 @@ def _nodes_of(document: Any, prefix: str = "") -> Iterator[str]:
             yield name
         elif isinstance(value, dict):
             yield from _nodes_of(value, name)
-
-
-def _matches(pattern: str, full: str) -> bool:
-    parts = (
-        {"**": r"(/[^/]+)*", "*": "/[^/]+"}.get(part, "/" + re.escape(part))
-        for part in pattern.strip("/").split("/")
-    )
-    return re.fullmatch("".join(parts), full) is not None
 
 
 def _advice(word: str, known: dict[str, Spec]) -> str:

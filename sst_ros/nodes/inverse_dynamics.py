@@ -8,7 +8,6 @@ import threading
 from array import array
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.action.server import CancelResponse, GoalResponse
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -22,7 +21,7 @@ from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.process import every
-from sst_ros.nodes.topics import ActionGoal, TorqueCommands, serve_action
+from sst_ros.nodes.topics import ActionGoal, TorqueCommands
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
@@ -72,16 +71,15 @@ class InverseDynamicsController:
         given = self.parameters = parameters.declare(self.node, ControllerNodeParameters)
         self.follower = TrajectoryFollower(scene.load(given.scene), given)
         self._commands = TorqueCommands(self.node, given)
-        own = topics.CONTROLLER
-        self._reference = own["reference"].publisher(self.node)
-        self._error = own["tracking_error"].publisher(self.node)
-        self._diagnostics = own["diagnostics"].publisher(self.node)
+        names = ("reference", "tracking_error", "diagnostics")
+        own = (topics.CONTROLLER[name].publisher(self.node) for name in names)
+        self._reference, self._error, self._diagnostics = own
         self._seen: Measurement | None = None
-        self._places: tuple[list[str], list[int]] = ([], [])
+        self._refused, self._last_refusal = 0, ""
         self._began = self._finished = self._heard = False
-        own["phase"].subscription(self.node, self._hear, simulator=given.simulator)
-        own["joint_states"].subscription(self.node, self._answer)
-        own["joint_trajectory"].subscription(self.node, self._replace)
+        heard = {"phase": self._hear, "joint_states": self._answer}
+        heard["joint_trajectory"] = self._replace
+        topics.subscribe(self.node, topics.CONTROLLER, given.simulator, **heard)
         self._goals = FollowJointTrajectoryServer(self)
         every(self.node, 0.5, self._watch)
         every(self.node, 1.0, self._report)
@@ -115,7 +113,7 @@ class InverseDynamicsController:
     def _answer(self, state: JointState) -> None:
         """Answer a state: of the run, or shown before it."""
         self._commands.restart_timeout()
-        self._seen = self._measure(state)
+        self._seen = _measure(state)
         if not self._has_subscribers():
             return
         stamp_ns = self._commands.answer_to(state)
@@ -141,36 +139,16 @@ class InverseDynamicsController:
         recorded = (self._reference, self._error) if self.parameters.wait_for_recorder else ()
         return all(publisher.get_subscription_count() for publisher in recorded)
 
-    def _measure(self, state: JointState) -> Measurement:
-        """Read the actuators, which may come in any order, among others.
-
-        Raises:
-            SstError: one is missing; nothing can be controlled by such messages.
-
-        """
-        names = list(state.name)
-        if names != self._places[0]:
-            absent = [name for name in ACTUATORS if name not in names]
-            if absent:
-                raise SstError(f"joint_states has no {', '.join(absent)}: its names are {names}")
-            self._places = (names, [names.index(name) for name in ACTUATORS])
-        if not len(names) == len(state.position) == len(state.velocity):
-            raise SstError("joint_states must have a position and a velocity for each name")
-        i, j, k = self._places[1]
-        p, v = state.position, state.velocity
-        return Measurement((p[i], p[j], p[k]), (v[i], v[j], v[k]))
-
     def _publish(self, state: JointState, command: Command) -> None:
         """Publish reference and tracking error under the stamp of the sample."""
         at = command.desired
-        for publisher, position, velocity, effort in (
+        for publisher, *numbers in (
             (self._reference, at.gamma, at.gamma_dot, command.feedforward),
             (self._error, command.error, command.error_rate, command.feedback),
         ):
-            message = JointState(name=list(ACTUATORS))
-            message.header.stamp = state.header.stamp
-            message.position, message.velocity = array("d", position), array("d", velocity)
-            message.effort = array("d", effort)
+            position, velocity, effort = (array("d", triple) for triple in numbers)
+            message = JointState(position=position, velocity=velocity, effort=effort)
+            message.header.stamp, message.name = state.header.stamp, list(ACTUATORS)
             publisher.publish(message)
 
     def _replace(self, trajectory: JointTrajectory) -> None:
@@ -194,7 +172,7 @@ class InverseDynamicsController:
 
     def refuse(self, error: SstError) -> None:
         """Count, log and publish a refusal."""
-        self.follower.refuse(error)
+        self._refused, self._last_refusal = self._refused + 1, str(error)
         self.node.get_logger().error(f"trajectory refused: {error}")
         self._report()
 
@@ -209,21 +187,34 @@ class InverseDynamicsController:
         follower = self.follower
         stage = "waiting for joint_states" if self._seen is None else follower.stage.value
         counts = follower.samples, follower.irregular, follower.limited
-        refusals = follower.refused, follower.last_refusal
+        refusals = self._refused, self._last_refusal
         row = (stage, self.parameters.mode, *counts, *follower.errors, *refusals)
-        values: dict[str, object] = dict(zip(KEYS, row, strict=True))
-        doubts = [
-            words
-            for count, words in (
-                (follower.irregular, "samples do not come at rate"),
-                (follower.limited, "torques are limited"),
-                (follower.refused, "a trajectory was refused"),
-            )
-            if count
-        ]
-        level = DiagnosticStatus.WARN if doubts else DiagnosticStatus.OK
-        text = "; ".join([stage, *doubts])
-        self._diagnostics.publish(topics.diagnostics(self.node, "control", level, text, values))
+        doubts = {
+            "samples do not come at rate": follower.irregular,
+            "torques are limited": follower.limited,
+            "a trajectory was refused": self._refused,
+        }
+        said = [stage, *(text for text, count in doubts.items() if count)]
+        values, level = dict(zip(KEYS, row, strict=True)), int(len(said) > 1)
+        message = topics.diagnostics(self.node, "control", level, "; ".join(said), values)
+        self._diagnostics.publish(message)
+
+
+def _measure(state: JointState) -> Measurement:
+    """Read the actuators, which may come in any order, among others.
+
+    Raises:
+        SstError: one is missing; nothing can be controlled by such messages.
+
+    """
+    names = list(state.name)
+    if absent := [name for name in ACTUATORS if name not in names]:
+        raise SstError(f"joint_states has no {', '.join(absent)}: its names are {names}")
+    if not len(names) == len(state.position) == len(state.velocity):
+        raise SstError("joint_states must have a position and a velocity for each name")
+    i, j, k = map(names.index, ACTUATORS)
+    p, v = state.position, state.velocity
+    return Measurement((p[i], p[j], p[k]), (v[i], v[j], v[k]))
 
 
 def _print(tracking: TrackingMetrics | None) -> None:
@@ -245,7 +236,7 @@ class FollowJointTrajectoryServer:
             return
         name = topics.CONTROLLER["follow_joint_trajectory"].name
         callbacks = {"goal_callback": self._check, "cancel_callback": self._cancel}
-        serve_action(controller.node, FollowJointTrajectory, name, self._begin, **callbacks)
+        ActionGoal.serve(controller.node, FollowJointTrajectory, name, self._begin, **callbacks)
         every(controller.node, _FEEDBACK_PERIOD_S, self._report)
 
     def sample(self, state: JointState, measured: Measurement, command: Command) -> None:

@@ -75,7 +75,7 @@ def declare(
         except (InvalidParameterTypeException, InvalidParameterValueException):
             problems.append(Problem(name, value, spec.describe()))
         values[name] = value
-    ours = arguments.known_anywhere()
+    ours = {name for _, parameters in arguments.COMMANDS.values() for name in specs(parameters)}
     for name in sorted(given.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")

@@ -10,10 +10,10 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import rclpy
 from rclpy.clock import Clock
@@ -22,7 +22,6 @@ from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
 
@@ -85,7 +84,7 @@ def run(words: Sequence[str]) -> int:
         print(text if text.startswith(command) else f"{command}: {text}", file=sys.stderr)
         return 2
     try:
-        if not signals.stop.is_set():
+        if not signals.came:
             module = importlib.import_module(f"sst_ros.nodes.{command}")
             spin(getattr(module, arguments.COMMANDS[command][0])())
     except (SstError, ParameterException) as error:
@@ -114,7 +113,10 @@ def _bound_time() -> Iterator[None]:
 
 
 class _Callbacks(threading.Thread):
-    """Thread of the executor: it sleeps until there is work, where signals would not wake it."""
+    """Thread of the executor: it sleeps until there is work, where signals would not wake it.
+
+    It runs callbacks until `end`, or until one fails, with this `error`.
+    """
 
     def __init__(self, node: Node) -> None:
         super().__init__(name="executor", daemon=True)
@@ -125,7 +127,6 @@ class _Callbacks(threading.Thread):
         self._ends = False
 
     def run(self) -> None:
-        """Run callbacks until `end`, or until one fails."""
         try:
             while not self._ends:
                 self._executor.spin_once()
@@ -139,7 +140,6 @@ class _Callbacks(threading.Thread):
         self.join(_CALLBACK_S)
 
     def shut_down(self) -> None:
-        """Give up the executor, after `end`."""
         self.join(_CALLBACK_S)
         self._executor.shutdown()
 
@@ -154,7 +154,7 @@ def spin(worker: Worker) -> None:
     callbacks = _Callbacks(worker.node)
     callbacks.start()
     try:
-        while callbacks.is_alive() and not (signals.stop.is_set() or is_orphan()):
+        while callbacks.is_alive() and not (signals.came or is_orphan()):
             if worker.done.wait(_POLL_S):
                 break
         callbacks.end()
@@ -165,7 +165,11 @@ def spin(worker: Worker) -> None:
             worker.close()
         finally:
             with _bound_time():
-                _wait_for_subscribers(worker.node.publishers)
+                # What was published is received first, if that takes no longer than this.
+                deadline = time.monotonic() + _ACKNOWLEDGE_S
+                for publisher in worker.node.publishers:
+                    left = max(0.0, deadline - time.monotonic())
+                    publisher.wait_for_all_acked(Duration(seconds=left))
                 callbacks.shut_down()
                 worker.node.destroy_node()
 
@@ -188,21 +192,11 @@ def configure_middleware() -> None:
     names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
     if any(os.environ.get(name) for name in names):
         return
-    try:
-        major = int(version("rclpy").partition(".")[0])
-    except (PackageNotFoundError, ValueError):
-        major = _FIRST_RCLPY_ON_FAST_DDS_3
-    # Both the variable and the setting have other names in Fast DDS 2.
-    generation = 3 if major >= _FIRST_RCLPY_ON_FAST_DDS_3 else 2
+    generation = 3
+    with contextlib.suppress(PackageNotFoundError, ValueError):
+        if int(version("rclpy").partition(".")[0]) < _FIRST_RCLPY_ON_FAST_DDS_3:
+            generation = 2  # which has other names for both the variable and the setting
     os.environ[names[generation - 2]] = str(Path(__file__).with_name(f"fast_dds_{generation}.xml"))
-
-
-def _wait_for_subscribers(publishers: Iterable[Publisher[Any]]) -> None:
-    """Wait a while until the subscribers have received what was published."""
-    deadline = time.monotonic() + _ACKNOWLEDGE_S
-    for publisher in publishers:
-        left = max(0.0, deadline - time.monotonic())
-        publisher.wait_for_all_acked(Duration(seconds=left))
 
 
 def every(node: Node, seconds: float, callback: Callable[[], None]) -> Timer:

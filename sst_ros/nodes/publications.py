@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
@@ -168,12 +169,15 @@ class TorqueLog:
     Point i holds over tick i; its time is the end of that tick, relative to the header's stamp.
     """
 
-    def __init__(self, usual: int, period_ns: int, *, moments: bool = False) -> None:
+    def __init__(self, period_ns: int, *, moments: bool = False) -> None:
         self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
         self._period_ns, self._moments = period_ns, moments
         self._rows: list[tuple[float, ...]] = []
-        # Made for the usual number of ticks, and for none, where there is no run.
-        self._layouts = {count: self._lay_out(count) for count in (0, usual)}
+        # Each point begins with no positions, velocities and accelerations and the length of a row;
+        # the first beginning is part of what stands before the points.
+        self._begin = 0, 0, 0, len(self._names)
+        parts = ("row", "<f8", (len(self._names),)), ("time", "<i4", (2,)), ("begin", "<u4", (4,))
+        self._point = np.dtype([*parts])
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -189,29 +193,16 @@ class TorqueLog:
 
     def take(self, stamp_ns: int) -> bytes:
         """Return the message of the ticks logged since stamp_ns and clear the log."""
-        count = len(self._rows)
-        pack, head, behind = self._layouts.get(count) or self._lay_out(count)
-        values: list[Any] = [_ENCAPSULATION, stamp(stamp_ns), head]
-        for row, after in zip(self._rows, behind, strict=True):
-            values += row
-            values.append(after)
+        points = np.empty(len(self._rows), self._point)
+        points["row"] = np.reshape(self._rows, points["row"].shape)
+        ends = self._period_ns * np.arange(1, len(points) + 1)
+        points["time"] = np.stack(np.divmod(ends, NANOSECONDS), axis=1)
+        points["begin"] = self._begin
         self._rows.clear()
-        return pack(*values)
-
-    def _lay_out(self, count: int) -> tuple[Callable[..., bytes], bytes, list[bytes]]:
-        """Return what packs a message, what stands before its rows and what behind each.
-
-        A point has no positions, velocities and accelerations, then the row, then its time.
-        """
-        begin = 0, 0, 0, len(self._names)
-        named = BASE_FRAME, len(self._names), *self._names, count
-        head = _layout(*named, *begin) if count else _layout(*named, align=1)
-        times = (stamp((point + 1) * self._period_ns) for point in range(count))
-        behind = [time + struct.pack("<4I", *begin) for time in times]
-        row = f"{len(self._names)}d"
-        rows = f"{row}{_STAMP.size + 16}s" * (count - 1) + f"{row}{_STAMP.size}s" * bool(count)
-        form = f"<{len(_ENCAPSULATION)}s{_STAMP.size}s{len(head)}s{rows}"
-        return struct.Struct(form).pack, head, behind
+        named = BASE_FRAME, len(self._names), *self._names, len(points)
+        head = _layout(*named, *self._begin) if len(points) else _layout(*named, align=1)
+        behind = 4 * len(self._begin)
+        return _ENCAPSULATION + stamp(stamp_ns) + head + points.tobytes()[:-behind]
 
 
 def follows_clock(node: Node) -> bool:
@@ -253,14 +244,9 @@ class PublishedClock:
         self.now_ns = self.now_ns if now_ns is None else now_ns
         self._publisher.publish(clock_message(self.now_ns))
 
-    def rivals(self) -> list[str]:
-        """Names of other nodes that publish /clock."""
-        own = self._node.get_fully_qualified_name()
-        return [name for name in topics.publishers(self._node, "/clock") if name != own]
-
 
 class SimulatorTopics:
-    """Publishers of the simulator.
+    """Publishers of the simulator: the `RunOutput` of its run.
 
     Raises:
         InputError: /clock has another publisher; wait_for_subscribers names a foreign topic.
@@ -278,19 +264,17 @@ class SimulatorTopics:
         self._states: list[tuple[Publisher[Any], Message]] = []
         self._counted_ns = 0
         self._phase = own["phase"].publisher(node)
-        self._scene = own["scene"].publisher(node)
-        self._scene.publish(String(data=dump(scene)))
+        own["scene"].publisher(node).publish(String(data=dump(scene)))
         if given.publish_description:
-            self._description = own["robot_description"].publisher(node)
-            self._description.publish(String(data=urdf(scene)))
+            own["robot_description"].publisher(node).publish(String(data=urdf(scene)))
         self.diagnostics = own["diagnostics"].publisher(node)
         self._awaited = self._find_publishers(given.wait_for_subscribers)
         self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
         self._valid: Numbers = (0.0, 0.0, 0.0, 1.0), _AT_REST * 2, ZERO
         moments = scene.moment is not None and scene.moment.topic
-        samples = math.ceil(LOG_NS / (given.ticks_per_sample * given.period_ns))
-        self._log_ticks = samples * given.ticks_per_sample
-        self._log = TorqueLog(self._log_ticks, given.period_ns, moments=moments)
+        ticks, period_ns = given.run.ticks_per_sample, given.run.period_ns
+        self._log_ticks = math.ceil(LOG_NS / (ticks * period_ns)) * ticks
+        self._log = TorqueLog(period_ns, moments=moments)
         self._log_from_ns = 0
 
     def now_ns(self) -> int:
@@ -309,11 +293,6 @@ class SimulatorTopics:
         self._count_subscribers(COUNT_NS)
         return not self._read and self._clock is None
 
-    def start(self) -> None:
-        """Forget the torques of the run before."""
-        self._log.clear()
-        self._counted_ns = 0
-
     def ticks(self, torque: Vector3, moment: Vector3, count: int) -> None:
         """Log the torque [N m] and external moment [N m] of some ticks."""
         self._log.append(torque, moment, count)
@@ -325,11 +304,11 @@ class SimulatorTopics:
             NotFinite: nothing has been published.
 
         """
-        self._count_subscribers(COUNT_NS)
+        logged = len(self._log)
+        self._count_subscribers(COUNT_NS if logged else 0)  # the first of a run goes to all
         numbers = finite(*simulation.sample)
         if self._clock is not None:
             self._clock.publish(stamp_ns)
-        logged = len(self._log)
         if logged >= self._log_ticks or not logged or self._torques not in self._read:
             self.flush()
             self._log_from_ns = stamp_ns
@@ -373,7 +352,9 @@ class SimulatorTopics:
 
     def rivals(self) -> list[str]:
         """Names of other nodes that publish /clock while this one does."""
-        return [] if self._clock is None else self._clock.rivals()
+        own = self._node.get_fully_qualified_name()
+        names = [] if self._clock is None else topics.publishers(self._node, "/clock")
+        return [name for name in names if name != own]
 
     def _count_subscribers(self, age_ns: int) -> None:
         """Find the topics that are subscribed to, unless that was done so long ago [ns]."""

@@ -47,16 +47,10 @@ class RecordingIncomplete(SstError):
 
 @dataclass
 class RecordedTopic:
-    """A topic that is recorded.
+    """A topic that is recorded; the connection is where its messages go in the bag.
 
-    Attributes:
-        subscription: reads it; no executor does.
-        connection: where its messages go in the bag.
-        counted: whether a gap in the sequence numbers is a loss; a latched topic, of which only
-            the last message matters, and /diagnostics may have gaps.
-        messages: number of messages recorded.
-        lost: number of messages that the publisher sent and that did not arrive.
-
+    A gap in the sequence numbers is a loss where it is `counted`: a latched topic, of which only
+    the last message matters, and /diagnostics may have gaps.
     """
 
     subscription: Subscription[Any]
@@ -141,17 +135,14 @@ class Recorder:
                 own = own if own and own.type_name in types else None
                 if not (silent and own and own.use == topics.SUBSCRIBES):
                     self._subscribe(topic, own.type_name if own else types[0], own)
-        if not self._ready:
-            waiting = silent | (self._foreign - self._recorded.keys())
-            if self._recorded and not (new or waiting):
-                self._ready = True
-                print(f"ready: {len(self._recorded)} topics", flush=True)
-            else:
-                self._wait_for(waiting or self._requested)
-
-    def _wait_for(self, names: set[str]) -> None:
-        text, log = f"waiting for {_join(names)}", self.node.get_logger()
-        if self._timeout_s and time.monotonic() - self._began_s > self._timeout_s:
+        if self._ready:
+            return
+        waiting = silent | (self._foreign - self._recorded.keys())
+        text, log = f"waiting for {_join(waiting or self._requested)}", self.node.get_logger()
+        if self._recorded and not (new or waiting):
+            self._ready = True
+            print(f"ready: {len(self._recorded)} topics", flush=True)
+        elif self._timeout_s and time.monotonic() - self._began_s > self._timeout_s:
             log.error(f"{text}: given up after {self._timeout_s:g} s")
             self.done.set()
         else:
@@ -168,13 +159,9 @@ class Recorder:
             return
         # That of a topic of ours does not depend on the order of discovery.
         qos = _qos([own.qos()] if own else offers)
+        kind, group = topics.message_type(type_name), NeverSpun()
         subscription = self.node.create_subscription(
-            topics.message_type(type_name),
-            topic,
-            lambda _: None,
-            qos,
-            callback_group=NeverSpun(),
-            raw=True,
+            kind, topic, lambda _: None, qos, callback_group=group, raw=True
         )
         counted = own is not None and not (own.latched or own.name.startswith("/"))
         connection = self._bag.connect(topic, type_name, [_bag_qos(qos)])

@@ -5,23 +5,9 @@ from __future__ import annotations
 
 import signal
 
-
-class StopRequest:
-    """Whether SIGINT or SIGTERM came; no lock, on which the handler of a second would wait."""
-
-    def __init__(self) -> None:
-        self._came = False
-
-    def set(self) -> None:
-        """Ask the node to end."""
-        self._came = True
-
-    def is_set(self) -> bool:
-        """Return whether the node is to end."""
-        return self._came
-
-
-stop = StopRequest()
+_NUMBERS = (signal.SIGINT, signal.SIGTERM)
+came: set[int] = set()
+"""Signals that ask the node to end; no lock, on which the handler of a second would wait."""
 
 
 def handle() -> None:
@@ -29,12 +15,12 @@ def handle() -> None:
 
     A SIGINT that the executables have blocked until now is delivered.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    for number in _NUMBERS:
+        signal.signal(number, lambda number, _: came.add(number))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
 
 
 def ignore() -> None:
     """Ignore signals from now on: Python gives up its handlers before it has exited."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _NUMBERS:
         signal.signal(number, signal.SIG_IGN)

@@ -27,7 +27,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
-from sst_ros.nodes.topics import ActionGoal, serve_action
+from sst_ros.nodes.topics import ActionGoal
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.state import BASE_FRAME, Quaternion, Vector3
 
@@ -63,27 +63,20 @@ INFORMATION = (
 )
 
 
-def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> bool:
-    """Create the services and the action if the package is installed; return whether it is."""
+def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> None:
+    """Create the services and the action if the package is installed; `leave` ends the node."""
     if srv is None:
-        return False
+        return
     answers = SimulationInterfaces(loop, leave)
     for name in SERVICES:
         kind = getattr(srv, name.title().replace("_", ""))
         qos = topics.SERVICE_QOS
         node.create_service(kind, f"~/{name}", getattr(answers, name), qos_profile=qos)
-    offer_steps(node, loop)
-    return True
+    ActionGoal.serve(node, action.SimulateSteps, "~/simulate_steps", answers.begin_steps)
 
 
 class SimulationInterfaces:
-    """Answers the services; each takes a request and fills a response.
-
-    Args:
-        loop: the run.
-        leave: ends the node.
-
-    """
+    """Answers the services; each takes a request and fills a response."""
 
     def __init__(self, loop: RunLoop, leave: Callable[[], None]) -> None:
         self._loop, self._leave = loop, leave
@@ -108,15 +101,15 @@ class SimulationInterfaces:
         if requested == PAUSED and self._state() == STOPPED:
             text = "a stopped simulation can be started, not paused"
             return answer(response, INCORRECT_TRANSITION, text)
+        pause = partial(self._loop.pause, requested != PLAYING)
         if requested == STOPPED:
-            pause = partial(self._loop.pause, True)
             paused = self._loop.ask(pause).success
             self._ask(response, self._loop.reset)
             if not paused:  # out of a fault a reset comes first
                 self._loop.ask(pause)
             return response
         if requested in (PLAYING, PAUSED):
-            return self._ask(response, partial(self._loop.pause, requested == PAUSED))
+            return self._ask(response, pause)
         if requested == QUITTING:
             self._leave()
             return answer(response, OK)
@@ -175,27 +168,45 @@ class SimulationInterfaces:
         frame, pose, twist = request.state.header.frame_id, request.state.pose, request.state.twist
         if frame not in ("", "world", BASE_FRAME):
             return answer(response, FAILED, f"frame_id {frame!r} must be {BASE_FRAME}")
-        now = self._loop.simulation.state
+        now, refusal = self._loop.simulation.state, INVALID_POSE
         quaternion, rate = now.quaternion, _turn(now.quaternion, now.body_rate)
-        if getattr(request, "set_pose", True):  # the flags are new in 2.1
-            try:
+        try:
+            if getattr(request, "set_pose", True):  # the flags are new in 2.1
                 quaternion = _unit(_numbers(pose.orientation, "xyzw"))
                 if any(_numbers(pose.position, "xyz")):
                     raise ValueError("position must be zero: the star turns about the origin")
-            except ValueError as error:
-                return answer(response, INVALID_POSE, str(error))
-        if getattr(request, "set_twist", True):
-            try:
+            if getattr(request, "set_twist", True):
+                refusal = FAILED
                 rate = _numbers(twist.angular, "xyz")
                 if any(_numbers(twist.linear, "xyz")):
                     raise ValueError("linear velocity must be zero: the star turns about O")
-            except ValueError as error:
-                return answer(response, FAILED, str(error))
-        try:
+            refusal = INVALID_POSE
             joints = self._actuators(quaternion, rate)
-        except (AssemblyError, ArithmeticError) as error:
-            return answer(response, INVALID_POSE, str(error) or "the manipulator is singular there")
+        except (ValueError, AssemblyError, ArithmeticError) as error:
+            return answer(response, refusal, str(error) or "the manipulator is singular there")
         return self._ask(response, partial(self._loop.set_state, *joints))
+
+    def begin_steps(self, handle: Any) -> None:
+        """Begin a goal of ~/simulate_steps: steps of a paused run, with feedback after each.
+
+        A thread asks for the steps, so that the node answers meanwhile.
+        """
+
+        def run() -> None:
+            steps, reply = int(handle.request.steps), Reply(True, "")
+            for done in range(1, steps + 1):
+                if handle.is_cancel_requested:
+                    break
+                reply = self._loop.ask(self._loop.step)
+                if not reply.success:
+                    break
+                left = steps - done
+                feedback = action.SimulateSteps.Feedback(completed_steps=done, remaining_steps=left)
+                handle.publish_feedback(feedback)
+            goal.end(answer_with(action.SimulateSteps.Result(), reply), success=reply.success)
+
+        goal = ActionGoal(handle)
+        threading.Thread(target=run, daemon=True).start()
 
     def _actuators(self, quaternion: Quaternion, rate: Vector3) -> tuple[Vector3, Vector3]:
         """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
@@ -217,13 +228,9 @@ class SimulationInterfaces:
     def _fill(self, message: Any) -> Any:
         state = self._loop.simulation.state
         message.header.frame_id = BASE_FRAME
-        turning = _turn(state.quaternion, state.body_rate)
-        for part, names, values in (
-            (message.pose.orientation, "xyzw", state.quaternion),
-            (message.twist.angular, "xyz", turning),
-        ):
-            for name, value in zip(names, values, strict=True):
-                setattr(part, name, value)
+        at, turning = message.pose.orientation, message.twist.angular
+        at.x, at.y, at.z, at.w = state.quaternion
+        turning.x, turning.y, turning.z = _turn(state.quaternion, state.body_rate)
         return message
 
     def _ask(self, response: Any, request: Callable[[], Reply]) -> Any:
@@ -233,32 +240,6 @@ class SimulationInterfaces:
         if self._loop.phase is Phase.PAUSED and not self._loop.begun:
             return STOPPED
         return PLAYING if self._loop.phase in (Phase.WAITING, Phase.RUNNING) else PAUSED
-
-
-def offer_steps(node: Node, loop: RunLoop) -> None:
-    """Offer the action ~/simulate_steps: steps of a paused run, with feedback after each.
-
-    A thread asks for the steps, so that the node answers meanwhile.
-    """
-
-    def run(goal: ActionGoal) -> None:
-        handle = goal.handle
-        steps, reply = int(handle.request.steps), Reply(True, "")
-        feedback = action.SimulateSteps.Feedback()
-        for done in range(1, steps + 1):
-            if handle.is_cancel_requested:
-                break
-            reply = loop.ask(loop.step)
-            if not reply.success:
-                break
-            feedback.completed_steps, feedback.remaining_steps = done, steps - done
-            handle.publish_feedback(feedback)
-        goal.end(answer_with(action.SimulateSteps.Result(), reply), success=reply.success)
-
-    def begin(handle: Any) -> None:
-        threading.Thread(target=run, args=(ActionGoal(handle),), daemon=True).start()
-
-    serve_action(node, action.SimulateSteps, "~/simulate_steps", begin)
 
 
 def answer(response: Any, code: int, text: str = "") -> Any:

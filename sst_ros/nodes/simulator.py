@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -38,7 +37,6 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
 
-_LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
 _DELAY_S = 5.0
 """Delay of the compiler: the first seconds of a real-time run have the processor alone."""
 _WATCH_S = 0.1
@@ -60,24 +58,22 @@ class Simulator:
         )
         simulated = scene.load(given.scene)
         self._topics = SimulatorTopics(self.node, simulated, given)
-        self._run = given.run
+        run = self._run = given.run
         names = ["commands", "commands_stamped"]
         if simulated.moment is not None and simulated.moment.topic:
             names.append("external_moment")
         readers = [Reader(self.node, topics.SIMULATOR[name]) for name in names]
-        self._input = TorqueInput(self._run, simulated.actuators, *readers)
-        follows = follows_clock(self.node)
-        source, longest_ns = (
-            (FollowedClock(self.node), FOLLOWED_STEP_NS) if follows else (SteadyTime(), 0)
-        )
-        self._pacer = Pacer(self._run.period_ns, given.real_time_factor, source, longest_ns)
+        self._input = TorqueInput(run, simulated.actuators, *readers)
+        if follows_clock(self.node):
+            source, longest_ns = FollowedClock(self.node), FOLLOWED_STEP_NS
+            self._pacer = Pacer(run.period_ns, given.real_time_factor, source, longest_ns)
+        else:
+            self._pacer = Pacer(run.period_ns, given.real_time_factor, SteadyTime())
         compiles = given.compiled and given.equations == "quaternion"
         self._code = CodeCompiler(self.node, simulated, given) if compiles else None
         self._latency = scheduling.CpuDmaLatency()
-        self._loop = RunLoop(
-            simulated, self._build, self._run, self._input, self._pacer, self._topics
-        )
-        period_s = given.period_ns / NANOSECONDS
+        self._loop = RunLoop(simulated, self._build, run, self._input, self._pacer, self._topics)
+        period_s = run.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
         serve(self.node, self._loop)
         simulation_interfaces.offer(self.node, self._loop, self.done.set)
@@ -179,7 +175,7 @@ class Simulator:
         level, text, news = self._diagnostics.status(values, [*self._warnings(commands)])
         for line in news:
             self.node.get_logger().warning(line)
-        message = topics.diagnostics(self.node, "run", _LEVELS[level], text, values)
+        message = topics.diagnostics(self.node, "run", level, text, values)
         self._topics.diagnostics.publish(message)
         scheduling.tidy()
         if self._loop.phase is not Phase.FINISHED:
@@ -232,16 +228,15 @@ def serve(node: Node, loop: RunLoop) -> None:
             node.get_logger().warning(f"set_state refused: {refused}")
             return
         reply = loop.ask(partial(loop.set_state, gamma, gamma_dot))
-        text = f"set_state: {reply.message}"
         if reply.success:  # rclpy refuses two severities from one line
-            node.get_logger().info(text)
+            node.get_logger().info(f"set_state: {reply.message}")
         else:
-            node.get_logger().warning(text)
+            node.get_logger().warning(f"set_state: {reply.message}")
 
     offer("pause", lambda request: partial(loop.pause, request.data))
     offer("step", lambda _: loop.step)
     offer("reset", lambda _: loop.reset)
-    topics.SIMULATOR["set_state"].subscription(node, set_state)
+    topics.subscribe(node, topics.SIMULATOR, set_state=set_state)
 
 
 class CodeCompiler:
@@ -279,9 +274,9 @@ class CodeCompiler:
             self._node.get_logger().info("another process compiles: this one does not")
             return
         given = self._given
-        command = ["compile", given.scene, "--integrator", given.integrator]
+        words = ["compile", given.scene, "--integrator", given.integrator]
         compiler = subprocess.Popen(
-            [sys.executable, "-m", "sst_ros", *command],
+            [sys.executable, "-m", "sst_ros", *words],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -12,8 +12,7 @@ import math
 import time
 from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import CallbackGroup
@@ -149,18 +148,14 @@ _UNKNOWN = "_UNKNOWN_"
 """Part of the names that DDS has for nodes whose discovery is not finished."""
 
 
-@dataclass(frozen=True)
-class Endpoint:
-    """One topic, service or action of a node.
+class Endpoint(NamedTuple):
+    """One topic, service or action of a node: a row of the table.
 
     Attributes:
         use: PUBLISHES, SUBSCRIBES, SERVES, CALLS or EXECUTES, the last of an action.
-        name: its name, with ~ and {simulator}.
-        type_name: type of its messages, as ROS writes it.
         depth: messages kept for slow readers; 0 for two seconds of them.
         latched: the last message is kept for late joiners.
         when: the condition under which it exists; always where empty.
-        doc: what it carries.
 
     """
 
@@ -182,19 +177,11 @@ class Endpoint:
         name = self.name.replace("~", node)
         return name if name.startswith("/") else f"{node.rpartition('/')[0]}/{name}"
 
-    def publisher(self, node: Node, depth: int = 0, *, simulator: str = "") -> Publisher[Any]:
-        """Create its publisher."""
-        return node.create_publisher(self.kind, self.resolve(simulator), self.qos(depth))
-
-    def subscription(
-        self, node: Node, callback: Callable[[Any], None], *, simulator: str = ""
-    ) -> Subscription[Any]:
-        """Create its subscription."""
-        return node.create_subscription(self.kind, self.resolve(simulator), callback, self.qos())
-
-    def resolve(self, simulator: str) -> str:
-        """Return its name with that of the simulator's node."""
-        return self.name.replace("{simulator}", simulator)
+    def publisher(self, node: Node, depth: int = 10, *, simulator: str = "") -> Publisher[Any]:
+        """Create its publisher; the depth is for a topic that has none of its own."""
+        return node.create_publisher(
+            self.kind, self.name.format(simulator=simulator), self.qos(depth)
+        )
 
     def qos(self, depth: int = 10) -> QoSProfile:
         """Return its QoS; the depth is for a topic that has none of its own."""
@@ -232,6 +219,15 @@ def message_type(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{form}"), name)
 
 
+def subscribe(
+    node: Node, own: dict[str, Endpoint], simulator: str = "", **callbacks: Callable[[Any], None]
+) -> None:
+    """Create the subscriptions of a node to topics of its own table, by the names there."""
+    for name, callback in callbacks.items():
+        one, topic = own[name], own[name].name.format(simulator=simulator)
+        node.create_subscription(one.kind, topic, callback, one.qos())
+
+
 def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str]:
     """Full names of the nodes that publish a topic, one for each (best-effort) publisher."""
     return [
@@ -244,13 +240,12 @@ def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str
 
 
 def diagnostics(
-    node: Node, what: str, level: bytes, text: str, values: dict[str, object]
+    node: Node, what: str, level: int, text: str, values: dict[str, Any]
 ) -> DiagnosticArray:
-    """Build a DiagnosticArray of one status of a node."""
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    name = f"{node.get_fully_qualified_name()}: {what}"
-    status = DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=pairs)
-    message = DiagnosticArray(status=[status])
+    """Build a DiagnosticArray of one status of a node; the level is 0, 1 or 2 for an error."""
+    message = DiagnosticArray(status=[DiagnosticStatus(level=bytes([level]), message=text)])
+    message.status[0].name = f"{node.get_fully_qualified_name()}: {what}"
+    message.status[0].values = [KeyValue(key=key, value=str(x)) for key, x in values.items()]
     now = node.get_clock().now().nanoseconds
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, NANOSECONDS)
     return message
@@ -316,34 +311,28 @@ class Reader:
         elif not self._published and until_ns < math.inf:
             return ()
         found: list[Any] = []
-        while len(found) < MOST_WAITING and (message := self._take(until_ns)) is not None:
+        while len(found) < MOST_WAITING and (following := self._next or self._take()):
+            message, arrived_ns = following
+            self.waiting = arrived_ns > until_ns
+            self._next = following if self.waiting else None
+            if self.waiting:
+                break
             found.append(message)
         return found
 
-    def _take(self, until_ns: float) -> Any:
-        if self._next is None:
-            # As bytes: otherwise an empty message is made each time that there is none.
-            if (taken := take(self._subscription)) is None:
-                return None
-            data, information = taken
-            message = deserialize_message(data, self._subscription.msg_type)
-            ago = max(0, time.time_ns() - information["received_timestamp"])
-            self._next = message, time.monotonic_ns() - ago
-        message, arrived_ns = self._next
-        self.waiting = arrived_ns > until_ns
-        if self.waiting:
+    def _take(self) -> tuple[Any, int] | None:
+        """Take the next message and find when it arrived; None if there is none."""
+        # As bytes: otherwise an empty message is made each time that there is none.
+        if (taken := take(self._subscription)) is None:
             return None
-        self._next = None
-        return message
+        data, information = taken
+        message = deserialize_message(data, self._subscription.msg_type)
+        ago = max(0, time.time_ns() - information["received_timestamp"])
+        return message, time.monotonic_ns() - ago
 
 
 class TorqueCommands:
-    """Publisher of the commands, and the time-out of the joint states that they answer.
-
-    Attributes:
-        publisher: of the commands.
-
-    """
+    """Publisher of the commands, and the time-out of the joint states that they answer."""
 
     def __init__(self, node: Node, given: AnsweringParameters) -> None:
         self._given = given
@@ -354,12 +343,12 @@ class TorqueCommands:
         else:
             self._message = topic.kind(data=array("d", ZERO))
             self._torques = self._message.data
-        self.publisher = topic.publisher(node, simulator=given.simulator)
+        self._publisher = topic.publisher(node, simulator=given.simulator)
         self.restart_timeout()
 
     def has_subscribers(self) -> bool:
         """Whether they have as many subscribers as the parameters ask for."""
-        return self.publisher.get_subscription_count() >= self._given.min_subscribers
+        return self._publisher.get_subscription_count() >= self._given.min_subscribers
 
     def answer_to(self, state: JointState) -> int:
         """Give the next commands the stamp of a state; return it [ns], 0 where it is no sample."""
@@ -371,7 +360,7 @@ class TorqueCommands:
     def send(self, torque: Vector3) -> None:
         """Publish torques [N m]."""
         self._torques[0], self._torques[1], self._torques[2] = torque
-        self.publisher.publish(self._message)
+        self._publisher.publish(self._message)
 
     def restart_timeout(self) -> None:
         """Count the time-out of joint_states from now on."""
@@ -382,16 +371,6 @@ class TorqueCommands:
         silent = time.monotonic() - self._received
         if silent > self._given.timeout:
             raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")
-
-
-def serve_action(
-    node: Node, kind: Any, name: str, begin: Callable[[Any], None], **callbacks: Callable[..., Any]
-) -> None:
-    """Serve an action whose goals are `ActionGoal`s, made by `begin` from a handle of rclpy."""
-    from rclpy.action.server import ActionServer, CancelResponse  # most nodes have no action
-
-    given: dict[str, Any] = {"cancel_callback": lambda _: CancelResponse.ACCEPT, **callbacks}
-    ActionServer(node, kind, name, lambda _: None, handle_accepted_callback=begin, **given)
 
 
 class ActionGoal:
@@ -406,6 +385,16 @@ class ActionGoal:
         self.handle = handle
         self._result: Future[Any] = Future()
         handle.execute(self._wait)
+
+    @staticmethod
+    def serve(
+        node: Node, kind: Any, name: str, begin: Callable[[Any], None], **callbacks: Any
+    ) -> None:
+        """Serve an action whose goals `begin` makes, from handles of rclpy."""
+        from rclpy.action.server import ActionServer, CancelResponse  # most nodes have no action
+
+        given = {"cancel_callback": lambda _: CancelResponse.ACCEPT, **callbacks}
+        ActionServer(node, kind, name, lambda _: None, handle_accepted_callback=begin, **given)
 
     async def _wait(self, _: Any) -> Any:
         return await self._result

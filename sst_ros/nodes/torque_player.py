@@ -17,7 +17,6 @@ from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import parameters, topics
 from sst_ros.nodes.process import every
-from sst_ros.nodes.topics import TorqueCommands
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
 from sst_ros.simulation.torque_profile import TorqueTable
@@ -30,32 +29,20 @@ class TorquePlayer:
     def __init__(self) -> None:
         self.node = Node("sst_torque_player")
         self.done = threading.Event()
-        self._parameters = parameters.declare(self.node, PlayerParameters)
-        self._profile, self._duration = self._load()
-        self._commands = TorqueCommands(self.node, self._parameters)
+        self._parameters = given = parameters.declare(self.node, PlayerParameters)
+        self._profile, self._duration = _load(given)
+        self._commands = topics.TorqueCommands(self.node, given)
         self._start_ns: int | None = None
         self._last_ns = 0
-        self._warned = False
-        topics.PLAYER["phase"].subscription(
-            self.node, self._hear, simulator=self._parameters.simulator
-        )
-        topics.PLAYER["joint_states"].subscription(self.node, self._answer)
+        self._warned = given.hold != "middle"
+        heard = {"phase": self._hear, "joint_states": self._answer}
+        topics.subscribe(self.node, topics.PLAYER, given.simulator, **heard)
         every(self.node, 0.5, self._commands.watch)
 
     def close(self) -> None:
         """Leave the actuators without torque if the profile was cut short."""
         if self._start_ns is not None and not self.done.is_set():
             self._commands.send(ZERO)
-
-    def _load(self) -> tuple[TorqueFunction, float]:
-        if self._parameters.csv != "-":
-            table = TorqueTable.read(self._parameters.csv)
-            return table, float(table.times[-1])
-        played = scene.load(self._parameters.scene)
-        if played.torque is None or played.duration is None:
-            allowed = "must have torque and duration to be played, or csv must name a file"
-            raise InputError("torque_player", [Problem("scene", played.name, allowed)])
-        return played.torque.at, played.duration
 
     def _hear(self, phase: String) -> None:
         if self._start_ns is not None and phase.data.startswith("fault"):
@@ -94,12 +81,24 @@ class TorquePlayer:
     def _check_period(self, stamp_ns: int) -> None:
         """Warn once where the samples come at another period than that of `rate`."""
         apart_ns, self._last_ns = stamp_ns - self._last_ns, stamp_ns
-        given = self._parameters
-        if self._warned or given.hold != "middle" or apart_ns in (0, given.period_ns):
+        period_ns = self._parameters.period_ns
+        if self._warned or apart_ns in (0, period_ns):
             return
         self._warned = True
         self.node.get_logger().warning(
             f"two samples are {apart_ns / NANOSECONDS:g} s apart, not 1 / rate = "
-            f"{given.period_ns / NANOSECONDS:g} s: torques are not those of the middle of the hold;"
+            f"{period_ns / NANOSECONDS:g} s: torques are not those of the middle of the hold;"
             " give rate = publish_rate of the simulator, or hold:=start"
         )
+
+
+def _load(given: PlayerParameters) -> tuple[TorqueFunction, float]:
+    """Return the profile and its length [s]."""
+    if given.csv != "-":
+        table = TorqueTable.read(given.csv)
+        return table, float(table.times[-1])
+    played = scene.load(given.scene)
+    if played.torque is None or played.duration is None:
+        allowed = "must have torque and duration to be played, or csv must name a file"
+        raise InputError("torque_player", [Problem("scene", played.name, allowed)])
+    return played.torque.at, played.duration

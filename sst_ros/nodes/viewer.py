@@ -8,6 +8,7 @@ import threading
 from array import array
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -53,18 +54,20 @@ class Viewer:
         self._commands: Publisher[Float64MultiArray] | None = None
         self._clients: dict[str, Client[Any, Any]] = {
             name: self.node.create_client(
-                one.kind, one.resolve(given.simulator), qos_profile=topics.SERVICE_QOS
+                one.kind, one.name.format(simulator=given.simulator), qos_profile=topics.SERVICE_QOS
             )
             for name, one in topics.VIEWER.items()
             if one.use == topics.CALLS
         }
-        for name, take in (
-            ("joint_states", self._take_state),
-            ("scene", self._take_scene),
-            ("phase", self._take_phase),
-            ("diagnostics", self._take_diagnostics),
-        ):
-            topics.VIEWER[name].subscription(self.node, take, simulator=given.simulator)
+        topics.subscribe(
+            self.node,
+            topics.VIEWER,
+            given.simulator,
+            joint_states=self._take_state,
+            scene=self._take_scene,
+            phase=self._take_phase,
+            diagnostics=self._take_diagnostics,
+        )
         every(self.node, _REPEAT_S, self._repeat)
         every(self.node, _LOOK_S, self._look)
         self._page = Page(self, given.host, given.port)
@@ -82,8 +85,7 @@ class Viewer:
 
     def status(self) -> RunStatus:
         """Return the phase and the latest diagnostics."""
-        latest = self._status
-        return RunStatus(self._phase, latest.level, latest.message, latest.values)
+        return replace(self._status, phase=self._phase)
 
     def pause(self, paused: bool) -> tuple[bool, str]:
         """Pause or resume the run."""
@@ -154,13 +156,11 @@ class Viewer:
         """Publish the torque before the simulator drops the last one as too old."""
         if self._driving and self._commands is None:
             self._look()
-        if not self._driving:
-            return
-        if self._commands is None:
-            self._commands = topics.VIEWER["commands"].publisher(
-                self.node, simulator=self._parameters.simulator
-            )
-        self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
+        if self._driving:
+            if self._commands is None:
+                simulator = self._parameters.simulator
+                self._commands = topics.VIEWER["commands"].publisher(self.node, simulator=simulator)
+            self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
 
     def _call(self, service: str, request: Any) -> tuple[bool, str]:
         """Call a service from a thread of the page; the node's thread takes the reply."""

@@ -18,8 +18,6 @@ from sst_ros.simulation.simulation import Simulation
 
 OK, WARN, ERROR = range(3)
 _ROWS = 16
-_COUNTS = ("commands_dropped", "commands_clamped", "command_timeouts", "ticks_missed")
-"""Keys of what is warned of when it has grown."""
 
 GAUGES = {
     "error_estimate": "estimated error of the orientation [rad]",
@@ -85,10 +83,10 @@ class RunDiagnostics:
         self.gauges: dict[str, object] = {}
         self.scheduling, self.cpu_dma_latency = "", scheduling.NO_LIMIT
         self._before = (0, 0.0)
-        self._noted: tuple[int, ...] = (0, 0, 0, 0)
+        self._noted: dict[str, Any] = {}
         self._warned: list[str] = []
-        self._rows: list[str] = []
-        self._last: tuple[float, str] | None = None
+        self._rows: list[tuple[float, list[object], float, int]] = []
+        self._last: tuple[float, list[object], float, int] | None = None
         self._count, self._stride = 0, 1
 
     def values(self, publishers: int) -> dict[str, Any]:
@@ -146,18 +144,18 @@ class RunDiagnostics:
 
         """
         running, fault = values["phase"] == Phase.RUNNING.value, values["fault"]
-        now = tuple(values[key] for key in _COUNTS)
-        dropped, clamped, timeouts, missed = (
-            after - before for after, before in zip(now, self._noted, strict=True)
-        )
-        self._noted = now
-        news = []
-        if dropped:
-            news.append(f"command dropped: {self._input.last_refusal} ({now[0]} in all)")
-        if clamped:
-            news.append(f"commands clamped to the scene's torque limit ({now[1]} in all)")
-        if timeouts:
-            news.append(f"no command within command_timeout: not held ({now[2]} in all)")
+        said = {
+            "commands_dropped": f"command dropped: {self._input.last_refusal}",
+            "commands_clamped": "commands clamped to the scene's torque limit",
+            "command_timeouts": "no command within command_timeout: not held",
+        }
+        before, self._noted = self._noted, values
+        missed = values["ticks_missed"] - before.get("ticks_missed", 0)
+        news = [
+            f"{text} ({values[key]} in all)"
+            for key, text in said.items()
+            if values[key] > before.get(key, 0)
+        ]
         if (publishers := values["command_publishers"]) > 1:
             news.append(f"{publishers} publishers of commands: the last message wins")
         news += [warning for warning in warnings if warning not in self._warned]
@@ -176,31 +174,25 @@ class RunDiagnostics:
 
     def table(self) -> Iterator[str]:
         """Yield the lines of the table of error against run time."""
-        yield (
-            f"{'run time':>12} {'error':>11} {'energy':>11} {'closure':>11} "
-            f"{'real-time':>10} {'ticks':>8}"
-        )
-        yield f"{'[s]':>12} {'[rad]':>11} {'[J]':>11} {'[1]':>11} {'factor':>10} {'missed':>8}"
-        yield from self._rows
-        if self._last is not None:
-            yield self._last[1]
+        columns = "{:>12} {:>11} {:>11} {:>11} {:>10} {:>8}"
+        yield columns.format("run time", "error", "energy", "closure", "real-time", "ticks")
+        yield columns.format("[s]", "[rad]", "[J]", "[1]", "factor", "missed")
+        for seconds, errors, factor, missed in filter(None, (*self._rows, self._last)):
+            cells = (f"{value:.2e}" if isinstance(value, float) else "-" for value in errors)
+            yield columns.format(f"{seconds:.3f}", *cells, f"{factor:.3f}", missed)
 
     def _keep_row(self, simulated_s: float, factor: float) -> None:
         """Keep the newest row and at most 16 before it, evenly over the run."""
         keys = ("error_estimate", "energy_residual_J", "closure_residual")
-        numbers = " ".join(
-            f"{value:11.2e}" if isinstance(value, float) else f"{'-':>11}"
-            for value in map(self.gauges.get, keys)
-        )
-        row = f"{simulated_s:12.3f} {numbers} {factor:10.3f} {self._pacer.missed:8d}"
+        errors = [self.gauges.get(key) for key in keys]
         if self._last is not None and self._last[0] != simulated_s:
             self._count += 1
             if self._count % self._stride == 0:
-                self._rows.append(self._last[1])
+                self._rows.append(self._last)
             if len(self._rows) >= _ROWS:
                 self._rows = self._rows[1::2]
                 self._stride *= 2
-        self._last = simulated_s, row
+        self._last = simulated_s, errors, factor, self._pacer.missed
 
 
 def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:

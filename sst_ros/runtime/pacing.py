@@ -41,11 +41,6 @@ class RunSettings:
     lockstep_timeout: float = 0.0
     subscriber_timeout: float = 0.0
 
-    @property
-    def ends(self) -> bool:
-        """Whether the run has a last tick."""
-        return self.last_tick < sys.maxsize
-
 
 class TimeSource(Protocol):
     """Clock that deadlines are measured by."""
@@ -67,13 +62,14 @@ class SteadyTime:
 class Pacer:
     """Deadlines anchor + k period / speed. After an overrun the whole periods in it are dropped.
 
+    Lateness up to `tolerance_ns` is made up for: the step of a followed clock.
+
     Attributes:
         speed: real-time factor; 0 for deadlines that have always come.
         interval_ns: time between deadlines [ns]; 0 without any.
         together: ticks that one sleep of 2 ms may end in, 1 at least; 1 on a clock that is
             followed: the next deadline is not known by it.
-        missed: ticks dropped.
-        overruns: times that ticks were dropped.
+        missed, overruns: ticks dropped, and times that some were.
         jumps: times that the clock went back.
         late_ns: lateness of the start of the last tick [ns].
 
@@ -82,7 +78,6 @@ class Pacer:
     def __init__(
         self, period_ns: int, speed: float, source: TimeSource, tolerance_ns: int = 0
     ) -> None:
-        """Lateness up to `tolerance_ns` is made up for: the step of a followed clock."""
         self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
         self._anchor = self._count = self._seen = 0
         self._set(speed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 import threading
 import time
 import traceback
@@ -85,13 +86,13 @@ class RunLoop(TickLoop):
         self._watched = (0.0, 0.0)
         self._missing_since: float | None = time.monotonic()
 
-    def ask(self, request: Callable[[], Reply], timeout: float = _REPLY_S) -> Reply:
+    def ask(self, request: Callable[[], Reply]) -> Reply:
         """Have a request (`pause`, `reset`, ...) served by the thread of the run; wait for it.
 
         The wait ends early where the run has stopped or a step does not end.
         """
         pending = self.post(request)
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + _REPLY_S
         while not wait([pending], _POLL_S).done:
             since = self.step_since
             stuck = since and time.perf_counter() - since > _STUCK_S
@@ -129,13 +130,6 @@ class RunLoop(TickLoop):
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
         self._thread, self._missing_since = threading.current_thread(), time.monotonic()
         self._output.publish_phase(self._status)
-        act: dict[Phase, Callable[[], None]] = {
-            Phase.WAITING: self._wait_for_start,
-            Phase.RUNNING: self._to_next_sample,
-            Phase.PAUSED: self._idle,
-            Phase.FAULT: self._idle,
-            Phase.FINISHED: lambda: None,  # a step led to the end
-        }
         warm = False
         while not (self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
             try:
@@ -144,7 +138,12 @@ class RunLoop(TickLoop):
                     self.warm_up()
                 if self.requested.is_set():
                     self._serve()
-                act[self.phase]()
+                if self.phase is Phase.WAITING:
+                    self._wait_for_start()
+                elif self.phase is Phase.RUNNING:
+                    self._to_next_sample()
+                elif self.phase in (Phase.PAUSED, Phase.FAULT):  # a step may have led to the end
+                    self._idle()
             except NoSubscribers as missing:
                 self._fail(str(missing))
                 self.failed = True
@@ -163,8 +162,7 @@ class RunLoop(TickLoop):
             return Reply(False, f"fault, reset first: {self.fault}")
         if paused:
             reply = "already paused" if self.phase is Phase.PAUSED else "paused"
-            self.publish_rest()
-            self._to(Phase.PAUSED)
+            self._rest(Phase.PAUSED)
             return Reply(True, reply)
         if self.phase is not Phase.PAUSED:
             return Reply(True, f"not paused: {self.phase.value}")
@@ -193,7 +191,7 @@ class RunLoop(TickLoop):
             if self.fault:
                 return Reply(False, self._status)
             if self.complete:
-                self._finish()
+                self._rest(Phase.FINISHED)
                 break
         return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
 
@@ -221,14 +219,15 @@ class RunLoop(TickLoop):
         self.counters.states_set += 1
         return Reply(True, f"the state is set, {self.phase.value}")
 
-    def _serve(self) -> None:
+    def _serve(self, *, refuses: bool = False) -> None:
+        """Serve what has been requested, or refuse it."""
         self.requested.clear()
         while self._requests:
             request, pending = self._requests.popleft()
             if pending.set_running_or_notify_cancel():
                 reply = _NOT_DONE
                 try:
-                    reply = request() or Reply(True, "")
+                    reply = _NOT_DONE if refuses else request() or Reply(True, "")
                 finally:
                     pending.set_result(reply)
 
@@ -245,25 +244,17 @@ class RunLoop(TickLoop):
 
     def _start(self) -> bool:
         """Start the run, unless it has to wait; return whether it runs."""
-        if not (self._has_subscribers() and (not self._run.waits or self._input.starts_run())):
-            return False
-        if not self.begin():
+        if self._missing_since is not None:  # of subscribers that have to be there once
+            if missing := self._output.missing_subscribers():
+                if time.monotonic() - self._missing_since > self._run.subscriber_timeout:
+                    reason = f"within {self._run.subscriber_timeout:g} s (wait_for_subscribers)"
+                    raise NoSubscribers(f"no subscriber of {', '.join(missing)} {reason}")
+                return False
+            self._missing_since = None
+        if (self._run.waits and not self._input.starts_run()) or not self.begin():
             return False
         self._resume()
         return True
-
-    def _has_subscribers(self) -> bool:
-        """Whether the topics of wait_for_subscribers have had subscribers."""
-        if self._missing_since is None:
-            return True
-        missing = self._output.missing_subscribers()
-        timeout = self._run.subscriber_timeout
-        if not missing:
-            self._missing_since = None
-        elif time.monotonic() - self._missing_since > timeout:
-            reason = f"no subscriber of {', '.join(missing)} within {timeout:g} s"
-            raise NoSubscribers(f"{reason} (wait_for_subscribers)")
-        return not missing
 
     def _resume(self) -> None:
         self._to(Phase.RUNNING)
@@ -274,11 +265,11 @@ class RunLoop(TickLoop):
         if self.fault:  # latched by `watch`: the step has ended after all
             self.publish_rest()
         elif done and self.complete:
-            self._finish()
+            self._rest(Phase.FINISHED)
 
-    def _finish(self) -> None:
+    def _rest(self, phase: Phase) -> None:
         self.publish_rest()
-        self._to(Phase.FINISHED)
+        self._to(phase)
 
     def _fail(self, reason: str) -> None:
         """Latch a fault; the last valid state is published, then held."""
@@ -295,10 +286,7 @@ class RunLoop(TickLoop):
         self.publish_rest()
         self.counters.hold()
         self.stopped.set()
-        while self._requests:
-            pending = self._requests.popleft()[1]
-            if pending.set_running_or_notify_cancel():
-                pending.set_result(_NOT_DONE)
+        self._serve(refuses=True)
 
     def _to(self, phase: Phase) -> None:
         with self._changing:
@@ -306,7 +294,7 @@ class RunLoop(TickLoop):
                 self.counters.hold()
             if self.fault:
                 phase = Phase.FAULT
-                self.failed = self.failed or self._run.ends
+                self.failed = self.failed or self._run.last_tick < sys.maxsize
             if phase is not self.phase:
                 self.phase = phase
                 self._output.publish_phase(self._status)

@@ -17,47 +17,46 @@ from sst_ros.scene.schema import Section, choice, flag, integer, number, text, t
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
 from sst_ros.state import NANOSECONDS
 
-
-def _seconds(doc: str, default: float, *, least: float = 0.0, most: float = 1e6) -> Any:
-    return number(doc, "s", default=default, least=least, most=most)
+_OF_A_GOAL = ", where the goal does not give it; 0 for none"
 
 
-def _rate(doc: str, default: int) -> Any:
-    return integer(doc, "Hz", default=default, least=1, most=100000)
+def _number(doc: str, unit: str, default: float, least: float = 0.0, most: float = 1e6) -> Any:
+    return number(doc, unit, default=default, least=least, most=most)
 
 
-def _tolerance(doc: str, unit: str, default: float) -> Any:
-    text = f"{doc}, where the goal does not give it; 0 for none"
-    return number(text, unit, default=default, least=0.0, most=1e6)
+def _positive(doc: str, unit: str, default: float) -> Any:
+    return number(doc, unit, default=default, above=0.0, most=1.0)
+
+
+def _whole(doc: str, unit: str, default: int, least: int, most: int) -> Any:
+    return integer(doc, unit, default=default, least=least, most=most)
 
 
 @dataclass(frozen=True)
 class SimulatorParameters(Section):
     """Parameters of sst_simulator."""
 
-    CHANGEABLE: ClassVar[tuple[str, ...]] = (
-        "real_time_factor",
-        "command_timeout",
-        "lockstep_timeout",
-    )
+    CHANGEABLE: ClassVar = ("real_time_factor", "command_timeout", "lockstep_timeout")
 
     scene: str = text("scene, by name or by path of a .yaml file", default="example2")
-    rate: int = _rate("steps per second of simulated time, a divisor of 1e9", 1000)
-    publish_rate: int = _rate(
-        "published samples per second of simulated time, a divisor of rate", 500
+    rate: int = _whole(
+        "steps per second of simulated time, a divisor of 1e9", "Hz", 1000, 1, 100000
+    )
+    publish_rate: int = _whole(
+        "published samples per second of simulated time, a divisor of rate", "Hz", 500, 1, 100000
     )
     wait_for_command: bool = flag("start the run at the first command, not at once", default=False)
-    duration: float = _seconds(
+    duration: float = _number(
         "length of the run, after which the node ends, by default the duration of the scene; 0 for "
         "no end",
-        0.0,
+        "s",
+        default=0.0,
         most=1e9,
     )
-    real_time_factor: float = number(
+    real_time_factor: float = _number(
         "simulated time per time of the clock, 0.001 to 1000; 0 for as fast as possible",
         "1",
         default=1.0,
-        least=0.0,
         most=1000.0,
     )
     publish_clock: bool = flag(
@@ -69,19 +68,19 @@ class SimulatorParameters(Section):
         "before the run starts",
         default=(),
     )
-    subscriber_timeout: float = _seconds(
-        "longest wait for them, after which the node ends with an error", 10.0
+    subscriber_timeout: float = _number(
+        "longest wait for them, after which the node ends with an error", "s", 10.0
     )
     sync: str = choice(
         "free: run by the clock; lockstep: wait for the command that answers each sample",
         ("free", "lockstep"),
         default="free",
     )
-    lockstep_timeout: float = _seconds(
-        "longest wait for the answer to a sample, then fault; 0 for no end", 10.0
+    lockstep_timeout: float = _number(
+        "longest wait for the answer to a sample, then fault; 0 for no end", "s", 10.0
     )
-    command_timeout: float = _seconds(
-        "age at which a command is no longer held (steady clock); 0 for never", 0.5
+    command_timeout: float = _number(
+        "age at which a command is no longer held (steady clock); 0 for never", "s", 0.5
     )
     partial_commands: bool = flag(
         "an effort of commands_stamped that is nan means that the actuator is not commanded, as "
@@ -89,12 +88,8 @@ class SimulatorParameters(Section):
         default=False,
     )
     integrator: str = choice("method of integration", INTEGRATORS, default="auto")
-    tolerance: float = number(
-        "largest local error of a step of the integrator",
-        "rad, relative",
-        default=1e-10,
-        above=0.0,
-        most=1.0,
+    tolerance: float = _positive(
+        "largest local error of a step of the integrator", "rad, relative", 1e-10
     )
     equations: str = choice(
         "equations of motion: those in the quaternion and the body rate, or the paper's Eqs. 1 to "
@@ -107,7 +102,7 @@ class SimulatorParameters(Section):
         "the same bits, and a process of low priority compiles the scene for the next",
         default=True,
     )
-    realtime_priority: int = integer(
+    realtime_priority: int = _whole(
         "SCHED_FIFO priority of the run's thread where that is permitted, the other threads of the "
         "node get half of it; 0 for none",
         "1",
@@ -115,7 +110,7 @@ class SimulatorParameters(Section):
         least=0,
         most=99,
     )
-    cpu_dma_latency: int = integer(
+    cpu_dma_latency: int = _whole(
         "largest exit latency of idle states that the machine is asked to use during a run with "
         "deadlines, where /dev/cpu_dma_latency may be written; with 0 no core sleeps, which wakes "
         "the run earlier and costs power; -1 for no limit",
@@ -136,29 +131,18 @@ class SimulatorParameters(Section):
                 yield Problem(name, getattr(self, name), "must be 0 or >= 0.001")
 
     @property
-    def period_ns(self) -> int:
-        """Length of a step [ns]."""
-        return NANOSECONDS // self.rate
-
-    @property
-    def ticks_per_sample(self) -> int:
-        """Steps between two published samples."""
-        return self.rate // self.publish_rate
-
-    @property
     def run(self) -> RunSettings:
         """Return what the run takes from them."""
-        lockstep = self.sync == "lockstep"
         return RunSettings(
-            self.period_ns,
-            self.ticks_per_sample,
-            math.ceil(self.duration * self.rate - 1e-6) or sys.maxsize,
-            lockstep,
-            self.wait_for_command or lockstep,
-            self.partial_commands,
-            self.command_timeout * NANOSECONDS,
-            self.lockstep_timeout,
-            self.subscriber_timeout,
+            period_ns=NANOSECONDS // self.rate,
+            ticks_per_sample=self.rate // self.publish_rate,
+            last_tick=math.ceil(self.duration * self.rate - 1e-6) or sys.maxsize,
+            lockstep=self.sync == "lockstep",
+            waits=self.wait_for_command or self.sync == "lockstep",
+            partial_commands=self.partial_commands,
+            command_timeout_ns=self.command_timeout * NANOSECONDS,
+            lockstep_timeout=self.lockstep_timeout,
+            subscriber_timeout=self.subscriber_timeout,
         )
 
 
@@ -166,22 +150,21 @@ class SimulatorParameters(Section):
 class AnsweringParameters(Section):
     """Parameters of the nodes that answer joint states with torques."""
 
-    rate: int = _rate(
+    rate: int = _whole(
         "commands per second of simulated time, a divisor of 1e9: publish_rate of the simulator",
-        500,
+        "Hz",
+        default=500,
+        least=1,
+        most=100000,
     )
     simulator: str = text("name of the simulator's node", default="sst_simulator")
     stamped: bool = flag(
         "answer on commands_stamped, as a simulator in lockstep asks", default=False
     )
-    min_subscribers: int = integer(
-        "least number of subscribers of the commands, before which none is sent",
-        "1",
-        default=1,
-        least=1,
-        most=100,
+    min_subscribers: int = _whole(
+        "least number of subscribers of the commands, before which none is sent", "1", 1, 1, 100
     )
-    timeout: float = _seconds("longest silence of joint_states", 10.0, least=0.1)
+    timeout: float = _number("longest silence of joint_states", "s", 10.0, least=0.1)
 
     def check(self) -> Iterator[Problem]:
         """Refuse a rate without a whole period."""
@@ -220,27 +203,26 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
         ("scene", "topic"),
         default="scene",
     )
-    hold: float = _seconds("time for which the end of the scene's motion is held", 0.0)
-    start_tolerance: float = number(
-        "largest distance of gamma from the start of the motion",
+    hold: float = _number("time for which the end of the scene's motion is held", "s", 0.0)
+    start_tolerance: float = _positive(
+        "largest distance of gamma from the start of the motion", "rad", 0.05
+    )
+    path_tolerance: float = _number(
+        "largest error of gamma while a goal of ~/follow_joint_trajectory moves" + _OF_A_GOAL,
         "rad",
-        default=0.05,
-        above=0.0,
-        most=1.0,
+        default=0.0,
     )
-    path_tolerance: float = _tolerance(
-        "largest error of gamma while a goal of ~/follow_joint_trajectory moves", "rad", 0.0
+    goal_tolerance: float = _number("largest error of gamma at its end" + _OF_A_GOAL, "rad", 0.0)
+    stopped_velocity_tolerance: float = _number(
+        "largest error of the rate of gamma at its end" + _OF_A_GOAL, "rad/s", 0.01
     )
-    goal_tolerance: float = _tolerance("largest error of gamma at its end", "rad", 0.0)
-    stopped_velocity_tolerance: float = _tolerance(
-        "largest error of the rate of gamma at its end", "rad/s", 0.01
+    goal_time_tolerance: float = _number(
+        "longest time after its end until both are met, else it is aborted" + _OF_A_GOAL, "s", 1.0
     )
-    goal_time_tolerance: float = _tolerance(
-        "longest time after its end until both are met, else it is aborted", "s", 1.0
-    )
-    stop_time: float = _seconds(
+    stop_time: float = _number(
         "time in which a goal that is cancelled or aborted comes to rest, on its path",
-        0.2,
+        "s",
+        default=0.2,
         least=0.001,
     )
     wait_for_recorder: bool = flag(
@@ -262,10 +244,11 @@ class RecorderParameters(Section):
         "folder of the bag, which must not exist yet; - for a dated name", default="-"
     )
     topics: tuple[str, ...] = texts("topics to record", default=default_topics())
-    timeout: float = _seconds(
+    timeout: float = _number(
         "longest wait until they are recorded, after which the node ends with an error; 0 for no "
         "end",
-        60.0,
+        "s",
+        default=60.0,
     )
 
 
@@ -278,7 +261,5 @@ class ViewerParameters(Section):
         "address to serve the page at; another than this opens the actuators to all who reach it",
         default="127.0.0.1",
     )
-    port: int = integer(
-        "port of the page; the next free one is taken", "1", default=8080, least=1024, most=65535
-    )
+    port: int = _whole("port of the page; the next free one is taken", "1", 8080, 1024, 65535)
     open: bool = flag("open the page in a browser, where there is a desktop", default=False)

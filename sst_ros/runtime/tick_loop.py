@@ -39,9 +39,6 @@ class RunOutput(Protocol):
     def unread(self) -> bool:
         """Whether nothing receives samples, so that only the last of several has to be made."""
 
-    def start(self) -> None:
-        """Forget the torques of the run before."""
-
     def ticks(self, torque: Vector3, moment: Vector3, count: int) -> None:
         """Log the torque [N m] and external moment [N m] of some ticks."""
 
@@ -64,14 +61,14 @@ class Counters:
     Attributes:
         ticks, published: steps done and samples published.
         resets, states_set: number of resets and of states set.
-        step_total_s, step_max_s: total time of the steps and longest mean time of one [s].
+        step_max_s: longest mean time of the steps of a call [s].
         ticks_at_once: steps that one call may take: one as long as none has been measured.
 
     """
 
     def __init__(self) -> None:
         self.ticks = self.published = self.resets = self.states_set = 0
-        self.step_total_s = self.step_max_s = 0.0
+        self._step_total_s = self.step_max_s = 0.0
         self.ticks_at_once = 1
         self._late_total = self._late_square = self._late_max = 0.0
         self._wall_s = 0.0
@@ -91,7 +88,7 @@ class Counters:
     def count(self, took_s: float, late_ns: int, ticks: int = 1) -> None:
         """Count steps of one call: their time [s] and the lateness of their start [ns]."""
         self.ticks += ticks
-        self.step_total_s += took_s
+        self._step_total_s += took_s
         if took_s > self.step_max_s * ticks:
             self.step_max_s = took_s / ticks
             self.ticks_at_once = int(min(max(1.0, _AT_ONCE_S / self.step_max_s), _TICKS_AT_ONCE))
@@ -104,21 +101,18 @@ class Counters:
     @property
     def wall_s(self) -> float:
         """Time spent running [s]."""
-        resumed = self._resumed
-        return self._wall_s + (time.monotonic() - resumed if resumed is not None else 0.0)
+        return self._wall_s + (time.monotonic() - self._resumed if self._resumed else 0.0)
 
     @property
     def step_mean_s(self) -> float:
         """Mean time of a step [s]."""
-        return self.step_total_s / max(self.ticks, 1)
+        return self._step_total_s / max(self.ticks, 1)
 
     @property
     def lateness_us(self) -> tuple[float, float, float]:
         """Mean, standard deviation and largest lateness of the ticks [us]."""
-        count = max(self.ticks, 1)
-        mean = self._late_total / count
-        variance = max(self._late_square / count - mean * mean, 0.0)
-        return mean, math.sqrt(variance), self._late_max
+        mean, square = (x / max(self.ticks, 1) for x in (self._late_total, self._late_square))
+        return mean, math.sqrt(max(square - mean * mean, 0.0)), self._late_max
 
 
 class HeldTorques:
@@ -164,19 +158,16 @@ class HeldTorques:
         late = axpy(1.0, self._impulse, -self._seconds, first)
         drift = axpy(self._changes, second, -self._changes, first)
         lost = add(axpy(1.0, last, -1.0, first), drift)
-        return (
-            0.5 * period * _acceleration(simulation, late),
-            period**2 / 24.0 * _acceleration(simulation, lost),
+        # How much the body acceleration changes by a change of the torques.
+        state, dynamics = simulation.state, simulation.dynamics
+        y, rest = (*state.quaternion, *state.body_rate), (0.0,) * (len(dynamics.drive) - 3)
+        without, by_late, by_lost = (
+            dynamics.derivative(*y, *torque, *rest)[4:7] for torque in (ZERO, late, lost)
         )
-
-
-def _acceleration(simulation: Simulation, torque: Vector3) -> float:
-    """Norm of the change of the body acceleration by a change of the torques."""
-    state, dynamics = simulation.state, simulation.dynamics
-    y, rest = (*state.quaternion, *state.body_rate), (0.0,) * (len(dynamics.drive) - 3)
-    with_torque = dynamics.derivative(*y, *torque, *rest)[4:7]
-    without = dynamics.derivative(*y, 0.0, 0.0, 0.0, *rest)[4:7]
-    return math.dist(with_torque, without)
+        return (
+            0.5 * period * math.dist(by_late, without),
+            period**2 / 24.0 * math.dist(by_lost, without),
+        )
 
 
 class NoAnswer(SstError):
@@ -241,7 +232,6 @@ class TickLoop:
             return False
         sample = self._stamp_ns + self._period_ns * self._ticks_per_sample
         self._start_ns = max(now, sample, self._idle_ns + 1)
-        self._output.start()
         self.begun = True
         self._publish()
         return True
@@ -287,7 +277,10 @@ class TickLoop:
             if interval_ns:
                 ticks = min(ticks, self._pacer.together if self.simulation.compiled else 1)
             elif paced and not self._lockstep and self._output.unread:
-                unread = self._unread_samples(ticks)
+                # Samples behind the one that these ticks lead to, within what is done at once.
+                if (self._tick + ticks) % self._ticks_per_sample == 0:
+                    most = min(self._last_tick - self._tick, self.counters.ticks_at_once)
+                    unread = (most - ticks) // self._ticks_per_sample
                 ticks += unread * self._ticks_per_sample
             if paced and not self._pacer.wait(self._is_interrupted, ticks):
                 return False
@@ -335,13 +328,6 @@ class TickLoop:
     def _ticks_left(self) -> int:
         left = self._ticks_per_sample - self._tick % self._ticks_per_sample
         return min(left, self._last_tick - self._tick, self.counters.ticks_at_once)
-
-    def _unread_samples(self, ticks: int) -> int:
-        """Count samples behind the one that these ticks lead to, within what is done at once."""
-        if (self._tick + ticks) % self._ticks_per_sample:
-            return 0
-        most = min(self._last_tick - self._tick, self.counters.ticks_at_once)
-        return (most - ticks) // self._ticks_per_sample
 
     def _advance(self, torque: Vector3, ticks: int) -> None:
         simulation, moment = self.simulation, self._input.moment

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 from sst_ros.mechanism.generic_math import ZERO
@@ -98,10 +98,9 @@ class TorqueInput:
         moments = self._moments
         if self._commands.waiting or self._stamped.waiting or (moments and moments.waiting):
             return False
-        timeout_ns = self._run.command_timeout_ns
-        if self.begun and not self.stale and 0.0 < timeout_ns < until_ns - self._since:
+        if self.begun and not self.stale and self._is_old(self._since, until_ns):
             return False
-        return self.moment == ZERO or not 0.0 < timeout_ns < until_ns - self._moment_since
+        return self.moment == ZERO or not self._is_old(self._moment_since, until_ns)
 
     def accept_idle(self, stamp_ns: int) -> None:
         """Accept answers to a state that was published with this stamp before the run."""
@@ -118,7 +117,10 @@ class TorqueInput:
     def torque(self, simulation: Simulation, now_ns: int) -> Vector3:
         """Return the torques of the tick that begins at this monotonic time [ns], in N m."""
         self._take(now_ns)
-        if not self._has_expired(now_ns):
+        old = self.begun and self._is_old(self._since, now_ns)
+        self.timeouts += old and not self.stale
+        self.stale = old
+        if not old:
             return self._held
         if not self._damping:
             return ZERO
@@ -135,29 +137,28 @@ class TorqueInput:
         found: Vector3 | None = None
         for _ in self._commands.read(math.inf):
             self._drop(MessageRefused("no stamp", "in lockstep only commands_stamped is used"))
-        for message in self._complete(self._stamped.read(math.inf)):
+        now_ns = time.monotonic_ns()
+        for message in self._read_stamped(math.inf):
             stamp = nanoseconds(message.header.stamp)
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
-            try:
-                if found is None and (to_idle if stamp_ns is None else stamp == stamp_ns):
-                    found = self._accept(torque_by_name(message), time.monotonic_ns())
-                elif not to_idle:
-                    reason = f"stamp {stamp} ns answers no sample that waits"
-                    raise MessageRefused("stamp", reason)
-            except MessageRefused as refused:
-                self._drop(refused)
-        self._take_moments(time.monotonic_ns())
+            if found is None and (to_idle if stamp_ns is None else stamp == stamp_ns):
+                found = self._accept(torque_by_name, message, now_ns)
+            elif not to_idle:
+                reason = f"stamp {stamp} ns answers no sample that waits"
+                self._drop(MessageRefused("stamp", reason))
+        self._take_moments(now_ns)
         return found
 
     def _take(self, now_ns: int) -> None:
         for message in self._commands.read(now_ns):
-            self._use(three_numbers, message.data, now_ns)
-        for message in self._complete(self._stamped.read(now_ns)):
-            self._use(torque_by_name, message, now_ns)
+            self._accept(three_numbers, message.data, now_ns)
+        for message in self._read_stamped(now_ns):
+            self._accept(torque_by_name, message, now_ns)
         self._take_moments(now_ns)
 
-    def _complete(self, found: Sequence[Any]) -> Sequence[Any]:
-        """Return stamped commands; with partial_commands nan is zero torque, all nan no command."""
+    def _read_stamped(self, until_ns: float) -> Iterable[Any]:
+        """Read stamped commands; with partial_commands nan is zero torque, all nan no command."""
+        found = self._stamped.read(until_ns)
         if not self._run.partial_commands:
             return found
         given = [one for one in found if not (one.effort and all(map(math.isnan, one.effort)))]
@@ -175,17 +176,16 @@ class TorqueInput:
                 self._moment_since = now_ns
             except MessageRefused as refused:
                 self._drop(refused)
-        timeout_ns = self._run.command_timeout_ns
-        if timeout_ns and not self._run.lockstep and now_ns - self._moment_since > timeout_ns:
+        if not self._run.lockstep and self._is_old(self._moment_since, now_ns):
             self.moment = ZERO
 
-    def _use(self, check: Callable[[Any], Vector3], content: Any, now_ns: int) -> None:
+    def _accept(self, check: Callable[[Any], Vector3], content: Any, now_ns: int) -> Vector3 | None:
+        """Hold the torques of a command; drop one that the check refuses."""
         try:
-            self._accept(check(content), now_ns)
+            torque = check(content)
         except MessageRefused as refused:
             self._drop(refused)
-
-    def _accept(self, torque: Vector3, now_ns: int) -> Vector3:
+            return None
         self._held = clamp(torque, self._limit)
         self.clamped += self._held != torque
         self.received += 1
@@ -197,21 +197,12 @@ class TorqueInput:
         self.reasons[refused.kind] = self.reasons.get(refused.kind, 0) + 1
         self.last_refusal = str(refused)
 
-    def _has_expired(self, now_ns: int) -> bool:
-        timeout_ns = self._run.command_timeout_ns
-        old = self.begun and 0.0 < timeout_ns < now_ns - self._since
-        self.timeouts += old and not self.stale
-        self.stale = old
-        return old
+    def _is_old(self, since_ns: int, now_ns: int) -> bool:
+        return 0.0 < self._run.command_timeout_ns < now_ns - since_ns
 
 
 def three_numbers(data: Sequence[float], what: str = "torques [N m]") -> Vector3:
-    """Return three finite numbers.
-
-    Raises:
-        MessageRefused: there are not three, or one is not finite.
-
-    """
+    """Return three finite numbers, or raise MessageRefused."""
     if (vector := finite_vector(data)) is None:
         kind = "not finite" if len(data) == 3 else "wrong size"
         raise MessageRefused(kind, f"{list(data)[:6]} must be 3 finite {what}")
@@ -219,12 +210,12 @@ def three_numbers(data: Sequence[float], what: str = "torques [N m]") -> Vector3
 
 
 def torque_by_name(message: Any) -> Vector3:
-    """Return the efforts of a JointState [N m]; the joints may come in any order."""
+    """Return the efforts of a JointState [N m]."""
     return by_name(message.name, message.effort, "torques [N m] in effort")
 
 
 def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3:
-    """Return one value for each actuator, gamma_1 to gamma_3.
+    """Return one value for each actuator, gamma_1 to gamma_3, which may come in any order.
 
     Raises:
         MessageRefused: names or values are not those of the three actuators.

@@ -25,7 +25,7 @@ from sst_ros.control.plan import check_motion
 from sst_ros.control.reference import Reference, ReferenceMotion, slow_down
 from sst_ros.control.reference_motions import reference_motion, through_points
 from sst_ros.control.tracking import TrackingMetrics, track_of
-from sst_ros.errors import InputError, Problem, SingularConfiguration, SstError
+from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO, axpy
@@ -39,7 +39,6 @@ from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 
 NO_TOLERANCE = -1.0
 """Of a message: the default does not hold either."""
-_QUANTITIES = {"position": "rad", "velocity": "rad/s"}
 _NUMBERS = 256 * 22
 """Numbers of samples, 22 each, that are added to the tracking metrics at once."""
 
@@ -112,8 +111,8 @@ class Outcome(NamedTuple):
     message: str
 
 
-Tolerances = dict[str, dict[str, float]]
-"""Largest error by actuator and quantity [rad], [rad/s]; 0 where there is none."""
+Tolerances = dict[tuple[str, str], float]
+"""Largest error by quantity and actuator [rad], [rad/s]; 0 where there is none."""
 
 
 class TrajectoryGoal:
@@ -125,10 +124,6 @@ class TrajectoryGoal:
             which are not measured, have no effect.
         defaults: of the tolerances.
 
-    Attributes:
-        path, goal: tolerances until the end of the trajectory, and from then on.
-        goal_time: time after the end until which those of the goal must be met [s]; 0 for no end.
-
     Raises:
         InputError: a tolerance is of another joint or not allowed, or the goal has joints of
             several degrees of freedom.
@@ -137,7 +132,7 @@ class TrajectoryGoal:
 
     def __init__(self, message: Any, defaults: ControllerNodeParameters) -> None:
         given = message.multi_dof_trajectory
-        problems = [
+        self._problems = [
             Problem(name, f"{len(rows)} entries", "must be empty: joints have one freedom")
             for name, rows in (
                 ("multi_dof_trajectory.joint_names", given.joint_names),
@@ -147,16 +142,42 @@ class TrajectoryGoal:
             )
             if len(rows)
         ]
-        own = defaults.path_tolerance, 0.0
-        self.path = _tolerances("path_tolerance", message.path_tolerance, own, problems)
-        own = defaults.goal_tolerance, defaults.stopped_velocity_tolerance
-        self.goal = _tolerances("goal_tolerance", message.goal_tolerance, own, problems)
-        time, usual = nanoseconds(message.goal_time_tolerance), defaults.goal_time_tolerance
-        self.goal_time = _resolve("goal_time_tolerance", time / NANOSECONDS, usual, problems)
-        if problems:
-            raise InputError("follow_joint_trajectory", problems)
+        own = {"position": defaults.path_tolerance, "velocity": 0.0}
+        self._path = self._resolve_all("path_tolerance", message.path_tolerance, own)
+        own = {
+            "position": defaults.goal_tolerance,
+            "velocity": defaults.stopped_velocity_tolerance,
+        }
+        self._goal = self._resolve_all("goal_tolerance", message.goal_tolerance, own)
+        time, name = nanoseconds(message.goal_time_tolerance) / NANOSECONDS, "goal_time_tolerance"
+        self._late = self._resolve(name, time, defaults.goal_time_tolerance)
+        if self._problems:
+            raise InputError("follow_joint_trajectory", self._problems)
         points = message.trajectory.points
         self._times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in points]
+
+    def _resolve_all(self, name: str, given: Iterable[Any], own: dict[str, float]) -> Tolerances:
+        """Resolve a sequence of JointTolerance messages."""
+        found = {(quantity, joint): own[quantity] for quantity in own for joint in ACTUATORS}
+        for index, tolerance in enumerate(given):
+            place = f"{name}[{index}]"
+            if tolerance.name not in ACTUATORS:
+                allowed = f"must be one of {', '.join(ACTUATORS)}"
+                self._problems.append(Problem(f"{place}.name", tolerance.name, allowed))
+                continue
+            for quantity, default in own.items():
+                value = getattr(tolerance, quantity)
+                resolved = self._resolve(f"{place}.{quantity}", value, default)
+                found[quantity, tolerance.name] = resolved
+        return found
+
+    def _resolve(self, name: str, value: float, default: float) -> float:
+        if value == NO_TOLERANCE:
+            return 0.0
+        if not 0.0 <= value < math.inf:
+            allowed = "must be > 0, 0 for the default or -1 for none"
+            self._problems.append(Problem(name, value, allowed))
+        return value or default
 
     def index(self, time: float) -> int:
         """Return the index of the point that is approached at a time of the motion [s]."""
@@ -171,55 +192,23 @@ class TrajectoryGoal:
             error_rate: the same of the rates [rad/s].
 
         """
-        errors, late = {"position": error, "velocity": error_rate}, time - self._times[-1]
+        late = time - self._times[-1]
+        kind, tolerances = ("path", self._path) if late < 0.0 else ("goal", self._goal)
+        errors, unmet = (*error, *error_rate), ""
+        for ((quantity, joint), allowed), off in zip(tolerances.items(), errors, strict=True):
+            if allowed and not abs(off) <= allowed:
+                unit = "rad" if quantity == "position" else "rad/s"
+                words = f"{kind} tolerance {allowed:g} {unit}"
+                unmet = f"{joint}: {quantity} error {off:.6g} {unit}, {words}"
+                break
         if late < 0.0:
-            for violation in _violations("path tolerance", self.path, errors):
-                return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, violation)
-            return None
-        unmet = next(_violations("goal tolerance", self.goal, errors), None)
-        if unmet is None:
+            return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, unmet) if unmet else None
+        if not unmet:
             return Outcome(ErrorCode.SUCCESSFUL, "goal reached")
-        if not 0.0 < self.goal_time < late:
+        if not 0.0 < self._late < late:
             return None
-        when = f"{late:.3f} s after the end, goal_time_tolerance {self.goal_time:g} s"
+        when = f"{late:.3f} s after the end, goal_time_tolerance {self._late:g} s"
         return Outcome(ErrorCode.GOAL_TOLERANCE_VIOLATED, f"{unmet} {when}")
-
-
-def _violations(kind: str, tolerances: Tolerances, errors: dict[str, Vector3]) -> Iterator[str]:
-    for quantity, unit in _QUANTITIES.items():
-        for joint, error in zip(ACTUATORS, errors[quantity], strict=True):
-            allowed = tolerances[joint][quantity]
-            if allowed and not abs(error) <= allowed:
-                yield f"{joint}: {quantity} error {error:.6g} {unit}, {kind} {allowed:g} {unit}"
-
-
-def _tolerances(
-    name: str, given: Iterable[Any], defaults: tuple[float, float], problems: list[Problem]
-) -> Tolerances:
-    """Resolve a sequence of JointTolerance messages; what is wrong joins the problems."""
-    usual = dict(zip(_QUANTITIES, defaults, strict=True))
-    found = {joint: dict(usual) for joint in ACTUATORS}
-    for index, tolerance in enumerate(given):
-        place = f"{name}[{index}]"
-        if tolerance.name not in found:
-            allowed = f"must be one of {', '.join(ACTUATORS)}"
-            problems.append(Problem(f"{place}.name", tolerance.name, allowed))
-            continue
-        for quantity, default in usual.items():
-            value = getattr(tolerance, quantity)
-            found[tolerance.name][quantity] = _resolve(
-                f"{place}.{quantity}", value, default, problems
-            )
-    return found
-
-
-def _resolve(name: str, value: float, default: float, problems: list[Problem]) -> float:
-    if value == NO_TOLERANCE:
-        return 0.0
-    if not (math.isfinite(value) and value >= 0.0):
-        allowed = "must be > 0, 0 for the default or -1 for none"
-        problems.append(Problem(name, value, allowed))
-    return value or default
 
 
 class Stage(Enum):
@@ -239,7 +228,6 @@ class TrajectoryFollower:
         stage: present stage.
         samples, irregular: samples answered, and those that came at another period.
         limited: samples of the motion in which a torque was limited.
-        refused, last_refusal: trajectories that were refused, and the reason of the last one.
 
     Raises:
         InputError, AssemblyError, SingularConfiguration: the scene's motion is refused.
@@ -259,8 +247,7 @@ class TrajectoryFollower:
         if settings.motion == "scene":
             self._planned = reference_motion(model, _read_motion)
             check_motion(self._planned, self._model)
-        self.samples = self.irregular = self.limited = self.refused = 0
-        self.last_refusal = ""
+        self.samples = self.irregular = self.limited = 0
         self._start_ns: int | None = None
         self.restart()
 
@@ -299,10 +286,6 @@ class TrajectoryFollower:
         self._controller.follow(motion)
         self._begin(motion, self._last_ns if moving else None)
         self.stage = Stage.FOLLOWING
-
-    def refuse(self, error: SstError) -> None:
-        """Count a trajectory that is refused."""
-        self.refused, self.last_refusal = self.refused + 1, str(error)
 
     def stop(self) -> None:
         """Come to rest on the path in `stop_time`, and hold; before the run, forget the motion."""
@@ -345,9 +328,9 @@ class TrajectoryFollower:
         time = passed_ns / NANOSECONDS
         command = self._controller.command(time, measured)
         self.limited += command.saturated
-        end_ns = round((self._motion.duration + self._settings.hold) * NANOSECONDS)
         if time >= self._motion.duration:
             self.stage = Stage.HOLDING
+        end_ns = round((self._motion.duration + self._settings.hold) * NANOSECONDS)
         if passed_ns >= end_ns and self._planned is not None:
             self.stage = Stage.ENDED
             command = dataclasses.replace(command, torque=ZERO)
@@ -388,11 +371,9 @@ class TrajectoryFollower:
         self.limited = 0
 
     def _log(self, time: float, command: Command) -> None:
-        desired, errors = command.desired, (command.error, command.error_rate)
-        torques = command.feedforward, command.feedback, command.torque
-        self._rows.append(time)
-        for triple in (desired.gamma, desired.gamma_dot, *errors, *torques):
-            self._rows.extend(triple)
+        desired, errors = command.desired, (*command.error, *command.error_rate)
+        torques = *command.feedforward, *command.feedback, *command.torque
+        self._rows.extend((time, *desired.gamma, *desired.gamma_dot, *errors, *torques))
         if len(self._rows) >= _NUMBERS:
             self._add_rows()
 

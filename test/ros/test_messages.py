@@ -74,7 +74,7 @@ def test_a_state_is_read_as_it_is(state):
 @pytest.mark.parametrize("moments", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 40])
 def test_torques_of_every_tick_are_read_as_they_were(count, moments):
-    log = TorqueLog(2, 1_500_000_000, moments=moments)
+    log = TorqueLog(1_500_000_000, moments=moments)
     for run in range(2):  # the second fills the same bytes anew
         rows = [(float(i), -1.0, run + 0.5) for i in range(count)]
         for row in rows:
@@ -91,7 +91,7 @@ def test_torques_of_every_tick_are_read_as_they_were(count, moments):
 
 
 def test_ticks_noted_at_once_are_those_noted_one_by_one():
-    one, other = TorqueLog(5, 1_000_000), TorqueLog(5, 1_000_000)
+    one, other = TorqueLog(1_000_000), TorqueLog(1_000_000)
     one.append((1.0, 2.0, 3.0), (), 5)
     for _ in range(5):
         other.append((1.0, 2.0, 3.0), ())
@@ -103,7 +103,7 @@ def test_the_layout_is_that_of_the_middleware(state, frame_id):
     """Byte for byte, except padding, which the middleware leaves as it is; none is left over."""
     store = get_typestore(Stores.ROS2_JAZZY)  # rosbags refuses bytes that are left over
     states = stamped(StateMessages(frame_id), 7, state)
-    log = TorqueLog(2, 1_000_000, moments=True)
+    log = TorqueLog(1_000_000, moments=True)
     none = log.take(9)
     log.append((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 2)
     made = [*states, log.take(9), none, publications.clock_message(STAMP_NS)]

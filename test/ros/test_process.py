@@ -222,14 +222,14 @@ class Worker:
 
 @pytest.fixture
 def stop(monkeypatch):
-    request = signals.StopRequest()
-    monkeypatch.setattr(signals, "stop", request)
+    request = set()
+    monkeypatch.setattr(signals, "came", request)
     return request
 
 
 def test_a_signal_ends_a_node_while_a_callback_waits_for_it(node, stop):
     worker = Worker(node.context, lambda own: own.closed.wait(60.0))
-    threading.Thread(target=lambda: worker.entered.wait(60.0) and stop.set()).start()
+    threading.Thread(target=lambda: worker.entered.wait(60.0) and stop.add(2)).start()
     began = time.monotonic()
     process.spin(worker)
     assert worker.closed.is_set() and time.monotonic() - began < 30.0  # it would wait for 60 s

@@ -152,7 +152,7 @@ signals.handle()
 sys.setprofile(again)
 signal.raise_signal(signal.SIGINT)
 sys.setprofile(None)
-print(signals.stop.is_set())
+print(bool(signals.came))
 """
 
 
