@@ -23,8 +23,9 @@ import numpy as np
 
 from benchmark.measure import describe_machine, join_line, read_options, time_in_turn
 from sst_ros import load_scene, sweep
-from sst_ros.sweeps.chunk_task import ChunkTask, list_versions, read_sweep, run_local
+from sst_ros.sweeps.engine import run_chunk, run_local
 from sst_ros.sweeps.prepared import prepare
+from sst_ros.sweeps.results import read_sweep
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 
 BODIES = (
@@ -125,8 +126,8 @@ def _ratios(steps: int) -> dict[str, float]:
 
 def _chunks(study: SweepStudy, steps: int, folder: str) -> None:
     """Compute and write all chunks of a study, on all cores."""
-    task = ChunkTask(study, steps, Path(folder), list_versions())
-    run_local(task, range(study.chunks), lambda _: None, len(os.sched_getaffinity(0)))
+    compute = partial(run_chunk, study, steps, Path(folder))
+    run_local(compute, range(study.chunks), lambda _: None, len(os.sched_getaffinity(0)))
 
 
 def _timed(call: Callable[[], Any]) -> tuple[float, float]:

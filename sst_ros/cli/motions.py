@@ -15,8 +15,8 @@ from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
-from sst_ros.sweeps.chunk_task import read_sweep, summarize
-from sst_ros.sweeps.cluster_engine import connect
+from sst_ros.sweeps.engine import connect
+from sst_ros.sweeps.results import read_sweep, summarize
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 

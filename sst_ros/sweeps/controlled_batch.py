@@ -8,7 +8,7 @@ of tracking errors. It is traced, without branches: what the settings do not use
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import cached_property
 from itertools import islice
@@ -79,12 +79,9 @@ _NOISE = 6
 _BLOCKS = 32
 """Blocks of scenarios that are advanced from sample to sample together: they fit the cache."""
 
-Group = dict[str, Any]
-"""Tuples of numbers by name."""
 
-
-def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> Group:
-    """Divide numbers into groups of the sizes given."""
+def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
+    """Divide numbers into tuples by name, of the sizes given."""
     rest = iter(numbers)
     return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
 
@@ -94,14 +91,9 @@ def control_source(program: Program, sizes: Mapping[str, int]) -> str:
 
     At a sample it gives scenarios whose code is 0, in the blocks begin to end, the torques in
     d (numbers, N) and the new memory (numbers, N). All share the references (samples, numbers);
-    `gaussian(seed, row, counter)` gives the noise of each.
-
-    Args:
-        program: outputs are three torques and the new memory.
-        sizes: how many inputs it has: references, state y, memory, noise, the rest of d behind the
-            torques, gains.
-
-    Ten lines of it:
+    `gaussian(seed, row, counter)` gives the noise of each. The outputs of the program are three
+    torques and the new memory; `sizes` are those of its inputs: references, state y, memory, noise,
+    the rest of d behind the torques, gains. Ten lines of it:
 
         def control(sample, begin, end, y, d, code, memory, references, gains, rows, seed):
             block = vector(2976)
@@ -113,7 +105,6 @@ def control_source(program: Program, sizes: Mapping[str, int]) -> str:
                 u0 = references[sample, 0]
                 for i in range(last + 1):
                     d[0, lo + i] = block[704 + i]
-
     """
     state, memory, noise, drive = sizes["y"], sizes["memory"], sizes["noise"], 3 + sizes["rest"]
     at = Layout(
@@ -163,13 +154,14 @@ class ControlledBatch:
         samples: control periods in a run.
 
     Raises:
-        InputError: the length is no whole number of periods, or the gains are not allowed.
+        InputError: the length is no whole number of periods, a period none of steps, or the gains
+            are not allowed.
 
     """
 
     def __init__(self, batch: Batch, study: SweepStudy) -> None:
         assert study.motion is not None
-        self._batch, self._model, self._seed = batch, study.scene, study.seed
+        self._batch, self._scene, self._seed = batch, study.scene, study.seed
         self._motion: ReferenceMotion = study.motion
         self._control: SampledControl = study.control
         control, length, period = self._control, study.length, self._control.period
@@ -177,15 +169,17 @@ class ControlledBatch:
         if not self.samples or abs(self.samples * period - length) > 1e-9 * length:
             allowed = f"must be a whole number of control periods of {period:g} s"
             raise InputError("sweep", [Problem("duration", length, allowed)])
-        controller = Controller(self._model, self._motion, control, period)
+        if study.steps and study.steps % self.samples:
+            allowed = f"must be a multiple of {self.samples}, the control periods of a run"
+            raise InputError("sweep", [Problem("steps", study.steps, allowed)])
+        controller = Controller(self._scene, self._motion, control, period)
         self._inertia = np.array(controller.inertia)[:, None]
-        self._space = ActuatorSpaceMap(Geometry.of(self._model))
         varied = {one.key for one in study.variations}
 
         def has(*names: str) -> bool:
             return any(getattr(control, name) or f"control.{name}" in varied for name in names)
 
-        limits = self._model.torque_limit, batch.scene.torque_limit
+        limits = self._scene.torque_limit, batch.scene.torque_limit
         self._limited = has("torque_limit") or any(limits)
         self._noise = _NOISE if has("angle_noise", "rate_noise") else 0
         self._memory_sizes = {
@@ -210,17 +204,62 @@ class ControlledBatch:
             "rest": drive - 3 + len(self._batch.model.names),
             "gains": sum(GAINS.values()),
         }
+        command = self._trace_command()
 
-        def command(*inputs: Expression) -> tuple[Any, ...]:
+        def answer(*inputs: Expression) -> tuple[Any, ...]:
             of = divide(sizes, inputs)
-            model = self._batch.model.constants(of["rest"][drive - 3 :]).model
+            plant = self._batch.model.constants(of["rest"][drive - 3 :]).model
             given, gains = divide(REFERENCES, of["references"]), divide(GAINS, of["gains"])
             memory = divide(self._memory_sizes, of["memory"])
-            return self._command(kernel.joints(model, of["y"]), given, memory, gains, of["noise"])
+            return command(kernel.joints(plant, of["y"]), given, memory, gains, of["noise"])
 
-        program = trace(command, [f"i{j}" for j in range(sum(sizes.values()))])
+        program = trace(answer, [f"i{j}" for j in range(sum(sizes.values()))])
         texts = [*NOISE, control_source(program, sizes)]
         return compiled_module.load(texts, {}, numba=True, nogil=True)
+
+    def _trace_command(self) -> Callable[..., tuple[Any, ...]]:
+        """Return the law and its channel: three torques and the new memory, see `module`."""
+        control, space = self._control, ActuatorSpaceMap(Geometry.of(self._scene))
+
+        def torque(*at: Any) -> Any:
+            return kernel.actuator_torque(kernel.model_of(self._scene), *at)[0]
+
+        def accelerate(q: Any, gamma_dot: Any, gamma_ddot: Any) -> tuple[Any, Any]:
+            found = space.star_accelerations(*q, *gamma_dot, *gamma_ddot)
+            return found[:3], found[3:]
+
+        def command(
+            joints: Any, given: Any, memory: Any, gains: Any, noise: Sequence[Any]
+        ) -> tuple[Any, ...]:
+            new = dict(memory)
+            angle, rate = gains["noise"]
+            scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
+            exact = joints.gamma, joints.gamma_dot
+            gamma, gamma_dot, new["before"] = control.measure(*exact, memory["before"], scaled)
+            if observed := memory["observed"]:  # in the last assembly mode
+                carriages = space.carriages(gamma)
+                for _ in range(NEWTON_STEPS):
+                    observed = space.newton_step(*observed, *carriages)[:4]
+            desired = Reference(**{name: given[name] for name in _DESIRED})
+            limit = gains["limit"][0] if self._limited else None
+            numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
+            law = ControlLaw(control, torque, accelerate, *numbers, control.period)
+            ahead = given["feedforward"], given["held"]
+            found = law.answer(desired, ahead, gamma, gamma_dot, observed, memory["integral"])
+            first, queue = given["first"][0], memory["queue"]
+            sent, new["queue"] = control.transmit(found.torque, queue, first)
+            if self._limited:
+                cut = axpy(1.0, found.total, -1.0, found.torque)
+                new["limited"] = (memory["limited"][0] + is_above(dot3(cut, cut)),)
+                sent = bound(sent, gains["plant_limit"][0])
+            off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
+            sums, most = (zip(memory[name], off, strict=True) for name in ("squares", "largest"))
+            new |= {"observed": observed, "integral": found.integral}
+            new["squares"] = tuple(s + e * e for s, e in sums)
+            new["largest"] = tuple(s + positive(positive(e) + positive(-e) - s) for s, e in most)
+            return (*sent, *(number for name in self._memory_sizes for number in new[name]))
+
+        return command
 
     def run(
         self,
@@ -230,7 +269,7 @@ class ControlledBatch:
         steps: int,
         kept: int = 0,
     ) -> tuple[BatchResult, dict[str, Array]]:
-        """Run scenarios.
+        """Run scenarios; return their results and tracking figures.
 
         Args:
             batch: of the scenarios.
@@ -239,16 +278,17 @@ class ControlledBatch:
             steps: number of steps, a multiple of `samples`.
             kept: keep the states every so many steps; 0 keeps none.
 
-        Returns:
-            The result, and the tracking figures.
-
         """
         count, hold, drawn_for = len(rows), steps // self.samples, rows
-        start = self._motion.at(0.0)
+        start, control = self._motion.at(0.0), self._control
         gamma = given.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
-        step = self.samples * self._control.period / steps
-        memory = self._start_memory(gamma, rate, count)
+        memory = np.zeros((sum(self._memory_sizes.values()), count))
+        blocks = divide(self._memory_sizes, memory)  # views of its rows
+        earlier = control.count(gamma - control.period * rate).T if control.counts else ()
+        for name, values in (("observed", start.quaternion), ("before", earlier)):
+            for row, value in zip(blocks[name], values, strict=False):
+                row[:] = value
         gains = self._make_gains(batch, given, count)
 
         def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
@@ -266,29 +306,29 @@ class ControlledBatch:
                     batch.module.batch(step, now, span, *part, *arrays)
                     now += span
 
+        step = self.samples * control.period / steps
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
-        return result, self._tracking(result, memory)
+        return result, self._judge_tracking(result, divide(self._memory_sizes, memory))
 
-    def _tracking(self, result: BatchResult, memory: Array) -> dict[str, Array]:
+    def _judge_tracking(self, result: BatchResult, memory: dict[str, Any]) -> dict[str, Array]:
         """Root of the mean square and largest error of gamma [rad] at the samples of a run."""
-        found = divide(self._memory_sizes, memory)
         desired = divide(REFERENCES, self._references[-1])
         final = np.array(desired["gamma"]) - result.gamma
-        complete = (result.code == 0)[:, None]
-        squares = np.stack(found["squares"], axis=1) + np.where(complete, final**2, 0.0)
-        largest = np.stack(found["largest"], axis=1)
+        complete = result.success[:, None]
+        squares = np.stack(memory["squares"], axis=1) + np.where(complete, final**2, 0.0)
+        largest = np.stack(memory["largest"], axis=1)
         largest = np.where(complete, np.maximum(largest, np.abs(final)), largest)
         samples = np.floor(result.t / self._control.period + 1e-9) + 1
         rms = np.sqrt(squares / samples[:, None])
         columns = {f"error_rms_{k + 1}": rms[:, k] for k in range(3)}
         columns |= {f"error_max_{k + 1}": largest[:, k] for k in range(3)}
-        return columns | {"limited_samples": found["limited"][0]}
+        return columns | {"limited_samples": memory["limited"][0]}
 
     @cached_property
     def _references(self) -> Array:
         """References of all samples of a run, shape (samples + 1, n)."""
         control, period = self._control, self._control.period
-        inverse, rows = InverseDynamics(self._model), []
+        inverse, rows = InverseDynamics(self._scene), []
         for k in range(self.samples + 1):
             time = k * round(period * 1e9) / 1e9
             at = self._motion.at(time)
@@ -296,62 +336,6 @@ class ControlledBatch:
             desired = (number for name in _DESIRED for number in getattr(at, name))
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)
-
-    def _command(
-        self, joints: Any, given: Group, memory: Group, gains: Group, noise: Sequence[Any]
-    ) -> tuple[Any, ...]:
-        """Return three torques and the new memory; the noise is six normal numbers, or none."""
-        control, new = self._control, dict(memory)
-        angle, rate = gains["noise"]
-        scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
-        exact = joints.gamma, joints.gamma_dot
-        gamma, gamma_dot, new["before"] = control.measure(*exact, memory["before"], scaled)
-        new["observed"] = self._observe(gamma, memory["observed"])
-        desired = Reference(**{name: given[name] for name in _DESIRED})
-        limit = gains["limit"][0] if self._limited else None
-        numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
-        law = ControlLaw(control, self._torque, self._accelerate, *numbers, control.period)
-        torques, observed = (given["feedforward"], given["held"]), new["observed"]
-        command = law.answer(desired, torques, gamma, gamma_dot, observed, memory["integral"])
-        new["integral"] = command.integral
-        torque, new["queue"] = control.transmit(command.torque, memory["queue"], given["first"][0])
-        if self._limited:
-            cut = axpy(1.0, command.total, -1.0, command.torque)
-            new["limited"] = (memory["limited"][0] + is_above(dot3(cut, cut)),)
-            torque = bound(torque, gains["plant_limit"][0])
-        off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
-        new["squares"] = tuple(s + e * e for s, e in zip(memory["squares"], off, strict=True))
-        new["largest"] = tuple(
-            s + positive(positive(e) + positive(-e) - s)
-            for s, e in zip(memory["largest"], off, strict=True)
-        )
-        return (*torque, *(number for name in self._memory_sizes for number in new[name]))
-
-    def _observe(self, gamma: Any, last: Any) -> Any:
-        """Quaternion at the measured angles in the last assembly mode; none if not needed."""
-        carriages = self._space.carriages(gamma) if last else ()
-        for _ in range(NEWTON_STEPS if last else 0):
-            last = self._space.newton_step(*last, *carriages)[:4]
-        return last
-
-    def _torque(self, *at: Any) -> Any:
-        """Inverse dynamics of the controller's model."""
-        return kernel.actuator_torque(kernel.model_of(self._model), *at)[0]
-
-    def _accelerate(self, q: Any, gamma_dot: Any, gamma_ddot: Any) -> tuple[Any, Any]:
-        """W and W_dot of the controller's model."""
-        found = self._space.star_accelerations(*q, *gamma_dot, *gamma_ddot)
-        return found[:3], found[3:]
-
-    def _start_memory(self, gamma: Array, rate: Array, count: int) -> Array:
-        """Return the memory before the first sample, a column a scenario."""
-        start, control = self._motion.at(0.0), self._control
-        blocks = {name: np.zeros((size, count)) for name, size in self._memory_sizes.items()}
-        if control.observes:
-            blocks["observed"][:] = np.array(start.quaternion)[:, None]
-        if control.counts:
-            blocks["before"][:] = control.count(gamma - control.period * rate).T
-        return np.concatenate(list(blocks.values()))
 
     def _make_gains(self, batch: Batch, given: dict[str, Array], count: int) -> Array:
         """Return the gains, a column a scenario; see GAINS."""
@@ -366,7 +350,7 @@ class ControlledBatch:
             *feedback_gains(self._inertia, value, self._control.direct or bool(varies)),
             self._inertia,
             value("integral_rate"),
-            command_limit(value("torque_limit"), self._model),
+            command_limit(value("torque_limit"), self._scene),
             batch.columns.torque_limit,
             value("angle_noise"),
             value("rate_noise"),

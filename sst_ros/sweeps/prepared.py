@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from sst_ros.scene.scene import Scenarios
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints, columns_of
 from sst_ros.sweeps.controlled_batch import ControlledBatch
 from sst_ros.sweeps.sweep_study import SweepStudy
-from sst_ros.sweeps.variations import Sampler, Variation
+from sst_ros.sweeps.variations import Sampler
 from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
@@ -36,8 +36,7 @@ PILOT = 256
 MOST_STEPS = 1_000_000
 
 _STATE_KEYS = ("initial.gamma", "initial.gamma_dot")
-
-_JOINTS, _ENDS = Joints._fields, ("min", "max")
+_ENDS = ("min", "max")
 
 Columns = dict[str, NDArray[Any]]
 
@@ -67,6 +66,7 @@ class PreparedSweep:
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
         self.controlled = None if study.control is None else ControlledBatch(self.batch, study)
         self.modules = [one.module for one in (self.batch, self.controlled) if one is not None]
+        self._quantities = [name for name in study.outputs if name != "extremes"]  # of a state
         self.pilot_error = math.nan
         self.steps = steps or study.steps or self._choose_steps()
 
@@ -83,7 +83,7 @@ class PreparedSweep:
         count = max(unit, 16)
         for _ in range(12):
             coarse, fine = (self.run(scenarios, starts, rows, n)[0] for n in (count, 2 * count))
-            both = (coarse.status == 0) & (fine.status == 0)
+            both = coarse.success & fine.success
             if not both.any():
                 return count
             apart = angle_between(coarse.quaternion[both], fine.quaternion[both])
@@ -97,49 +97,34 @@ class PreparedSweep:
         allowed = f"is not reached by {MOST_STEPS} steps; give `steps`, or a larger tolerance"
         raise InputError("sweep", [Problem("tolerance", tolerance, allowed)])
 
-    def chunk(self, index: int) -> tuple[pa.Table, pa.Table | None]:
-        """Table of the rows of a chunk, and of their trajectories if the study asks for some."""
-        pyarrow, study = require("pyarrow"), self.study
-        rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
-        values = study.sampler.rows(int(rows[0]), len(rows))
-        columns, texts, reason = self._results(values, rows)
-        arrays: Columns = {"scenario": rows}
-        for one in study.variations:
-            arrays |= dict(zip(one.columns, values[one.key].T, strict=True))
-        # Arrow copies strided columns an entry at a time.
-        arrays = {name: np.ascontiguousarray(x) for name, x in (arrays | columns).items()}
-        arrays["reason"] = pyarrow.DictionaryArray.from_arrays(
-            reason.astype(np.int32), pyarrow.array(texts, pyarrow.string())
-        )
-        asked = study.trajectory
-        if asked is None or rows[0] >= asked["rows"]:
-            return pyarrow.table(arrays), None
-        kept = rows[rows < asked["rows"]]
-        some = {key: array[: len(kept)] for key, array in values.items()}
-        return pyarrow.table(arrays), pyarrow.table(self._trajectory(some, kept, asked["samples"]))
-
     def check(self, values: dict[str, Array]) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
-        numbers, _ = self._split(values)
-        Scenarios(self.study.model_scene, numbers).check()
+        Scenarios(self.study.model_scene, self._split(values)[0]).check()
 
     @cached_property
     def about(self) -> dict[str, Any]:
         """Metadata of the files: study, its digest, version, units."""
+        units = UNITS | {"fault_time": "s", "local_error": "1"}
+        for k in DIMENSIONS["leg"]:
+            joints = {f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in _extremes()}
+            units |= joints | {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
+        for one in self.study.variations:
+            units |= dict.fromkeys(one.columns, "1" if one.factor else one.targets[0].spec.unit)
         return {
             "version": VERSION,
             "digest": self.study.digest,
             "steps": self.steps,
             "duration": self.study.length,
             "study": self.study.document(),
-            "units": units_of(self.study.variations),
+            "units": units,
             "inputs": [name for one in self.study.variations for name in one.columns],
         }
 
-    def _results(
-        self, values: dict[str, Array], rows: NDArray[np.int64]
-    ) -> tuple[Columns, list[str], NDArray[np.intp]]:
-        """Columns of the results, the texts of how runs ended, and the index of that of each."""
+    def chunk(self, index: int) -> tuple[pa.Table, pa.Table | None]:
+        """Table of the rows of a chunk, and of their trajectories if the study asks for some."""
+        pyarrow, study = require("pyarrow"), self.study
+        rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
+        values = study.sampler.rows(int(rows[0]), len(rows))
         scenarios, starts, faults = self.scenarios(values)
         result, more = self.run(scenarios, starts, rows, self.steps)
         columns: Columns = {
@@ -149,24 +134,38 @@ class PreparedSweep:
             "local_error": result.local_error,
         }
         columns |= columns_of(result, self._quantities) | more
-        distinct_texts, reason = result.reasons
-        texts = distinct_texts.tolist()
+        texts, reason = result.reasons
         if faults:  # no numbers, and the first problem as the reason
-            wrong, reason = list(faults), reason.copy()
-            for name, array in columns.items():
-                columns[name] = array.copy()
-                columns[name][wrong] = -1 if name == "status" else np.nan
-            columns["fault_time"][wrong] = 0.0
+            wrong = list(faults)
             keys = [error.problems[0].key.partition(": ")[2] for error in faults.values()]
-            distinct = sorted(set(keys))
-            reason[wrong] = [len(texts) + distinct.index(key) for key in keys]
-            texts += [f"no scene: {key}" for key in distinct]
-        return columns, texts, reason
-
-    @property
-    def _quantities(self) -> list[str]:
-        """Outputs that are quantities of a state."""
-        return [name for name in self.study.outputs if name != "extremes"]
+            columns = {name: column.copy() for name, column in columns.items()}
+            for name, column in columns.items():
+                column[wrong] = {"status": -1, "fault_time": 0.0}.get(name, np.nan)
+            distinct, which = np.unique([f"no scene: {key}" for key in keys], return_inverse=True)
+            reason[wrong] = len(texts) + which
+            texts = np.append(texts, distinct)
+        inputs = {
+            name: column
+            for one in study.variations
+            for name, column in zip(one.columns, values[one.key].T, strict=True)
+        }
+        # Arrow copies strided columns an entry at a time.
+        named = {"scenario": rows, **inputs, **columns}
+        arrays = {name: np.ascontiguousarray(column) for name, column in named.items()}
+        arrays["reason"] = pyarrow.DictionaryArray.from_arrays(
+            reason.astype(np.int32), pyarrow.array(texts, pyarrow.string())
+        )
+        trajectory, asked = None, study.trajectory
+        if asked is not None and rows[0] < asked["rows"]:
+            kept = rows[rows < asked["rows"]]
+            scenarios, starts, _ = self.scenarios({k: x[: len(kept)] for k, x in values.items()})
+            every = max(1, self.steps // asked["samples"])
+            states = self.run(scenarios, starts, kept, self.steps, every)[0].kept
+            assert states is not None
+            found: Columns = {"scenario": np.broadcast_to(kept, states.t.shape)}
+            found |= columns_of(states, self._quantities)
+            trajectory = pyarrow.table({name: column.ravel() for name, column in found.items()})
+        return pyarrow.table(arrays), trajectory
 
     def scenarios(
         self, values: dict[str, Array]
@@ -207,18 +206,6 @@ class PreparedSweep:
             more |= extremes_of(result.kept)
             result.kept = None
         return result, more
-
-    def _trajectory(
-        self, values: dict[str, Array], rows: NDArray[np.int64], samples: int
-    ) -> Columns:
-        """States at equal intervals, in long form."""
-        scenarios, starts, _ = self.scenarios(values)
-        every = max(1, self.steps // samples)
-        result, _ = self.run(scenarios, starts, rows, self.steps, every)
-        assert result.kept is not None
-        columns = columns_of(result.kept, self._quantities)
-        scenario = np.tile(rows, len(result.kept.t))
-        return {"scenario": scenario} | {name: x.ravel() for name, x in columns.items()}
 
     def _split(self, values: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
         """Numbers of the scene by key, and what a run is given: initial state and gains."""
@@ -266,19 +253,12 @@ def draw_pilot_rows(study: SweepStudy) -> dict[str, Array]:
     if study.table is None:
         return Sampler(study.variations, PILOT, study.seed, "random").rows(0, PILOT)
     chosen = np.linspace(0, study.rows - 1, min(PILOT, study.rows)).astype(int)
-    parts = [study.sampler.rows(int(row), 1) for row in chosen]
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    whole = study.sampler.rows(0, study.rows)
+    return {key: values[chosen] for key, values in whole.items()}
 
 
-def units_of(variations: Sequence[Variation]) -> dict[str, str]:
-    """Return the unit of each column that has one."""
-    found = UNITS | {"fault_time": "s", "local_error": "1"}
-    for k in DIMENSIONS["leg"]:
-        found |= {f"{name}_{end}_{k}": QUANTITIES[name][0] for name in _JOINTS for end in _ENDS}
-        found |= {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
-    for one in variations:
-        found |= dict.fromkeys(one.columns, "1" if one.factor else one.targets[0].spec.unit)
-    return found
+def _extremes() -> list[tuple[str, str]]:
+    return [(name, end) for name in Joints._fields for end in _ENDS]
 
 
 def extremes_of(kept: BatchStates) -> Columns:
@@ -286,7 +266,6 @@ def extremes_of(kept: BatchStates) -> Columns:
     with np.errstate(all="ignore"):
         return {
             f"{name}_{end}_{k + 1}": getattr(getattr(kept, name)[..., k], end)(axis=0)
-            for name in _JOINTS
-            for end in _ENDS
+            for name, end in _extremes()
             for k in range(3)
         }

@@ -8,24 +8,18 @@ import os
 import time
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.host.output import Bar, require_free, write_into
+from sst_ros.host.output import TEMPORARY, Bar, require_free, write_into
 from sst_ros.scene.scene import scene_of
-from sst_ros.sweeps.chunk_task import (
-    ChunkOutcome,
-    ChunkTask,
-    clear_temporary,
-    find_complete,
-    list_versions,
-    read_sweep,
-    run_local,
-    to_frame,
-)
+from sst_ros.sweeps.engine import ChunkOutcome, run_chunk, run_local, run_on_cluster, send_code
 from sst_ros.sweeps.prepared import prepare
+from sst_ros.sweeps.results import find_complete, read_sweep, to_frame
 from sst_ros.sweeps.sweep_study import SweepStudy
 
 if TYPE_CHECKING:
@@ -106,62 +100,58 @@ def run_study(
         raise InputError("sweep", [Problem("workers", workers, allowed)])
     if resume and out is None:
         raise InputError("sweep", [Problem("resume", True, "needs out")])
-    if out is not None and not resume:
-        require_free(out, "sweep")
-    ready = prepare(study, _read_steps(out) if resume and out is not None else None)
+    steps = None
+    if out is not None:
+        out = out.resolve()
+        if resume:  # with the number of steps that was chosen when it was started
+            with suppress(OSError, ValueError, KeyError, TypeError):
+                steps = int(json.loads((out / "study.json").read_text(encoding="utf-8"))["steps"])
+        else:
+            require_free(out, "sweep")
+    ready = prepare(study, steps)
     if study.table is not None:  # refuse rows that make no scene, before anything runs
         ready.check(study.sampler.rows(0, study.rows))
     complete: set[int] = set()
     if out is not None:
-        out = out.resolve()
         with write_into(out, "sweep"):
-            clear_temporary(out)
+            for left in out.glob(f"{TEMPORARY}*"):  # by killed processes
+                left.unlink(missing_ok=True)
             complete = find_complete(out, study, ready.steps)
             text = json.dumps(ready.about, indent=1) + "\n"
             (out / "study.json").write_text(text, encoding="utf-8")
     missing = [index for index in range(study.chunks) if index not in complete]
-    bar, began, reasons = Bar("sweep", progress), time.monotonic(), Counter[str]()
-    left = total = sum(len(study.rows_of(index)) for index in missing)
-    tables: dict[int, ChunkOutcome] = {}
+    total = sum(len(study.rows_of(index)) for index in missing)
+    bar, began, reasons, runs = Bar("sweep", progress), time.monotonic(), Counter[str](), 0
+    tables: dict[int, Any] = {}
 
     def done(outcome: ChunkOutcome) -> None:
         """Keep a chunk, and show the runs that are done and how the early ones ended."""
-        nonlocal left
-        left -= len(study.rows_of(outcome.index))
+        nonlocal runs
+        runs += len(study.rows_of(outcome.index))
         reasons.update(outcome.reasons)
-        rate = (total - left) / max(time.monotonic() - began, 1e-9)
-        ended = ", ".join(f"{count} {text}" for text, count in reasons.most_common(3))
-        text = f"{rate:.0f} runs/s, {left / max(rate, 1e-9):.0f} s left"
-        bar.draw(1.0 - left / study.rows, text + (f"; early: {ended}" if ended else ""))
-        if out is None:
-            tables[outcome.index] = outcome
+        tables[outcome.index] = outcome.tables
+        rate = max(runs / max(time.monotonic() - began, 1e-9), 1e-9)
+        text = f"{rate:.0f} runs/s, {(total - runs) / rate:.0f} s left"
+        if reasons:
+            common = (f"{count} {reason}" for reason, count in reasons.most_common(3))
+            text += f"; early: {', '.join(common)}"
+        bar.draw(1.0 - (total - runs) / study.rows, text)
 
-    task = ChunkTask(study, ready.steps, out, list_versions())
+    compute = partial(run_chunk, study, ready.steps, out)
     if client is None:
-        run_local(task, missing, done, workers or len(os.sched_getaffinity(0)))
+        run_local(compute, missing, done, workers or len(os.sched_getaffinity(0)))
     else:
-        from sst_ros.sweeps.cluster_engine import run_on_cluster, send_code
-
         send_code(client, ready.modules)
-        run_on_cluster(client, task, missing, done)
+        run_on_cluster(client, compute, out, missing, done)
 
-    def read(kind: str) -> pd.DataFrame:
+    def read(kind: int) -> pd.DataFrame:
         if out is not None:
-            return read_sweep(out, kind)
-        ordered = [tables[index] for index in range(study.chunks)]
-        parts = [one.table if kind == "part" else one.trajectory for one in ordered]
-        found = [part for part in parts if part is not None]
-        return to_frame(require("pyarrow").concat_tables(found), ready.about)
+            return read_sweep(out, ("part", "trajectory")[kind])
+        parts = (tables[index][kind] for index in range(study.chunks))
+        whole = require("pyarrow").concat_tables(part for part in parts if part is not None)
+        return to_frame(whole, ready.about)
 
-    frame = read("part")
+    frame = read(0)
     if study.trajectory is not None:
-        frame.attrs["trajectory"] = read("trajectory")
+        frame.attrs["trajectory"] = read(1)
     return frame
-
-
-def _read_steps(out: Path) -> int | None:
-    """Return the number of steps of the study in a folder, chosen when it was started."""
-    try:
-        return int(json.loads((out / "study.json").read_text(encoding="utf-8"))["steps"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None

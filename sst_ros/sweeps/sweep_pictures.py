@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_ros.host.output import write_into
 from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
-from sst_ros.sweeps.chunk_task import correlate, list_outputs
+from sst_ros.sweeps.results import correlate, list_outputs
 
 if TYPE_CHECKING:
     import pandas as pd

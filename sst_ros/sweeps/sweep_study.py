@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +31,6 @@ from sst_ros.sweeps.variations import (
     Sampler,
     Target,
     Variation,
-    keys_of,
     read_table,
     read_variation,
     tabulate,
@@ -46,6 +46,8 @@ OUTPUTS = (*QUANTITIES, "energy", "extremes")
 """What `outputs` may name: quantities of the final state, and extremes of joints."""
 
 MOST = 10_000_000
+
+_NO_TORQUE = "has no effect: the controller gives the torques"
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ class SweepStudy(Section):
                 yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
         torque, kept = self.torque, self.trajectory
         if torque is not None and self.control is not None:
-            yield Problem("torque", "given", "has no effect: the controller gives the torques")
+            yield Problem("torque", "given", _NO_TORQUE)
         constant = not isinstance(torque, (Mapping, SineTorque, type(None)))
         if constant and finite_vector(torque) is None:
             yield Problem("torque", torque, "must be three finite numbers [N m] or a mapping")
@@ -182,11 +184,8 @@ class SweepStudy(Section):
         if torque is None:
             return self.scene
         if not isinstance(torque, Mapping):  # constant: a sine that stays at its largest value
-            torque = {
-                "amplitude": list(torque),
-                "frequency": [0.0] * 3,
-                "phase": [math.pi / 2] * 3,
-            }
+            zeros, right = [0.0] * 3, [math.pi / 2] * 3
+            torque = {"amplitude": list(torque), "frequency": zeros, "phase": right}
         return self.scene.with_values({"torque": dict(torque)})
 
     @cached_property
@@ -214,12 +213,14 @@ class SweepStudy(Section):
                 found.append(read_variation(key, given, self._targets(key)))
             except (ValueError, TypeError, OverflowError) as error:
                 problems.append(Problem(f"vary.{key}", given, str(error)))
-        columns = {name for one in found for name in one.columns}
-        for key, names in keys_of(self.table or {}).items():
+        columns: dict[str, dict[str, Any]] = {}
+        for name, column in (self.table or {}).items():  # a trailing index is that of a component
+            columns.setdefault(re.sub(r"(\[\d+\])+$", "", name), {})[name] = column
+        taken = {name for one in found for name in one.columns}
+        for key, own in columns.items():
             try:
-                if key in self.vary or columns & set(names):
+                if key in self.vary or taken & own.keys():
                     raise ValueError("is given in vary, too")
-                own = {name: self.table[name] for name in names}
                 found.append(tabulate(key, own, self._targets(key)))
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
@@ -234,22 +235,21 @@ class SweepStudy(Section):
         """Number of runs."""
         grid = math.prod(len(one.numbers) for one in self.variations if one.kind == "grid")
         lengths = {len(values) for values in (self.table or {}).values()}
-        drawn = any(one.kind in ("uniform", "normal") for one in self.variations)
         natural = min(lengths, default=grid)
+        rows, key, allowed = self.n or natural, "n", ""
         if len(lengths) > 1 or (lengths and grid > 1):
-            allowed = "must have columns of equal length, and no grid beside it"
-            raise InputError("sweep", [Problem("table", sorted(lengths), allowed)])
-        if self.n is None and drawn and grid == 1 and not lengths:
-            raise InputError("sweep", [Problem("n", None, "must be given with distributions")])
-        rows, allowed = self.n or natural, ""
-        if lengths and rows > natural:
+            key, allowed = "table", "must have columns of equal length, and no grid beside it"
+        elif not (self.n or lengths or grid > 1) and any(one.drawn for one in self.variations):
+            allowed = "must be given with distributions"
+        elif lengths and rows > natural:
             allowed = f"must be <= {natural}, the rows of the table"
         elif grid > 1 and rows % grid:
             allowed = f"must be a multiple of {grid}, the size of the grid"
         elif self.sampling == "latin_hypercube" and rows > LARGEST_HYPERCUBE:
             allowed = f"must be <= {LARGEST_HYPERCUBE} with latin_hypercube; use sobol"
         if allowed:
-            raise InputError("sweep", [Problem("n", rows, allowed)])
+            value = sorted(lengths) if key == "table" else self.n
+            raise InputError("sweep", [Problem(key, value, allowed)])
         return rows
 
     @cached_property
@@ -289,7 +289,7 @@ class SweepStudy(Section):
         if section == "control":
             return targets_of(self.control, name, ("control",))
         if section == "torque" and self.control is not None:
-            raise ValueError("has no effect: the controller gives the torques")
+            raise ValueError(_NO_TORQUE)
         return targets_of(self.model_scene, key)
 
 

@@ -14,7 +14,6 @@ row; Sobol points from their index; a Latin hypercube from all n rows at once.
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -67,7 +66,7 @@ class Variation:
     key: str
     kind: str
     numbers: Array
-    targets: tuple[Target, ...]
+    targets: Sequence[Target]
     factor: bool
 
     @cached_property
@@ -75,6 +74,11 @@ class Variation:
         """Names of the columns of a table, one for each component."""
         shape = () if self.factor else self.targets[0].nominal.shape
         return tuple(self.key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape))
+
+    @property
+    def drawn(self) -> bool:
+        """Whether values are drawn from a distribution."""
+        return self.kind in ("uniform", "normal")
 
     def values(self, quantiles: Array) -> Array:
         """Values, shape (n, components), at quantiles in (0, 1) of the same shape."""
@@ -114,88 +118,8 @@ class Variation:
                 raise ValueError(f"{spec.refuse()}; {words}")
 
 
-def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
-    """Read one entry of `vary`.
-
-    Args:
-        key: as given.
-        given: distribution or values.
-        targets: what the key names, see `targets_of`.
-
-    Raises:
-        ValueError: it is no distribution, or its numbers are not allowed.
-
-    """
-    kind, numbers, relative = _read(given)
-    factor = _scales_tensor(key, targets)
-    if factor and not relative:
-        raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
-    nominal = np.ones(()) if factor else targets[0].nominal
-    if kind == "linspace":
-        low, high, count = numbers
-        kind, numbers = "grid", np.linspace(low, high, int(count))
-    if kind == "grid":
-        values = np.array(numbers, dtype=float)
-        if values.shape[1:] != nominal.shape or not len(values) or not np.all(np.isfinite(values)):
-            raise ValueError(f"must be a list of values of shape {nominal.shape}")
-    else:
-        values = _read_distribution(kind, numbers, nominal.shape)
-    if relative and not factor:
-        if any(not np.array_equal(one.nominal, nominal) for one in targets):
-            raise ValueError("its entries differ in the scene: give each by its index")
-        values = values * nominal
-        if kind == "normal":  # a negative value has mirrored it
-            values[1] = np.abs(values[1])
-            values[2:] = np.sort(values[2:], axis=0)
-        if kind == "uniform":
-            values = np.sort(values, axis=0)
-    if kind == "normal" and not np.all(values[1] > 0.0):
-        raise ValueError("the standard deviation must be > 0")
-    found = Variation(key, kind, values.reshape(len(values), -1), tuple(targets), factor)
-    found.refuse_forbidden()
-    return found
-
-
-def _read(given: Any) -> tuple[str, Any, bool]:
-    """Kind, numbers, and whether they are relative."""
-    allowed = f"must be a list of values, or one of {', '.join(KINDS)} with its numbers"
-    kind, numbers, relative = "grid", given, False
-    if isinstance(given, Mapping):
-        words = dict(given)
-        relative = words.pop("relative", False)
-        kind, numbers = next(iter(words.items())) if len(words) == 1 else ("", ())
-    elif isinstance(given, tuple) and given and isinstance(given[0], str):
-        kind, relative = given[0], isinstance(given[-1], str) and given[-1] == "relative"
-        numbers = given[1 : len(given) - relative]
-    if kind not in KINDS or not isinstance(relative, bool):
-        raise ValueError(allowed)
-    if isinstance(numbers, str) or not np.iterable(numbers):
-        raise ValueError(allowed)
-    return kind, numbers, relative
-
-
-def _read_distribution(kind: str, numbers: Any, shape: tuple[int, ...]) -> Array:
-    """Numbers of a distribution, broadcast to the shape of the key: (2 or 4, *shape)."""
-    count = len(numbers)
-    if count not in ((2,) if kind == "uniform" else (2, 4)):
-        allowed = "low, high" if kind == "uniform" else "mean, standard deviation[, low, high]"
-        raise ValueError(f"{kind} takes {allowed}")
-    more = [] if count != 2 or kind == "uniform" else [-np.inf, np.inf]
-    values = np.array([np.broadcast_to(np.array(x, dtype=float), shape) for x in (*numbers, *more)])
-    if np.any(np.isnan(values)) or not np.all(np.isfinite(values[:2])):
-        raise ValueError("must be finite numbers")
-    if not np.all(values[-2] < values[-1]):
-        raise ValueError("the lower end must be less than the upper one")
-    return values
-
-
 def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
-    """Return what a key names; a list without an index means all of its entries.
-
-    Args:
-        tree: the scene, or settings.
-        key: in it.
-        place: of the tree in a study.
+    """Return what a key of a scene, or of settings at a place of the study, names.
 
     Raises:
         ValueError: it names nothing that can vary.
@@ -225,15 +149,69 @@ def _scales_tensor(key: str, targets: Sequence[Target]) -> bool:
     return targets[0].key.count(".") > key.count(".")
 
 
-def keys_of(table: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Columns of a table by key: a trailing index is that of a component."""
-    found: dict[str, list[str]] = {}
-    for name in table:
-        found.setdefault(re.sub(r"(\[\d+\])+$", "", name), []).append(name)
+def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
+    """Read one entry of `vary`, whose key names the targets.
+
+    Raises:
+        ValueError: it is no distribution, or its numbers are not allowed.
+
+    """
+    kind, numbers, relative = "grid", given, False
+    if isinstance(given, Mapping):
+        words = dict(given)
+        relative = words.pop("relative", False)
+        kind, numbers = next(iter(words.items())) if len(words) == 1 else ("", ())
+    elif isinstance(given, tuple) and given and isinstance(given[0], str):
+        kind, relative = given[0], isinstance(given[-1], str) and given[-1] == "relative"
+        numbers = given[1 : len(given) - relative]
+    listed = np.iterable(numbers) and not isinstance(numbers, str)
+    if kind not in KINDS or not isinstance(relative, bool) or not listed:
+        raise ValueError(f"must be a list of values, or one of {', '.join(KINDS)} with its numbers")
+    factor = _scales_tensor(key, targets)
+    if factor and not relative:
+        raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
+    nominal = np.ones(()) if factor else targets[0].nominal
+    if kind == "linspace":
+        low, high, count = numbers
+        kind, numbers = "grid", np.linspace(low, high, int(count))
+    if kind == "grid":
+        values = np.array(numbers, dtype=float)
+        if values.shape[1:] != nominal.shape or not len(values) or not np.all(np.isfinite(values)):
+            raise ValueError(f"must be a list of values of shape {nominal.shape}")
+    else:
+        values = _read_distribution(kind, numbers, nominal.shape)
+    if relative and not factor:
+        if any(not np.array_equal(one.nominal, nominal) for one in targets):
+            raise ValueError("its entries differ in the scene: give each by its index")
+        values = values * nominal
+        if kind == "normal":  # a negative value has mirrored it
+            values[1] = np.abs(values[1])
+        if kind != "grid":
+            values[-2:] = np.sort(values[-2:], axis=0)
+    if kind == "normal" and not np.all(values[1] > 0.0):
+        raise ValueError("the standard deviation must be > 0")
+    found = Variation(key, kind, values.reshape(len(values), -1), targets, factor)
+    found.refuse_forbidden()
     return found
 
 
-def tabulate(key: str, columns: Mapping[str, Array], targets: list[Target]) -> Variation:
+def _read_distribution(kind: str, numbers: Any, shape: tuple[int, ...]) -> Array:
+    """Numbers of a distribution, broadcast to the shape of the key: (2 or 4, *shape)."""
+    count, words = 2, "low, high"
+    if kind == "normal":
+        count, words = 4, "mean, standard deviation[, low, high]"
+        numbers = (*numbers, -np.inf, np.inf) if len(numbers) == 2 else numbers
+    if len(numbers) != count:
+        raise ValueError(f"{kind} takes {words}")
+    values = np.array([np.broadcast_to(np.array(x, dtype=float), shape) for x in numbers])
+    if np.any(np.isnan(values)) or not np.all(np.isfinite(values[:2])):
+        raise ValueError("must be finite numbers")
+    if not np.all(values[-2] < values[-1]):
+        raise ValueError("the lower end must be less than the upper one")
+    return values
+
+
+def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) -> Variation:
     """Return the variation of a key whose values are columns of a table.
 
     Raises:
@@ -243,7 +221,7 @@ def tabulate(key: str, columns: Mapping[str, Array], targets: list[Target]) -> V
     if len(set(map(len, columns.values()))) > 1:
         raise ValueError("must have columns of equal length")
     numbers = np.stack(list(columns.values()), axis=1)
-    found = Variation(key, "table", numbers, tuple(targets), _scales_tensor(key, targets))
+    found = Variation(key, "table", numbers, targets, _scales_tensor(key, targets))
     if tuple(columns) != found.columns:
         raise ValueError(f"needs the columns {', '.join(found.columns)}")
     return found
@@ -283,24 +261,23 @@ class Sampler:
 
     def __init__(self, variations: Sequence[Variation], n: int, seed: int, sampling: str) -> None:
         self._variations, self._n, self._seed, self._sampling = variations, n, seed, sampling
-        drawn = (one for one in variations if one.kind in ("uniform", "normal"))
-        self._width = sum(len(one.columns) for one in drawn)
+        self._width = sum(len(one.columns) for one in variations if one.drawn)
 
     def rows(self, first: int, count: int) -> dict[str, Array]:
         """Values of rows `first` to `first + count`, shape (count, components), by key."""
-        quantiles = iter(self._quantiles(first, count).T)
+        quantiles, used = self._quantiles(first, count), 0
         found, index = {}, np.arange(first, first + count)
         for one in self._variations:
-            if one.kind == "table":
+            if one.drawn:
+                found[one.key] = one.values(quantiles[:, used : used + len(one.columns)])
+                used += len(one.columns)
+            else:
                 found[one.key] = one.numbers[first : first + count]
-            elif one.kind != "grid":
-                own = np.stack([next(quantiles) for _ in one.columns], axis=1)
-                found[one.key] = one.values(own)
         for one in reversed(self._variations):  # the last key of a grid varies fastest
             if one.kind == "grid":
                 found[one.key] = one.numbers[index % len(one.numbers)]
                 index = index // len(one.numbers)
-        return {one.key: found[one.key] for one in self._variations}
+        return found
 
     def _quantiles(self, first: int, count: int) -> Array:
         """Numbers in (0, 1), shape (count, width)."""

@@ -14,9 +14,8 @@ from contextlib import contextmanager
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.sweeps import cluster_engine
-from sst_ros.sweeps.chunk_task import SweepFailed
-from sst_ros.sweeps.cluster_engine import connect
+from sst_ros.sweeps import engine
+from sst_ros.sweeps.engine import SweepFailed, connect
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from test.sweeps.test_sweep import same
@@ -164,7 +163,7 @@ def test_workers_killed_at_random_lose_nothing(processes, tmp_path):
 
 
 def test_a_study_resumes_after_its_scheduler_was_killed(processes, expected, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_engine, "NO_SCHEDULER", 3.0)
+    monkeypatch.setattr(engine, "NO_SCHEDULER", 3.0)
     processes.add_worker(SLOW)
     out = tmp_path / "out"
 
@@ -203,7 +202,7 @@ def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
 
 
 def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_engine, "NO_WORKER", 2.0)
+    monkeypatch.setattr(engine, "NO_WORKER", 2.0)
     processes.add_worker(OLD)
     with processes.client(1) as client, pytest.raises(SweepFailed, match=r"in place of"):
         run_study(STUDY, tmp_path / "out", client=client)
@@ -212,7 +211,7 @@ def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, 
 def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
     processes, expected, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(cluster_engine, "MOST_DEATHS", 2)
+    monkeypatch.setattr(engine, "MOST_DEATHS", 2)
     processes.stop()
     processes.environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
     processes.start_scheduler()

@@ -139,9 +139,16 @@ def test_noise_is_normal_and_depends_on_row_counter_and_seed_alone():
     assert np.array_equal(others[2][:-1], drawn[1:])
 
 
-def test_a_duration_that_is_no_whole_number_of_periods_is_refused():
-    study = SweepStudy(SCENE, VARY, n=2, control={"period": 0.3}, duration=1.0)
-    with pytest.raises(InputError, match=r"= 1\.0: must be a whole number of control periods"):
+@pytest.mark.parametrize(
+    ("period", "message"),
+    [
+        (0.3, r"= 1\.0: must be a whole number of control periods"),
+        (0.1, "steps = 25: must be a multiple of 10, the control periods"),
+    ],
+)
+def test_a_duration_or_steps_that_fit_no_whole_periods_are_refused(period, message):
+    study = SweepStudy(SCENE, VARY, n=2, control={"period": period}, duration=1.0, steps=25)
+    with pytest.raises(InputError, match=message):
         PreparedSweep(study)
 
 

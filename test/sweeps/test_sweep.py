@@ -9,8 +9,8 @@ import pytest
 
 import sst_ros
 from sst_ros import InputError, Simulation, load_scene, simulate
-from sst_ros.sweeps import chunk_task
-from sst_ros.sweeps.chunk_task import SweepFailed
+from sst_ros.sweeps import engine, results
+from sst_ros.sweeps.engine import SweepFailed
 from sst_ros.sweeps.prepared import PreparedSweep
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
@@ -132,7 +132,7 @@ def test_files_are_whole_and_explain_themselves(table, tmp_path):
     same(found, table)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == [*(f"part-{i:07d}.parquet" for i in range(5)), "study.json"]
-    about = chunk_task.read_about(tmp_path / "out" / names[0])
+    about = results.read_about(tmp_path / "out" / names[0])
     units, study = about["units"], about["study"]
     assert about["version"] == sst_ros.__version__
     assert (units["gamma_dot_1"], units["star.inertia"]) == ("rad/s", "1")
@@ -161,7 +161,7 @@ def test_resume_computes_only_what_is_missing(table, tmp_path, monkeypatch):
 
 
 def test_a_full_disk_leaves_whole_files_and_the_study_resumes(table, tmp_path, monkeypatch):
-    out, write, written = tmp_path / "out", chunk_task.write, []
+    out, write, written = tmp_path / "out", results.write, []
 
     def full(given, folder, name, about):
         if len(written) == 2:
@@ -169,7 +169,7 @@ def test_a_full_disk_leaves_whole_files_and_the_study_resumes(table, tmp_path, m
         written.append(name)
         write(given, folder, name, about)
 
-    monkeypatch.setattr(chunk_task, "write", full)
+    monkeypatch.setattr(engine, "write", full)
     with pytest.raises(SweepFailed, match="No space left on device"):
         run_study(STUDY, out, workers=1)
     monkeypatch.undo()

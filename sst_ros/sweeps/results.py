@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results of a study: a file for each chunk, all of them as one table, and what it shows.
+
+A Parquet file is complete or absent. Its metadata holds the study, its digest, the version and the
+units, so that a file explains itself and `--resume` knows which chunks are there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sst_ros.errors import InputError, Problem
+from sst_ros.extras import require
+from sst_ros.host.output import replace_file
+from sst_ros.sweeps.sweep_study import SweepStudy
+from sst_ros.version import VERSION
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+METADATA = b"sst_ros"
+
+_SHOWN = 8
+"""Causes of early ends in a summary."""
+
+_NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
+
+
+def name_part(index: int, kind: str = "part") -> str:
+    """Return the name of the file of a chunk."""
+    return f"{kind}-{index:07d}.parquet"
+
+
+def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) -> None:
+    """Write a table as a file that is there whole or not at all.
+
+    Raises:
+        OSError: it cannot be written; nothing of it is left.
+
+    """
+    names = set(table.column_names)
+    units = {name: unit for name, unit in about["units"].items() if name in names}
+    metadata = json.dumps({**about, "units": units}).encode()
+    table = table.replace_schema_metadata({METADATA: metadata})
+    with replace_file(folder / name) as own:
+        # Random mantissas do not compress, and their least and greatest help no reader.
+        require("pyarrow.parquet").write_table(
+            table, own, compression="none", use_dictionary=["reason"], write_statistics=False
+        )
+        own.chmod(0o644)
+
+
+def read_about(path: Path) -> dict[str, Any] | None:
+    """Metadata of a file, with its number of rows; None if it is no complete file of a study."""
+    try:
+        with require("pyarrow.parquet").ParquetFile(path) as file:
+            found: dict[str, Any] = json.loads(file.schema_arrow.metadata[METADATA])
+            return found | {"rows": file.metadata.num_rows}
+    except (OSError, ValueError, KeyError, TypeError, require("pyarrow").ArrowException):
+        return None
+
+
+def find_complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
+    """Return the chunks whose files are there.
+
+    Raises:
+        InputError: a file is that of another study or version.
+
+    """
+    expected = {"digest": study.digest, "steps": steps, "version": VERSION}
+    found = set()
+    for path in folder.glob("part-*.parquet"):
+        about = read_about(path)
+        if about is None:
+            continue
+        if any(about[key] != value for key, value in expected.items()):
+            allowed = "is of another study or version: choose another --out"
+            raise InputError("sweep", [Problem("--resume", str(path), allowed)])
+        index = int(path.stem.removeprefix("part-"))
+        rows, trajectory = study.rows_of(index), folder / name_part(index, "trajectory")
+        kept = study.trajectory is not None and rows.start < study.trajectory["rows"]
+        if about["rows"] == len(rows) and (not kept or read_about(trajectory) is not None):
+            found.add(index)
+    return found
+
+
+def read_sweep(folder: Path, kind: str = "part") -> pd.DataFrame:
+    """Read the results in a folder as one table, units and study in its `attrs`.
+
+    Raises:
+        InputError: there are none.
+
+    """
+    paths = sorted(folder.glob(f"{kind}-*.parquet"))
+    about = next(filter(None, map(read_about, paths)), None)
+    if about is None:
+        allowed = f"must be a folder with files {kind}-*.parquet of `sst-ros sweep`"
+        raise InputError("sweep", [Problem("DIR", str(folder), allowed)])
+    return to_frame(require("pyarrow.parquet").read_table(list(map(str, paths))), about)
+
+
+def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
+    """Return a table as pandas, with its metadata as `attrs`."""
+    frame: pd.DataFrame = table.replace_schema_metadata(None).to_pandas()
+    if "status" in frame:
+        frame = frame.set_index("scenario")
+    frame.attrs = {key: value for key, value in about.items() if key != "rows"}
+    return frame
+
+
+def summarize(table: pd.DataFrame) -> str:
+    """Return a text of the table of a study."""
+    steps, length = table.attrs["steps"], table.attrs["duration"]
+    lines = [f"{len(table)} runs of {length:g} s, {steps} steps each"]
+    counts = table["reason"].value_counts()
+    lines += [f"  {count:>10}  {reason}" for reason, count in counts.items() if count]
+    causes = correlate(table)
+    if len(causes):
+        lines.append("Rank correlation of inputs with an early end:")
+        lines += [f"  {value:>10.3f}  {name}" for name, value in causes.head(_SHOWN).items()]
+    outputs = table.loc[table["status"] == 0, list_outputs(table)]
+    if len(outputs):
+        shown = outputs.describe(percentiles=[0.01, 0.99]).T[["mean", "std", "1%", "99%"]]
+        shown["unit"] = [table.attrs["units"].get(name, "") for name in shown.index]
+        lines.append(shown.to_string(float_format="{:.6g}".format))
+    return "\n".join(lines)
+
+
+def list_outputs(table: pd.DataFrame) -> list[str]:
+    """Names of the outputs of a study."""
+    known = (*table.attrs["inputs"], *_NOT_OUTPUTS)
+    return [name for name in table.columns if name not in known]
+
+
+def correlate(table: pd.DataFrame, column: pd.Series | None = None) -> pd.Series:
+    """Spearman's rank correlation of each input with a column, largest first; none if constant.
+
+    The column is by default whether a run ended early.
+    """
+    column = (table["status"] != 0).astype(float) if column is None else column
+    inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
+    if column.nunique() < 2 or not inputs:
+        return table[[]].sum()
+    found = table[inputs].corrwith(column, method="spearman")
+    return found.sort_values(key=abs, ascending=False)
