@@ -42,7 +42,7 @@ CLOSED = 1e-14
 """Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
 _STEPS = 20
 _STAR = (*"xyzw", "wx", "wy", "wz", "ax", "ay", "az")
-_ACTUATORS = ("d1", "d2", "d3", "dd1", "dd2", "dd3")
+_MOVING = (*_STAR[:4], "d1", "d2", "d3", "dd1", "dd2", "dd3")
 _POSE = (*_STAR[:4], *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
 
 
@@ -61,7 +61,7 @@ class ActuatorSpaceMap:
             for w, v, e in rows
         ]
         self._actuators = compile_program(trace(self._of_star, _STAR))
-        self._star = compile_program(trace(self.star_accelerations, (*_STAR[:4], *_ACTUATORS)))
+        self._star = compile_program(trace(self.star_accelerations, _MOVING))
         self._posture = compile_program(trace(self._of_posture, _STAR[:4]))
         self._newton = compile_program(trace(self.newton_step, _POSE))
 
@@ -79,8 +79,9 @@ class ActuatorSpaceMap:
     ) -> Reference:
         """Return the reference of a state of the actuators, of the assembly closest to `near`."""
         q = self.orientation(near, gamma)
-        star = self.star_motion(q, gamma_dot, gamma_ddot)
-        return Reference(q, *star, gamma, gamma_dot, gamma_ddot)
+        return Reference(
+            q, *self.star_motion(q, gamma_dot, gamma_ddot), gamma, gamma_dot, gamma_ddot
+        )
 
     def star_motion(
         self, q: Quaternion, gamma_dot: Vector3, gamma_ddot: Vector3
@@ -90,17 +91,24 @@ class ActuatorSpaceMap:
         return (x, y, z), (ax, ay, az)
 
     def orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
-        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`."""
+        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`.
+
+        Raises:
+            ArithmeticError: in a parallel singularity, and where no such assembly is found.
+
+        """
         carriages = self.carriages(gamma)
         best, least, q = near, math.inf, near
         for _ in range(_STEPS):
-            *moved, first, second, third = self._newton(*q, *carriages)
-            largest = max(abs(first), abs(second), abs(third))
+            x, y, z, w, *residuals = self._newton(*q, *carriages)
+            largest = max(map(abs, residuals))
             if largest < least:
                 best, least = q, largest
             if not largest > ROUNDING:
                 break
-            q = (moved[0], moved[1], moved[2], moved[3])
+            q = (x, y, z, w)
+        if least > CLOSED:
+            raise ArithmeticError("the loops do not close")
         return best
 
     def carriages(self, gamma: Any) -> list[Any]:
@@ -114,7 +122,7 @@ class ActuatorSpaceMap:
     @cached_property
     def star_rates(self) -> Callable[..., tuple[Any, ...]]:
         """W and W_dot in {E}, six arrays (n,), of (q, gamma_dot, gamma_ddot), ten arrays (n,)."""
-        return compile_for_arrays(trace(self.star_accelerations, (*_STAR[:4], *_ACTUATORS)))
+        return compile_for_arrays(trace(self.star_accelerations, _MOVING))
 
     @cached_property
     def postures(self) -> Callable[..., tuple[Any, ...]]:
@@ -223,14 +231,12 @@ class OrientationObserver:
     """
 
     def __init__(self, geometry: Geometry, quaternion: Quaternion, gamma: Vector3) -> None:
-        self.coordinates = ActuatorSpaceMap(geometry)
-        self._begin, self._arcs = (quaternion, gamma), geometry.e.tolist()
+        self.coordinates, self._begin = ActuatorSpaceMap(geometry), (quaternion, gamma)
         self.reset()
 
     def reset(self) -> None:
         """Return to the initial orientation."""
         self._quaternion, self._gamma = self._begin
-        self._sigma, _ = self._measures(self._quaternion, self._gamma)
 
     def update(self, gamma: Vector3) -> Quaternion:
         """Return the quaternion (x, y, z, w) at the next angles [rad].
@@ -243,35 +249,19 @@ class OrientationObserver:
         if found is None:
             geometry = self.coordinates.geometry
             found = follow_assembly(geometry, self._quaternion, self._gamma, gamma)
-            self._sigma, _ = self._measures(found, gamma)
         self._quaternion, self._gamma = found, gamma
         return found
 
     def _step(self, gamma: Vector3) -> Quaternion | None:
         """Newton's method in one step; None where it might reach another assembly mode."""
-        step, sigma = math.dist(gamma, self._gamma), self._sigma
-        if step > continuation.SAFE * sigma * sigma:
-            return None
+        step = math.dist(gamma, self._gamma)
         try:
+            sigma = 2.0 / 3.0 * abs(self.coordinates.posture(self._quaternion)[-1])
+            if step > continuation.SAFE * sigma * sigma:
+                return None
             found = self.coordinates.orientation(self._quaternion, gamma)
         except ArithmeticError:
             return None
         # The theorem holds in a ball about R; chords of rotations are 2 sqrt(2) sin(angle / 2).
         half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, self._quaternion)) ** 2))
-        next_sigma, residual = self._measures(found, gamma)
-        if residual > CLOSED or half > 0.25 * (sigma - step):
-            return None
-        self._sigma = next_sigma
-        return found
-
-    def _measures(self, quaternion: Quaternion, gamma: Vector3) -> tuple[float, float]:
-        """Return a lower bound of sigma, and the largest residual abs(r_k . t_k)."""
-        rows, carriages = rotation_rows(quaternion), self.coordinates.carriages(gamma)
-        normals, largest = [], 0.0
-        for k, (x, y, z) in enumerate(self._arcs):
-            r = (carriages[3 * k], carriages[3 * k + 1], carriages[3 * k + 2])
-            t = dot3(rows[0], (x, y, z)), dot3(rows[1], (x, y, z)), dot3(rows[2], (x, y, z))
-            normals.append(cross3(t, r))
-            largest = max(largest, abs(dot3(r, t)))
-        determinant = dot3(normals[0], cross3(normals[1], normals[2]))
-        return 2.0 / 3.0 * abs(determinant), largest
+        return found if half <= 0.25 * (sigma - step) else None

@@ -173,12 +173,8 @@ class ControlChannel(Section):
     ) -> tuple[Triple, Triple, Any]:
         """Return the angles and rates that the controller receives, and angles to remember.
 
-        Args:
-            gamma: angles [rad].
-            gamma_dot: rates [rad/s].
-            before: angles to remember of the last sample; none without encoders.
-            noise: six numbers that are added to gamma and gamma_dot; or none.
-
+        `before` are those of the last sample, none without encoders; `noise` are six numbers that
+        are added to gamma [rad] and gamma_dot [rad/s], or none.
         """
         if self.counts:
             gamma = triple(map(self.count, gamma))
@@ -265,16 +261,11 @@ class ControlLaw(NamedTuple):
         observed: Any,
         integral: Any,
     ) -> Command:
-        """Return the torques at a sample.
+        """Return the torques at a sample, of angles [rad] and rates [rad/s] as measured.
 
-        Args:
-            desired: the reference.
-            torques: of the desired motion [N m], now and at the instant whose torque is held.
-            gamma: as measured [rad].
-            gamma_dot: as measured [rad/s].
-            observed: orientation at the measured angles, where the law needs it.
-            integral: sum of errors [rad s]; none without integral action.
-
+        `torques` are those of the desired motion [N m], now and at the instant whose torque is
+        held; `observed` is the orientation at the measured angles, where the law needs it, and
+        `integral` the sum of errors [rad s], none without integral action.
         """
         mode, feedback, summed = self.settings.mode, ZERO, ZERO
         feedforward = torques[1] if self.settings.feeds else ZERO
@@ -330,11 +321,8 @@ def feedback_gains(
 ) -> tuple[Array, Array]:
     """Return gains kp [1/s^2] and kd [1/s] of accelerations, shape (3, n).
 
-    Args:
-        inertia: M_kk, shape (3, 1).
-        value: of a field of `ControllerSettings`, for n loops or for all of them.
-        direct: whether stiffness and damping are given.
-
+    The inertia is M_kk, shape (3, 1); `value` is that of a field of `ControllerSettings`, for n
+    loops or for all of them; gains are `direct` where stiffness and damping are given.
     """
     if direct:
         kp, kd = (np.reshape(value(name), (3, -1)) / inertia for name in ("stiffness", "damping"))

@@ -20,21 +20,11 @@ from pathlib import Path, PurePath
 from typing import IO, Any, TypeAlias
 
 import yaml
+from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    McapRecord,
-    Message,
-    MessageIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Chunk, ChunkIndex, McapRecord
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2 import Reader
@@ -47,16 +37,15 @@ _RECORD_HEAD = 9
 _DATA_END_SIZE = _RECORD_HEAD + 4
 _PIECE = 1 << 20
 
+RawMessage: TypeAlias = tuple[str, str, int, bytes]
+"""Topic, type, reception by the recorder [ns], serialized content."""
+
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic to look for: one whose full name ends in its key.
+    """A topic to look for: the last word of its name, its message type.
 
-    Attributes:
-        key: last word of its name.
-        type: message type.
-        anywhere: any namespace and node name may precede the key.
-
+    Any namespace and node name may precede the key where it is `anywhere`.
     """
 
     key: str
@@ -71,10 +60,6 @@ class Topic:
     def matches(self, name: str) -> bool:
         """Return whether a full name is that of this topic."""
         return name.endswith(self.ending) if self.anywhere else name == self.ending
-
-
-RawMessage: TypeAlias = tuple[str, str, int, bytes]
-"""Topic, type, reception by the recorder [ns], serialized content."""
 
 
 class Bag:
@@ -104,7 +89,6 @@ class Bag:
         self.damage: tuple[str, ...] = ()
         self.unverified = 0
         self._requested, self._damaged = requested, damaged
-        self._store = message_types()
         self._channels: dict[tuple[str, str], Topic | None] = {}
 
     def messages(self) -> Iterator[tuple[str, int, Any]]:
@@ -117,8 +101,7 @@ class Bag:
                 empty; or two topics match one that is requested.
 
         """
-        count = 0
-        files = self._mcap_files()
+        count, files, store = 0, self._mcap_files(), message_types()
         for name, message_type, received_ns, data in (
             self._read_mcap(files) if files else self._read_by_rosbags()
         ):
@@ -127,9 +110,9 @@ class Bag:
             if topic is None:
                 continue
             try:
-                content = self._store.deserialize_cdr(data, message_type)
+                content = store.deserialize_cdr(data, message_type)
             except Exception as error:  # rosbags raises anything on bad bytes
-                raise self._not_whole(_one_line(error), f" in {topic.key}") from None
+                raise self._not_whole(error, f" in {topic.key}") from None
             yield topic.key, received_ns, content
         if not count:
             raise refusal(self.path, "messages", 0, "the recording is empty")
@@ -161,18 +144,20 @@ class Bag:
         return files
 
     def _read_mcap(self, paths: Sequence[Path]) -> Iterator[RawMessage]:
-        files = [McapFile(path) for path in paths]
-        for file in files:
+        damage: list[str] = []
+        for file in map(McapFile, paths):
             try:
                 yield from file.messages()
             except OSError as error:
-                raise self._not_whole(_one_line(error)) from None
+                raise self._not_whole(error) from None
             for channel in file.channels.values():
                 self._topic(*channel)
-            if not file.intact and not self._damaged:
-                raise self._not_whole("; ".join(file.describe()), advice=True)
-        self.damage = tuple(line for file in files for line in file.describe())
-        self.unverified = sum(file.unverified for file in files)
+            told = file.describe()
+            if told and not self._damaged:
+                raise self._not_whole("; ".join(told), advice=", --damaged reads it here")
+            damage += told
+            self.unverified += file.unverified
+        self.damage = tuple(damage)
 
     def _read_by_rosbags(self) -> Iterator[RawMessage]:
         count = 0
@@ -186,7 +171,7 @@ class Bag:
         except InputError:
             raise
         except Exception as error:  # rosbags and what it is built on raise anything on bad bytes
-            raise self._not_whole(_one_line(error), f" after {count} messages") from None
+            raise self._not_whole(error, f" after {count} messages") from None
 
     def _topic(self, name: str, message_type: str) -> Topic | None:
         """Return the requested topic of a channel, and note that it was found."""
@@ -196,32 +181,25 @@ class Bag:
             (one for one in self._requested if one.matches(name) and one.type == message_type), None
         )
         self._channels[name, message_type] = topic
-        if topic is not None:
-            names = sorted({self.topics.setdefault(topic.key, name), name})
-            if len(names) > 1:
-                allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
-                raise refusal(self.path, topic.key, ", ".join(names), allowed)
+        if topic is not None and self.topics.setdefault(topic.key, name) != name:
+            names = ", ".join(sorted([self.topics[topic.key], name]))
+            allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
+            raise refusal(self.path, topic.key, names, allowed)
         return topic
 
-    def _not_whole(self, reason: str, where: str = "", *, advice: bool = False) -> InputError:
+    def _not_whole(self, reason: object, where: str = "", advice: str = "") -> InputError:
         allowed = "must be a whole rosbag2 recording, MCAP or sqlite3; "
-        allowed += f"reading failed{where}: {reason}; "
+        allowed += f"reading failed{where}: {_one_line(reason)}; "
         allowed += "python -m sst_ros recover BAG makes a whole one of what is intact"
-        if advice:
-            allowed += ", --damaged reads it here"
-        return refusal(self.path, "bag", self.path.name, allowed)
+        return refusal(self.path, "bag", self.path.name, allowed + advice)
 
 
 @dataclass
 class Damage:
-    """A part of a file that cannot be used.
+    """A part of a file that cannot be used: its first byte, and what is wrong with it.
 
-    Attributes:
-        offset: first byte of the part.
-        reason: what is wrong with it.
-        messages: number of messages in it, 0 where that is not known.
-        begin_ns, end_ns: first and last reception of them [ns], 0 where that is not known.
-
+    The number of messages in it, and the first and last reception of them [ns], are 0 where they
+    are not known.
     """
 
     offset: int
@@ -243,9 +221,6 @@ class Damage:
 class McapFile:
     """Reads one MCAP file; the attributes are complete when `messages` is exhausted.
 
-    Args:
-        path: the file.
-
     Attributes:
         channels: topic and type by number.
         damage: what cannot be used.
@@ -253,9 +228,6 @@ class McapFile:
         unverified: number of chunks without a checksum.
         count: number of messages read.
         lost: number of messages known to be lost.
-
-    Raises:
-        OSError: the file cannot be read.
 
     """
 
@@ -267,14 +239,10 @@ class McapFile:
         self.unverified = self.count = self.lost = 0
         self._origin_ns = 0
 
-    @property
-    def intact(self) -> bool:
-        """Whether the file is whole and all its checksums are right."""
-        return not (self.cut or self.damage or self.lost)
-
     def describe(self) -> list[str]:
-        """Name what is damaged or lost, a line for each part."""
-        lines = [f"{self.path.name}, {one.describe(self._origin_ns)}" for one in self.damage]
+        """Name what is damaged or lost, a line for each part; none of a whole file."""
+        lines = [one.describe(self._origin_ns) for one in self.damage]
+        lines = [f"{self.path.name}, {line}" for line in lines]
         if self.cut:
             lines.append(f"{self.path.name}: the file ends before its index")
         if self.lost:
@@ -282,7 +250,12 @@ class McapFile:
         return lines
 
     def messages(self) -> Iterator[RawMessage]:
-        """Yield all messages that are intact, in the order of the file."""
+        """Yield all messages that are intact, in the order of the file.
+
+        Raises:
+            OSError: the file cannot be read.
+
+        """
         schemas: dict[int, str] = {}
         with self.path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -291,11 +264,11 @@ class McapFile:
             chunks = [one for one in index if isinstance(one, ChunkIndex)]
             stored = self._read_at(file, chunks) if chunks else self._read_on(file)
             for record in itertools.chain(index, stored):
-                if isinstance(record, Schema):
+                if isinstance(record, records.Schema):
                     schemas[record.id] = record.name
-                elif isinstance(record, Channel):
+                elif isinstance(record, records.Channel):
                     self.channels[record.id] = record.topic, schemas.get(record.schema_id, "")
-                elif isinstance(record, Message):
+                elif isinstance(record, records.Message):
                     if channel := self.channels.get(record.channel_id):
                         self.count += 1
                         yield *channel, record.log_time, record.data
@@ -305,7 +278,7 @@ class McapFile:
             if index and not self.damage:
                 self._check_data(file, data_end)
         # Only an index whose checksum is right says how many there were.
-        written = (one.message_count for one in index if isinstance(one, Statistics))
+        written = (one.message_count for one in index if isinstance(one, records.Statistics))
         self.lost = max(sum(one.messages for one in self.damage), next(written, 0) - self.count)
 
     def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
@@ -317,15 +290,15 @@ class McapFile:
             self.cut = True
             return [], 0
         try:
-            footer = next(StreamReader(io.BytesIO(end), skip_magic=True).records)
-            if not isinstance(footer, Footer) or footer.summary_start > footer_at:
+            footer = next(_records(end))
+            if not isinstance(footer, records.Footer) or footer.summary_start > footer_at:
                 raise ValueError("index with wrong position")
             begin = footer.summary_start or footer_at
             file.seek(begin)
             content = file.read()
             if footer.summary_crc not in (0, zlib.crc32(content[: -4 - len(MCAP0_MAGIC)])):
                 raise ValueError("index with wrong checksum")
-            index = list(StreamReader(io.BytesIO(content), skip_magic=True).records)
+            index = list(_records(content))
             chunks = [one for one in index if isinstance(one, ChunkIndex)]
             if any(one.chunk_start_offset + one.chunk_length > begin for one in chunks):
                 raise ValueError("index with wrong position")
@@ -341,30 +314,27 @@ class McapFile:
             indexed = one.message_index_length - 15 * len(one.message_index_offsets)
             times = one.message_start_time, one.message_end_time
             file.seek(one.chunk_start_offset)
-            content = io.BytesIO(file.read(one.chunk_length))
-            records = StreamReader(content, skip_magic=True, emit_chunks=True).records
-            yield from self._open(
-                records, Damage(one.chunk_start_offset, "", indexed // 16, *times)
-            )
+            stored = _records(file.read(one.chunk_length), chunks=True)
+            yield from self._open(stored, Damage(one.chunk_start_offset, "", indexed // 16, *times))
 
     def _read_on(self, file: IO[bytes]) -> Iterator[McapRecord]:
         """Yield the records from the beginning to where they end, or to what is no record."""
         file.seek(len(MCAP0_MAGIC))
-        records = StreamReader(file, skip_magic=True, emit_chunks=True).records
+        stored = _records(file, chunks=True)
         broken: Damage | None = None
         while True:
             offset = file.tell()
             try:
-                record = next(records)
+                record = next(stored)
             except Exception:  # mcap raises anything on bad bytes
                 break
-            if isinstance(record, DataEnd):
+            if isinstance(record, records.DataEnd):
                 return
             if isinstance(record, Chunk):
                 times = record.message_start_time, record.message_end_time
                 broken = Damage(offset, "", 0, *times)
                 yield from self._open(iter([record]), broken)
-            elif isinstance(record, MessageIndex):
+            elif isinstance(record, records.MessageIndex):
                 if broken is not None and broken.reason:
                     broken.messages += len(record.records)
             else:
@@ -374,23 +344,21 @@ class McapFile:
         else:
             self.damage.append(Damage(offset, "unreadable bytes"))
 
-    def _open(self, records: Iterator[McapRecord], place: Damage) -> Sequence[McapRecord]:
+    def _open(self, stored: Iterator[McapRecord], place: Damage) -> Sequence[McapRecord]:
         """Return the records in a chunk that comes next; none, and note it, if it is damaged."""
         self._origin_ns = self._origin_ns or place.begin_ns
         try:
-            chunk = next(records)
+            chunk = next(stored)
             if not isinstance(chunk, Chunk):
                 raise ValueError("no chunk where the index has one")
             found = breakup_chunk(chunk, validate_crc=True)
-        except CRCValidationError:
-            place.reason = "chunk with wrong checksum"
         except Exception as error:  # mcap raises anything on bad bytes
-            place.reason = _one_line(error)
-        else:
-            self.unverified += not chunk.uncompressed_crc
-            return found
-        self.damage.append(place)
-        return ()
+            wrong = isinstance(error, CRCValidationError)
+            place.reason = "chunk with wrong checksum" if wrong else _one_line(error)
+            self.damage.append(place)
+            return ()
+        self.unverified += not chunk.uncompressed_crc
+        return found
 
     def _read_cut_chunk(self, file: IO[bytes], offset: int) -> Iterator[McapRecord]:
         """Yield the whole records of an uncompressed chunk that the file ends in."""
@@ -400,7 +368,7 @@ class McapFile:
                 return
             chunk = Chunk.read(ReadDataStream(file))
             if not chunk.compression and len(chunk.data) < chunk.uncompressed_size:
-                yield from StreamReader(io.BytesIO(chunk.data), skip_magic=True).records
+                yield from _records(chunk.data)
 
     def _check_data(self, file: IO[bytes], end: int) -> None:
         """Check the data section, which ends at `end`: also what lies between its chunks."""
@@ -408,14 +376,19 @@ class McapFile:
         file.seek(0)
         for _ in range(0, begin, _PIECE):
             checksum = zlib.crc32(file.read(min(_PIECE, begin - file.tell())), checksum)
-        try:
-            record = next(StreamReader(file, skip_magic=True).records)
-        except Exception:  # mcap raises anything on bad bytes
-            record = None
-        if not isinstance(record, DataEnd) or file.tell() != end:
+        record = None
+        with contextlib.suppress(Exception):  # mcap raises anything on bad bytes
+            record = next(_records(file))
+        if not isinstance(record, records.DataEnd) or file.tell() != end:
             self.damage.append(Damage(begin, "the end of the data section is missing"))
         elif record.data_section_crc not in (0, checksum):
             self.damage.append(Damage(begin, "data section with wrong checksum"))
+
+
+def _records(source: bytes | IO[bytes], *, chunks: bool = False) -> Iterator[McapRecord]:
+    """Yield the records of a file from here on, or of bytes; chunks whole, or what is in them."""
+    file = io.BytesIO(source) if isinstance(source, bytes) else source
+    return StreamReader(file, skip_magic=True, emit_chunks=chunks).records
 
 
 @cache
@@ -429,5 +402,5 @@ def refusal(path: Path, key: str, value: object, allowed: str) -> InputError:
     return InputError(str(path), [Problem(key, value, allowed)])
 
 
-def _one_line(error: Exception) -> str:
+def _one_line(error: object) -> str:
     return " ".join(str(error).split()) or type(error).__name__

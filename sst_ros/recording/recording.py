@@ -22,28 +22,9 @@ from sst_ros.host.output import require_free, write_into
 from sst_ros.host.table_file import write_table
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
+from sst_ros.recording import topic_tables as topics
 from sst_ros.recording.bag_reader import Bag, refusal
-from sst_ros.recording.topic_tables import (
-    COMMANDS,
-    DIAGNOSTICS,
-    EULER,
-    JOINT_STATES,
-    ORIENTATION,
-    SCENE,
-    STAMPED_COMMANDS,
-    TABLES,
-    TICKS,
-    TIMES,
-    TOPIC_TABLES,
-    CollectedRows,
-    Column,
-    Integers,
-    InvalidMessage,
-    Series,
-    TopicTable,
-    join,
-    places,
-)
+from sst_ros.recording.topic_tables import Column, Integers, Series, TopicTable, places
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import TorqueTable
@@ -53,9 +34,9 @@ from sst_ros.state import NANOSECONDS
 if TYPE_CHECKING:
     import pandas as pd
 
-ESSENTIAL = (JOINT_STATES.key, ORIENTATION.key, TICKS.key, SCENE.key)
+ESSENTIAL = (topics.JOINT_STATES, topics.ORIENTATION, topics.TICKS, topics.SCENE)
 """Topics without which a recording is not that of a run."""
-OPTIONAL = (EULER.key, DIAGNOSTICS.key, COMMANDS.key)
+OPTIONAL = (topics.EULER, topics.DIAGNOSTICS, topics.COMMANDS)
 
 
 class Status(NamedTuple):
@@ -90,21 +71,18 @@ class Signals:
     @cached_property
     def tables(self) -> dict[str, Series]:
         """Rows by the names of `TABLES`; only what was recorded."""
-        found = {
-            name: [self.topic_series[t.key] for t in tables if t.key in self.topic_series]
-            for name, tables in TABLES.items()
-        }
-        return {
-            name: join(parts) if len(parts) > 1 else parts[0]
-            for name, parts in found.items()
-            if parts
-        }
+        found = {}
+        for name, listed in topics.TABLES.items():
+            parts = [self.topic_series[one.key] for one in listed if one.key in self.topic_series]
+            if parts:
+                found[name] = topics.join(parts) if len(parts) > 1 else parts[0]
+        return found
 
     @cached_property
     def missing(self) -> tuple[str, ...]:
         """Keys of the topics that are not in the recording, or without a row of the run."""
-        found = [*self.topic_series, *([SCENE.key] if self.scene else [])]
-        return tuple(topic.key for topic in (*TOPIC_TABLES, SCENE) if topic.key not in found)
+        missing = [one.key for one in topics.TOPIC_TABLES if one.key not in self.topic_series]
+        return (*missing, *([] if self.scene else [topics.SCENE.key]))
 
     def time_ns(self, table: str) -> Integers:
         """Time of each row since the start of the run [ns].
@@ -139,11 +117,10 @@ class Signals:
             raise refusal(self.bag.path, "table", table, allowed)
         series = self.tables[table]
         times = (self.time_ns(table), series.stamp_ns, series.received_ns)
-        numbers = zip(series.columns, series.values.T, strict=True)
-        return dict(zip(TIMES, times, strict=True)) | {
-            column: values.astype(np.int64) if column.unit == "ns" else values
-            for column, values in numbers
-        }
+        found: dict[Column, NDArray[Any]] = dict(zip(topics.TIMES, times, strict=True))
+        for column, values in zip(series.columns, series.values.T, strict=True):
+            found[column] = values.astype(np.int64) if column.unit == "ns" else values
+        return found
 
     def table(self, name: str = "samples") -> pd.DataFrame:
         """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
@@ -155,7 +132,7 @@ class Signals:
         """
         columns = self.columns(name)
         numbers = {column.name: values for column, values in columns.items()}
-        result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index(TIMES[0].name)
+        result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index(topics.TIMES[0].name)
         result.attrs = {column.name: column.text for column in columns}
         return result
 
@@ -172,34 +149,34 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
 
     """
     path = Path(path)
-    bag = Bag(path, [*TOPIC_TABLES, SCENE, DIAGNOSTICS], damaged=damaged)
-    collected = {table.key: CollectedRows(table) for table in TOPIC_TABLES}
+    bag = Bag(path, [*topics.TOPIC_TABLES, topics.SCENE, topics.DIAGNOSTICS], damaged=damaged)
+    collected = {table.key: topics.CollectedRows(table) for table in topics.TOPIC_TABLES}
     scenes: set[str] = set()
     statuses: list[Status] = []
     for key, received_ns, content in bag.messages():
-        if key == SCENE.key:
+        if key == topics.SCENE.key:
             scenes.add(content.data)
-        elif key == DIAGNOSTICS.key:
+        elif key == topics.DIAGNOSTICS.key:
             for status in content.status:
                 values = {pair.key: pair.value for pair in status.values}
                 statuses.append(Status(received_ns, status.name, values))
         else:
             try:
                 collected[key].add(received_ns, content)
-            except InvalidMessage as error:
-                raise refusal(path, key, error.value, str(error)) from None
-    idle = collected[JOINT_STATES.key].skipped
+            except topics.InvalidMessage as error:
+                raise refusal(path, key, *error.args) from None
+    idle = collected[topics.JOINT_STATES.key].skipped
     # Each is let go when it is a series: an hour takes some hundred megabytes.
     series = {key: collected.pop(key).series(path) for key in list(collected)}
     found = {key: one for key, one in series.items() if len(one)}
     if not found:
-        allowed = "must have at least one of " + ", ".join(t.ending for t in TOPIC_TABLES)
+        allowed = "must have at least one of " + ", ".join(t.ending for t in topics.TOPIC_TABLES)
         raise refusal(path, "topics", None, allowed)
     if len(scenes) > 1:
-        raise refusal(path, SCENE.key, len(scenes), "the recording must hold one scene")
-    stamped = [one.key for one in (*TABLES["samples"], TICKS)]
+        raise refusal(path, topics.SCENE.key, len(scenes), "the recording must hold one scene")
+    stamped = [one.key for one in (*topics.TABLES["samples"], topics.TICKS)]
     starts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
-    origin = f"{path}: {bag.topics.get(SCENE.key)}"
+    origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
     return Signals(
         bag=bag,
         scene=yaml_document.read(Scene, scenes.pop(), origin) if scenes else None,
@@ -262,6 +239,7 @@ class Recording:
             `stamp_ns`, that of the sample which is answered, 0 where commands have none [ns],
             shape (c,); `torque` [N m], shape (c, 3).
         reports: diagnostics of the simulator's run: when received [ns], text by key.
+        diagnostics: the last of them; may be empty.
         missing: keys of the topics that are not in the recording.
         signals: those given.
         table: `Signals.table`, a table as pandas by its name: samples (the default), ticks,
@@ -275,19 +253,21 @@ class Recording:
     def __init__(self, found: Signals) -> None:
         self.signals, self.path, self.table = found, found.bag.path, found.table
         absent = found.bag.absent
-        if problems := [absent[key] for key in ESSENTIAL if key in absent]:
+        if problems := [absent[topic.key] for topic in ESSENTIAL if topic.key in absent]:
             raise InputError(str(self.path), problems)
         if found.scene is None:
-            raise refusal(self.path, SCENE.key, 0, "the recording must hold one scene")
+            raise refusal(self.path, topics.SCENE.key, 0, "the recording must hold one scene")
         self.scene, self.idle_states = found.scene, found.idle_states
-        self.missing = tuple(key for key in OPTIONAL if key in absent)
+        self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
         self.reports = tuple(
             (one.received_ns, one.values)
             for one in found.statuses
             if one.name.endswith("run") and "phase" in one.values
         )
+        self.diagnostics: dict[str, str] = self.reports[-1][1] if self.reports else {}
         joints, orientation, euler, ticks = (
-            _finite_rows(found, table) for table in (JOINT_STATES, ORIENTATION, EULER, TICKS)
+            _finite_rows(found, table)
+            for table in (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER, topics.TICKS)
         )
         if len(joints) < 2:
             allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
@@ -308,12 +288,11 @@ class Recording:
             allowed = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), allowed)
         self.ticks = _ticks(self.path, ticks, self.start_ns)
-        # The commands of both topics in order of their reception.
-        parts = [_rows(found, table) for table in (COMMANDS, STAMPED_COMMANDS)]
+        parts = [_rows(found, one) for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
         order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
         names = ("stamp_ns", "received_ns", "values")
         columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
-        self.commands = Series(COMMANDS.columns, *columns)
+        self.commands = Series(topics.COMMANDS.columns, *columns)
 
     @property
     def period_ns(self) -> int:
@@ -334,11 +313,6 @@ class Recording:
         return result
 
     @property
-    def diagnostics(self) -> dict[str, str]:
-        """The last diagnostics of the simulator's run, text by key; may be empty."""
-        return self.reports[-1][1] if self.reports else {}
-
-    @property
     def seconds(self) -> Array:
         """Time of each sample since the start of the run [s], shape (n,)."""
         return np.asarray(self.time_ns / NANOSECONDS)
@@ -354,13 +328,12 @@ class Recording:
         rates = (self.gamma_dot, self.mu_dot, self.beta_dot)
         body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
         joints = np.hstack([self.gamma, self.mu, self.beta, *rates])
-        reported = self.diagnostics
+        reported, ticks = self.diagnostics, self.ticks
         try:
             error_estimate = float(reported.get("error_estimate", "nan"))
         except ValueError:
             error_estimate = np.nan
         fault = reported.get("fault", "")
-        ticks = self.ticks
         return Trajectory(
             self.scene,
             self.seconds[known],
@@ -374,6 +347,43 @@ class Recording:
             error_estimate=error_estimate,
             law=None if ticks.gaps else TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque),
         )
+
+
+def _rows(found: Signals, table: TopicTable) -> Series:
+    """Return the rows of a topic; none where it was not recorded."""
+    none = np.empty(0, dtype=np.int64)
+    empty = Series(table.columns, none, none, np.empty((0, len(table.columns))))
+    return found.topic_series.get(table.key, empty)
+
+
+def _finite_rows(found: Signals, table: TopicTable) -> Series:
+    """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
+    series = _rows(found, table)
+    bad = ~np.isfinite(series.values[:, : 4 if table is topics.TICKS else None]).all(axis=1)
+    if bad.any():
+        stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
+        raise refusal(found.bag.path, table.key, row, f"is not finite at stamp {stamp} ns")
+    return series
+
+
+def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
+    """Return the ticks of a run that starts at `start_ns`; they must not overlap."""
+    starts = series.stamp_ns
+    ends = starts + series.values[:, 0].astype(np.int64)
+    overlap = starts[1:] < ends[:-1]
+    if overlap.any():
+        at = int(starts[1:][overlap][0])
+        allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
+        raise refusal(path, topics.TICKS.key, at, allowed)
+    moment = series.values[:, 4:]
+    known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
+    return Ticks(starts - start_ns, ends - start_ns, series.torque, moment if known else None)
+
+
+def _usual(lengths_ns: Integers) -> int:
+    """Return the most frequent length, the shortest where several are."""
+    values, counts = np.unique(lengths_ns, return_counts=True)
+    return int(values[np.argmax(counts)])
 
 
 def read(path: str | Path, *, damaged: bool = False) -> Recording:
@@ -427,40 +437,3 @@ def export(bag: Path, out: Path, form: str = "csv", *, force: bool = False) -> l
             about = {one.name: {"unit": one.unit, "description": one.text} for one in columns}
             write_table({one.name: values for one, values in columns.items()}, path, about)
     return list(paths.values())
-
-
-def _rows(found: Signals, table: TopicTable) -> Series:
-    """Return the rows of a topic; none where it was not recorded."""
-    none = np.empty(0, dtype=np.int64)
-    empty = Series(table.columns, none, none, np.empty((0, len(table.columns))))
-    return found.topic_series.get(table.key, empty)
-
-
-def _finite_rows(found: Signals, table: TopicTable) -> Series:
-    """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
-    series = _rows(found, table)
-    bad = ~np.isfinite(series.values[:, : 4 if table is TICKS else None]).all(axis=1)
-    if bad.any():
-        stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-        raise refusal(found.bag.path, table.key, row, f"is not finite at stamp {stamp} ns")
-    return series
-
-
-def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
-    """Return the ticks of a run that starts at `start_ns`; they must not overlap."""
-    starts = series.stamp_ns
-    ends = starts + series.values[:, 0].astype(np.int64)
-    overlap = starts[1:] < ends[:-1]
-    if overlap.any():
-        at = int(starts[1:][overlap][0])
-        allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
-        raise refusal(path, TICKS.key, at, allowed)
-    moment = series.values[:, 4:]
-    known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
-    return Ticks(starts - start_ns, ends - start_ns, series.torque, moment if known else None)
-
-
-def _usual(lengths_ns: Integers) -> int:
-    """Return the most frequent length, the shortest where several are."""
-    values, counts = np.unique(lengths_ns, return_counts=True)
-    return int(values[np.argmax(counts)])

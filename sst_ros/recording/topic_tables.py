@@ -25,6 +25,8 @@ ACTUATED = JOINTS[:3]
 MOMENTS = ("moment_x", "moment_y", "moment_z")
 
 Integers: TypeAlias = NDArray[np.int64]
+Rows: TypeAlias = list[tuple[int, Sequence[float]]]
+"""Stamps [ns], 0 for none, and the numbers of one message; none for what is no part of a run."""
 
 
 class Column(NamedTuple):
@@ -48,28 +50,20 @@ class Column(NamedTuple):
         return f"{self.what} [{self.unit}]" + (f", from {self.topic}" if self.topic else "")
 
 
-class InvalidMessage(ValueError):
-    """A message has numbers or names that cannot be used; `value` was found."""
-
-    def __init__(self, value: object, allowed: str) -> None:
-        self.value = value
-        super().__init__(allowed)
-
-
-Rows = list[tuple[int, Sequence[float]]]
-"""Stamps [ns], 0 for none, and the numbers of one message; none for what is no part of a run."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class TopicTable(Topic):
     """A topic, the columns of its rows, and the function that reads the rows of a message.
 
-    `stamped`: rows are ordered by stamps, and there is one at each.
+    The function raises InvalidMessage. `stamped`: rows are ordered by stamps, one at each.
     """
 
     columns: tuple[Column, ...]
     rows: Callable[[Any], Rows]
     stamped: bool
+
+
+class InvalidMessage(ValueError):
+    """A message has numbers or names that cannot be used: what was found, what is allowed."""
 
 
 @dataclass(frozen=True)
@@ -126,12 +120,7 @@ class CollectedRows:
         self._times, self._values = array("q"), array("d")
 
     def add(self, received_ns: int, content: Any) -> None:
-        """Add the rows of a message that was received at a time [ns].
-
-        Raises:
-            InvalidMessage: it cannot be used.
-
-        """
+        """Add the rows of a message that was received at a time [ns]; raises InvalidMessage."""
         rows = self._table.rows(content)
         self.skipped += not rows
         for stamp, values in rows:
@@ -148,20 +137,18 @@ class CollectedRows:
         table, columns = self._table, self._table.columns
         times = np.frombuffer(self._times, dtype=np.int64).reshape(-1, 2)
         values = np.frombuffer(self._values, dtype=float).reshape(len(times), len(columns))
-        key = times[:, 0 if table.stamped else 1]
-        if np.any(key[1:] < key[:-1]):
-            order = np.argsort(key, kind="stable")
-            times, values, key = times[order], values[order], key[order]
+        order = np.argsort(times[:, 1], kind="stable")
         if table.stamped:
-            again = np.flatnonzero(key[1:] == key[:-1])
+            stamps, order = np.unique(times[:, 0], return_index=True)
+            again = np.delete(np.arange(len(times)), order)
             if table in (ORIENTATION, EULER):  # an idle state shows the last sample again
-                again = again[~(values[again] == values[again + 1]).all(axis=1)]
+                first = order[np.searchsorted(stamps, times[again, 0])]
+                again = again[~(values[again] == values[first]).all(axis=1)]
             if len(again):
-                allowed = f"stamp {key[again[0]]} ns comes twice; record one simulator a bag"
+                allowed = f"stamp {times[again[0], 0]} ns comes twice; record one simulator a bag"
                 raise refusal(path, table.key, len(again), allowed)
-            _, first = np.unique(key, return_index=True)
-            if len(first) < len(key):
-                times, values = times[first], values[first]
+        if not np.array_equal(order, np.arange(len(times))):  # most need no copy
+            times, values = times[order], values[order]
         if table is TICKS and np.isnan(values[:, -3:]).all():
             columns, values = columns[:-3], values[:, :-3]  # no moment was recorded
         stamps, received = times.T.copy()
