@@ -21,9 +21,15 @@ def step_pair(t, h, y, z, d, p, new_y, new_z, error):
     """
     middle = vector(SIZE)
     other = vector(SIZE)
-    attempt(t, h, y, y, d, p, new_y, error)
-    attempt(t, 0.5 * h, z, y, d, p, middle, other)
-    attempt(t + 0.5 * h, 0.5 * h, middle, middle, d, p, new_z, other)
+    for part in range(3):  # one call: the compiler puts the step here once
+        begin, length = t, 0.5 * h
+        if part == 0:
+            length, old, near, new, local = h, y, y, new_y, error
+        elif part == 1:
+            old, near, new, local = z, y, middle, other
+        else:
+            begin, old, near, new, local = t + 0.5 * h, middle, middle, new_z, other
+        attempt(begin, length, old, near, d, p, new, local)
     if DOUBLING:  # the method has no estimate of its own
         for i in range(SIZE):
             error[i] = (new_z[i] - z[i]) - (new_y[i] - y[i])
