@@ -25,8 +25,9 @@ from sst_ros.integration.compiled_method import (
     Method,
     Place,
     Vector,
+    methods_of,
 )
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS5P, Rosenbrock
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RODAS5P, Rosenbrock
 from sst_ros.mechanism.geometry import Array
 
 GROW = 5.0
@@ -83,19 +84,17 @@ WHOLE_MOTION_BUDGET = 10_000_000
 class EvaluationBudget:
     """Evaluations of the right-hand side that a period may take; `spent` counts those of a run.
 
-    `per_period` is None for no bound; with `whole_run` they are those of a run, whatever its
-    periods.
+    With `whole_run` they are those of a run, whatever its periods.
     """
 
-    def __init__(self, per_period: int | None = None, *, whole_run: bool = False) -> None:
+    def __init__(self, per_period: int, *, whole_run: bool = False) -> None:
         self.per_period, self._whole_run = per_period, whole_run
-        self.spent = 0
-        self._end: float = float("inf")
+        self.spent, self._end = 0, per_period
 
     def begin(self) -> None:
         """Begin a period."""
-        if self.per_period is not None:
-            self._end = self.per_period + (0 if self._whole_run else self.spent)
+        if not self._whole_run:
+            self._end = self.per_period + self.spent
 
     def charge(self, evaluations: int) -> None:
         """Count evaluations before they are made.
@@ -196,9 +195,8 @@ class AdaptiveStepper:
         law: a torque function, whose derivatives take the place of those of the ODE.
         ranges: see `CompiledMethod`.
         joints: nine angles and nine rates of a state's first seven numbers, for the ends of steps.
-
-    Attributes:
-        budget: as given; `budget.spent` counts evaluations.
+        budget: counts evaluations, and ends a period that takes too many.
+        max_step: longest step [s].
 
     """
 
@@ -209,18 +207,16 @@ class AdaptiveStepper:
         tolerance: float,
         *,
         compiled: bool,
+        joints: Function,
+        budget: EvaluationBudget,
+        max_step: float,
+        ranges: JointRanges = (),
         derivative: Function | None = None,
         law: AppliedTorque | None = None,
-        ranges: JointRanges = (),
-        joints: Function = lambda *_: (),
-        budget: EvaluationBudget | None = None,
-        max_step: float = math.inf,
     ) -> None:
-        self.tolerance = tolerance
-        self.budget = budget or EvaluationBudget()
+        self.tolerance, self.budget = tolerance, budget
         self._ode, self._law, self._max_step = ode, law, max_step
-        self._auto, self._compiled = method == "auto", compiled
-        self._first = DORMAND_PRINCE if self._auto else METHODS[method]
+        self._methods, self._compiled = methods_of(method), compiled
         self._derivative = derivative if law is None else law.derivative
         self._linearise = None if law is None or not law.is_traced else law.linearise
         self._ranges, self._joints = ranges, joints
@@ -229,15 +225,19 @@ class AdaptiveStepper:
     def begin(self, y: list[float]) -> Point:
         """Return the point at which a run begins; numbers that y lacks at its end are zero."""
         full = [*y, *(0.0,) * (len(self._ode.state) - len(y))]
-        return Point(full, list(full), self._joints(*full[:7]), self._first)
+        return Point(full, list(full), self._joints(*full[:7]), self._methods[0])
+
+    @property
+    def _chooses(self) -> bool:
+        return len(self._methods) > 1
 
     def load(self) -> None:
         """Have the code of all methods that a run may turn to loaded, or made."""
         if self._derivative is not None:
             return  # plain Python, and an explicit method to the end
-        for method in (DORMAND_PRINCE, DOP853, RODAS5P) if self._auto else (self._first,):
+        for method in self._methods:
             self._machine(method).load()
-        if self._auto:
+        if self._chooses:
             _ = self._ode.linearised
 
     def compile(self) -> None:
@@ -303,10 +303,9 @@ class AdaptiveStepper:
         if min(at.h, self._max_step) < h or self._derivative is not None:
             return 0, at
         machine = self._machine(at.method)
-        if self.budget.per_period is not None:
-            count = min(count, max(self.budget.per_period // (3 * machine.cost), 1))
+        count = min(count, max(self.budget.per_period // (3 * machine.cost), 1))
         implicit = isinstance(at.method, Rosenbrock)
-        if implicit and self._auto:
+        if implicit and self._chooses:
             count = min(count, _CHOOSE_EVERY - 1 - at.attempts)
         done, place = machine.step_many(h, count, self.tolerance, Place(*at[:3]), d)
         if not done:
@@ -356,7 +355,7 @@ class AdaptiveStepper:
         """
         at = at._replace(attempts=at.attempts + 1)
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(at.method, Rosenbrock)
-        if not self._auto or (self._derivative is not None and self._linearise is None):
+        if not self._chooses or (self._derivative is not None and self._linearise is None):
             return at
         if at.attempts < _CHOOSE_EVERY and not early:
             return at

@@ -45,12 +45,14 @@ _LANES = 4
 
 
 _SHARED = (step_loops.size_of, step_loops.normalise, step_loops.all_far)
-_LOOPS = (
-    step_loops.step_pair,
-    step_loops.step_fixed,
-    step_loops.step_many,
-)
+_LOOPS = (step_loops.step_pair, step_loops.step_fixed, step_loops.step_many)
 _IMPLICIT = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
+
+
+def methods_of(integrator: str) -> tuple[Method, ...]:
+    """Methods that an integrator may use, the one it begins with first: of auto three."""
+    named = METHODS.get(integrator)
+    return (named,) if named else (DORMAND_PRINCE, DOP853, RODAS5P)
 
 
 class Place(NamedTuple):
@@ -348,7 +350,7 @@ def code_is_there(scene: Scene, integrator: str) -> bool:
     if compiled_module.numba_version() is None:
         return False
     system = ode_with_work(Dynamics.of(scene))
-    return all(has_step_code(system, method) for method in _methods(integrator))
+    return all(has_step_code(system, method) for method in methods_of(integrator))
 
 
 def make_code(scene: Scene, integrator: str) -> Iterator[str]:
@@ -363,11 +365,7 @@ def make_code(scene: Scene, integrator: str) -> Iterator[str]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return
-        for method in _methods(integrator):
+        for method in methods_of(integrator):
             if not has_step_code(system, method):
                 CompiledMethod(system, method, compiled=True).load()
             yield method.name
-
-
-def _methods(integrator: str) -> tuple[Method, ...]:
-    return (METHODS[integrator],) if integrator in METHODS else (DORMAND_PRINCE, DOP853, RODAS5P)
