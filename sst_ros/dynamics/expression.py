@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import add, mul, sub, truediv
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,23 +23,23 @@ from sst_ros.scene.schema import Place, leaves, rebuild
 
 Value = Any  # an Expression, a Number or a float
 
+FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
 _TEMPLATES = {
     "add": "{} + {}",
     "sub": "{} - {}",
     "mul": "{} * {}",
     "div": "{} / {}",
     "neg": "-{}",
-    "sqrt": "sqrt({})",
-    "tanh": "tanh({})",
-    "exp": "exp({})",
-    "sin": "sin({})",
-    "cos": "cos({})",
+    **{name: f"{name}({{}})" for name in FUNCTIONS},
     "atan2": "atan2({}, {})",
     "positive": "max({}, 0.0)",
     "step": "(1.0 if {} > 0.0 else 0.0)",
 }
-FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
-_OPERATORS = {"add": add, "sub": sub, "mul": mul, "div": truediv}
+_ON_FLOATS: dict[str, Callable[..., float]] = {
+    **{"add": add, "sub": sub, "mul": mul, "div": truediv},
+    **{name: getattr(math, name) for name in FUNCTIONS},
+    "positive": lambda x: max(x, 0.0),
+}
 
 
 class Graph:
@@ -75,21 +75,22 @@ class Expression:
     def __add__(self, other: Value) -> Value:
         if _is(other, 0.0):
             return self
-        if _drop_minus(other) is not None:
-            return self - _drop_minus(other)
-        if _drop_minus(self) is not None and not _is_constant(other):
-            return other - _drop_minus(self)
+        mine, theirs = _drop_minus(self), _drop_minus(other)
+        if theirs is not None:
+            return self - theirs
+        if mine is not None and isinstance(other, Expression):
+            return other - mine
         return self.graph.node("add", self, other)
 
     __radd__ = __add__
 
     def __sub__(self, other: Value) -> Value:
-        if _is(other, 0.0):
-            return self
         if other is self:
             return 0.0
-        inner = _drop_minus(other)
-        return self + inner if inner is not None else self.graph.node("sub", self, other)
+        if _is(other, 0.0):
+            return self
+        theirs = _drop_minus(other)
+        return self + theirs if theirs is not None else self.graph.node("sub", self, other)
 
     def __rsub__(self, other: Value) -> Value:
         return -self if _is(other, 0.0) else self.graph.node("sub", other, self)
@@ -103,19 +104,19 @@ class Expression:
         if mine is not None and theirs is not None:
             return mine * theirs
         if mine is not None:
-            return -(mine * other) if not _is_constant(other) else mine * -other
+            return -(mine * other) if isinstance(other, Expression) else mine * -other
         return -(self * theirs) if theirs is not None else self.graph.node("mul", self, other)
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: Value) -> Value:
-        if _is_constant(other) and not isinstance(other, Number):
-            if abs(other) == 1.0:
-                return self * other
-            if math.frexp(other)[0] in (0.5, -0.5):
-                return self * (1.0 / other)
         if other is self:
             return 1.0
+        if not isinstance(other, (Expression, Number)):
+            if abs(other) == 1.0:
+                return self * other
+            if math.frexp(other)[0] in (0.5, -0.5):  # a power of two: its inverse is exact
+                return self * (1.0 / other)
         mine = _drop_minus(self)
         return -(mine / other) if mine is not None else self.graph.node("div", self, other)
 
@@ -123,8 +124,8 @@ class Expression:
         return 0.0 if _is(other, 0.0) else self.graph.node("div", other, self)
 
     def __neg__(self) -> Value:
-        inner = _drop_minus(self)
-        return inner if inner is not None else self.graph.node("neg", self)
+        mine = _drop_minus(self)
+        return mine if mine is not None else self.graph.node("neg", self)
 
     def __bool__(self) -> bool:
         raise TypeError("a traced number has no truth value: branch on constants only")
@@ -150,14 +151,7 @@ def mark_present(value: Any) -> Any:
 
 def _folds(op: str) -> tuple[Callable[[Number, Value], Value], Callable[[Number, Value], Value]]:
     """Return an operator of numbers and its reflected form."""
-
-    def forward(self: Number, other: Value) -> Value:
-        return self._fold(op, self, other)
-
-    def reflected(self: Number, other: Value) -> Value:
-        return self._fold(op, other, self)
-
-    return forward, reflected
+    return lambda x, other: x.fold(op, x, other), lambda x, other: x.fold(op, other, x)
 
 
 class Number(float):
@@ -182,12 +176,15 @@ class Number(float):
         for entry in args:
             if isinstance(entry, Expression):
                 return entry.apply(op, *args)
-        values = tuple(map(float, args))
-        if op in _OPERATORS:
-            value = _OPERATORS[op](*values)
-        else:
-            value = max(*values, 0.0) if op == "positive" else getattr(math, op)(*values)
-        return Number(value, (op, *map(_origin, args)))
+        return Number(_ON_FLOATS[op](*map(float, args)), (op, *map(_origin, args)))
+
+    def fold(self, op: str, *args: Value) -> Value:
+        """Return what an operator gives, of which one operand is this number."""
+        if any(isinstance(entry, Expression) for entry in args):
+            return NotImplemented
+        if op == "mul" and 0.0 in args and not all(isinstance(x, Number) for x in args):
+            return 0.0
+        return self.apply(op, *args)
 
     __add__, __radd__ = _folds("add")
     __sub__, __rsub__ = _folds("sub")
@@ -198,12 +195,30 @@ class Number(float):
         op, *args = self.origin if isinstance(self.origin, tuple) else ("",)
         return Number(-float(self), args[0] if op == "neg" else ("neg", self.origin))
 
-    def _fold(self, op: str, *args: Value) -> Value:
-        if any(isinstance(entry, Expression) for entry in args):
-            return NotImplemented
-        if op == "mul" and 0.0 in args and not all(isinstance(x, Number) for x in args):
-            return 0.0
-        return self.apply(op, *args)
+
+def _is(value: Value, number: float) -> bool:
+    return not isinstance(value, (Expression, Number)) and float(value) == number
+
+
+def _origin(value: float) -> Any:
+    return value.origin if isinstance(value, Number) else value
+
+
+def _drop_minus(value: Value) -> Value:
+    """Return x where value is -x, else None."""
+    if not isinstance(value, Expression):
+        return None
+    op, args = value.graph.nodes[value.index]
+    return args[0] if op == "neg" else None
+
+
+def number_constants(value: Any, origin: Place = ()) -> Any:
+    """Return a tree of constants with a Number for each that is neither 0 nor 1 nor -1.
+
+    Its sections become objects that are not checked.
+    """
+    numbers = {place: x for place, x in leaves(value).items() if abs(x) not in (0.0, 1.0)}
+    return rebuild(value, {place: Number(x, (*origin, *place)) for place, x in numbers.items()})
 
 
 @dataclass(frozen=True)
@@ -212,15 +227,15 @@ class Program:
 
     Attributes:
         inputs: names of the inputs.
-        steps: (op, operands) in order; an operand is a float, or the number of an input or, from
-            len(inputs) on, of a step.
+        steps: (op, operands) in order; an operand is a float, or an int: the number of an input or,
+            from len(inputs) on, of a step.
         outputs: operands that are the results.
 
     """
 
     inputs: tuple[str, ...]
-    steps: tuple[tuple[str, tuple[float | Operand, ...]], ...]
-    outputs: tuple[float | Operand, ...]
+    steps: tuple[tuple[str, tuple[float | int, ...]], ...]
+    outputs: tuple[float | int, ...]
 
     @property
     def operations(self) -> Counter[str]:
@@ -234,31 +249,27 @@ class Program:
     def prune(self) -> Program:
         """Return the program without steps that no output needs."""
         inputs, needed = len(self.inputs), set[int]()
-        waiting = [out.number for out in self.outputs if isinstance(out, Operand)]
+        waiting = [out for out in self.outputs if isinstance(out, int)]
         while waiting:
             number = waiting.pop()
             if number >= inputs and number not in needed:
                 needed.add(number)
-                operands = self.steps[number - inputs][1]
-                waiting += [x.number for x in operands if isinstance(x, Operand)]
+                waiting += [x for x in self.steps[number - inputs][1] if isinstance(x, int)]
         kept = sorted(needed)
         numbers = {old: new for new, old in enumerate([*range(inputs), *kept])}
 
-        def renumber(operand: float | Operand) -> float | Operand:
-            return Operand(numbers[operand.number]) if isinstance(operand, Operand) else operand
+        def renumber(operands: Sequence[float | int]) -> tuple[float | int, ...]:
+            return tuple(numbers[x] if isinstance(x, int) else x for x in operands)
 
         steps = (self.steps[number - inputs] for number in kept)
-        return Program(
-            self.inputs,
-            tuple((op, tuple(map(renumber, operands))) for op, operands in steps),
-            tuple(map(renumber, self.outputs)),
-        )
+        renumbered = tuple((op, renumber(operands)) for op, operands in steps)
+        return Program(self.inputs, renumbered, renumber(self.outputs))
 
     def steps_of(self, inputs: Sequence[str]) -> list[bool]:
         """Return of each step whether it depends on one of these inputs."""
         depends = [name in inputs for name in self.inputs]
         for _, operands in self.steps:
-            depends.append(any(depends[x.number] for x in operands if isinstance(x, Operand)))
+            depends.append(any(depends[x] for x in operands if isinstance(x, int)))
         return depends[len(self.inputs) :]
 
     def source(self, name: str, slots: Slots | None = None) -> str:
@@ -277,9 +288,9 @@ class Program:
         """Lines v0 = .., v1 = .., one for each step, and the outputs; numbers have their slots."""
         names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
 
-        def word(operand: float | Operand) -> str:
-            if isinstance(operand, Operand):
-                return names[operand.number]
+        def word(operand: float | int) -> str:
+            if isinstance(operand, int):
+                return names[operand]
             if slots is not None and isinstance(operand, Number):
                 return slots.name(operand)
             return repr(operand) if operand >= 0.0 else f"({operand!r})"
@@ -316,81 +327,54 @@ class Slots:
         return [f"c{slot} = {place.format(slot)}" for slot in sorted(used)]
 
 
-class Operand(NamedTuple):
-    """Reference to an input or to the result of a step."""
-
-    number: int
-
-
 def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Program:
     """Run `function` on one expression per input and return what it does."""
     return with_jacobian(function, inputs, ())
 
 
-def number_constants(value: Any, origin: Place = ()) -> Any:
-    """Return a tree of constants with a Number for each that is neither 0 nor 1 nor -1.
-
-    Its sections become objects that are not checked.
-    """
-    numbers = {place: x for place, x in leaves(value).items() if abs(x) not in (0.0, 1.0)}
-    return rebuild(value, {place: Number(x, (*origin, *place)) for place, x in numbers.items()})
-
-
 def with_jacobian(
-    function: Callable[..., Sequence[Value]], inputs: Sequence[str], by: Sequence[str]
+    function: Callable[..., Sequence[Value]],
+    inputs: Sequence[str],
+    by: Sequence[str],
+    along: Sequence[str] = (),
 ) -> Program:
-    """Trace `function` and its exact derivatives; outputs are f, then df/dx for each x in `by`."""
-    graph = Graph()
-    symbols = [graph.node("input", name) for name in inputs]
-    outputs = tuple(function(*symbols))
-    last = len(graph.nodes)
-    everything = list(outputs)
-    for name in by:
-        everything += _differentiate(graph, last, outputs, {list(inputs).index(name): 1.0})
-    return program_of(graph, tuple(inputs), tuple(everything))
+    """Trace `function` and its exact derivatives; outputs are f, then df/dx for each x in `by`.
 
-
-def with_derivative_along(
-    function: Callable[..., Sequence[Value]], inputs: Sequence[str], by: Sequence[str]
-) -> Program:
-    """Trace `function` and its exact derivative along one direction; outputs are both.
-
-    The direction is given by further inputs, d_x for each x in `by`.
+    With `along` the last ones are the derivative along one direction, which is given by further
+    inputs, d_x for each x in `along`.
     """
     graph = Graph()
-    names = (*inputs, *(f"d_{name}" for name in by))
-    symbols = [graph.node("input", name) for name in names]
-    outputs = tuple(function(*symbols[: len(inputs)]))
-    direction = dict(zip(map(list(inputs).index, by), symbols[len(inputs) :], strict=True))
-    slopes = _differentiate(graph, len(graph.nodes), outputs, direction)
-    return program_of(graph, names, (*outputs, *slopes))
+    names = (*inputs, *(f"d_{name}" for name in along))
+    symbols = {name: graph.node("input", name) for name in names}
+    outputs = tuple(function(*[symbols[name] for name in inputs]))
+    directions: list[dict[str, Value]] = [{name: 1.0} for name in by]
+    if along:
+        directions.append({name: symbols[f"d_{name}"] for name in along})
+    results, last = list(outputs), len(graph.nodes)
+    for direction in directions:
+        results += _differentiate(graph, last, outputs, direction)
 
-
-def program_of(graph: Graph, inputs: tuple[str, ...], outputs: Sequence[Value]) -> Program:
-    """Return what a graph computes, whose first nodes are the inputs."""
-
-    def operand(value: Value) -> float | Operand:
+    def operand(value: Value) -> float | int:
         if isinstance(value, Expression):
-            return Operand(value.index)
+            return value.index
         return value if isinstance(value, Number) else float(value)
 
-    steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(inputs) :])
-    return Program(inputs, steps, tuple(map(operand, outputs))).prune()
+    steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(names) :])
+    return Program(names, steps, tuple(map(operand, results))).prune()
 
 
 def _differentiate(
-    graph: Graph, last: int, outputs: Sequence[Value], direction: Mapping[int, Value]
+    graph: Graph, last: int, outputs: Sequence[Value], direction: Mapping[str, Value]
 ) -> list[Value]:
     """Differentiate outputs among the first `last` nodes along a direction (forward mode).
 
-    It has a number or an expression for the indices of some inputs.
+    It has a number or an expression for the names of some inputs.
     """
     slopes: list[Value] = []
-    for index in range(last):
-        op, args = graph.nodes[index]
-        here = Expression(graph, index)
+    for index, (op, args) in enumerate(graph.nodes[:last]):
         d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
-        slopes.append(direction.get(index, 0.0) if op == "input" else _chain(op, args, d, here))
+        here = Expression(graph, index)
+        slopes.append(direction.get(args[0], 0.0) if op == "input" else _chain(op, args, d, here))
     return [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
 
 
@@ -417,41 +401,20 @@ def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -
     return 0.0 if _is(d[0], 0.0) else inner[op]() * d[0]
 
 
-def _is_constant(value: Value) -> bool:
-    return not isinstance(value, Expression)
-
-
-def _is(value: Value, number: float) -> bool:
-    return not isinstance(value, (Expression, Number)) and float(value) == number
-
-
-def _origin(value: float) -> Any:
-    return value.origin if isinstance(value, Number) else value
-
-
-def _drop_minus(value: Value) -> Value:
-    """Return x where value is -x, else None."""
-    if not isinstance(value, Expression):
-        return None
-    op, args = value.graph.nodes[value.index]
-    return args[0] if op == "neg" else None
-
-
-def compile_program(program: Program) -> Callable[..., tuple[float, ...]]:
-    """Turn a program into a Python function of its inputs.
+def compile_program(
+    program: Program, functions: Mapping[str, Any] | None = None
+) -> Callable[..., tuple[Any, ...]]:
+    """Turn a program into a Python function of its inputs, of plain floats by default.
 
     The function raises ArithmeticError or ValueError where a float has no value.
     """
-    return _compile(program, {name: getattr(math, name) for name in FUNCTIONS})
+    names = dict(functions or {name: getattr(math, name) for name in FUNCTIONS})
+    exec(program.source("function"), names)
+    function: Callable[..., tuple[Any, ...]] = names["function"]
+    return function
 
 
 def compile_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
     """Turn a program into a function of NumPy arrays, element by element."""
-    names: dict[str, Any] = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
-    return _compile(program, names | {"atan2": np.arctan2, "max": np.maximum})
-
-
-def _compile(program: Program, names: dict[str, Any]) -> Callable[..., tuple[Any, ...]]:
-    exec(program.source("function"), names)
-    function: Callable[..., tuple[Any, ...]] = names["function"]
-    return function
+    names = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
+    return compile_program(program, names | {"atan2": np.arctan2, "max": np.maximum})

@@ -8,13 +8,12 @@ Eq. 90 for gamma_ddot and takes omega_dot from Eq. 40.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import InputError, Problem, SingularConfiguration, refuse_unless
+from sst_ros.errors import SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import quaternion_rate
@@ -125,16 +124,13 @@ def accelerate_by_paper(
     torque: ArrayLike,
     moment: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array]:
-    """Return W_dot and gamma_dot by Eqs. 1 to 92.
+    """Return W_dot in {E} [rad/s^2] and gamma_dot [rad/s], each shape (3,), by Eqs. 1 to 92.
 
     Args:
         mechanism: geometry and inertias.
         state: quaternion (x, y, z, w) and body rate W in {E} [rad/s], shape (7,).
         torque: actuator torques [N m], shape (3,).
         moment: external moment on the star in {B} [N m], shape (3,).
-
-    Returns:
-        W_dot in {E} [rad/s^2] and gamma_dot [rad/s], each of shape (3,).
 
     Raises:
         SingularConfiguration: the posture is singular.
@@ -164,8 +160,14 @@ class VirtualWorkDerivative:
     """
 
     def __init__(self, scene: Scene) -> None:
-        if problems := list(_foreign_terms(scene)):
-            raise InputError(scene.name, problems)
+        lag = scene.actuators and scene.actuators.time_constant
+        end, terms = scene.stroke.at_end, ("gravity", "friction", "springs")
+        refuse_unless(
+            scene.name,
+            *((name, getattr(scene, name), not getattr(scene, name), REFUSED) for name in terms),
+            ("actuators.time_constant", lag, not scene.lags, REFUSED),
+            ("stroke.at_end", end, end != "elastic", REFUSED),
+        )
         self._mechanism = virtual_work.Mechanism.of(scene)
         value = scene.moment.value if scene.moment is not None else None
         self._moment = np.array(value or (0.0, 0.0, 0.0))
@@ -185,24 +187,10 @@ class VirtualWorkDerivative:
         torque = np.array(inputs[8:11])
         moment = self._moment + inputs[11:14] if len(inputs) > 11 else self._moment
         try:
-            acceleration, gamma_dot = accelerate_by_paper(
-                self._mechanism, inputs[:7], torque, moment
-            )
+            found = accelerate_by_paper(self._mechanism, inputs[:7], torque, moment)
         except SingularConfiguration as error:
             raise ArithmeticError(str(error)) from None
+        acceleration, gamma_dot = found
+        turning = quaternion_rate((x, y, z, w), (rate[0], rate[1], rate[2]))
         omega = rotation_matrix(np.array(inputs[:4])) @ rate
-        return (
-            *quaternion_rate((x, y, z, w), (rate[0], rate[1], rate[2])),
-            *acceleration.tolist(),
-            float(torque @ gamma_dot + moment @ omega),
-        )
-
-
-def _foreign_terms(scene: Scene) -> Iterator[Problem]:
-    for name in ("gravity", "friction", "springs"):
-        if value := getattr(scene, name):
-            yield Problem(name, value, REFUSED)
-    if scene.lags and scene.actuators is not None:
-        yield Problem("actuators.time_constant", scene.actuators.time_constant, REFUSED)
-    if scene.stroke.at_end == "elastic":
-        yield Problem("stroke.at_end", scene.stroke.at_end, REFUSED)
+        return (*turning, *acceleration.tolist(), float(torque @ gamma_dot + moment @ omega))

@@ -19,6 +19,7 @@ and expressions alike; the simulation runs what `trace` leaves of them for a sce
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from sst_ros.dynamics.model import ElasticStops, Leg, LegLoads, Model, model_of
@@ -54,26 +55,17 @@ __all__ = ["Leg", "Model", "model_of"]
 
 
 class LegMotion(NamedTuple):
-    """One leg at one instant, vectors in {E}; for the letters see above.
-
-    Attributes:
-        leg: its constants.
-        axis: w_k.
-        along: t_k = (e0, e1, 0).
-        outward: p in {B}, which points along r_k.
-        b: beta_dot = b.W.
-
-    """
+    """One leg at one instant, vectors in {E} but for `outward`; for the letters see above."""
 
     leg: Leg
-    axis: Triple
-    along: Triple
+    axis: Triple  # w_k
+    along: Triple  # t_k = (e0, e1, 0)
     a: Scalar
     p: Triple
     u: Scalar
     g: Triple
-    b: Triple
-    outward: Triple
+    b: Triple  # beta_dot = b.W
+    outward: Triple  # p in {B}, along r_k
     gamma_dot: Scalar
     a_dot: Scalar
     beta_dot: Scalar
@@ -94,11 +86,9 @@ def derivative(
     """
     x, y, z, w, wx, wy, wz, *given = state
     more: tuple[Scalar, ...] = ()
-    if model.time_constant is not None:
-        more = tuple(
-            (asked - has) / model.time_constant for asked, has in zip(torque, given, strict=True)
-        )
-        torque = (given[0], given[1], given[2])
+    if (lag := model.time_constant) is not None:
+        more = tuple((asked - has) / lag for asked, has in zip(torque, given, strict=True))
+        torque = triple(given)
     inertia, force, _ = balance(model, (x, y, z, w), (wx, wy, wz), torque, moment)
     acceleration = solve_symmetric(inertia, force)
     return (*quaternion_rate((x, y, z, w), (wx, wy, wz)), *acceleration, *more)
@@ -158,7 +148,7 @@ def balance(
         toward_a = multiply(c_inertia, g)
         toward_gamma = axpy(a_inertia, g, c_inertia, p)
         if leg.loads is not None:
-            at_gamma, at_mu, at_beta = joint_torques(at, field)
+            at_gamma, at_mu, at_beta = joint_torques(at, leg.loads, field)
             force_gamma = force_gamma - at_gamma
             if not (type(at_mu) is float and at_mu == 0.0):
                 force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
@@ -177,16 +167,21 @@ def balance(
 
 def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
-    x, y, z, w, wx, wy, wz = state[:7]
-    rows = rotation_rows((x, y, z, w))
     angles, rates = [], []
-    for leg in model.legs:
-        at = leg_motion(leg, rows, (wx, wy, wz))
+    for at in leg_motions(model, state):
         angles.append([joint_angle(at, kind) for kind in range(3)])
         rates.append([joint_rate(at, kind) for kind in range(3)])
     gamma, mu, beta = zip(*angles, strict=True)
     gamma_dot, mu_dot, beta_dot = zip(*rates, strict=True)
     return Joints(gamma, mu, beta, gamma_dot, mu_dot, beta_dot)
+
+
+def leg_motions(model: Model, state: Sequence[Scalar]) -> Iterator[LegMotion]:
+    """Yield the motion of each leg; the state begins with quaternion and W."""
+    x, y, z, w, wx, wy, wz = state[:7]
+    rows = rotation_rows((x, y, z, w))
+    for leg in model.legs:
+        yield leg_motion(leg, rows, (wx, wy, wz))
 
 
 def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
@@ -203,20 +198,8 @@ def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
     g = ((x - a * e0) / u, (y - a * e1) / u, z / u)
     b = ((a * x - e0) / u, (a * y - e1) / u, a * z / u)
     outward = triple(dot3(row, p) for row in rows)
-    return LegMotion(
-        leg=leg,
-        axis=(x, y, z),
-        along=(e0, e1, 0.0),
-        a=a,
-        p=p,
-        u=u,
-        g=g,
-        b=b,
-        outward=outward,
-        gamma_dot=dot3(g, rate),
-        a_dot=dot3(p, rate),
-        beta_dot=dot3(b, rate),
-    )
+    rates = dot3(g, rate), dot3(p, rate), dot3(b, rate)
+    return LegMotion(leg, (x, y, z), (e0, e1, 0.0), a, p, u, g, b, outward, *rates)
 
 
 def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
@@ -244,13 +227,12 @@ def field_of(model: Model, rows: Rows) -> Triple:
 
 def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     """Kinetic energy of all seven links, payload and rotors [J]."""
-    x, y, z, w, wx, wy, wz = state[:7]
+    wx, wy, wz = state[4:7]
     ixx, iyy, izz, ixy, ixz, iyz = model.star
     total = ixx * wx * wx + iyy * wy * wy + izz * wz * wz
     total = total + 2.0 * (ixy * wx * wy + ixz * wx * wz + iyz * wy * wz)
-    rows = rotation_rows((x, y, z, w))
-    for leg in model.legs:
-        at = leg_motion(leg, rows, (wx, wy, wz))
+    for at in leg_motions(model, state):
+        leg = at.leg
         total = total + (leg.a0 + leg.a2 * (at.a * at.a)) * at.gamma_dot * at.gamma_dot
         if leg.ixy or leg.ixz or leg.iyz:
             root = sqrt(at.u)
@@ -262,14 +244,12 @@ def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
 
 def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     """Potential energy [J]: weight, springs and elastic stops."""
-    x, y, z, w, wx, wy, wz = state[:7]
-    rows = rotation_rows((x, y, z, w))
-    field = field_of(model, rows)
+    x, y, z, w = state[:4]
+    field = field_of(model, rotation_rows((x, y, z, w)))
     total: Scalar = 0.0 if model.gravity is None else -dot3(model.weight, field)
-    for leg in model.legs:
-        if leg.loads is not None:
-            at = leg_motion(leg, rows, (wx, wy, wz))
-            total = total + spring_and_weight_energy(at, field)
+    for at in leg_motions(model, state):
+        if at.leg.loads is not None:
+            total = total + spring_and_weight_energy(at, at.leg.loads, field)
     return total
 
 
@@ -284,11 +264,10 @@ def power(
     rows = rotation_rows((x, y, z, w))
     acting = torque if model.time_constant is None else given
     total: Scalar = 0.0
-    for leg, drive in zip(model.legs, acting, strict=True):
-        at = leg_motion(leg, rows, (wx, wy, wz))
+    for at, drive in zip(leg_motions(model, state), acting, strict=True):
         total = total + drive * at.gamma_dot
-        if leg.loads is not None:
-            total = total - dissipation(at)
+        if at.leg.loads is not None:
+            total = total - dissipation(at, at.leg.loads)
     for external in (model.moment, moment):
         if external is not None:
             total = total + dot3(external, triple(dot3(row, (wx, wy, wz)) for row in rows))
@@ -299,11 +278,8 @@ def power(
 # Python's 0.0, which leaves nothing behind in a traced program.
 
 
-def joint_torques(at: LegMotion, field: Triple) -> Triple:
+def joint_torques(at: LegMotion, loads: LegLoads, field: Triple) -> Triple:
     """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
-    loads = at.leg.loads
-    if loads is None:
-        return ZERO
     friction = triple(
         0.0 if one is None else -friction_torque(one, joint_rate(at, kind))
         for kind, one in enumerate(loads.friction)
@@ -315,18 +291,14 @@ def joint_torques(at: LegMotion, field: Triple) -> Triple:
     at_gamma, at_mu = _weight(loads, at, field)
     if loads.stops is not None:
         at_gamma = at_gamma + stop_torque(loads.stops, joint_angle(at, 0), at.gamma_dot)
-    return (
-        friction[0] + springs[0] + at_gamma,
-        friction[1] + springs[1] + at_mu,
-        friction[2] + springs[2],
-    )
+    rubbing = zip(friction, springs, strict=True)
+    first, second, third = (rub + spring for rub, spring in rubbing)
+    return first + at_gamma, second + at_mu, third
 
 
-def spring_and_weight_energy(at: LegMotion, field: Triple) -> Scalar:
+def spring_and_weight_energy(at: LegMotion, loads: LegLoads, field: Triple) -> Scalar:
     """Energy [J] in springs, elastic stops and the weight of the links."""
-    loads, total = at.leg.loads, 0.0
-    if loads is None:
-        return total
+    total: Scalar = 0.0
     for kind, spring in enumerate(loads.springs):
         if spring is not None:
             stretch = joint_angle(at, kind) - spring.rest
@@ -342,11 +314,9 @@ def spring_and_weight_energy(at: LegMotion, field: Triple) -> Scalar:
     return total
 
 
-def dissipation(at: LegMotion) -> Scalar:
+def dissipation(at: LegMotion, loads: LegLoads) -> Scalar:
     """Power [W] that friction and the damping of elastic stops take out."""
-    loads, total = at.leg.loads, 0.0
-    if loads is None:
-        return total
+    total: Scalar = 0.0
     for kind, friction in enumerate(loads.friction):
         if friction is not None:
             total = total + friction_torque(friction, joint_rate(at, kind)) * joint_rate(at, kind)
@@ -388,12 +358,17 @@ def joint_rate(at: LegMotion, kind: int) -> Scalar:
 
 def joint_angle(at: LegMotion, kind: int) -> Scalar:
     """Angle of gamma (0), mu (1) or beta (2) [rad]."""
+    return atan2(*direction_of(at, kind))
+
+
+def direction_of(at: LegMotion, kind: int) -> tuple[Scalar, Scalar]:
+    """Sine and cosine of gamma (0), mu (1) or beta (2); of gamma and beta times sqrt(u)."""
     if kind == 0:
-        return atan2(dot3(at.outward, at.leg.across), dot3(at.outward, at.leg.v))
+        return dot3(at.outward, at.leg.across), dot3(at.outward, at.leg.v)
     if kind == 1:
-        return atan2(sqrt(at.u), at.a)
-    # r.(t x s) and r.s with s = (0, 0, 1), both times sqrt(u).
-    return atan2(at.p[0] * at.along[1] - at.p[1] * at.along[0], at.p[2])
+        return sqrt(at.u), at.a
+    # r.(t x s) and r.s with s = (0, 0, 1).
+    return at.p[0] * at.along[1] - at.p[1] * at.along[0], at.p[2]
 
 
 def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Scalar]:
@@ -402,15 +377,14 @@ def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Sca
         return 0.0, 0.0
     first, second = _directions(leg)
     on_link = cross3(_combine(loads.link, *second), field)
-    on_both = cross3(_combine(loads.drive, *first), field)
-    total = (on_link[0] + on_both[0], on_link[1] + on_both[1], on_link[2] + on_both[2])
-    return dot3(total, leg.axis), -dot3(on_link, first[0])
+    on_drive = cross3(_combine(loads.drive, *first), field)
+    return dot3(add(on_link, on_drive), leg.axis), -dot3(on_link, first[0])
 
 
 def _directions(leg: LegMotion) -> tuple[Rows, Rows]:
     """Axes of {1k} = [r, w x r, w] and {2k} = [r, t x r, t] in {E}."""
     root = sqrt(leg.u)
-    r = (leg.p[0] / root, leg.p[1] / root, leg.p[2] / root)
+    r = triple(part / root for part in leg.p)
     return (r, cross3(leg.axis, r), leg.axis), (r, cross3(leg.along, r), leg.along)
 
 

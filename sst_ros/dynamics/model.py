@@ -10,11 +10,36 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, WorkspaceLeft
-from sst_ros.mechanism.generic_math import ZERO, Symmetric, Triple, cross3, multiply
+from sst_ros.mechanism.generic_math import ZERO, Symmetric, Triple, cross3, multiply, triple
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.bodies import PLACES, Payload, Star, entries_of, point_inertia
+from sst_ros.scene.bodies import PLACES, Payload, Star, entries_of
 from sst_ros.scene.loads import Friction, Stroke
 from sst_ros.scene.scene import Scene
+
+
+class JointSpring(NamedTuple):
+    """All springs of one joint as one: torque -stiffness (angle - rest)."""
+
+    stiffness: float
+    rest: float
+
+
+class ElasticStops(NamedTuple):
+    """Elastic stops at the ends of the stroke, 0 and arc."""
+
+    arc: float
+    stiffness: float
+    damping: float
+
+
+class LegLoads(NamedTuple):
+    """Loads of one leg; None or zero where the scene has none."""
+
+    friction: tuple[Friction | None, Friction | None, Friction | None]  # of gamma, mu, beta
+    springs: tuple[JointSpring | None, JointSpring | None, JointSpring | None]
+    drive: Triple  # mass times centre of the actuated link in {1k} [kg m]
+    link: Triple  # mass times centre of the intermediate link in {2k} [kg m]
+    stops: ElasticStops | None
 
 
 class Leg(NamedTuple):
@@ -38,59 +63,14 @@ class Leg(NamedTuple):
 
 
 class Model(NamedTuple):
-    """All constants of the dynamics.
+    """All constants of the dynamics; None for what the scene does not have."""
 
-    Attributes:
-        star: inertia (xx, yy, zz, xy, xz, yz) in {E} of star, payload and what of the intermediate
-            links turns with the star [kg m^2].
-        legs: the three legs.
-        gravity: acceleration of free fall in {B} [m/s^2]; None without gravity.
-        weight: mass times centre of star and payload in {E} [kg m].
-        moment: constant external moment on the star in {B} [N m]; None without one.
-        time_constant: lag of the actuators [s]; None without one.
-
-    """
-
-    star: Symmetric
+    star: Symmetric  # of star, payload and what of the intermediate links turns with them, in {E}
     legs: tuple[Leg, Leg, Leg]
-    gravity: Triple | None = None
-    weight: Triple = ZERO
-    moment: Triple | None = None
-    time_constant: float | None = None
-
-
-class JointSpring(NamedTuple):
-    """All springs of one joint as one: torque -stiffness (angle - rest)."""
-
-    stiffness: float
-    rest: float
-
-
-class ElasticStops(NamedTuple):
-    """Elastic stops at the ends of the stroke, 0 and arc."""
-
-    arc: float
-    stiffness: float
-    damping: float
-
-
-class LegLoads(NamedTuple):
-    """Loads of one leg; None or zero where the scene has none.
-
-    Attributes:
-        friction: of the joints gamma, mu, beta.
-        springs: at the joints gamma, mu, beta.
-        drive: mass times centre of the actuated link in {1k} [kg m].
-        link: mass times centre of the intermediate link in {2k} [kg m].
-        stops: elastic stops of the stroke.
-
-    """
-
-    friction: tuple[Friction | None, Friction | None, Friction | None]
-    springs: tuple[JointSpring | None, JointSpring | None, JointSpring | None]
-    drive: Triple
-    link: Triple
-    stops: ElasticStops | None
+    gravity: Triple | None = None  # acceleration of free fall in {B} [m/s^2]
+    weight: Triple = ZERO  # mass times centre of star and payload in {E} [kg m]
+    moment: Triple | None = None  # constant, on the star in {B} [N m]
+    time_constant: float | None = None  # lag of the actuators [s]
 
 
 def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
@@ -102,10 +82,8 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     carried: list[Star | Payload] = [scene.star]
     damping = damping_of(scene.stroke)
     if scene.payload is not None:
-        load = scene.payload
-        carried.append(load)
-        about_o = zip(entries_of(load.inertia), point_inertia(load.mass, load.centre), strict=True)
-        star = [part + (own + point) for part, (own, point) in zip(star, about_o, strict=True)]
+        carried.append(scene.payload)
+        star = [part + own for part, own in zip(star, scene.payload.entries, strict=True)]
     for k in range(3):
         w, v, e = (tuple(geometry.of_leg(name, k)) for name in ("w", "v", "e"))
         drive_zz = entries_of(scene.actuated_links[k].inertia)[2]
@@ -114,19 +92,15 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
             drive_zz = drive_zz + gear * gear * scene.actuators.rotor_inertia
         xx, yy, zz, xy, xz, yz = entries_of(scene.intermediate_links[k].inertia)
         constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
-        star = [
-            part + xx * (float(i == j) - e[i] * e[j])
-            for part, (i, j) in zip(star, PLACES, strict=True)
-        ]
-        legs.append(
-            Leg(w, v, cross3(w, v), e[0], e[1], *constants, _loads(scene, geometry, k, damping))
-        )
-    weight = [sum(body.mass * body.centre[i] for body in carried) for i in range(3)]
+        turning = zip(star, PLACES, strict=True)
+        star = [part + xx * (float(i == j) - e[i] * e[j]) for part, (i, j) in turning]
+        loads = _loads(scene, geometry, k, damping)
+        legs.append(Leg(w, v, cross3(w, v), e[0], e[1], *constants, loads))
     return Model(
-        star=(star[0], star[1], star[2], star[3], star[4], star[5]),
+        star=tuple(star),
         legs=(legs[0], legs[1], legs[2]),
         gravity=None if scene.gravity is None else scene.gravity.acceleration,
-        weight=(weight[0], weight[1], weight[2]),
+        weight=triple(sum(body.mass * body.centre[i] for body in carried) for i in range(3)),
         moment=None if scene.moment is None else scene.moment.value,
         time_constant=None if scene.actuators is None else scene.actuators.time_constant,
     )
@@ -134,11 +108,10 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
 
 def _loads(scene: Scene, geometry: Geometry, k: int, damping: Any) -> LegLoads | None:
     """Collect the loads of leg k, whose stops have this damping; None where it has none."""
-    joints, springs = scene.friction, scene.springs
-    friction = (joints.gamma, joints.mu, joints.beta) if joints else (None, None, None)
-    by_joint = tuple(
-        _join([s for s in springs if s.joint == f"{kind}_{k + 1}"])
-        for kind in ("gamma", "mu", "beta")
+    kinds = ("gamma", "mu", "beta")
+    friction = triple(getattr(scene.friction, kind, None) for kind in kinds)
+    springs = triple(
+        _join([one for one in scene.springs if one.joint == f"{kind}_{k + 1}"]) for kind in kinds
     )
     drive = link = ZERO
     if scene.gravity is not None:
@@ -147,10 +120,10 @@ def _loads(scene: Scene, geometry: Geometry, k: int, damping: Any) -> LegLoads |
     stops = None
     if scene.stroke.stiffness is not None:
         stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
-    heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
-    if not (any(friction) or any(by_joint) or heavy or stops):
+    heavy = any(np.any(x) for x in (*drive, *link))
+    if not (any(friction) or any(springs) or heavy or stops):
         return None
-    return LegLoads(friction, (by_joint[0], by_joint[1], by_joint[2]), drive, link, stops)
+    return LegLoads(friction, springs, drive, link, stops)
 
 
 def damping_of(stroke: Stroke) -> Any:
@@ -192,9 +165,9 @@ def _inverse_langevin(y: float) -> float:
 
 
 def _join(springs: list[Any]) -> JointSpring | None:
-    stiffness = sum(spring.stiffness for spring in springs)
     if not springs:
         return None
+    stiffness = sum(spring.stiffness for spring in springs)
     return JointSpring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
 
 
@@ -203,22 +176,13 @@ SINGULAR_MU = 1e-6
 
 
 class Limit(NamedTuple):
-    """One end: sign * (angle of a joint - end) >= 0.
+    """One end: sign * (angle of a joint - end) >= 0."""
 
-    Attributes:
-        reason: text of the error when the run stops here.
-        error: what is raised then; None for a contact event.
-        joint: number of the joint in (gamma_1..3, mu_1..3, beta_1..3), from 0.
-        sign: +1 for a lower end, -1 for an upper one.
-        end: angle [rad].
-
-    """
-
-    reason: str
-    error: type[RunStopped] | None
-    joint: int
-    sign: float
-    end: Any
+    reason: str  # text of the error when the run stops here
+    error: type[RunStopped] | None  # what is raised then; None for a contact event
+    joint: int  # number in (gamma_1..3, mu_1..3, beta_1..3), from 0
+    sign: float  # +1 for a lower end, -1 for an upper one
+    end: Any  # angle [rad]
 
     def distance(self, joints: Sequence[float]) -> float:
         """Distance to the end [rad], negative beyond it; nine angles, then nine rates."""
@@ -244,19 +208,19 @@ def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
 
     Of many geometries the ends are columns, which no text names.
     """
+
+    def above(name: str, end: Any) -> str:
+        return f"{name} > {end:.6f} rad" if isinstance(end, float) else f"{name} > its end"
+
     for k in range(3):
-        name = f"serial singularity, mu_{k + 1}"
-        yield Limit(f"{name} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
-        yield Limit(f"{name} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU)
+        mu, gamma, beta = f"serial singularity, mu_{k + 1}", f"gamma_{k + 1}", f"beta_{k + 1}"
+        yield Limit(f"{mu} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
+        yield Limit(f"{mu} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU)
         if scene.stroke.at_end == "stop":
-            arc, name = geometry.of_leg("arc", k), f"gamma_{k + 1}"
-            yield Limit(f"{name} < 0", StrokeExceeded, k, 1.0, 0.0)
-            yield Limit(_above(name, arc), StrokeExceeded, k, -1.0, arc)
+            arc = geometry.of_leg("arc", k)
+            yield Limit(f"{gamma} < 0", StrokeExceeded, k, 1.0, 0.0)
+            yield Limit(above(gamma, arc), StrokeExceeded, k, -1.0, arc)
         if scene.workspace.at_edge == "stop":
-            most, name = geometry.beta_max, f"beta_{k + 1}"
-            yield Limit(f"{name} < 0", WorkspaceLeft, k + 6, 1.0, 0.0)
-            yield Limit(_above(name, most), WorkspaceLeft, k + 6, -1.0, most)
-
-
-def _above(name: str, end: Any) -> str:
-    return f"{name} > {end:.6f} rad" if isinstance(end, float) else f"{name} > its end"
+            most = geometry.beta_max
+            yield Limit(f"{beta} < 0", WorkspaceLeft, k + 6, 1.0, 0.0)
+            yield Limit(above(beta, most), WorkspaceLeft, k + 6, -1.0, most)

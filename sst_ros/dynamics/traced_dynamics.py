@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,10 @@ from sst_ros.dynamics.expression import (
     compile_program,
     number_constants,
     trace,
-    with_derivative_along,
     with_jacobian,
 )
-from sst_ros.dynamics.model import Leg, Limit
-from sst_ros.mechanism.generic_math import Scalar, dot3, positive, rotation_rows, sin
+from sst_ros.dynamics.model import Limit
+from sst_ros.mechanism.generic_math import Scalar, positive, sin
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
@@ -32,8 +32,6 @@ LAG = ("l1", "l2", "l3")
 TORQUE = ("t1", "t2", "t3")
 MOMENT = ("n1", "n2", "n3")
 BODY_ACCELERATION = ("ax", "ay", "az")
-
-_MOST_RECENT = 32
 
 
 class Dynamics:
@@ -65,11 +63,8 @@ class Dynamics:
     @cached_property
     def program(self) -> Program:
         """Derivative of the state by time; inputs are state and drive."""
-
-        def slope(*inputs: Any) -> tuple[Any, ...]:
-            return kernel.derivative(self.numbers, *self._split(inputs))
-
-        return trace(slope, (*self.state, *self.drive))
+        function = partial(kernel.derivative, self.numbers)
+        return trace(lambda *given: function(*self._split(given)), (*self.state, *self.drive))
 
     @cached_property
     def derivative(self) -> Function:
@@ -84,11 +79,8 @@ class Dynamics:
     @cached_property
     def joints_program(self) -> Program:
         """The program of `joints`."""
-
-        def joints(*state: Any) -> tuple[Any, ...]:
-            return tuple(number for kind in kernel.joints(self.numbers, state) for number in kind)
-
-        return trace(joints, (*QUATERNION, *RATE))
+        joints = partial(kernel.joints, self.numbers)
+        return trace(lambda *state: [*chain(*joints(state))], (*QUATERNION, *RATE))
 
     @cached_property
     def inverse(self) -> Function:
@@ -100,9 +92,7 @@ class Dynamics:
         def torques(*inputs: Any) -> tuple[Any, ...]:
             q, rate, acceleration, moment = inputs[:4], inputs[4:7], inputs[7:10], inputs[10:]
             found = kernel.actuator_torque(self.model, q, rate, acceleration, moment or None)
-            rows = rotation_rows(q)
-            squares = (kernel.leg_motion(leg, rows, rate).u for leg in self.model.legs)
-            return (*found[0], found[1], *squares)
+            return (*found[0], found[1], *(at.u for at in kernel.leg_motions(self.model, inputs)))
 
         more = MOMENT if self.has_moment_topic else ()
         return compile_program(trace(torques, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more)))
@@ -112,10 +102,10 @@ class Dynamics:
         """Kinetic and potential energy [J] and power put in [W], of state and drive."""
 
         def energies(*inputs: Any) -> tuple[Any, ...]:
-            model, (state, torque, moment) = self.model, self._split(inputs)
-            kinetic = kernel.kinetic_energy(model, state)
-            potential = kernel.potential_energy(model, state)
-            return kinetic, potential, kernel.power(model, state, torque, moment)
+            given = self._split(inputs)
+            kinetic = kernel.kinetic_energy(self.model, given[0])
+            potential = kernel.potential_energy(self.model, given[0])
+            return kinetic, potential, kernel.power(self.model, *given)
 
         return compile_program(trace(energies, (*self.state, *self.drive)))
 
@@ -135,7 +125,7 @@ class Dynamics:
         return inputs[:size], inputs[size : size + 3], inputs[size + 3 :] or None
 
 
-recent = lru_cache(maxsize=_MOST_RECENT)(Dynamics)
+recent = lru_cache(maxsize=32)(Dynamics)
 
 
 class ODE:
@@ -143,8 +133,7 @@ class ODE:
 
     Args:
         dynamics: the scene.
-        torque: torques over time that replace those of the drive; the drive is then what else
-            acts from outside, or nothing.
+        torque: torques over time that replace those of the drive.
         limit: of the actuators, which clamps `torque` [N m].
         phases: the drive keeps three numbers for the torques: the phases [rad] of `torque`.
         work: append to the state the work [J] that actuators and moments have put in, less what
@@ -152,7 +141,7 @@ class ODE:
 
     Attributes:
         state: names of the state's numbers: quaternion, body rate, lagged torques, work.
-        drive: names of the drive's numbers, which are constant over a step.
+        drive: names of what acts from outside and is constant over a step.
 
     """
 
@@ -165,13 +154,11 @@ class ODE:
         work: bool = False,
         phases: bool = False,
     ) -> None:
-        self._dynamics = dynamics
-        self._torque = torque
-        self._limit = limit
-        self._work = work
-        self._phases = phases
+        self._dynamics, self._torque, self._limit = dynamics, torque, limit
+        self._work, self._phases = work, phases
         self.state = (*dynamics.state, *(("work",) if work else ()))
         self.drive = dynamics.drive if torque is None or phases else dynamics.drive[3:]
+        self._inputs = ("t", *self.state, *self.drive)
 
     @cached_property
     def program(self) -> Program:
@@ -192,7 +179,7 @@ class ODE:
     @cached_property
     def directional(self) -> Program:
         """The derivative, and its own along the direction d_x, .. of further inputs."""
-        return with_derivative_along(self._of_numbers, self._inputs, self.variables)
+        return with_jacobian(self._of_numbers, self._inputs, (), self.variables)
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
@@ -221,38 +208,31 @@ class ODE:
         """Nine angles and nine rates, of quaternion and body rate."""
         return self._dynamics.joints_program
 
-    @property
-    def _inputs(self) -> tuple[str, ...]:
-        return ("t", *self.state, *self.drive)
-
     def derivative(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative at the time, the state and the drive given, of any kind."""
-        return self._derivative(self._dynamics.model, self._torque, self._limit, time, inputs)
+        return self._slope(self._dynamics.model, self._torque, self._limit, time, inputs)
 
     def _of_numbers(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative with numbers that may be others in another scene."""
         torque = number_constants(self._torque, ("torque",))
         limit = number_constants(self._limit, ("limit",))
-        return self._derivative(self._dynamics.numbers, torque, limit, time, inputs)
+        return self._slope(self._dynamics.numbers, torque, limit, time, inputs)
 
-    def _derivative(
+    def _slope(
         self, model: Any, sine: Any, limit: Any, time: Any, inputs: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        size = len(self._dynamics.state)
-        state, drive = inputs[:size], inputs[len(self.state) :]
-        torque, rest = drive[:3], drive[3:]
+        state, drive = inputs[: len(self._dynamics.state)], inputs[len(self.state) :]
+        torque, moment = drive[:3], drive[3:]
         if sine is not None:
             phase = torque if self._phases else sine.phase
+            moment = moment if self._phases else drive
             rows = zip(sine.amplitude, sine.frequency, phase, strict=True)
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
             if limit is not None:
                 torque = tuple(_clamp(tau, limit) for tau in torque)
-            rest = rest if self._phases else drive
-        moment = (rest[0], rest[1], rest[2]) if rest else None
-        slope = kernel.derivative(model, state, torque, moment)
-        if not self._work:
-            return slope
-        return (*slope, kernel.power(model, state, torque, moment))
+        slope = kernel.derivative(model, state, torque, moment or None)
+        work = (kernel.power(model, state, torque, moment or None),) if self._work else ()
+        return (*slope, *work)
 
 
 def _clamp(torque: Any, limit: float) -> Any:
@@ -283,26 +263,22 @@ def limit_distances(
     They hold for angles less than pi away from the limit. `ends` has cosine and sine of the end of
     each limit; the state is quaternion and body rate.
     """
-    x, y, z, w, *rate = state
-    rows = rotation_rows((x, y, z, w))
-    legs = [kernel.leg_motion(leg, rows, (rate[0], rate[1], rate[2])) for leg in model.legs]
+    legs = list(kernel.leg_motions(model, state))
     pairs = [
-        _distance(limit, *end, legs[limit.joint % 3], model.legs[limit.joint % 3])
+        _distance(limit, *end, legs[limit.joint % 3])
         for limit, end in zip(limits, ends, strict=True)
     ]
     return tuple(pair[0] for pair in pairs) + tuple(pair[1] for pair in pairs)
 
 
 def _distance(
-    limit: Limit, cosine: Scalar, sine: Scalar, at: kernel.LegMotion, leg: Leg
+    limit: Limit, cosine: Scalar, sine: Scalar, at: kernel.LegMotion
 ) -> tuple[Scalar, Scalar]:
     """sqrt(u) sin(sign * (angle - end)) and its rate; of mu sin(mu)^2 - sin(end)^2."""
-    if limit.joint < 3:
-        along, across, rate = dot3(at.outward, leg.v), dot3(at.outward, leg.across), at.gamma_dot
-    elif limit.joint < 6:
+    kind = limit.joint // 3
+    if kind == 1:
         return at.u - sine * sine, -2.0 * at.a * at.a_dot
-    else:
-        along, across, rate = at.p[2], at.p[0] * leg.e1 - at.p[1] * leg.e0, at.beta_dot
+    across, along = kernel.direction_of(at, kind)
     distance = limit.sign * (across * cosine - along * sine)
-    turning = limit.sign * (along * cosine + across * sine) * rate
+    turning = limit.sign * (along * cosine + across * sine) * kernel.joint_rate(at, kind)
     return distance, turning - distance * at.a * at.a_dot / at.u

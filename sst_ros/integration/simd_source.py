@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import accumulate
 
-from sst_ros.dynamics.expression import Operand, Program, Slots
+from sst_ros.dynamics.expression import Program, Slots
 
 
 class Layout:
@@ -52,7 +52,7 @@ def split(
     late = {i for i, known in enumerate(early) if not known}
     steps = zip(lines, program.steps, strict=True)
     for number, (line, (_, operands)) in enumerate(steps, start=count):
-        if any(isinstance(x, Operand) and x.number in late for x in operands):
+        if any(isinstance(x, int) and x in late for x in operands):
             late.add(number)
         (after if number in late else before).append(line)
     return before, after, results

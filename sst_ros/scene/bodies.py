@@ -252,11 +252,15 @@ class Payload(Section):
     )
 
     @property
+    def entries(self) -> list[Any]:
+        """Inertia about O in {E}: xx, yy, zz, xy, xz, yz [kg m^2]."""
+        point = point_inertia(self.mass, self.centre)
+        return [own + part for own, part in zip(entries_of(self.inertia), point, strict=True)]
+
+    @property
     def about_o(self) -> NDArray[np.float64]:
         """Inertia about O in {E}, shape (3, 3) [kg m^2]."""
-        return _matrix_of(entries_of(self.inertia)) + _matrix_of(
-            point_inertia(self.mass, self.centre)
-        )
+        return _matrix_of(self.entries)
 
 
 PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
