@@ -30,7 +30,7 @@ from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.host import scheduling
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import process, topics
-from sst_ros.nodes.publications import LOG_NS, StateMessages, TorqueLog, finite, stamp
+from sst_ros.nodes.publications import LOG_NS, TorqueLog, finite, stamp, state_messages
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
 from sst_ros.runtime.pacing import Pacer, SteadyTime
@@ -62,9 +62,8 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     publishers = [topics.SIMULATOR[name].publisher(node, 1000) for name in names]
     inputs = ("commands", "commands_stamped")[:read]
     readers = [Reader(node, topics.SIMULATOR[name]) for name in inputs]
-    messages, log = StateMessages(), TorqueLog(TICK_NS)
+    states, log = state_messages(), TorqueLog(TICK_NS)
     numbers = finite(*Simulation("swing").sample)
-    states = (messages.joint_states, messages.orientation, messages.euler_zyz)
     wait_for(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
 
     def publish(stamp_ns: int) -> None:

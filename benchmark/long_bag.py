@@ -26,7 +26,7 @@ import numpy as np
 from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros.host.output import slices
 from sst_ros.mechanism.geometry import Array
-from sst_ros.nodes.publications import StateMessages, TorqueLog, stamp
+from sst_ros.nodes.publications import TorqueLog, stamp, state_messages
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.report.reference import TickPropagator, initial, joint_columns
 from sst_ros.scene import scene as scenes
@@ -71,7 +71,8 @@ def endless() -> Scene:
 def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
     """Write the bag of a run of the endless scene; its folder must not exist."""
     scene, samples = endless(), round(seconds * 1e9 / SAMPLE_NS)
-    writer, messages, log = BagWriter(path), StateMessages(), TorqueLog(TICK_NS)
+    writer, log = BagWriter(path), TorqueLog(TICK_NS)
+    joint_states, orientation, euler_zyz = state_messages()
     connections = {topic: writer.connect(topic, kind)
                    for topic, kind in TOPICS.items()}  # fmt: skip
 
@@ -92,9 +93,9 @@ def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
                 received_ns = at_ns + SENT_NS
                 send("/sst_simulator/applied_torques", received_ns, log.take(asked_ns))
             at, numbers = stamp(at_ns), (y, joints, torque if number else (0.0, 0.0, 0.0))
-            send("/joint_states", at_ns + SENT_NS, messages.joint_states(at, numbers))
-            send("/sst_simulator/orientation", at_ns + SENT_NS, messages.orientation(at, numbers))
-            send("/sst_simulator/euler_zyz", at_ns + SENT_NS, messages.euler_zyz(at, numbers))
+            send("/joint_states", at_ns + SENT_NS, joint_states(at, numbers))
+            send("/sst_simulator/orientation", at_ns + SENT_NS, orientation(at, numbers))
+            send("/sst_simulator/euler_zyz", at_ns + SENT_NS, euler_zyz(at, numbers))
     writer.close()
     return path
 

@@ -14,6 +14,7 @@ import re
 import sys
 import traceback
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -52,26 +53,9 @@ class Subcommand:
         self.needs, self.description = needs, description
 
 
-def _flag(name: str, what: str) -> Arg:
-    """Describe an option without a value."""
-    return Arg(name, what, action="store_true")
-
-
-def _path(name: str, what: str | None = None, **options: Any) -> Arg:
-    """Describe an argument or an option that is a path."""
-    return Arg(name, what, type=Path, **options)
-
-
-def _number(name: str, what: str, default: float | None = None) -> Arg:
-    """Describe an option that is a number."""
-    return Arg(name, what, type=float, default=default)
-
-
-def _scene(
-    name: str, what: str = "name of a scene, or path of a .yaml file", **options: Any
-) -> Arg:
-    """Describe an argument that is a scene, which shells complete by argcomplete."""
-    return Arg(name, what, completer="scene.scene:names", **options)
+_flag = partial(Arg, action="store_true")
+_path, _number = partial(Arg, type=Path), partial(Arg, type=float)
+_scene = partial(Arg, completer="scene.scene:names")  # which shells complete by argcomplete
 
 
 def _out(what: str, default: str) -> tuple[Arg, Arg]:
@@ -80,19 +64,15 @@ def _out(what: str, default: str) -> tuple[Arg, Arg]:
     return _path("--out", f"{what}; default: {default}"), force
 
 
-def integer_from(least: int, most: int) -> Any:
-    """Return a type of arguments: a whole number in a range."""
-
-    def convert(text: str) -> int:
-        if not (text.isdecimal() and least <= int(text) <= most):
-            allowed = f"must be a whole number from {least} to {most}, not {text!r}"
-            raise argparse.ArgumentTypeError(allowed)
-        return int(text)
-
-    return convert
+def _integer(least: int, most: int, text: str) -> int:
+    if not (text.isdecimal() and least <= int(text) <= most):
+        allowed = f"must be a whole number from {least} to {most}, not {text!r}"
+        raise argparse.ArgumentTypeError(allowed)
+    return int(text)
 
 
-SCENE = _scene("scene", metavar="SCENE")
+_OF_SCENE = "name of a scene, or path of a .yaml file"
+SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")
 COMMANDS: dict[str, Subcommand | str] = {
     "simulate": Subcommand(
@@ -139,7 +119,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     "describe": Subcommand(
         "write a scene as URDF",
         "cli.scenes:describe",
-        _scene("--scene", default="example2", metavar="S"),
+        _scene("--scene", _OF_SCENE, default="example2", metavar="S"),
         _flag(
             "--ros2-control",
             "with the tag by which ros2_control drives the actuators of a running simulator",
@@ -148,7 +128,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     "compile": Subcommand(
         "compile a scene before its first fast run",
         "cli.runs:compile_code",
-        _scene("scene", nargs="?", default="example2", metavar="SCENE"),
+        _scene("scene", _OF_SCENE, nargs="?", default="example2", metavar="SCENE"),
         Arg("--integrator", "auto, or the name of an integrator; default: auto", default="auto"),
     ),
     "demo": Subcommand(
@@ -174,7 +154,12 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
         Arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
-        Arg("--port", "port, or the next free one", type=integer_from(1024, 65535), default=8080),
+        Arg(
+            "--port",
+            "port, or the next free one",
+            type=partial(_integer, 1024, 65535),
+            default=8080,
+        ),
         _flag("--open", "open it, where there is a desktop"),
         needs=("viser",),
         description="Show a running simulator, one that is started for it (--scene), or a bag.",
@@ -200,7 +185,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     "report stability": Subcommand(
         "stable steps along the motion of a scene; runs at its limits and with other numbers",
         "cli.reports:report_stability",
-        _scene("scene", metavar="SCENE"),
+        SCENE,
         Arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
         *_out("folder of the results", "stability_out"),
         needs=("pandas", "matplotlib"),
@@ -240,7 +225,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
         _path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
         Arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
-        Arg("--workers", "threads; default: one a core", type=integer_from(1, 1024)),
+        Arg("--workers", "threads; default: one a core", type=partial(_integer, 1, 1024)),
         _flag("--resume", "compute only the chunks that are missing in --out"),
         description="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
@@ -363,14 +348,12 @@ def refuse_unknown(
         refuse(options, option, word, allowed)
 
 
-FAILED, BUG, INTERRUPTED = 1, 3, 130
-
-
 def run_command(words: list[str]) -> int:
     """Run a command or a node; return the exit status. Errors are one line on stderr."""
-    debug, words = _without_debug(words)
+    end = words.index("--ros-args") if "--ros-args" in words else len(words)
+    debug = "--debug" in words[:end]  # wherever it is before the words of ROS
     try:
-        status = _run(words)
+        status = _run([*(word for word in words[:end] if word != "--debug"), *words[end:]])
         print(end="", flush=True)  # does nothing where stdout was closed before the start
     except (Exception, KeyboardInterrupt) as error:
         if debug:
@@ -402,13 +385,6 @@ def _run(words: list[str]) -> int:
     return done or 0
 
 
-def _without_debug(words: list[str]) -> tuple[bool, list[str]]:
-    """Take --debug out of the words, wherever it is before those of ROS."""
-    end = words.index("--ros-args") if "--ros-args" in words else len(words)
-    kept = [word for word in words[:end] if word != "--debug"]
-    return len(kept) < end, [*kept, *words[end:]]
-
-
 def _abandon_stdout() -> None:
     """Keep Python from failing once more, when it ends, on a stdout that takes nothing."""
     try:
@@ -421,21 +397,21 @@ def failure(error: BaseException) -> tuple[int, str]:
     """Return the exit status and the message, "" for none."""
     text = " ".join(str(error).split())
     if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, "interrupted"
+        return 130, "interrupted"
     if isinstance(error, BrokenPipeError):
-        return FAILED, ""
+        return 1, ""
     if isinstance(error, SstError):
-        return FAILED, str(error)
+        return 1, str(error)
     if isinstance(error, ModuleNotFoundError) and (said := explanation(error)):
-        return FAILED, said
+        return 1, said
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
-        return FAILED, f"{where}{error.strerror or error}"
+        return 1, f"{where}{error.strerror or error}"
     if isinstance(error, UnicodeError):
-        return FAILED, f"text cannot be encoded or decoded: {error}"
+        return 1, f"text cannot be encoded or decoded: {error}"
     if isinstance(error, MemoryError):
-        return FAILED, "not enough memory"
+        return 1, "not enough memory"
     if type(error).__module__.partition(".")[0] in ("rclpy", "rosbags"):
-        return FAILED, text
+        return 1, text
     report = "internal error, please report it with the output of --debug"
-    return BUG, f"{report}: {type(error).__name__}: {text}"
+    return 3, f"{report}: {type(error).__name__}: {text}"

@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from array import array
 from typing import Any
 
 from rclpy.action.server import CancelResponse, GoalResponse
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -19,8 +17,8 @@ from sst_ros.control.law import Command
 from sst_ros.control.tracking import TrackingMetrics, tracking_table
 from sst_ros.errors import SstError
 from sst_ros.mechanism.generic_math import ZERO
-from sst_ros.nodes import parameters, topics
-from sst_ros.nodes.process import every
+from sst_ros.nodes import topics
+from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.topics import ActionGoal, TorqueCommands
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
@@ -56,19 +54,17 @@ _SPIN_S = 0.01
 """Least time to deliver the result of a goal that the end of the node aborts: 0.2 s."""
 
 
-class InverseDynamicsController:
+class InverseDynamicsController(Worker[ControllerNodeParameters]):
     """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`.
 
     Attributes:
         follower: follows the motion.
-        parameters: those of the node.
 
     """
 
     def __init__(self) -> None:
-        self.node = Node("sst_inverse_dynamics")
-        self.done = threading.Event()
-        given = self.parameters = parameters.declare(self.node, ControllerNodeParameters)
+        super().__init__("sst_inverse_dynamics", ControllerNodeParameters)
+        given = self.parameters
         self.follower = TrajectoryFollower(scene.load(given.scene), given)
         self._commands = TorqueCommands(self.node, given)
         names = ("reference", "tracking_error", "diagnostics")

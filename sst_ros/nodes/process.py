@@ -1,33 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One process, one node: start, spin until it is done or stopped, close in order."""
+"""One process, one node: its parameters, its start, its callbacks, and an end in order."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import faulthandler
 import importlib
+import math
 import os
 import sys
 import threading
 import time
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Generic, TypeVar
 
 import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import SetParametersResult as Result
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterException,
+)
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
 
-from sst_ros.errors import InputError, SstError
+from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.host.child_process import is_orphan
 from sst_ros.nodes import arguments, signals
+from sst_ros.scene.schema import Section, Spec, specs
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _FIRST_RCLPY_ON_FAST_DDS_3 = 9
@@ -42,18 +53,125 @@ _CLEAN_UP_S = 10.0
 """Longer than any clean-up of the middleware, also on a busy machine."""
 _STDERR = 2
 
+_TYPES = {
+    "number": Parameter.Type.DOUBLE,
+    "integer": Parameter.Type.INTEGER,
+    "flag": Parameter.Type.BOOL,
+    "text": Parameter.Type.STRING,
+    "choice": Parameter.Type.STRING,
+    "texts": Parameter.Type.STRING_ARRAY,
+}
+_WIDEST = 1e300
 
-class Worker(Protocol):
-    """What a process runs: a node, `done` when its work is."""
+P = TypeVar("P", bound=Section)
 
-    node: Node
-    done: threading.Event
+
+class Worker(Generic[P]):
+    """What a process runs: a node with parameters, `done` when its work is.
+
+    Fields of `cls` are read-only, except those of `cls.CHANGEABLE`.
+
+    Args:
+        node: name of the node.
+        cls: its parameters.
+        more_defaults: defaults that depend on the values given at the start.
+
+    Attributes:
+        parameters: those of the node, checked.
+
+    Raises:
+        InputError: values given at the start are refused, or names are unknown; lists all of them.
+
+    """
+
+    def __init__(
+        self,
+        node: str,
+        cls: type[P],
+        more_defaults: Callable[[dict[str, Any]], dict[str, Any]] = lambda given: {},
+    ) -> None:
+        self.node, self.done = Node(node), threading.Event()
+        self.parameters = _declare(self.node, cls, more_defaults)
+        self.node.add_on_set_parameters_callback(self._set)
 
     def close(self) -> None:
         """Finish while still connected; raise an SstError where the work has failed.
 
         What it publishes is received by its subscribers before the node leaves.
         """
+
+    def change(self, changed: P) -> None:
+        """Take over values that were set at run time, all of which are checked."""
+        self.parameters = changed
+
+    def _set(self, given: list[Parameter[Any]]) -> Result:
+        known, values = specs(type(self.parameters)), {one.name: one.value for one in given}
+        if "use_sim_time" in values:
+            reason = "use_sim_time is read when the node starts, and cannot be changed"
+            return Result(successful=False, reason=reason)
+        mine = {name: value for name, value in values.items() if name in known}
+        try:
+            changed = dataclasses.replace(self.parameters, **mine)
+        except InputError as error:
+            return Result(successful=False, reason=str(error))
+        if mine:
+            self.change(changed)
+        return Result(successful=True)
+
+
+def _declare(
+    node: Node, cls: type[P], more_defaults: Callable[[dict[str, Any]], dict[str, Any]]
+) -> P:
+    """Declare every field of a section on the node and return the values."""
+    # rclpy has no public call for the values that were given; Jazzy and Kilted have this.
+    given: dict[str, Any] = {name: one.value for name, one in node._parameter_overrides.items()}
+    changeable = getattr(cls, "CHANGEABLE", ())
+    values: dict[str, Any] = {}
+    problems: list[Problem] = []
+    defaults = {**vars(cls()), **more_defaults(given)}
+    for name, spec in specs(cls).items():
+        default = defaults[name]
+        value = given.get(name, list(default) if isinstance(default, tuple) else default)
+        if spec.kind == "number":  # "-p duration:=1" means 1.0
+            value = float(value) if type(value) is int else value
+            value = list(map(float, value)) if isinstance(value, array) else value
+        try:
+            node.declare_parameter(
+                name, value, _descriptor(name, spec, name not in changeable), ignore_override=True
+            )
+        except (InvalidParameterTypeException, InvalidParameterValueException):
+            problems.append(Problem(name, value, spec.describe()))
+        values[name] = value
+    ours = {name for _, parameters in arguments.COMMANDS.values() for name in specs(parameters)}
+    for name in sorted(given.keys() - values.keys()):
+        if name in ours:  # nodes may share a parameter file
+            node.get_logger().info(f"parameter {name} is one of another node: not used")
+        elif not arguments.is_foreign(name):
+            problems.append(arguments.unknown_parameter(name, [*values]))
+    try:
+        if problems:
+            raise InputError("", problems)
+        return cls(**values)
+    except InputError as error:
+        raise InputError(node.get_fully_qualified_name(), error.problems) from None
+
+
+def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        name=name,
+        type=(Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]).value,
+        description=spec.doc + (f" [{spec.unit}]" if spec.unit else ""),
+        additional_constraints=spec.describe(),
+        read_only=read_only,
+    )
+    low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
+    if spec.kind == "number" and not spec.shape:
+        # Only a parameter with a range refuses NaN.
+        low = math.nextafter(spec.above, math.inf) if math.isfinite(spec.above) else low
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    if spec.kind == "integer":
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+    return descriptor
 
 
 def run(words: Sequence[str]) -> int:
@@ -144,7 +262,7 @@ class _Callbacks(threading.Thread):
         self._executor.shutdown()
 
 
-def spin(worker: Worker) -> None:
+def spin(worker: Worker[Any]) -> None:
     """Run a worker until it is done or asked to end, then close it.
 
     Raises:

@@ -105,41 +105,35 @@ def finite(y: Sequence[float], joints: Sequence[float], torque: Sequence[float])
     return quaternion, joints, torque
 
 
-class StateMessages:
-    """Bytes of joint_states, orientation and euler_zyz, for the bytes of a stamp and the numbers.
+def state_messages(frame_id: str = "") -> tuple[Message, Message, Message]:
+    """Return what makes the messages joint_states, orientation and euler_zyz.
 
-    Each is one call of a struct: field by field takes 1.7 times as long.
-
-    Args:
-        frame_id: of joint_states; the others are in base_link.
-
+    The frame is that of joint_states, whose effort is the torque over the step that ended; the
+    others are in base_link. Each is one call of a struct: field by field takes 1.7 times as long.
     """
+    count = len(JOINTS)
+    names, base = _layout(frame_id, count, *JOINTS, count), _layout(BASE_FRAME)
+    stamped = f"<{len(_ENCAPSULATION)}s{_STAMP.size}s"
+    more = f"I4x{count}d"  # a sequence: its length, padding, the numbers
+    pack_joints, pack_quaternion, pack_angles = (
+        struct.Struct(stamped + form).pack
+        for form in (f"{len(names)}s{count}d{more}{more}", f"{len(base)}s4d", f"{len(base)}s3d")
+    )
 
-    def __init__(self, frame_id: str = "") -> None:
-        count = len(JOINTS)
-        self._names, self._base = _layout(frame_id, count, *JOINTS, count), _layout(BASE_FRAME)
-        stamped = f"<{len(_ENCAPSULATION)}s{_STAMP.size}s"
-        more = f"I4x{count}d"  # a sequence: its length, padding, the numbers
-        self._joints = struct.Struct(f"{stamped}{len(self._names)}s{count}d{more}{more}").pack
-        self._quaternion, self._angles = (
-            struct.Struct(f"{stamped}{len(self._base)}s{numbers}d").pack for numbers in (4, 3)
-        )
-
-    def joint_states(self, at: bytes, numbers: Numbers) -> bytes:
-        """Return a JointState; the effort is the torque over the step that ended."""
+    def joint_states(at: bytes, numbers: Numbers) -> bytes:
         _, joints, torque = numbers
-        angles, rates, count = joints[:9], joints[9:], len(JOINTS)
-        return self._joints(
-            _ENCAPSULATION, at, self._names, *angles, count, *rates, count, *torque, *_PASSIVE
+        angles, rates = joints[:9], joints[9:]
+        return pack_joints(
+            _ENCAPSULATION, at, names, *angles, count, *rates, count, *torque, *_PASSIVE
         )
 
-    def orientation(self, at: bytes, numbers: Numbers) -> bytes:
-        """Return a QuaternionStamped."""
-        return self._quaternion(_ENCAPSULATION, at, self._base, *numbers[0])
+    def orientation(at: bytes, numbers: Numbers) -> bytes:
+        return pack_quaternion(_ENCAPSULATION, at, base, *numbers[0])
 
-    def euler_zyz(self, at: bytes, numbers: Numbers) -> bytes:
-        """Return a Vector3Stamped of the ZYZ angles theta, phi, psi [rad]."""
-        return self._angles(_ENCAPSULATION, at, self._base, *zyz_angles(numbers[0]))
+    def euler_zyz(at: bytes, numbers: Numbers) -> bytes:
+        return pack_angles(_ENCAPSULATION, at, base, *zyz_angles(numbers[0]))
+
+    return joint_states, orientation, euler_zyz
 
 
 def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
@@ -269,7 +263,7 @@ class SimulatorTopics:
             own["robot_description"].publisher(node).publish(String(data=urdf(scene)))
         self.diagnostics = own["diagnostics"].publisher(node)
         self._awaited = self._find_publishers(given.wait_for_subscribers)
-        self._samples, self._idles = StateMessages(), StateMessages(IDLE_FRAME_ID)
+        self._samples, self._idles = state_messages(), state_messages(IDLE_FRAME_ID)
         self._valid: Numbers = (0.0, 0.0, 0.0, 1.0), _AT_REST * 2, ZERO
         moments = scene.moment is not None and scene.moment.topic
         ticks, period_ns = given.run.ticks_per_sample, given.run.period_ns
@@ -365,10 +359,9 @@ class SimulatorTopics:
             self._read = [topic for topic in every if topic.get_subscription_count()]
             self._states = self._messages(self._samples)
 
-    def _messages(self, of: StateMessages) -> list[tuple[Publisher[Any], Message]]:
+    def _messages(self, of: Sequence[Message]) -> list[tuple[Publisher[Any], Message]]:
         """Messages of a state whose topics have subscribers."""
-        pairs = zip(self._shown, (of.joint_states, of.orientation, of.euler_zyz), strict=True)
-        return [pair for pair in pairs if pair[0] in self._read]
+        return [pair for pair in zip(self._shown, of, strict=True) if pair[0] in self._read]
 
     def _find_publishers(self, names: tuple[str, ...]) -> list[Publisher[Any]]:
         own = {publisher.topic_name: publisher for publisher in self._node.publishers}

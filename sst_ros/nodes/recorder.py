@@ -8,7 +8,6 @@ an executor, measured in two processes at once.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -16,14 +15,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rosbags import interfaces
 
 from sst_ros.errors import SstError
-from sst_ros.nodes import parameters, topics
-from sst_ros.nodes.process import every
+from sst_ros.nodes import topics
+from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.topics import Endpoint, NeverSpun
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters
@@ -70,13 +68,12 @@ class RecordedTopic:
             self._last[publisher["data"]] = number
 
 
-class Recorder:
+class Recorder(Worker[RecorderParameters]):
     """Worker of the process `recorder`."""
 
     def __init__(self) -> None:
-        self.node = Node("sst_recorder")
-        self.done = threading.Event()
-        given = parameters.declare(self.node, RecorderParameters)
+        super().__init__("sst_recorder", RecorderParameters)
+        given = self.parameters
         self._requested = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
         self._foreign = {topic for topic in self._requested if _last(topic) not in _DECLARED}
         sampled = set(map(_last, topics.SAMPLED))

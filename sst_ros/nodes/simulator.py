@@ -23,8 +23,8 @@ from sst_ros.host import compiled_module, scheduling
 from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import compiled_method
 from sst_ros.mechanism.generic_math import ZERO
-from sst_ros.nodes import parameters, simulation_interfaces, topics
-from sst_ros.nodes.process import every
+from sst_ros.nodes import simulation_interfaces, topics
+from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
 from sst_ros.nodes.topics import Reader
 from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
@@ -47,15 +47,12 @@ FOLLOWED_STEP_NS = 200_000_000
 _LONGEST_WAIT_S = 0.05
 
 
-class Simulator:
+class Simulator(Worker[SimulatorParameters]):
     """Worker of the process `simulator`: connects the parts, reports once a second."""
 
     def __init__(self) -> None:
-        self.node = Node("sst_simulator")
-        self.done = threading.Event()
-        given = self.parameters = parameters.declare(
-            self.node, SimulatorParameters, self._change, _scene_duration
-        )
+        super().__init__("sst_simulator", SimulatorParameters, _scene_duration)
+        given = self.parameters
         simulated = scene.load(given.scene)
         self._topics = SimulatorTopics(self.node, simulated, given)
         run = self._run = given.run
@@ -128,7 +125,7 @@ class Simulator:
             equations=given.equations,
         )
 
-    def _change(self, changed: SimulatorParameters) -> None:
+    def change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
         before, self.parameters, run = self.parameters, changed, changed.run
         self._run.command_timeout_ns = run.command_timeout_ns

@@ -7,29 +7,25 @@ the period, that of its start first order only.
 
 from __future__ import annotations
 
-import threading
-
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism.generic_math import ZERO
-from sst_ros.nodes import parameters, topics
-from sst_ros.nodes.process import every
+from sst_ros.nodes import topics
+from sst_ros.nodes.process import Worker, every
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
 from sst_ros.simulation.torque_profile import TorqueTable
 from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
 
 
-class TorquePlayer:
+class TorquePlayer(Worker[PlayerParameters]):
     """Worker of the process `torque_player`."""
 
     def __init__(self) -> None:
-        self.node = Node("sst_torque_player")
-        self.done = threading.Event()
-        self._parameters = given = parameters.declare(self.node, PlayerParameters)
+        super().__init__("sst_torque_player", PlayerParameters)
+        given = self.parameters
         self._profile, self._duration = _load(given)
         self._commands = topics.TorqueCommands(self.node, given)
         self._start_ns: int | None = None
@@ -72,7 +68,7 @@ class TorquePlayer:
 
     def _hold(self, elapsed_ns: int) -> Vector3:
         """Torques [N m] from this time of the profile [ns] until the next sample or its end."""
-        given = self._parameters
+        given = self.parameters
         end_ns = round(self._duration * NANOSECONDS)
         hold_ns = min(given.period_ns, max(0, end_ns - elapsed_ns))
         at_ns = elapsed_ns + (hold_ns / 2 if given.hold == "middle" else 0)
@@ -81,7 +77,7 @@ class TorquePlayer:
     def _check_period(self, stamp_ns: int) -> None:
         """Warn once where the samples come at another period than that of `rate`."""
         apart_ns, self._last_ns = stamp_ns - self._last_ns, stamp_ns
-        period_ns = self._parameters.period_ns
+        period_ns = self.parameters.period_ns
         if self._warned or apart_ns in (0, period_ns):
             return
         self._warned = True

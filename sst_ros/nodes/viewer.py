@@ -13,7 +13,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.client import Client
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -21,8 +20,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from sst_ros.errors import InputError
 from sst_ros.mechanism.generic_math import ZERO
-from sst_ros.nodes import parameters, topics
-from sst_ros.nodes.process import every
+from sst_ros.nodes import topics
+from sst_ros.nodes.process import Worker, every
 from sst_ros.runtime.settings import ViewerParameters
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
@@ -38,13 +37,12 @@ _LOOK_S = 0.5
 _QUEUE = topics.VIEWER["joint_states"].depth
 
 
-class Viewer:
+class Viewer(Worker[ViewerParameters]):
     """Worker of the process `viewer`; a `RunControl` of the page."""
 
     def __init__(self) -> None:
-        self.node = Node("sst_viewer")
-        self.done = threading.Event()
-        self._parameters = given = parameters.declare(self.node, ViewerParameters)
+        super().__init__("sst_viewer", ViewerParameters)
+        given = self.parameters
         self.scene: Scene | None = None
         self._phase, self._status = "", RunStatus()
         self._start_ns, self._time_ns = 0, 0
@@ -122,7 +120,7 @@ class Viewer:
 
     def _take_scene(self, message: String) -> None:
         with contextlib.suppress(InputError):  # a scene of another version
-            self.scene = yaml_document.read(Scene, message.data, self._parameters.simulator)
+            self.scene = yaml_document.read(Scene, message.data, self.parameters.simulator)
 
     def _take_phase(self, message: String) -> None:
         if message.data == "waiting" and self._phase:  # the first that is heard is no news
@@ -130,7 +128,7 @@ class Viewer:
         self._phase = message.data
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
-        name = f"{self.node.resolve_topic_name(self._parameters.simulator)}: run"
+        name = f"{self.node.resolve_topic_name(self.parameters.simulator)}: run"
         for status in message.status:
             if status.name == name:
                 values = {pair.key: pair.value for pair in status.values}
@@ -139,7 +137,7 @@ class Viewer:
 
     def _look(self) -> None:
         """Look for another node that publishes commands, and leave the run to it."""
-        own, simulator = self.node.get_fully_qualified_name(), self._parameters.simulator
+        own, simulator = self.node.get_fully_qualified_name(), self.parameters.simulator
         names = [
             name
             for topic in ("commands", "commands_stamped")
@@ -158,7 +156,7 @@ class Viewer:
             self._look()
         if self._driving:
             if self._commands is None:
-                simulator = self._parameters.simulator
+                simulator = self.parameters.simulator
                 self._commands = topics.VIEWER["commands"].publisher(self.node, simulator=simulator)
             self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
 

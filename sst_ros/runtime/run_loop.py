@@ -130,7 +130,7 @@ class RunLoop(TickLoop):
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
         self._thread, self._missing_since = threading.current_thread(), time.monotonic()
         self._output.publish_phase(self._status)
-        warm = False
+        warm, shown = False, -math.inf
         while not (self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
             try:
                 if not warm:
@@ -138,12 +138,20 @@ class RunLoop(TickLoop):
                     self.warm_up()
                 if self.requested.is_set():
                     self._serve()
-                if self.phase is Phase.WAITING:
-                    self._wait_for_start()
+                if self.phase is Phase.WAITING and not self._start():
+                    if time.monotonic() - shown > IDLE_PERIOD_S:
+                        shown = time.monotonic()
+                        self.show(fault=False)
+                    time.sleep(_POLL_S)
                 elif self.phase is Phase.RUNNING:
-                    self._to_next_sample()
-                elif self.phase in (Phase.PAUSED, Phase.FAULT):  # a step may have led to the end
-                    self._idle()
+                    done = self.to_next_sample(paced=True)
+                    if self.fault:  # latched by `watch`: the step has ended after all
+                        self.publish_rest()
+                    elif done and self.complete:
+                        self._rest(Phase.FINISHED)
+                elif self.phase in (Phase.PAUSED, Phase.FAULT):
+                    self.show(fault=bool(self.fault))
+                    self.requested.wait(IDLE_PERIOD_S)
             except NoSubscribers as missing:
                 self._fail(str(missing))
                 self.failed = True
@@ -154,7 +162,10 @@ class RunLoop(TickLoop):
                 where = f"{at.filename.rpartition('/')[2]}:{at.lineno}"
                 self._fail(f"internal error: {type(error).__name__}: {error} ({where})")
                 self.stopped.wait(IDLE_PERIOD_S)
-        self._end_of_run()
+        self.publish_rest()
+        self.counters.hold()
+        self.stopped.set()
+        self._serve(refuses=True)
 
     def pause(self, paused: bool) -> Reply:
         """Pause the run, or resume it; idempotent."""
@@ -231,17 +242,6 @@ class RunLoop(TickLoop):
                 finally:
                     pending.set_result(reply)
 
-    def _wait_for_start(self) -> None:
-        """Show the state until the run starts: by itself, or by a command."""
-        shown = -math.inf
-        while not self.requested.is_set():
-            if self._start():
-                return
-            if time.monotonic() - shown > IDLE_PERIOD_S:
-                shown = time.monotonic()
-                self.show(fault=bool(self.fault))
-            time.sleep(_POLL_S)
-
     def _start(self) -> bool:
         """Start the run, unless it has to wait; return whether it runs."""
         if self._missing_since is not None:  # of subscribers that have to be there once
@@ -260,13 +260,6 @@ class RunLoop(TickLoop):
         self._to(Phase.RUNNING)
         self.resume()
 
-    def _to_next_sample(self) -> None:
-        done = self.to_next_sample(paced=True)
-        if self.fault:  # latched by `watch`: the step has ended after all
-            self.publish_rest()
-        elif done and self.complete:
-            self._rest(Phase.FINISHED)
-
     def _rest(self, phase: Phase) -> None:
         self.publish_rest()
         self._to(phase)
@@ -277,16 +270,6 @@ class RunLoop(TickLoop):
         if self.phase is not Phase.FAULT:
             self.publish_rest()
         self._to(Phase.FAULT)
-
-    def _idle(self) -> None:
-        self.show(fault=bool(self.fault))
-        self.requested.wait(IDLE_PERIOD_S)
-
-    def _end_of_run(self) -> None:
-        self.publish_rest()
-        self.counters.hold()
-        self.stopped.set()
-        self._serve(refuses=True)
 
     def _to(self, phase: Phase) -> None:
         with self._changing:

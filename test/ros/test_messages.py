@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from sst_ros import load_scene
 from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
 from sst_ros.nodes import publications
-from sst_ros.nodes.publications import NotFinite, SimulatorTopics, StateMessages, TorqueLog, finite
+from sst_ros.nodes.publications import NotFinite, SimulatorTopics, TorqueLog, finite, state_messages
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import Simulation
@@ -39,8 +39,7 @@ def state():
 def stamped(messages, stamp_ns, state):
     """Those of `SHOWN`."""
     numbers, at = finite(*sample(state)), publications.stamp(stamp_ns)
-    made = messages.joint_states, messages.orientation, messages.euler_zyz
-    return [message(at, numbers) for message in made]
+    return [message(at, numbers) for message in messages]
 
 
 def sample(state):
@@ -57,7 +56,7 @@ def broken(state, bad):
 
 
 def test_a_state_is_read_as_it_is(state):
-    made = stamped(StateMessages(), STAMP_NS, state)
+    made = stamped(state_messages(), STAMP_NS, state)
     read, orientation, euler = map(deserialize_message, made, SHOWN)
     at = state.joints
     assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
@@ -102,7 +101,7 @@ def test_ticks_noted_at_once_are_those_noted_one_by_one():
 def test_the_layout_is_that_of_the_middleware(state, frame_id):
     """Byte for byte, except padding, which the middleware leaves as it is; none is left over."""
     store = get_typestore(Stores.ROS2_JAZZY)  # rosbags refuses bytes that are left over
-    states = stamped(StateMessages(frame_id), 7, state)
+    states = stamped(state_messages(frame_id), 7, state)
     log = TorqueLog(1_000_000, moments=True)
     none = log.take(9)
     log.append((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 2)
