@@ -223,11 +223,7 @@ class OrientationObserver:
     to 3, the product of the larger two is at most 3/2, and sigma >= 2/3 abs(det J2): enough for
     most steps, and cheap. Where a step is too long for that, `continuation` divides it.
 
-    Args:
-        geometry: base triangle and star.
-        quaternion: initial orientation (x, y, z, w).
-        gamma: actuator angles there [rad].
-
+    It begins at an orientation (x, y, z, w), with the actuator angles gamma [rad] there.
     """
 
     def __init__(self, geometry: Geometry, quaternion: Quaternion, gamma: Vector3) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,7 @@ class ControlStopped(SstError):
         super().__init__(f"control stopped at t = {time:.9f} s: {reason}")
 
 
-@dataclass(frozen=True)
-class Measurement:
+class Measurement(NamedTuple):
     """Angles [rad] and rates [rad/s] of the actuators, as encoders measure them."""
 
     gamma: Vector3
@@ -123,12 +122,12 @@ class Controller:
         """
         if self._failure is not None:
             raise self._failure
-        gamma, gamma_dot = measured.gamma, measured.gamma_dot
+        gamma, gamma_dot = measured
+        settings, motion = self._settings, self._motion
         try:
             _require_finite((*gamma, *gamma_dot), "measured")
-            settings, desired = self._settings, self._motion.at(time)
-            instant = time + 0.5 * self._period_s
-            torques = feedforward_torques(settings, self._inverse, self._motion, desired, instant)
+            desired, instant = motion.at(time), time + 0.5 * self._period_s
+            torques = feedforward_torques(settings, self._inverse, motion, desired, instant)
             observed = self._observer.update(gamma) if settings.observes else ()
             command = self._law.answer(desired, torques, gamma, gamma_dot, observed, self._integral)
             _require_finite(command.total, "torque")

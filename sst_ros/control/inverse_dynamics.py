@@ -53,8 +53,7 @@ class InverseDynamics:
             quaternion: of {E} in {B}, (x, y, z, w), of any length > 0.
             body_rate: W in {E} [rad/s].
             body_acceleration: W_dot in {E} [rad/s^2].
-            moment: external moment on the star in {B} [N m], used where the scene takes it from
-                a topic.
+            moment: external moment on the star in {B} [N m], used where a topic gives it.
 
         Raises:
             SingularConfiguration: serial (sin(mu_k) = 0) or parallel (det J2 = 0); no torques
@@ -66,13 +65,12 @@ class InverseDynamics:
         given = (*quaternion, *body_rate, *body_acceleration, *acting)
         try:
             first, second, third, determinant, *squares = self._program(*given)
+            det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
         except (ArithmeticError, ValueError):
             raise self._refusal(quaternion, given) from None
-        least = min(squares)
-        det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
         # Comparisons with NaN are false: what is not finite is refused, too.
-        sound = math.isfinite(first + second + third)
-        if not (sound and least > SINGULAR * SINGULAR and det_j2 > SINGULAR):
+        sound = math.isfinite(first + second + third) and det_j2 > SINGULAR
+        if not (sound and min(squares) > SINGULAR * SINGULAR):
             raise self._refusal(quaternion, given)
         return first, second, third
 
@@ -103,11 +101,13 @@ class InverseDynamics:
         return self.torque((x, y, z, w), ZERO, ZERO)
 
     def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> Exception:
+        """Return why there is no torque."""
+        problem = None
         if not all(map(math.isfinite, given)):
             problem = Problem("state", tuple(given), "must be finite numbers")
-            return InputError("inverse dynamics", [problem])
-        if math.hypot(*quaternion) < 1e-100:
+        elif math.hypot(*quaternion) < 1e-100:
             problem = Problem("quaternion", quaternion, "must have a length > 0")
+        if problem is not None:
             return InputError("inverse dynamics", [problem])
         geometry = Geometry.of(self.scene)
         # t_k x w_k is r_k times sin(mu_k); J2 has the rows t_k x r_k.

@@ -196,25 +196,15 @@ class ControlChannel(Section):
 
 @dataclass(frozen=True)
 class Command:
-    """What the law answers at a sample.
+    """What the law answers at a sample."""
 
-    Attributes:
-        torque: the command [N m]: feedforward + feedback, limited.
-        feedforward: torque of the model without an error [N m]; gravity_pd: gravity compensation.
-        feedback: torque due to the error [N m].
-        desired: the reference at this instant.
-        error, error_rate: desired - measured, of gamma [rad] and gamma_dot [rad/s].
-        integral: the new sum of errors [rad s].
-
-    """
-
-    torque: Vector3
-    feedforward: Vector3
-    feedback: Vector3
+    torque: Vector3  # the command [N m]: feedforward + feedback, limited
+    feedforward: Vector3  # of the model without an error [N m]; gravity_pd: of the weight
+    feedback: Vector3  # due to the error [N m]
     desired: Reference
-    error: Vector3
-    error_rate: Vector3
-    integral: Any
+    error: Vector3  # desired - measured gamma [rad]
+    error_rate: Vector3  # desired - measured gamma_dot [rad/s]
+    integral: Any  # the new sum of errors [rad s]
 
     @property
     def total(self) -> Vector3:
@@ -228,29 +218,18 @@ class Command:
 
 
 class ControlLaw(NamedTuple):
-    """The law of some settings, and its numbers; by joint where there are three.
-
-    Attributes:
-        settings: what it is.
-        torque: inverse dynamics of the model [N m], of quaternion, W and W_dot.
-        accelerate: W and W_dot of the model, of quaternion, gamma_dot and gamma_ddot.
-        kp, kd: gains of accelerations [1/s^2], [1/s].
-        inertia: M_kk at the start of the motion [kg m^2].
-        integral_rate: of the integral action [1/s].
-        limit: of commands [N m]; None for none.
-        period: time from one sample to the next [s].
-
-    """
+    """The law of some settings, and its numbers; by joint where there are three."""
 
     settings: ControllerSettings
-    torque: Callable[[Any, Any, Any], Triple]
-    accelerate: Callable[[Any, Any, Any], tuple[Triple, Triple]]
-    kp: Triple
-    kd: Triple
-    inertia: Triple
-    integral_rate: Scalar
-    limit: Scalar | None
-    period: float
+    torque: Callable[[Any, Any, Any], Triple]  # of the model, by quaternion, W and W_dot [N m]
+    accelerate: Callable[[Any, Any, Any], tuple[Triple, Triple]]  # W and W_dot of the model, by
+    # quaternion, gamma_dot and gamma_ddot
+    kp: Triple  # gains of accelerations [1/s^2]
+    kd: Triple  # [1/s]
+    inertia: Triple  # M_kk at the start of the motion [kg m^2]
+    integral_rate: Scalar  # [1/s]
+    limit: Scalar | None  # of commands [N m]
+    period: float  # from one sample to the next [s]
 
     def answer(
         self,

@@ -69,24 +69,14 @@ class ActuatorDemand:
 
 @dataclass(frozen=True)
 class LimitDistance:
-    """Distance of a motion to a limit.
+    """Distance of a motion to a limit."""
 
-    Attributes:
-        key: the limited quantity.
-        end: value of the limit.
-        sign: +1 for a lower limit, -1 for an upper one.
-        unit: of both.
-        reached: the value closest to the limit, or farthest beyond it.
-        refused: whether the motion is refused beyond it.
-
-    """
-
-    key: str
-    end: float
-    sign: float
+    key: str  # the limited quantity
+    end: float  # value of the limit
+    sign: float  # +1 for a lower limit, -1 for an upper one
     unit: str
-    reached: Peak
-    refused: bool
+    reached: Peak  # the value closest to the limit, or farthest beyond it
+    refused: bool  # whether the motion is refused beyond it
 
     @property
     def least(self) -> float:
@@ -106,36 +96,22 @@ class LimitDistance:
 
 @dataclass(frozen=True)
 class MotionPlan:
-    """A reference motion of a scene with the result of its check.
-
-    Attributes:
-        times: where it was sampled [s], shape (n,).
-        references: the motion there.
-        torques: actuator torques there [N m], shape (n, 3).
-        demands: on the actuators, by leg.
-        distances: from all limits.
-        problems: reasons of a refusal; empty where it is feasible.
-
-    """
+    """A reference motion of a scene with the result of its check."""
 
     motion: ReferenceMotion
     scene: Scene
-    times: Array
-    references: tuple[Reference, ...]
-    torques: Array
-    demands: tuple[ActuatorDemand, ...]
-    distances: tuple[LimitDistance, ...]
-    problems: tuple[Problem, ...]
+    times: Array  # where it was sampled [s], shape (n,)
+    references: tuple[Reference, ...]  # the motion there
+    torques: Array  # actuator torques there [N m], shape (n, 3)
+    demands: tuple[ActuatorDemand, ...]  # by leg
+    distances: tuple[LimitDistance, ...]  # from all limits
+    problems: tuple[Problem, ...]  # reasons of a refusal; empty where it is feasible
 
 
 def check_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
-    """Examine a motion and raise if it is infeasible.
+    """Examine a motion; raises MotionRefused, with every reason, where it is infeasible.
 
-    Raises:
-        MotionRefused: it leaves the stroke or the workspace, or exceeds a limit of the actuators;
-            lists every reason.
-        SingularConfiguration: it meets a singularity.
-
+    It is where it leaves the stroke or the workspace, or exceeds a limit of the actuators.
     """
     plan = examine_motion(motion, scene)
     if plan.problems:
@@ -146,11 +122,8 @@ def check_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
 def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     """Compute demands of a motion and its distances from all limits, between samples too.
 
-    An external moment from a topic counts as zero; the lag of actuators is not included.
-
-    Raises:
-        SingularConfiguration: the motion meets a singularity; no torque is defined there.
-
+    An external moment from a topic counts as zero; the lag of actuators is not included. Raises
+    SingularConfiguration where the motion meets a singularity: no torque is defined there.
     """
     parts = (
         np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in pairwise(motion.pieces)
@@ -290,15 +263,11 @@ def limits(actuators: Actuators | None) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class TimeScaling:
-    """Factors of speed at which the actuators can do a motion.
+    """Factors of speed at which the actuators can do a motion, from `lowest` to `highest`.
 
-    Attributes:
-        highest: the largest feasible factor; infinite where no limit is ever met, None where no
-            factor is feasible.
-        lowest: the smallest one of the range that ends at `highest`; 0 where the actuators can
-            hold the manipulator all along the path.
-        binding: which limit ends the range: torque, velocity or acceleration; empty if none does.
-
+    The lowest is 0 where the actuators can hold the manipulator all along the path; the highest is
+    infinite where no limit is ever met, None where no factor is feasible. `binding` is the limit
+    that ends the range: torque, velocity or acceleration; empty if none does.
     """
 
     highest: float | None

@@ -48,7 +48,7 @@ NEAR = 0.1
 _SAMPLES = 16
 
 StarPath: TypeAlias = Callable[[float], tuple[Quaternion, Vector3, Vector3]]
-"""Share of the way to the turn from the start, a quaternion, and to W and W_dot per share."""
+"""Share of the path to the turn from the start, a quaternion, and to W and W_dot per share."""
 ActuatorPath: TypeAlias = Callable[[float], tuple[Vector3, Vector3, Vector3]]
 """Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2]."""
 OpenPoints: TypeAlias = Sequence[Sequence[float] | None]
@@ -195,13 +195,7 @@ def move_actuators(
 
     Orientations are computed once along the path, by `continuation` in steps that cannot leave the
     assembly mode; any other orientation is computed from the nearest of these. The motion therefore
-    does not depend on what was asked before.
-
-    Args:
-        geometry: base triangle and star.
-        path: gamma and its two derivatives between time 0 and the duration.
-        pieces: see `ReferenceMotion`.
-        start: quaternion (x, y, z, w) of {E} in {B} at time 0.
+    does not depend on what was asked before. It starts from an orientation (x, y, z, w).
 
     Raises:
         SingularConfiguration: the path meets a parallel singularity; the message has the time.
@@ -244,9 +238,9 @@ def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
         times.append(np.linspace(begin, end, count + 1)[1:])
     fine = np.concatenate(times)
     gammas = np.array([path(time)[0] for time in fine.tolist()])
-    way = np.cumsum(np.linalg.norm(np.diff(gammas, axis=0), axis=1))
-    # The first of each half a STEP of the way.
-    _, kept = np.unique(np.append(0.0, way) // (0.5 * STEP), return_index=True)
+    passed = np.cumsum(np.linalg.norm(np.diff(gammas, axis=0), axis=1))
+    # The first of each half a STEP of the path.
+    _, kept = np.unique(np.append(0.0, passed) // (0.5 * STEP), return_index=True)
     return [*fine[kept].tolist(), pieces[-1]]
 
 
@@ -306,19 +300,12 @@ def through_points(
 ) -> ReferenceMotion:
     """Return the motion of the actuators through points, quintic between them.
 
-    The fields of trajectory_msgs/JointTrajectory, rows in the order of the legs. A first point
-    after time 0 is reached from the start; one at time 0 is the start itself, at rest. The motion
-    ends at rest. Rates and accelerations that are not given (no rows, or None or nothing in place
-    of a row) are zero at the ends and chosen for minimum jerk between them.
-
-    Args:
-        geometry: base triangle and star.
-        start: quaternion (x, y, z, w) of {E} in {B} from which the motion begins.
-        times: of the points [s], n >= 1.
-        positions: gamma [rad], n rows of three.
-        velocities: gamma_dot [rad/s], n rows.
-        accelerations: gamma_ddot [rad/s^2], n rows.
-        begin: gamma_dot and gamma_ddot at the start, where the first point comes after time 0.
+    The fields of trajectory_msgs/JointTrajectory: times of n >= 1 points [s], and n rows of gamma
+    [rad] and its derivatives in the order of the legs. A first point after time 0 is reached from
+    the start, an orientation (x, y, z, w), and `begin`, gamma_dot and gamma_ddot there; one at time
+    0 is the start itself, at rest. The motion ends at rest. Rates and accelerations that are not
+    given (no rows, or None or nothing in place of a row) are zero at the ends and chosen for
+    minimum jerk between them.
 
     Raises:
         InputError: no points, wrong shapes, numbers that are not finite, times that do not rise,
@@ -359,17 +346,8 @@ def through_samples(
 ) -> ReferenceMotion:
     """Return the motion through dense samples, quintic between them; it may begin and end moving.
 
-    Args:
-        geometry: base triangle and star.
-        start: quaternion (x, y, z, w) of {E} in {B} at the first sample.
-        times: of the samples, rising [s], shape (n,); the motion begins with the first.
-        positions: gamma [rad], shape (n, 3).
-        velocities: gamma_dot [rad/s], shape (n, 3).
-
-    Raises:
-        AssemblyError: the samples are of another manipulator.
-        SingularConfiguration: the motion meets a parallel singularity.
-
+    It begins with the first sample, from an orientation (x, y, z, w). Samples are rising times [s],
+    shape (n,), gamma [rad] and gamma_dot [rad/s], shape (n, 3). Raises as `move_actuators`.
     """
     times, gamma = times - times[0], np.unwrap(positions, axis=0)
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
@@ -425,17 +403,10 @@ _UNIT = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))
 def quintic(
     times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, accelerations: ArrayLike
 ) -> PPoly:
-    """Return a path of m numbers with its derivatives, quintic between points.
+    """Return position, velocity and acceleration, shape (3, m), quintic between points.
 
-    Args:
-        times: of the points, rising [s], shape (n,), n >= 2.
-        positions: shape (n, m).
-        velocities: shape (n, m); NaN where they are left open.
-        accelerations: the same.
-
-    Returns:
-        Position, velocity and acceleration, shape (3, m), as a function of time.
-
+    Times of the points rise [s], shape (n,), n >= 2; the numbers there have shape (n, m), NaN where
+    a velocity or an acceleration is left open.
     """
     at = np.asarray(times, dtype=float)
     nodes = np.stack([positions, velocities, accelerations], axis=1).astype(float)

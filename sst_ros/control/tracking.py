@@ -37,16 +37,9 @@ def track_of(rows: ArrayLike) -> Track:
 class TrackingMetrics:
     """Metrics of a tracking record, which may come part by part. Those of joints have shape (3,).
 
-    Args:
-        track: the record of one sample or more, or its first part; see `track_of`.
-        limited: samples in which a torque was limited; None where that is not known.
-
-    Attributes:
-        samples: number of samples.
-        largest, last: largest error, and that at the end [rad].
-        torque_largest: effort [N m].
-        limited: as given.
-
+    Beside the properties: the number of `samples`, the `largest` and the `last` error [rad],
+    `torque_largest` [N m], and `limited`, the samples in which a torque was limited, None where
+    that is not known.
     """
 
     def __init__(self, track: Track | None = None, limited: int | None = None) -> None:

@@ -42,14 +42,10 @@ STEP = np.radians(6.0)
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint: child = parent * origin * rotation about the axis by the angle.
+    """A joint between two links, named as in joint_states.
 
-    Attributes:
-        name: as in joint_states.
-        parent, child: links.
-        origin: rotation of the joint's frame in that of the parent, shape (3, 3).
-        axis: unit vector in the joint's frame, shape (3,).
-
+    child = parent * origin * rotation about the axis by the angle, with the origin, shape (3, 3), a
+    rotation in the frame of the parent, and the axis a unit vector in the joint's frame.
     """
 
     name: str
@@ -60,8 +56,7 @@ class Joint:
 
     def rotation(self, angle: float) -> Array:
         """Rotation of the child in its parent at an angle [rad], shape (3, 3)."""
-        x, y, z = self.axis
-        across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        across = np.cross(np.eye(3), np.array(self.axis))
         turn = np.eye(3) + np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
         return np.asarray(self.origin @ turn)
 
@@ -105,15 +100,10 @@ def _leg(geometry: Geometry, k: int) -> tuple[Joint, Joint, Joint]:
 
 @dataclass(frozen=True)
 class Arc:
-    """A round bar along a circular arc about O.
+    """A round bar along a circular arc about O, `thickness` its radius [m].
 
-    Attributes:
-        begin: unit vector to its first point, shape (3,).
-        axis: unit vector that it turns about, perpendicular to `begin`, shape (3,).
-        angle: its length [rad].
-        radius: of the arc [m].
-        thickness: radius of the bar [m].
-
+    From the unit vector `begin` it turns by an angle [rad] about `axis`, a unit vector
+    perpendicular to it; `radius` is that of the arc [m].
     """
 
     begin: Array

@@ -7,9 +7,8 @@ stops and no Stribeck friction: a simulation of the file must add them. No shape
 collisions.
 
 A scene gives inertias about O, and a mass only where something weighs; URDF wants a mass. Where the
-scene has none, the centre is put at O, about which everything turns: the motion is then the same
-for any mass, under gravity too. The mass written is the one that would have this tensor on the
-sphere of its link, trace / (2 radius^2).
+scene has none, it is the one that would have this tensor on the sphere of its link,
+trace / (2 radius^2), with its centre at O: the motion is then the same for any mass.
 
 The actuators can be hardware of ros2_control, which drives them over topics by the plug-in
 JointStateTopicSystem of the package joint_state_topic_hardware_interface. It sends the effort of
@@ -102,14 +101,9 @@ def urdf_with_ros2_control(
 ) -> str:
     """Write a scene as URDF with the ros2_control tag of its actuators.
 
-    Until the first joint states arrive, the hardware has the initial state of the scene: without it
+    The simulator takes commands by name on the one topic, and has its joint states on the other.
+    Until the first of them arrive, the hardware has the initial state of the scene: without it
     joint_trajectory_controller, activated before, holds nan, and no command starts the run.
-
-    Args:
-        scene: the scene.
-        commands: topic on which the simulator takes commands by name.
-        states: topic of its joint states.
-
     """
     root = _robot(scene)
     tag = ET.SubElement(root, "ros2_control", name="sst_ros", type="system")
@@ -133,24 +127,14 @@ def urdf_with_ros2_control(
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body that is fixed to a link.
-
-    Attributes:
-        name: its own; the link's where it is the link.
-        link: of the tree, whose frame all vectors are in.
-        mass: [kg].
-        centre: of mass [m], shape (3,).
-        tensor: about the centre of mass [kg m^2], shape (3, 3).
-        assumed: the scene has no mass for it.
-
-    """
+    """A rigid body that is fixed to a link of the tree, and has its name where it is the link."""
 
     name: str
-    link: str
-    mass: float
-    centre: Array
-    tensor: Array
-    assumed: bool = False
+    link: str  # whose frame all vectors are in
+    mass: float  # [kg]
+    centre: Array  # of mass [m], shape (3,)
+    tensor: Array  # about the centre of mass [kg m^2], shape (3, 3)
+    assumed: bool = False  # the scene has no mass for it
 
 
 def bodies(scene: Scene) -> list[Body]:
@@ -173,23 +157,20 @@ def bodies(scene: Scene) -> list[Body]:
             # A thin disc behind its gear: only its inertia about w matters.
             behind = motor.gear_ratio**2 * motor.rotor_inertia
             tensor = np.diag([behind / 2.0, behind / 2.0, behind])
-            mass = _mass(tensor, base.radius)
-            rotor = Body(
-                f"rotor_{leg}", name_actuated(leg), mass, np.zeros(3), tensor, assumed=True
-            )
-            found.append(rotor)
+            found.append(_massless(f"rotor_{leg}", name_actuated(leg), tensor, base.radius))
     return found
 
 
 def _body(name: str, mass: float, centre: Vector3, about_o: Array, radius: float) -> Body:
     if mass == 0.0:
-        return Body(name, name, _mass(about_o, radius), np.zeros(3), about_o, assumed=True)
+        return _massless(name, name, about_o, radius)
     c = np.array(centre)
     return Body(name, name, mass, c, about_o - mass * (c @ c * np.eye(3) - np.outer(c, c)))
 
 
-def _mass(tensor: Array, radius: float) -> float:
-    return float(np.trace(tensor)) / (2.0 * radius**2)
+def _massless(name: str, link: str, tensor: Array, radius: float) -> Body:
+    mass = float(np.trace(tensor)) / (2.0 * radius**2)
+    return Body(name, link, mass, np.zeros(3), tensor, assumed=True)
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
@@ -210,10 +191,10 @@ def _link(root: ET.Element, name: str, body: Body | None, drawn: Iterable[Shape]
         inertial = ET.SubElement(link, "inertial")
         ET.SubElement(inertial, "origin", xyz=_exact(body.centre))
         ET.SubElement(inertial, "mass", value=_exact([body.mass]))
-        entries = {
-            f"i{'xyz'[i]}{'xyz'[j]}": body.tensor[i, j] for i in range(3) for j in range(i, 3)
-        }
-        ET.SubElement(inertial, "inertia", {key: _exact([x]) for key, x in entries.items()})
+        entries = zip(
+            ("xx", "xy", "xz", "yy", "yz", "zz"), body.tensor[np.triu_indices(3)], strict=True
+        )
+        ET.SubElement(inertial, "inertia", {f"i{key}": _exact([x]) for key, x in entries})
     for shape in drawn:
         _draw(link, shape)
 
@@ -227,10 +208,9 @@ def _joint(root: ET.Element, scene: Scene, joint: Joint, ends: tuple[float, floa
     ET.SubElement(element, "origin", xyz="0 0 0", rpy=_exact(roll_pitch_yaw(joint.origin)))
     ET.SubElement(element, "axis", xyz=_exact(joint.axis))
     motor = scene.actuators if joint.name.startswith("gamma") else None
-    effort = motor.torque_limit if motor is not None else None
-    velocity = motor.velocity_limit if motor is not None else None
     bounds = {"lower": _exact(ends[:1]), "upper": _exact(ends[1:])} if limited else {}
-    bounds |= {"effort": _exact([effort or LARGEST]), "velocity": _exact([velocity or LARGEST])}
+    for name, key in (("effort", "torque_limit"), ("velocity", "velocity_limit")):
+        bounds[name] = _exact([getattr(motor, key, None) or LARGEST])
     ET.SubElement(element, "limit", bounds)
     friction: Friction | None = getattr(scene.friction, joint.name.split("_")[0], None)
     if friction is not None:
@@ -239,34 +219,38 @@ def _joint(root: ET.Element, scene: Scene, joint: Joint, ends: tuple[float, floa
 
 
 def _draw(link: ET.Element, shape: Shape) -> None:
+    straight = np.zeros(3)
     if isinstance(shape, Ball):
-        geometry = _visual(link, shape.centre, np.zeros(3), shape.colour, shape.opacity)
-        ET.SubElement(geometry, "sphere", radius=_short([shape.radius]))
+        size = {"radius": _short([shape.radius])}
+        _visual(link, "sphere", size, shape.centre, straight, shape.colour, shape.opacity)
     elif isinstance(shape, Box):
-        geometry = _visual(link, shape.centre, np.zeros(3), shape.colour)
-        ET.SubElement(geometry, "box", size=_short(shape.size))
+        _visual(link, "box", {"size": _short(shape.size)}, shape.centre, straight, shape.colour)
     else:
         ends = shape.points() if isinstance(shape, Arc) else (shape.begin, shape.end)
         for begin, end in pairwise(ends):
             x, y, z = end - begin
             # The cylinder's axis is z; it ends a little late, so that no gap shows at the bends.
             turn = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
-            geometry = _visual(link, (begin + end) / 2.0, turn, shape.colour)
             length = float(np.linalg.norm(end - begin)) + 0.1 * shape.thickness
             size = {"radius": _short([shape.thickness]), "length": _short([length])}
-            ET.SubElement(geometry, "cylinder", size)
+            _visual(link, "cylinder", size, (begin + end) / 2.0, turn, shape.colour)
 
 
 def _visual(
-    link: ET.Element, at: Array, turn: Array, colour: Colour, opacity: float = 1.0
-) -> ET.Element:
+    link: ET.Element,
+    kind: str,
+    size: dict[str, str],
+    at: Array,
+    turn: Array,
+    colour: Colour,
+    opacity: float = 1.0,
+) -> None:
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=_short(at), rpy=_short(turn))
-    geometry = ET.SubElement(visual, "geometry")
+    ET.SubElement(ET.SubElement(visual, "geometry"), kind, size)
     name = "_".join(f"{round(255 * part):02x}" for part in (*colour, opacity))
     material = ET.SubElement(visual, "material", name=f"rgba_{name}")
     ET.SubElement(material, "color", rgba=_short((*colour, opacity)))
-    return geometry
 
 
 def _exact(values: Iterable[float]) -> str:

@@ -63,38 +63,24 @@ class Topic:
 
 
 class Bag:
-    """A recording: MCAP or sqlite3, a folder or a single file.
+    """A recording, MCAP or sqlite3, a folder or a single file; refused where there is none.
 
-    Args:
-        path: of the recording.
-        requested: topics to read; all others are skipped.
-        damaged: read what is intact of a damaged recording instead of refusing it.
-
-    Attributes:
-        path: as given.
-        topics: full names of the topics found, by key; complete when `messages` is exhausted.
-        damage: what is damaged or lost, a line for each part.
-        unverified: number of chunks without a checksum.
-
-    Raises:
-        InputError: there is no recording at the path.
-
+    Topics that are not requested are skipped. With `damaged`, what is intact of a damaged recording
+    is read instead of refusing it. Attributes are complete when `messages` is exhausted.
     """
 
     def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
         if not path.exists():
             raise refusal(path, "bag", str(path), "does not exist")
         self.path = path
-        self.topics: dict[str, str] = {}
-        self.damage: tuple[str, ...] = ()
-        self.unverified = 0
+        self.topics: dict[str, str] = {}  # full names of the topics found, by key
+        self.damage: tuple[str, ...] = ()  # what is damaged or lost, a line for each part
+        self.unverified = 0  # chunks without a checksum
         self._requested, self._damaged = requested, damaged
         self._channels: dict[tuple[str, str], Topic | None] = {}
 
     def messages(self) -> Iterator[tuple[str, int, Any]]:
-        """Yield the messages of the requested topics in the order of the file.
-
-        Each is the key of its topic, its reception by the recorder [ns], and its content.
+        """Yield key of the topic, reception [ns] and content of the messages, as the file has them.
 
         Raises:
             InputError: the recording is damaged, which is known at the end at the latest; it is
@@ -152,10 +138,10 @@ class Bag:
                 raise self._not_whole(error) from None
             for channel in file.channels.values():
                 self._topic(*channel)
-            told = file.describe()
-            if told and not self._damaged:
-                raise self._not_whole("; ".join(told), advice=", --damaged reads it here")
-            damage += told
+            lines = file.describe()
+            if lines and not self._damaged:
+                raise self._not_whole("; ".join(lines), advice=", --damaged reads it here")
+            damage += lines
             self.unverified += file.unverified
         self.damage = tuple(damage)
 
@@ -196,17 +182,13 @@ class Bag:
 
 @dataclass
 class Damage:
-    """A part of a file that cannot be used: its first byte, and what is wrong with it.
+    """A part of a file that cannot be used; numbers that are not known are 0."""
 
-    The number of messages in it, and the first and last reception of them [ns], are 0 where they
-    are not known.
-    """
-
-    offset: int
-    reason: str
-    messages: int = 0
-    begin_ns: int = 0
-    end_ns: int = 0
+    offset: int  # first byte of the part
+    reason: str  # what is wrong with it
+    messages: int = 0  # in it
+    begin_ns: int = 0  # first reception of them
+    end_ns: int = 0  # last one
 
     def describe(self, origin_ns: int) -> str:
         """Name offset, reason and time range, in seconds after `origin_ns`."""
@@ -219,24 +201,15 @@ class Damage:
 
 
 class McapFile:
-    """Reads one MCAP file; the attributes are complete when `messages` is exhausted.
-
-    Attributes:
-        channels: topic and type by number.
-        damage: what cannot be used.
-        cut: the file ends before its index does.
-        unverified: number of chunks without a checksum.
-        count: number of messages read.
-        lost: number of messages known to be lost.
-
-    """
+    """Reads one MCAP file; the attributes are complete when `messages` is exhausted."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.channels: dict[int, tuple[str, str]] = {}
+        self.channels: dict[int, tuple[str, str]] = {}  # topic and type by number
         self.damage: list[Damage] = []
-        self.cut = False
-        self.unverified = self.count = self.lost = 0
+        self.cut = False  # the file ends before its index does
+        self.unverified = 0  # chunks without a checksum
+        self.count = self.lost = 0  # messages that were read, and that are known to be lost
         self._origin_ns = 0
 
     def describe(self) -> list[str]:
@@ -250,12 +223,7 @@ class McapFile:
         return lines
 
     def messages(self) -> Iterator[RawMessage]:
-        """Yield all messages that are intact, in the order of the file.
-
-        Raises:
-            OSError: the file cannot be read.
-
-        """
+        """Yield all messages that are intact, in the order of the file; may raise OSError."""
         schemas: dict[int, str] = {}
         with self.path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:

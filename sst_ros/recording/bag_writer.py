@@ -98,13 +98,6 @@ class BagWriter:
     power cut) the messages that were flushed are in its .mcap file, and `recover` makes a
     whole recording of them.
 
-    Args:
-        path: folder to be made.
-
-    Attributes:
-        path: the folder.
-        messages: number of messages written.
-
     Raises:
         InputError: the folder exists, or cannot be made.
         RecordingAborted: by any method, when the file cannot be written.
@@ -167,35 +160,20 @@ class BagWriter:
 
 
 class Recovered(NamedTuple):
-    """A recovered recording.
+    """A recovered recording."""
 
-    Attributes:
-        bag: folder of the new recording.
-        messages: number of messages in it.
-        lost: number of messages known to be lost; those behind a cut are not known.
-        cut: the old recording ends before its index.
-        damage: what is damaged or lost, a line for each part.
-
-    """
-
-    bag: Path
-    messages: int
-    lost: int
-    cut: bool
-    damage: tuple[str, ...]
+    bag: Path  # folder of the new recording
+    messages: int  # in it
+    lost: int  # messages known to be lost; those behind a cut are not known
+    cut: bool  # the old recording ends before its index
+    damage: tuple[str, ...]  # what is damaged or lost, a line for each part
 
 
 def recover(path: Path, out: Path | None = None) -> Recovered:
-    """Write the intact messages of a recording into a new one.
+    """Write the intact messages of a recording, a folder with one .mcap file or the file, anew.
 
-    Args:
-        path: folder with one .mcap file, or the file.
-        out: folder of the new recording, which must not exist; `path` with _recovered behind by
-            default.
-
-    Raises:
-        InputError: there is no such file, it is no MCAP, holds nothing, or `out` exists.
-
+    The new folder is `path` with _recovered behind by default. Raises InputError where there is no
+    such file, it is no MCAP or holds nothing, or where the new folder exists.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if len(files) != 1:

@@ -106,12 +106,7 @@ class Signals:
         return self.tables[table].take(*names)
 
     def columns(self, table: str) -> dict[Column, NDArray[Any]]:
-        """Columns of a table, times first, whole numbers where they are in ns.
-
-        Raises:
-            InputError: the recording has no such table.
-
-        """
+        """Columns of a table, times first, whole numbers where they are in ns; see `table`."""
         if table not in self.tables:
             allowed = "must be one of those in the bag: " + ", ".join(self.tables)
             raise refusal(self.bag.path, "table", table, allowed)
@@ -125,10 +120,7 @@ class Signals:
     def table(self, name: str = "samples") -> pd.DataFrame:
         """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
 
-        Raises:
-            InputError: the recording has no such table.
-            MissingDependency: pandas is not installed.
-
+        Raises InputError where the recording has no such table.
         """
         columns = self.columns(name)
         numbers = {column.name: values for column, values in columns.items()}
@@ -138,11 +130,9 @@ class Signals:
 
 
 def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
-    """Read a recording in one pass.
+    """Read a rosbag2 recording, MCAP or sqlite3, in one pass.
 
-    Args:
-        path: a rosbag2 recording, MCAP or sqlite3.
-        damaged: read what is intact of a damaged recording; `Signals.bag.damage` names the rest.
+    With `damaged`, what is intact of a damaged recording; `Signals.bag.damage` names the rest.
 
     Raises:
         InputError: there is no recording, it is damaged, or it has nothing of a run.
@@ -189,20 +179,12 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
 
 @dataclass(frozen=True)
 class Ticks:
-    """Applied torques by tick, in order of time.
+    """Applied torques by tick, in order of time; m of them."""
 
-    Attributes:
-        start_ns, end_ns: the tick, relative to the start of the run [ns], shape (m,).
-        torque: actuator torques held over the tick [N m], shape (m, 3).
-        moment: external moment on the star in {B} held over the tick [N m], shape (m, 3); None
-            where it was not recorded.
-
-    """
-
-    start_ns: Integers
+    start_ns: Integers  # relative to the start of the run, shape (m,)
     end_ns: Integers
-    torque: Array
-    moment: Array | None = None
+    torque: Array  # of the actuators, held over the tick [N m], shape (m, 3)
+    moment: Array | None = None  # external moment on the star in {B} [N m], where recorded
 
     @property
     def period_ns(self) -> int:
@@ -401,12 +383,7 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
 
 
 def read_run_motion(bag: str | Path) -> Trajectory:
-    """Read the motion of a run, to be done again: the samples that have an orientation.
-
-    Raises:
-        InputError: it is no recording of a run, or it has fewer than two such samples.
-
-    """
+    """Read the motion of a run, to be done again: two or more samples that have an orientation."""
     motion = read(bag).trajectory
     if len(motion) < 2:
         problem = Problem("orientation", len(motion), "two samples or more must have one")
@@ -415,13 +392,9 @@ def read_run_motion(bag: str | Path) -> Trajectory:
 
 
 def export(bag: Path, out: Path, form: str = "csv", *, force: bool = False) -> list[Path]:
-    """Write a file for each table of a recording into the folder `out`; return their paths.
+    """Write each table of a recording, as csv or parquet, into a folder; return the paths.
 
-    Args:
-        bag: a rosbag2 recording, MCAP or sqlite3.
-        out: folder, made if it is not there.
-        form: csv or parquet.
-        force: replace earlier files.
+    The folder is made if it is not there; `force` replaces earlier files.
 
     Raises:
         InputError: the recording cannot be read, `out` cannot be written or is not empty.
