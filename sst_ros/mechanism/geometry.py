@@ -5,18 +5,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.state import Array
 
 __all__ = ["Array", "Geometry", "frozen"]
 
 _KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 """What a geometry is made from."""
+
+
+class _Shapes(Protocol):
+    """The sections of a `Scene` that a geometry is made from."""
+
+    @property
+    def base(self) -> Any: ...
+
+    @property
+    def star(self) -> Any: ...
+
+    @property
+    def workspace(self) -> Any: ...
 
 
 def frozen(*arrays: Any) -> tuple[Any, ...]:
@@ -50,7 +62,7 @@ class Geometry:
     beta_max: Any
 
     @classmethod
-    def of(cls, scene: Scene) -> Geometry:
+    def of(cls, scene: _Shapes) -> Geometry:
         """Derive the geometry of a scene."""
         return _recent(scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg)
 
@@ -79,19 +91,19 @@ class Geometry:
         return cls(*arrays, most)
 
     @classmethod
-    def of_scenarios(cls, scenarios: Scenarios) -> tuple[Geometry, NDArray[np.intp]]:
-        """Derive the distinct geometries of scenarios, and the index of that of each row."""
-        scene, count, rows = scenarios.document, scenarios.count or 1, scenarios.rows
-        varied = [rows[key].reshape(count, -1) for key in _KEYS if key in rows]
+    def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
+        """Derive the distinct geometries of `Scenarios`, and the index of that of each row."""
+        scene, rows = scenarios.document, [scenarios.rows.get(key) for key in _KEYS]
+        varied = [values.reshape(len(values), -1) for values in rows if values is not None]
         if not varied:
-            return cls.of(scene), np.zeros(count, dtype=np.intp)
+            return cls.of(scene), np.zeros(scenarios.count or 1, dtype=np.intp)
         _, first, index = np.unique(
             np.hstack(varied), axis=0, return_index=True, return_inverse=True
         )
         nominal = scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg
         v, alpha, beta = (
-            rows[key][first] if key in rows else np.repeat([value], len(first), axis=0)
-            for key, value in zip(_KEYS, nominal, strict=True)
+            np.repeat([value], len(first), axis=0) if values is None else values[first]
+            for values, value in zip(rows, nominal, strict=True)
         )
         found = cls.build(v, np.radians(alpha), np.radians(beta))
         if len(first) == 1:  # one for all rows: its numbers are no columns
@@ -102,8 +114,7 @@ class Geometry:
         """Return the geometries of rows, or of a row; this one where it is a single one."""
         if self.v.ndim == 2:
             return self
-        arrays = (self.v, self.w, self.e, self.alpha, self.arc, self.beta_max)
-        return Geometry(*(array[rows] for array in arrays))
+        return Geometry(*(array[rows] for array in vars(self).values()))
 
     def of_leg(self, name: str, k: int) -> Any:
         """Return what an array has for leg k as floats, or as columns of many geometries."""

@@ -31,7 +31,6 @@ from sst_ros.mechanism.geometry import Array, Geometry, frozen
 from sst_ros.state import Assembly
 
 Index = NDArray[np.intp]
-
 Mask = NDArray[np.bool_]
 
 NEAR = 0.1
@@ -40,21 +39,8 @@ NEAR = 0.1
 ROUNDING = 1e-15
 """Largest abs(r_k . t_k) that is rounding and not a residual."""
 
-_NOT_ISOLATED = 1e-13
-
-_NEAR_REAL = 1e-3
-
-_SAME = 1e-3
-
-_MISFIT = 1e-2
-
-_STEPS = 40
-
-_LONGEST_TURN = 0.3
-
-_LAST_STEP = 1e-9
-
-_REGULAR = 1e-5
+_NOT_ISOLATED, _NEAR_REAL, _SAME, _MISFIT = 1e-13, 1e-3, 1e-3, 1e-2
+_STEPS, _LONGEST_TURN, _LAST_STEP, _REGULAR = 40, 0.3, 1e-9, 1e-5
 
 
 @dataclass(frozen=True)
@@ -155,8 +141,7 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     mu, beta, det_j2, admissible = describe_assemblies(
         geometry.of_rows(configuration), r[configuration], rotation
     )
-    arrays = frozen(configuration, rotation, mu, beta, det_j2, admissible, isolated)
-    return Assemblies(*arrays)
+    return Assemblies(*frozen(configuration, rotation, mu, beta, det_j2, admissible, isolated))
 
 
 def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = None) -> Assembly:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rates and accelerations of every joint and link, and the moments that their joints transmit.
 
-From the actuators or from the star, one leg equation serves both, Eqs. 9 and 24 to 27. Written with
-c_k = (r x t).w = (w x r).t::
+One leg equation, Eqs. 9 and 24 to 27, serves both ways; with c_k = (r x t).w = (w x r).t::
 
     omega     = w gamma_dot - r mu_dot - t beta_dot
     omega_dot = w gamma_ddot - r mu_ddot - t beta_ddot
@@ -12,11 +11,10 @@ Scalar products with N = r x t, r and w x r give gamma, mu and beta of a leg fro
 needs no J2 and works at a parallel singularity. From the actuators, omega = J gamma_dot, Eq. 15,
 and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40, come first.
 
-The virtual work eliminates the constraint moments. All seven links turn about O, so every joint is
-a revolute about an axis through O: w_k (base to actuated link), r_k (to the intermediate link), t_k
-(the curved prismatic joint, to the star). A joint without friction transmits a moment about O with
-two components, both across its axis. The 9 x 2 components and 3 torques (or accelerations) are as
-many as the 7 x 3 moment balances, so the moments about O are determinate, and each leg gives them
+All seven links turn about O, so every joint is a revolute about an axis through O: w_k (base to
+actuated link), r_k (to the intermediate link), t_k (the curved prismatic joint, to the star).
+Without friction it transmits a moment about O across its axis: 9 x 2 components, which with 3
+torques are as many as the 7 x 3 moment balances. So they are determinate, and each leg gives them
 in closed form: with the rates of change of angular momentum D_1k and D_2k of its links, the moment
 m on the star obeys::
 
@@ -149,12 +147,12 @@ def _motion(
     beta_ddot = -(wr @ omega_dot + push + beta_dot * np.sum(wr * turning, axis=1)) / c  # Eq. 46
     gamma_dot, gamma_ddot = actuators or (gamma_dot, gamma_ddot)
     joints = gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot
-    zero = np.zeros(3)
-    omega_a = np.stack([zero, zero, gamma_dot], axis=1)
-    omega_a_dot = np.stack([zero, zero, gamma_ddot], axis=1)
+    x, zero = np.array([1.0, 0.0, 0.0]), np.zeros(3)
+    omega_a, omega_a_dot = (
+        np.stack([zero, zero, about_w], axis=1) for about_w in (gamma_dot, gamma_ddot)
+    )
     # {2k} = [r, t x r, t]; w has no component along r.
     turn = np.stack([zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)], axis=1)
-    x = np.array([1.0, 0.0, 0.0])
     omega_ipl = gamma_dot[:, None] * turn - mu_dot[:, None] * x
     # (d/dt)(-r mu_dot) in {B} is -r mu_ddot - gamma_dot mu_dot (w x r); w is constant.
     across = cross(turn, np.broadcast_to(x, turn.shape))
@@ -221,31 +219,23 @@ def _reactions(
     mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike, torque: Array
 ) -> Reactions:
     motion = of_actuators(at, gamma_dot, gamma_ddot)
-    first, second = virtual_work.link_frames(at)
-    d1 = _seen(first, _momentum_rate(mechanism.actuated, motion.omega_a, motion.omega_a_dot))
-    d2 = _seen(
-        second, _momentum_rate(mechanism.intermediate, motion.omega_ipl, motion.omega_ipl_dot)
+    frames = virtual_work.link_frames(at)
+    inertias = mechanism.actuated, mechanism.intermediate
+    rates = (motion.omega_a, motion.omega_a_dot), (motion.omega_ipl, motion.omega_ipl_dot)
+    # I omega_dot + omega x I omega of three links in their own frames, then in {B}.
+    changes = (
+        np.einsum("kij,kj->ki", i, omega_dot) + cross(omega, np.einsum("kij,kj->ki", i, omega))
+        for i, (omega, omega_dot) in zip(inertias, rates, strict=True)
     )
+    d1, d2 = (np.einsum("kij,kj->ki", f, d) for f, d in zip(frames, changes, strict=True))
     # With t.m = 0 and r, N = r x t across t: m = x r + y N, and w.r = 0, w.N = c.
     x = -np.sum(at.r * d2, axis=1)
     y = (torque - np.sum(at.w * (d1 + d2), axis=1)) / at.c
     prismatic = x[:, None] * at.r + y[:, None] * cross(at.r, at.t)
     revolute = prismatic + d2
     actuated = revolute + d1 - torque[:, None] * at.w
-    moments = [actuated, revolute, prismatic]
-    frames, axes = (first, second, second), (2, 0, 2)
-    local = [np.einsum("kij,ki->kj", f, m) for f, m in zip(frames, moments, strict=True)]
-    for array, axis in zip(local, axes, strict=True):
+    moments, own_frames = [actuated, revolute, prismatic], (*frames, frames[1])
+    local = [np.einsum("kij,ki->kj", f, m) for f, m in zip(own_frames, moments, strict=True)]
+    for array, axis in zip(local, (2, 0, 2), strict=True):
         array[:, axis] = 0.0  # by the equations above; what rounding left goes
     return Reactions(*frozen(*moments, *local, np.array(torque)))
-
-
-def _momentum_rate(inertia: Array, omega: Array, omega_dot: Array) -> Array:
-    """I omega_dot + omega x I omega of three links in their own frames [N m]."""
-    spin = np.einsum("kij,kj->ki", inertia, omega)
-    return np.asarray(np.einsum("kij,kj->ki", inertia, omega_dot) + cross(omega, spin))
-
-
-def _seen(frames: Array, vectors: Array) -> Array:
-    """Vectors of three frames as {B} sees them."""
-    return np.asarray(np.einsum("kij,kj->ki", frames, vectors))

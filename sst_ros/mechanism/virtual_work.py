@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import cross
-from sst_ros.mechanism.geometry import Array, Geometry, frozen
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 
 SINGULAR = 1e-12
@@ -161,6 +161,9 @@ def equation_of_motion(
 ) -> tuple[Array, Array]:
     """T1 and T2 of T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
 
+    M = -T1 is the mass matrix; h = -T2 without a moment has the velocity products. Inertia tensors
+    may be full.
+
     Args:
         mechanism: geometry and inertias.
         at: posture.
@@ -217,59 +220,3 @@ def inverse_dynamics(
     """Actuator torques [N m], shape (3,), that give gamma_ddot [rad/s^2], Eq. 90."""
     t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)
     return np.asarray(-(t1 @ np.asarray(gamma_ddot, dtype=float) + t2))
-
-
-@dataclass(frozen=True)
-class EquationOfMotion:
-    """M gamma_ddot + h = tau + J^T n_ext at one posture and rate. Arrays are read-only.
-
-    The paper writes T1 gamma_ddot + T2 + tau = 0 (Eq. 90); M = -T1 is symmetric and positive
-    definite and h = -T2 at n_ext = 0 holds the velocity products. Inertia tensors may be full.
-
-    Attributes:
-        m: mass matrix M = -T1 [kg m^2], shape (3, 3).
-        h: velocity products [N m], shape (3,).
-        j: J, omega = J gamma_dot, shape (3, 3).
-        gamma_dot: actuator rates [rad/s], shape (3,).
-
-    """
-
-    m: Array
-    h: Array
-    j: Array
-    gamma_dot: Array
-
-    @classmethod
-    def of(cls, mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike) -> EquationOfMotion:
-        """Evaluate Eqs. 63 to 92 once."""
-        rate = np.array(gamma_dot, dtype=float)
-        t1, t2 = equation_of_motion(mechanism, at, rate)
-        # Rounding leaves T1 symmetric to 1e-16 only; M is symmetric.
-        return cls(*frozen(-0.5 * (t1 + t1.T), -t2, at.j.copy(), rate))
-
-    @property
-    def momentum(self) -> Array:
-        """Generalized momentum M gamma_dot [N m s], shape (3,)."""
-        return np.asarray(self.m @ self.gamma_dot)
-
-    @property
-    def kinetic_energy(self) -> float:
-        """Kinetic energy of the seven links [J]."""
-        return 0.5 * float(self.gamma_dot @ self.m @ self.gamma_dot)
-
-    def power(self, torque: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0)) -> float:
-        """Power of actuator torques and of n_ext on the star in {B} [W]: d/dt kinetic_energy."""
-        return float(self.gamma_dot @ self._driving(torque, moment))
-
-    def acceleration(self, torque: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-        """Direct dynamics: gamma_ddot [rad/s^2], shape (3,), of torques and n_ext [N m]."""
-        return np.asarray(np.linalg.solve(self.m, self._driving(torque, moment) - self.h))
-
-    def torque(self, gamma_ddot: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-        """Inverse dynamics: actuator torques [N m], shape (3,), that give gamma_ddot [rad/s^2]."""
-        acceleration = np.asarray(gamma_ddot, dtype=float)
-        return np.asarray(self.m @ acceleration + self.h - self._driving((0.0, 0.0, 0.0), moment))
-
-    def _driving(self, torque: ArrayLike, moment: ArrayLike) -> Array:
-        applied = np.asarray(torque, dtype=float)
-        return np.asarray(applied + self.j.T @ np.asarray(moment, dtype=float))

@@ -25,9 +25,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import columns, cross
 from sst_ros.mechanism.geometry import Array, Geometry, frozen
 
-_BLOCK = 20_000
-
-_BISECTIONS = 55
+_BLOCK, _BISECTIONS = 20_000, 55
 
 
 @dataclass(frozen=True)
@@ -186,20 +184,16 @@ def orientations(s: Array, psi: ArrayLike) -> Array:
 
 def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array, NDArray[np.intp]]:
     """Directions inside the base triangle, shape (m, 3), and their triangles, shape (n, 3)."""
-    index: dict[tuple[int, int], int] = {}
-    weights: list[tuple[float, float, float]] = []
-    for i in range(divisions + 1):
-        for j in range(divisions + 1 - i):
-            index[i, j] = len(weights)
-            weights.append((i + 0.1, j + 0.1, divisions - i - j + 0.1))
-    faces = []
-    for (i, j), here in index.items():
-        if (i + 1, j) in index and (i, j + 1) in index:
-            faces.append((here, index[i + 1, j], index[i, j + 1]))
-        if (i + 1, j - 1) in index and (i + 1, j) in index:
-            faces.append((here, index[i + 1, j - 1], index[i + 1, j]))
-    s = np.array(weights) @ geometry.v
-    return s / np.linalg.norm(s, axis=1)[:, None], np.array(faces, dtype=np.intp)
+    i, j = np.nonzero(np.add.outer(range(divisions + 1), range(divisions + 1)) <= divisions)
+    number = np.full((divisions + 2, divisions + 2), -1)
+    number[i, j] = np.arange(len(i))
+    upward = number[i, j], number[i + 1, j], number[i, j + 1]
+    downward = number[i, j], np.where(j > 0, number[i + 1, j - 1], -1), number[i + 1, j]
+    faces = np.stack([upward, downward], axis=-1).reshape(3, -1).T
+    s = np.column_stack([i, j, divisions - i - j]) + 0.1
+    s = s @ geometry.v
+    inside = np.asarray(faces[faces.min(axis=1) >= 0], dtype=np.intp)
+    return s / np.linalg.norm(s, axis=1)[:, None], inside
 
 
 @dataclass(frozen=True)
