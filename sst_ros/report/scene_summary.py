@@ -11,7 +11,8 @@ IV.3). The eigenvalues lambda are those of the linearised dynamics.
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
+import itertools
 import math
 import textwrap
 import time
@@ -31,8 +32,6 @@ from sst_ros.integration.compiled_method import CompiledMethod, Method
 from sst_ros.integration.methods import DORMAND_PRINCE, RK4, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.results import WHOLE_RUN_S, render
-from sst_ros.scene.bodies import Link
-from sst_ros.scene.loads import Stroke
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulate_gauss import GAUSS
@@ -55,26 +54,18 @@ def summary(scene: Scene) -> str:
         damping=damping_of(scene.stroke) if scene.stroke.at_end == "elastic" else 0.0,
         limits=len(list(limits_of(scene, geometry))),
         advice=step_advice(scene).text,
-        wrap=_wrap,
-    )
+        wrap=lambda text, first: textwrap.fill(
+            text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first),
+            break_on_hyphens=False,
+        ),
+    )  # fmt: skip
 
 
-def _wrap(text: str, first: str) -> str:
-    """Wrap a text whose first line begins with `first`, the others with as many blanks."""
-    rest = " " * len(first)
-    return textwrap.fill(
-        text, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
-    )
-
-
-TIMED_STEPS, ROUNDS = 2000, 200
-"""Steps of a measurement of the time of an evaluation, and how many: a scene and what it is without
-each term take turns, and each has the time of its fastest turn, which no other process has met."""
-
+LINKS = ("actuated_links", "intermediate_links")
 
 TERMS: dict[str, tuple[str, ...]] = {
-    "actuated links": ("actuated_links",),
-    "intermediate links": ("intermediate_links",),
+    "actuated links": (LINKS[0],),
+    "intermediate links": (LINKS[1],),
     "payload": ("payload",),
     "gravity": ("gravity",),
     "external moment": ("moment",),
@@ -94,7 +85,7 @@ def has(scene: Scene, term: str) -> bool:
     """Return whether a scene has one of TERMS."""
     section, *fields = TERMS[term]
     value: Any = getattr(scene, section)
-    if section in ("actuated_links", "intermediate_links"):
+    if section in LINKS:
         return any(link.inertia for link in value)
     return bool(value and getattr(value, fields[0]) if fields else value)
 
@@ -102,21 +93,11 @@ def has(scene: Scene, term: str) -> bool:
 def without(scene: Scene, term: str) -> Scene:
     """Return a scene without one of TERMS; gravity goes with the last links that it acts on."""
     section, *fields = TERMS[term]
-    value: Any = getattr(scene, section)
-    change: Any = () if section == "springs" else None
-    if section in ("actuated_links", "intermediate_links"):
-        change = (Link(),) * 3
-    elif section == "stroke":
-        change = Stroke(at_end="ignore") if value.stiffness else value
-    elif value is not None and fields:
-        blank = {field.name: field.default for field in dataclasses.fields(value)}
-        if any(getattr(value, name) != blank[name] for name in blank if name not in fields):
-            change = dataclasses.replace(value, **{name: blank[name] for name in fields})
-    changes: dict[str, Any] = {section: change}
-    try:
-        return dataclasses.replace(scene, **changes)
-    except InputError:
-        return dataclasses.replace(scene, **changes, gravity=None)
+    whole: dict[str, Any] = {section: [{}] if section in LINKS else None}
+    for change in ({f"{section}.{name}": None for name in fields} or whole, whole):
+        with contextlib.suppress(InputError):  # nothing is left in the section, or for gravity
+            return scene.with_values(change)
+    return scene.with_values({**whole, "gravity": None})
 
 
 def operations(scene: Scene) -> int:
@@ -139,6 +120,11 @@ def costs(scene: Scene) -> list[Cost]:
     return [Cost(term, total - count, count) for term, count in bare.items()]
 
 
+TIMED_STEPS, ROUNDS = 2000, 200
+"""Steps of a measurement of the time of an evaluation, and how many: a scene and what it is without
+each term take turns, and each has the time of its fastest turn, which no other process has met."""
+
+
 def cost_table(scene: Scene) -> list[dict[str, Any]]:
     """Return operations and times [ns] of an evaluation: the whole, then each term present."""
     found, runs = costs(scene), []
@@ -146,24 +132,22 @@ def cost_table(scene: Scene) -> list[dict[str, Any]]:
         ode, start = ODE(Dynamics.of(one)), [*initial_state(one, Geometry.of(one))]
         start += [0.0] * (len(ode.state) - len(start))
         method = CompiledMethod(ode, RK4, compiled=numba_version() is not None)
-        method.step_fixed(0.0, 1e-7, 1, start, (0.0,) * len(ode.drive))  # compiles
-        runs.append((method, start, (0.0,) * len(ode.drive)))
-    count, rounds = (TIMED_STEPS, ROUNDS) if runs[0][0].compiled else (TIMED_STEPS // 100, 3)
-    times = [math.inf] * len(runs)
-    for _ in range(rounds):
-        for k, (method, start, drive) in enumerate(runs):
-            began = time.perf_counter()
-            method.step_fixed(0.0, 1e-7, count, start, drive)
-            times[k] = min(times[k], time.perf_counter() - began)
-    whole, *bare = (1e9 * took / (len(RK4.b) * count) for took in times)
+        runs.append((method.step_fixed, start, (0.0,) * len(ode.drive)))
+        method.step_fixed(0.0, 1e-7, 1, *runs[-1][1:])  # compiles
+    count, rounds = (TIMED_STEPS, ROUNDS) if method.compiled else (TIMED_STEPS // 100, 3)
+    times = np.full(len(runs), np.inf)
+    for _, (k, (step, start, drive)) in itertools.product(range(rounds), enumerate(runs)):
+        began = time.perf_counter()
+        step(0.0, 1e-7, count, start, drive)
+        times[k] = min(times[k], time.perf_counter() - began)
+    whole, *bare = (1e9 * times / (len(RK4.b) * count)).tolist()
     rows = [("all", operations(scene), whole)]
-    for cost, ns in zip(found, bare, strict=True):
-        # A term that folds into constants leaves the same number of operations, and its time.
-        rows.append((cost.name, cost.adds, whole - ns if cost.adds else 0.0))
-    return [
-        {"scene": scene.name, "term": term, "operations": added, "ns": ns}
-        for term, added, ns in rows
+    # A term that folds into constants leaves the same number of operations, and its time.
+    rows += [
+        (x.name, x.adds, whole - ns if x.adds else 0.0) for x, ns in zip(found, bare, strict=True)
     ]
+    names = ("scene", "term", "operations", "ns")
+    return [dict(zip(names, (scene.name, *row), strict=True)) for row in rows]
 
 
 LONGEST_S = 10.0
@@ -216,11 +200,10 @@ def eigenvalues(
         torque: that acts [N m], shape (3,).
 
     """
-    dynamics = Dynamics.of(scene)
+    ode = _ode(Dynamics.of(scene))
     y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
-    lagged = (0.0,) * (len(dynamics.state) - len(y))
-    drive = (*torque, *(0.0,) * (len(dynamics.drive) - 3))
-    return np.asarray(_ode(dynamics).eigenvalues(0.0, (*y, *lagged), drive), dtype=complex)
+    lagged, moment = (0.0,) * (len(ode.state) - len(y)), (0.0,) * (len(ode.drive) - 3)
+    return np.asarray(ode.eigenvalues(0.0, (*y, *lagged), (*torque, *moment)), dtype=complex)
 
 
 _ode = lru_cache(maxsize=4)(ODE)  # whose Jacobian is traced once

@@ -10,13 +10,13 @@ a hundredth of the tolerance checks, or with a limit or an error that names the 
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
+import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -39,9 +39,8 @@ from sst_ros.report.scene_summary import (
     largest_stable_step,
     step_advice,
 )
-from sst_ros.scene.loads import Initial, JointFriction
-from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section
+from sst_ros.scene.scene import Scene, with_initial
+from sst_ros.scene.schema import key_of, sections_of, specs
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
@@ -99,13 +98,7 @@ class StabilityReport(NamedTuple):
 def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
     """Examine a scene, print the report and write stability.csv, .json, .md and .png into `out`.
 
-    Args:
-        scene: what is examined.
-        out: folder of the files.
-        only: names of rows of ROWS; by default all.
-
-    Returns:
-        Whether no run failed.
+    `only` names rows of ROWS; by default all. Returns whether no run failed.
 
     Raises:
         InputError: a name is unknown, or `out` cannot be written.
@@ -137,14 +130,13 @@ def examine_stability(
     if shown:
         about = max(1.0, 2.0 * (time.perf_counter() - began)) * len(chosen)
         print(f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about {about:.0f} s")
-    rows = []
+    rows: list[dict[str, Any]] = []
     for part in slices(len(chosen), 1, f"{scene.name:<16}", shown):
         name = chosen[part.start]
         what, change = ROWS[name]
         rows.append({"name": name, "change": what} | _run(change(scene, motion), seconds))
-    columns = ("name", "change", "passed", "result", "method", "error", "estimate", "wall_s")
-    runs = data_frame(rows, columns)
-    return StabilityReport(scene.name, _steps(scene, motion), step_advice(scene).text, runs)
+    steps = _steps(scene, motion)
+    return StabilityReport(scene.name, steps, step_advice(scene).text, data_frame(rows))
 
 
 def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
@@ -163,9 +155,9 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
 
 def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
     """Run a scene at two tolerances, and say how it ended: the last columns of a row."""
-    row = {"method": "", "error": math.nan, "estimate": math.nan, "wall_s": 0.0}
+    nothing = {"method": "", "error": math.nan, "estimate": math.nan}
     if isinstance(changed, str):
-        return row | {"passed": None, "result": changed}
+        return {"passed": None, "result": changed, **nothing, "wall_s": 0.0}
     began = time.perf_counter()
     try:
         with np.errstate(all="ignore"):
@@ -174,70 +166,44 @@ def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
                 for tolerance in (TOLERANCE, FINER * TOLERANCE)
             )
     except SstError as fault:
-        reason = f"{type(fault).__name__}: {str(fault).splitlines()[0]}"
-        return row | {"passed": True, "result": reason, "wall_s": time.perf_counter() - began}
+        result, passed = f"{type(fault).__name__}: {str(fault).splitlines()[0]}", True
+    else:
+        at = min(float(run.t[-1]), float(fine.t[-1]))
+        error = float(angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine))))
+        # A run that ends where it starts has no estimate.
+        holds = bool(error <= np.fmax(FACTOR * run.error_estimate, ROUNDING))
+        passed, result = run.status == fine.status and (run.status < 0 or holds), run.message
+        if run.status != fine.status:
+            result += f"; finer: {fine.message}"
+        nothing = {"method": run.method, "error": error, "estimate": run.error_estimate}
     wall = time.perf_counter() - began
-    at = min(float(run.t[-1]), float(fine.t[-1]))
-    error = float(angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine))))
-    # A run that ends where it starts has no estimate.
-    holds = error <= np.fmax(FACTOR * run.error_estimate, ROUNDING)
-    return {
-        "passed": run.status == fine.status and (run.status < 0 or bool(holds)),
-        "result": run.message + (f"; finer: {fine.message}" if run.status != fine.status else ""),
-        "method": run.method,
-        "error": error,
-        "estimate": run.error_estimate,
-        "wall_s": wall,
-    }
+    return {"passed": passed, "result": result, **nothing, "wall_s": wall}
 
 
-Part = TypeVar("Part", bound=Section)
+def _scale(factor: float, keys: str, absent: str) -> Change:
+    """Multiply all numbers of a scene whose key is `keys`, a regular expression."""
 
+    def change(scene: Scene, _: Trajectory) -> Scene | str:
+        found = {
+            key: factor * np.array(getattr(section, name))
+            for place, section in sections_of(scene)
+            for name in specs(type(section))
+            if re.fullmatch(keys, key := key_of((*place, name)))
+            and getattr(section, name) is not None
+        }
+        return scene.with_values(found) if found else f"the scene has no {absent}"
 
-def _scale(part: Part, factor: float, *names: str) -> Part:
-    """Multiply numbers of a section, or the three of each, by a factor; None stays."""
-    changes: dict[str, Any] = {
-        name: factor * value if isinstance(value, float) else tuple(factor * x for x in value)
-        for name in names
-        if (value := getattr(part, name)) is not None
-    }
-    return dataclasses.replace(part, **changes)
-
-
-def _stronger(scene: Scene, _: Trajectory) -> Scene | str:
-    if scene.torque is None:
-        return "the scene has no torques of its own"
-    return dataclasses.replace(scene, torque=_scale(scene.torque, 10.0, "amplitude"))
+    return change
 
 
 def _faster(scene: Scene, motion: Trajectory) -> Scene | str:
+    """Start with ten times the rates, or ten times those that it reaches from rest."""
     rates = np.array(scene.initial.gamma_dot)
-    if not rates.any():  # it starts at rest: ten times the rates that it reaches
+    if not rates.any():
         rates = np.abs(motion.gamma_dot).max(axis=0)
     if not rates.any():
         return "nothing moves"
-    first, second, third = (10.0 * rates).tolist()
-    initial = dataclasses.replace(scene.initial, gamma_dot=(first, second, third))
-    return dataclasses.replace(scene, initial=initial)
-
-
-def _stiffer(scene: Scene, _: Trajectory) -> Scene | str:
-    if not scene.springs and scene.stroke.stiffness is None:
-        return "the scene has no springs and no elastic stops"
-    springs = tuple(_scale(spring, 100.0, "stiffness") for spring in scene.springs)
-    stroke = _scale(scene.stroke, 100.0, "stiffness")
-    return dataclasses.replace(scene, springs=springs, stroke=stroke)
-
-
-def _rougher(scene: Scene, _: Trajectory) -> Scene | str:
-    if scene.friction is None:
-        return "the scene has no friction"
-    joints = {
-        field.name: _scale(one, 100.0, "viscous", "coulomb", "static")
-        for field in dataclasses.fields(JointFriction)
-        if (one := getattr(scene.friction, field.name))
-    }
-    return dataclasses.replace(scene, friction=JointFriction(**joints))
+    return scene.with_values({"initial.gamma_dot": 10.0 * rates})
 
 
 def _at_limit(name: str) -> Change:
@@ -305,21 +271,28 @@ def _measure(geometry: Geometry, rotation: Array) -> workspace.Measures:
 
 def _start(scene: Scene, rotation: Array, rate: Array) -> Scene:
     """Start a scene at an orientation with an angular velocity in {B} [rad/s]."""
-    a, b, c = kinematics.inverse(Geometry.of(scene), rotation)[0].tolist()
-    x, y, z, w = quaternion_of(rotation).tolist()
-    turning = (rotation.T @ rate).tolist()
-    rates = kernel.joints(kernel.model_of(scene), (x, y, z, w, *turning)).gamma_dot
-    p, q, r = (float(each) for each in rates)
-    start = Initial(gamma=(a, b, c), gamma_dot=(p, q, r), orientation=(x, y, z, w))
-    return dataclasses.replace(scene, initial=start)
+    gamma, quaternion = kinematics.inverse(Geometry.of(scene), rotation)[0], quaternion_of(rotation)
+    state = (*quaternion.tolist(), *(rotation.T @ rate).tolist())
+    rates = kernel.joints(kernel.model_of(scene), state).gamma_dot
+    start = {"gamma": gamma, "gamma_dot": np.array(rates), "orientation": quaternion}
+    return with_initial(scene, start)
 
 
 ROWS: dict[str, tuple[str, Change]] = {
     "as-it-is": ("nothing", lambda scene, _: scene),
-    "torque": ("ten times the torque", _stronger),
+    "torque": (
+        "ten times the torque",
+        _scale(10.0, r"torque\.amplitude", "torques of its own"),
+    ),
     "rates": ("ten times the rates at the start", _faster),
-    "stiffness": ("a hundred times the stiffness", _stiffer),
-    "friction": ("a hundred times the friction", _rougher),
+    "stiffness": (
+        "a hundred times the stiffness",
+        _scale(100.0, r".*\.stiffness", "springs and no elastic stops"),
+    ),
+    "friction": (
+        "a hundred times the friction",
+        _scale(100.0, r"friction\..*\.(viscous|coulomb|static)", "friction"),
+    ),
     "stroke": ("from an end of the stroke into it", _at_limit("stroke")),
     "edge": ("from beta = 0 into it", _at_limit("edge")),
     "reach": ("from the largest beta into it", _at_limit("reach")),
@@ -337,34 +310,37 @@ def stability_page(found: StabilityReport) -> str:
 @styled
 def draw_stability(found: StabilityReport) -> Figure:
     """Draw eigenvalues and stable steps along the motion, and how the runs ended."""
-    steps = found.steps
-    runs = found.runs[[passed is not None for passed in found.runs.passed]]
+    runs = found.runs[found.runs.passed.notna()]
     below = 0.36 * max(len(runs), 1) + 0.6
     figure = Figure(figsize=(11.0, 4.6 + below))
     parts: Any = figure.subfigures(2, 1, height_ratios=[4.6, below])
-    above, place = parts
-    left, right = above.subplots(1, 2)
+    left, right = parts[0].subplots(1, 2)
+    times, free = found.steps.t_s, []
     for name, colour, line in (("decay", BLUE, "-"), ("oscillation", VERMILION, "--")):
-        values = steps[name].where(steps[name] > 0.0)
-        left.plot(steps.t_s, values, line, color=colour, linewidth=1.8, label=name)
-    finite = steps[list(METHODS)].where(np.isfinite(steps[list(METHODS)])).dropna(axis=1, how="all")
-    for name in finite:
-        right.plot(steps.t_s, finite[name], color=MARKERS[name][0], linewidth=1.8, label=name)
-    free = [name for name in METHODS if name not in finite]
+        values = found.steps[name].where(found.steps[name] > 0.0)
+        left.plot(times, values, line, color=colour, linewidth=1.8, label=name)
+    for name in METHODS:
+        longest = found.steps[name].where(np.isfinite(found.steps[name]))
+        if longest.isna().all():
+            free.append(name)
+        else:
+            right.plot(times, longest, color=MARKERS[name][0], linewidth=1.8, label=name)
     right.plot([], [], " ", label=f"{', '.join(free)}: every step")
-    labels = "fastest rate of the eigenvalues [1/s]", "longest stable step [s]"
-    for axes, label in zip((left, right), labels, strict=True):
+    for axes, label in (
+        (left, "fastest rate of the eigenvalues [1/s]"),
+        (right, "longest stable step [s]"),
+    ):
         axes.set(yscale="log", xlabel="time t [s]", ylabel=label)
         legend(axes)
     if len(runs):
-        _draw_ends(place.subplots(), runs)
+        _draw_ends(parts[1].subplots(), runs)
     figure.suptitle(f"Stability of {found.scene}", fontsize=12)
     note(figure, provenance(), 185)
     return figure
 
 
 def _draw_ends(axes: Axes, runs: DataFrame) -> None:
-    """Draw error and estimate of each run, with how it ended beside them."""
+    """Draw error (dot) and estimate (bar) of each run, with how it ended beside them."""
     axes.set(xscale="log", xlim=(1e-17, 1e3), ylim=(len(runs) - 0.5, -0.5))
     for place, run in enumerate(runs.itertuples()):
         colour = GREEN if run.passed else VERMILION
