@@ -80,7 +80,8 @@ class InitialValueProblem:
         torque: the sine of the scene, or three zeros [N m].
         system: right-hand side, torques and work included; `drive` are its inputs, all zero.
         start: state at time zero, shape (n,).
-        interval_ns, interval: time between the instants of comparison [ns], [s].
+        interval_ns, interval: time between the instants of comparison, 1, 2 or 5 times a power of
+            ten [ns], [s].
         count: number of intervals.
         times: instants of comparison [s], shape (count + 1,).
         seconds: time span [s].
@@ -100,17 +101,25 @@ class InitialValueProblem:
         self.system = ODE(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)
         self.start = (*initial(scene), 0.0)
-        limit = scene.torque_limit
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
-        self.clamped = limit is not None and largest > limit
+        self.clamped = scene.torque_limit is not None and largest > scene.torque_limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"
-        self.interval_ns, self.count, self.ends = self._horizon()
+        motion = simulate(scene, duration=scene.duration or WHOLE_RUN_S)
+        whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
+        self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
+        if whole * NANOSECONDS < 1000 * INTERVALS:
+            allowed = f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
+            raise InputError(scene.name, [Problem("initial", whole, allowed)])
+        whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)  # may be a little less than it is called
+        lengths = (f * 10**n for n in range(18) for f in (1, 2, 5))
+        self.interval_ns = max(x for x in lengths if x * INTERVALS <= whole_ns)
         self.interval = self.interval_ns / NANOSECONDS
+        self.count = math.floor(whole_ns / self.interval_ns)
         self.times: Array = self.interval_ns * np.arange(self.count + 1) / NANOSECONDS
         self.seconds = float(self.times[-1])
 
     def errors(
-        self, solution: Array | NDArray[np.longdouble], reference: NDArray[np.longdouble]
+        self, solution: Array | LongArray, reference: LongArray
     ) -> tuple[StateError, StateError]:
         """Distances of states (count + 1, n) at the end, and the largest; nan where unknown."""
         angle = angle_between(solution[:, :4], reference[:, :4])
@@ -119,7 +128,7 @@ class InitialValueProblem:
         found = np.stack([angle.astype(float), *legs])
         return StateError(*found[:, -1].tolist()), StateError(*found.max(axis=1).tolist())
 
-    def joints(self, solution: Array | NDArray[np.longdouble]) -> Array:
+    def joints(self, solution: Array | LongArray) -> Array:
         """Nine angles [rad] and nine rates [rad/s] of states, shape (n, 18)."""
         return joint_columns(self.dynamics.model, solution[:, :7].astype(float))
 
@@ -162,19 +171,6 @@ class InitialValueProblem:
             rows.append(tuple(simulation.sample[0]))
         return np.array(rows)
 
-    def _horizon(self) -> tuple[int, int, str]:
-        """Return interval [ns], count of intervals, and why the span ends early."""
-        motion = simulate(self.scene, duration=self.scene.duration or WHOLE_RUN_S)
-        whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
-        ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
-        if whole * NANOSECONDS < 1000 * INTERVALS:
-            allowed = f"the run is over before it can be studied: {ends or f'{whole} s'}"
-            raise InputError(self.scene.name, [Problem("initial", whole, allowed)])
-        interval = 10.0 ** math.floor(math.log10(whole / INTERVALS) + 1e-9)
-        interval *= max(f for f in (1, 2, 5) if f * interval * INTERVALS <= whole * (1 + 1e-9))
-        interval_ns = round(interval * NANOSECONDS)
-        return interval_ns, math.floor(whole * NANOSECONDS * (1 + 1e-9) / interval_ns), ends
-
 
 class ReferenceSolution(NamedTuple):
     """States at the instants of comparison, their own error, and how they were found."""
@@ -196,27 +192,31 @@ def solve_reference(problem: InitialValueProblem, kind: str = EXTENDED) -> Refer
 
     """
     if problem.kinked:
-        rough, fine = (
-            problem.run_simulation(problem.simulation("dop853", tolerance)).astype(np.longdouble)
+        pair: list[Any] = [
+            problem.run_simulation(problem.simulation("dop853", tolerance))
             for tolerance in (1e-13, 1e-14)
-        )
+        ]
         how = "Simulation, dop853, tolerance 1e-14"
-        return ReferenceSolution(fine, _own(problem, rough, fine), how)
-    machine = CompiledMethod(problem.system, DOP853, compiled=numba_version() is not None)
-    best, solution = _finest(problem, machine)
-    solver = ExtendedSolver(problem, kind)
-    began = time.perf_counter()
-    solver.run_steps(3, intervals=1)
-    seconds = (time.perf_counter() - began) / 3 * problem.count
-    steps = (3 * best // 2, 2 * best)
-    if kind != EXTENDED or seconds * sum(steps) < LONGEST_S:
-        rough, fine = map(solver.run_steps, steps)
-        how = f"DOP853, {problem.interval / steps[1]:.3g} s steps, {solver.numbers}"
     else:
-        fine = solution.astype(np.longdouble)
-        rough = problem.run_steps(machine, best // 2).astype(np.longdouble)
-        how = f"DOP853, {problem.interval / best:.3g} s steps, double precision"
-    return ReferenceSolution(fine, _own(problem, rough, fine), how)
+        machine = CompiledMethod(problem.system, DOP853, compiled=numba_version() is not None)
+        best, solution = _finest(problem, machine)
+        solver = ExtendedSolver(problem, kind)
+        began = time.perf_counter()
+        solver.run_steps(3, intervals=1)
+        seconds = (time.perf_counter() - began) / 3 * problem.count
+        steps, numbers = (3 * best // 2, 2 * best), solver.numbers
+        if kind != EXTENDED or seconds * sum(steps) < LONGEST_S:
+            pair = [solver.run_steps(number) for number in steps]
+        else:
+            pair, steps = [problem.run_steps(machine, best // 2), solution], (best // 2, best)
+            numbers = "double precision"
+        how = f"DOP853, {problem.interval / steps[1]:.3g} s steps, {numbers}"
+    # Twice the difference of two solutions, but not less than doubles resolve.
+    rough, fine = (states.astype(np.longdouble) for states in pair)
+    change, joints = problem.errors(rough, fine)[1], np.abs(problem.joints(fine))
+    least = 1e-17, *(2.3e-16 * float(joints[:, i : i + 3].max()) for i in (0, 9))
+    own = StateError(*(max(2.0 * x, floor) for x, floor in zip(change, least, strict=True)))
+    return ReferenceSolution(fine, own, how)
 
 
 def _finest(problem: InitialValueProblem, machine: CompiledMethod) -> tuple[int, Array]:
@@ -235,19 +235,7 @@ def _finest(problem: InitialValueProblem, machine: CompiledMethod) -> tuple[int,
     if not found:
         problems = [Problem("duration", problem.scene.duration, "the reference is not finite")]
         raise InputError(problem.scene.name, problems)
-    _, steps, solution = min(found, key=lambda row: row[0])
-    return steps, solution
-
-
-def _own(problem: InitialValueProblem, rough: LongArray, fine: LongArray) -> StateError:
-    """Return twice the difference of two step sizes, but not less than doubles resolve."""
-    change, joints = problem.errors(rough, fine)[1], np.abs(problem.joints(fine))
-    gamma, rate = (2.3e-16 * float(joints[:, i : i + 3].max()) for i in (0, 9))
-    return StateError(
-        max(2.0 * change.orientation, 1e-17),
-        max(2.0 * change.gamma, gamma),
-        max(2.0 * change.gamma_dot, rate),
-    )
+    return min(found, key=lambda row: row[0])[1:]
 
 
 class ExtendedSolver:
@@ -259,23 +247,22 @@ class ExtendedSolver:
     """
 
     def __init__(self, problem: InitialValueProblem, kind: str) -> None:
-        names = ("sqrt", "sin", "cos", "tanh", "exp")
+        library: Any = np
         if kind == EXTENDED:
             self.numbers = f"{np.finfo(np.longdouble).precision}-digit floats"
-            functions = {each: getattr(np, each) for each in names} | {"atan2": np.arctan2}
-            self._number: Any = np.longdouble
+            self._number, arctan = np.longdouble, "arctan2"
         else:
-            context = require("mpmath").mp.clone()
-            context.dps = DIGITS
+            library = require("mpmath").mp.clone()
+            library.dps = DIGITS
             self.numbers = f"mpmath, {DIGITS} digits"
-            functions = {each: getattr(context, each) for each in (*names, "atan2")}
-            self._number = context.mpf
+            self._number, arctan = library.mpf, "atan2"
         self._problem = problem
         step = explicit_step(EXACT, len(problem.start), len(problem.drive))
         self._code: Any = compiled_module.load(
             [problem.system.program.source("rhs"), step], {}, numba=False
         )
-        vars(self._code).update(functions)
+        for name in ("sqrt", "sin", "cos", "tanh", "exp", "atan2"):
+            vars(self._code)[name] = getattr(library, arctan if name == "atan2" else name)
 
     def run_steps(self, steps: int, intervals: int | None = None) -> LongArray:
         """States at the instants, of the first `intervals` or all, with `steps` steps an interval.
