@@ -116,7 +116,7 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array
         drives = np.repeat(held, TICKS_A_SAMPLE, axis=0)[run]
         starts = np.full((len(start), len(y)), np.nan)
         starts[:1] = y
-        reached = motion.follow(start, start + TICK_NS, drives, starts)[:, 0, :-1]
+        reached = motion.follow((start, start + TICK_NS, drives), starts)[:, 0, :-1]
         state = reached[TICKS_A_SAMPLE - 1 :: TICKS_A_SAMPLE]
         if not rows.start:
             state = np.vstack([y, state])

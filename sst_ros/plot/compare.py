@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.frames import angle_between
-from sst_ros.plot import workspace
-from sst_ros.plot.pictures import DEGREES, Picture, draw_legs, known, save, tick_torques
+from sst_ros.plot import pictures, workspace
+from sst_ros.plot.pictures import DEGREES, Picture, draw_legs, tick_torques
 from sst_ros.plot.style import LINES, hide_zeros, legend, stack, styled
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
@@ -46,16 +46,14 @@ def _difference(runs: Drawn) -> Figure:
     figure, panels = stack(["largest |Δγₖ| [rad]", "largest |Δγ̇ₖ| [rad/s]"], 2.6)
     first = runs[0][0]
     for axes, name in zip(panels, ("gamma", "gamma_dot"), strict=True):
-        some = False
         for run, label, style in runs[1:]:
             here, there = _common(first, run)
             apart = np.abs(run.legs(name)[there] - first.legs(name)[here])
             largest = apart.max(axis=1, initial=0.0)
             axes.plot(run.seconds()[there], hide_zeros(largest), label=label, **style)
-            some |= bool((apart > 0.0).any())
-        if some:
-            axes.set_yscale("log")
-        else:
+            if apart.any():
+                axes.set_yscale("log")
+        if axes.get_yscale() == "linear":
             axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center")
     legend(panels[0])
     return figure
@@ -66,7 +64,7 @@ def _sphere(runs: Drawn) -> Figure:
     assert scene is not None
     figure, axes, view = workspace.ground(scene)
     for run, label, style in runs:
-        axes.plot(*view.flat(workspace.directions(run)), label=label, **style)
+        axes.plot(*view.flat(pictures.directions(run)), label=label, **style)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
     return figure
 
@@ -88,7 +86,7 @@ PICTURES = {
 def draw_comparison(
     runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of several runs into `out`, as `pictures.draw` does of one.
+    """Write the pictures of several runs into `out`, as `pictures.draw_run` does of one.
 
     Raises:
         InputError: there are too many runs, a name is unknown, or `out` cannot be written.
@@ -99,7 +97,7 @@ def draw_comparison(
         raise InputError("plot", [Problem("compare", len(runs), allowed)])
     paths: list[Path] = []
     missing: dict[str, str] = {}
-    for name in known(only, PICTURES):
+    for name in pictures.known(only, PICTURES):
         title, needs, make = PICTURES[name]
         all_runs = list(zip(runs, labels(runs), LINES, strict=False))
         drawn = [each for each in all_runs if not set(needs) & set(each[0].missing)]
@@ -107,7 +105,7 @@ def draw_comparison(
             missing[name] = f"without {', '.join(left)}: no {' or '.join(needs)} there"
         paired = len(drawn) > 1 and drawn[0][0] is runs[0]
         if paired or (drawn and name != "difference"):
-            paths += save(make(drawn), title, out, f"compare_{name}")
+            paths += pictures.save(make(drawn), title, out, f"compare_{name}")
         else:
             missing[name] = f"not drawn: {missing[name]}"
     return paths, missing
@@ -125,7 +123,7 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
     """
     from pandas import DataFrame, Series
 
-    first, names = runs[0], labels(runs)
+    first = runs[0]
     rows: list[dict[str, float]] = []
     for run in runs[1:]:
         here, there = _common(first, run)
@@ -140,10 +138,10 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
             row[f"{name} rms [{unit}]"] = (apart**2).mean() ** 0.5
         turn = Series(dtype=float)
         if TURN not in absent:
-            q = ("q_x", "q_y", "q_z", "q_w")
-            turn = Series(angle_between(first.take(*q)[here], run.take(*q)[there]))
+            one, other = (each.take(*pictures.QUATERNION) for each in (first, run))
+            turn = Series(angle_between(one[here], other[there]))
         rows.append(row | {"turn max [rad]": turn.max()})
-    return DataFrame(rows, index=names[1:])
+    return DataFrame(rows, index=labels(runs)[1:])
 
 
 def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -166,9 +164,9 @@ def labels(runs: Sequence[Signals]) -> list[str]:
 
 def difference_text(runs: Sequence[Signals]) -> str:
     """Write the differences as text."""
-    found = differences(runs)
-    shown = found.drop(columns=["samples", "of"])
-    shown.insert(0, "samples", [f"{row.samples:.0f} of {row.of:.0f}" for row in found.itertuples()])
+    shown = differences(runs)
+    counts = shown.pop("samples").astype(str) + " of " + shown.pop("of").astype(str)
+    shown.insert(0, "samples", counts)
     return (
         f"Differences from {labels(runs)[0]}, at samples that both have at the same time since "
         "the start of each run\n(whole nanoseconds, nothing interpolated):\n\n"

@@ -9,28 +9,16 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.interpolate import CubicHermiteSpline
 
+from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import write_into
+from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot import motion, workspace
-from sst_ros.plot.motion import Solution
-from sst_ros.plot.style import (
-    BLUE,
-    GREY,
-    VERMILION,
-    envelope,
-    few,
-    leg_names,
-    legend,
-    lines,
-    mark_ends,
-    save_figure,
-    scale_down,
-    span,
-    stack,
-    styled,
-)
+from sst_ros.mechanism.rates import body_rates
+from sst_ros.plot import motion, style, workspace
+from sst_ros.plot.style import BLUE, GREY, VERMILION, few, leg_names, lines, stack
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 from sst_ros.scene.scene import Scene
@@ -41,6 +29,7 @@ FORMATS = ("pdf", "png")
 DEGREES = float(np.degrees(1.0))
 """Angles are drawn in degrees, their errors in radians."""
 
+QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
 
 
@@ -80,35 +69,39 @@ def draw_legs(label: str, series: Sequence[tuple[str, Array, Array, Mapping[str,
     """Draw series of a name, times [s] (n,), values (n, 3) and a style: a panel for each leg."""
     letter, _, unit = label.partition(" ")
     figure, panels = stack([f"{name} {unit}" for name in leg_names(letter)])
-    for name, seconds, values, style in series:
+    for name, seconds, values, looks in series:
         for axes, column in zip(panels, values.T, strict=True):
-            axes.plot(seconds, column, label=name, **style)
-    legend(panels[0])
-    span(panels, np.concatenate([seconds for _, seconds, _, _ in series]))
+            axes.plot(seconds, column, label=name, **looks)
+    style.legend(panels[0])
+    style.span(panels, np.concatenate([seconds for _, seconds, _, _ in series]))
     return figure
 
 
-def solution(run: Signals) -> Solution:
-    """Return the recorded motion of the star."""
-    quaternion = run.take("q_x", "q_y", "q_z", "q_w")
-    euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else None
-    both = quaternion.T if euler is None else [*quaternion.T, *euler.T]
-    rows = envelope(both, len(quaternion))
-    shown = None if euler is None else euler[rows]
-    return Solution("run", run.seconds()[rows], quaternion[rows], shown)
+def _star(draw: Callable[[Scene, list[motion.Solution]], Figure]) -> Callable[..., Figure]:
+    """Return what draws the recorded motion of the star by a figure of `motion`."""
+
+    def make(run: Signals, scene: Scene) -> Figure:
+        quaternion = run.take(*QUATERNION)
+        euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else None
+        both = quaternion.T if euler is None else [*quaternion.T, *euler.T]
+        rows = style.envelope(both, len(quaternion))
+        shown = None if euler is None else euler[rows]
+        return draw(scene, [motion.Solution("run", run.seconds()[rows], quaternion[rows], shown)])
+
+    return make
 
 
 def _tracking(run: Signals, _: Scene) -> Figure:
     """Draw the desired angle of each actuator, and the measured one over it."""
-    desired, measured = (DEGREES * run.legs(name) for name in ("gamma_desired", "gamma"))
-    looks = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
-    return draw_legs(
-        "γ [deg]",
-        [
-            ("desired", run.seconds(), desired, {"color": GREY, "linewidth": 3.2}),
-            ("measured", run.seconds(), measured, looks),
-        ],
-    )
+    shown = {
+        "desired": ("gamma_desired", {"color": GREY, "linewidth": 3.2}),
+        "measured": ("gamma", {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}),
+    }
+    series = [
+        (name, run.seconds(), DEGREES * run.legs(quantity), looks)
+        for name, (quantity, looks) in shown.items()
+    ]
+    return draw_legs("γ [deg]", series)
 
 
 def _torques(run: Signals, _: Scene) -> Figure:
@@ -128,17 +121,58 @@ def _torques(run: Signals, _: Scene) -> Figure:
     return draw_legs("τ [N m]", series)
 
 
+def _ticks(run: Signals) -> tuple[Any, Any, Array]:
+    """Begin and end of each tick [ns], shape (m,), and its torques [N m], (m, 3)."""
+    start = run.time_ns("ticks")
+    length = run.take("length", table="ticks")[:, 0].astype(np.int64)
+    return start, start + length, run.legs("tau", "ticks")
+
+
 def tick_torques(run: Signals) -> tuple[Array, Array]:
     """Return times [s] and torques [N m], shape (m, 3), that draw what each tick held.
 
     A gap between ticks is nan.
     """
-    start = run.time_ns("ticks")
-    end = start + run.take("length", table="ticks")[:, 0].astype(np.int64)
+    start, end, torque = _ticks(run)
     seconds = np.stack([start, end], axis=1).ravel() / NANOSECONDS
-    torques = np.repeat(run.legs("tau", "ticks"), 2, axis=0)
+    torques = np.repeat(torque, 2, axis=0)
     gaps = 2 * (np.flatnonzero(start[1:] != end[:-1]) + 1)
     return few(np.insert(seconds, gaps, seconds[gaps]), np.insert(torques, gaps, np.nan, axis=0))
+
+
+def energies(run: Signals, scene: Scene) -> tuple[Array, Array]:
+    """Kinetic and potential energy at each sample [J], shape (n,); nan where it was lost."""
+    quaternion = run.take(*QUATERNION)
+    rates = [run.legs(name) for name in ("gamma_dot", "mu_dot", "beta_dot")]
+    known = np.isfinite(np.concatenate([quaternion, *rates], axis=1)).all(axis=1)
+    turned = body_rates(Geometry.of(scene), quaternion[known], *(rate[known] for rate in rates))
+    model, state = model_of(scene), (*quaternion[known].T, *turned.T)
+    result = np.full((2, len(known)), np.nan)
+    result[0, known] = kinetic_energy(model, state)
+    result[1, known] = potential_energy(model, state)
+    return result[0], result[1]
+
+
+def work(run: Signals) -> Array:
+    """Work of each actuator from the first sample to each [J], shape (n, 3).
+
+    A torque that is held over a tick does work by the angle of that tick. Angles at the ends of
+    ticks between samples are those of the cubic through angles and rates of both; where ticks are
+    lost the work is nan from there on.
+    """
+    time, gamma, rate = run.time_ns("samples"), run.legs("gamma"), run.legs("gamma_dot")
+    start, end, torque = _ticks(run)
+    known = np.isfinite(gamma).all(axis=1) & np.isfinite(rate).all(axis=1)
+    if np.count_nonzero(known) < 2:
+        return np.full(gamma.shape, np.nan)
+    angles = CubicHermiteSpline(time[known] / NANOSECONDS, gamma[known], rate[known])
+    steps = torque * (angles(end / NANOSECONDS) - angles(start / NANOSECONDS))
+    steps[1:][start[1:] != end[:-1]] = np.nan
+    steps[start < time[0]] = 0.0
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    done = np.searchsorted(end, time, side="right")
+    whole = (time == time[0]) | np.isin(time, end)
+    return np.asarray(np.where(whole[:, None], total[done], np.nan))
 
 
 def _energy(run: Signals, scene: Scene) -> Figure:
@@ -146,12 +180,12 @@ def _energy(run: Signals, scene: Scene) -> Figure:
 
     The difference is what friction, loads from outside and the integrator took or gave.
     """
-    kinetic, potential = motion.energies(run, scene)
-    done = motion.work(run).sum(axis=1)
-    known = np.flatnonzero(np.isfinite(kinetic))[:1]
-    raised = potential - (potential[known[0]] if len(known) else 0.0)
-    gained = kinetic - (kinetic[known[0]] if len(known) else 0.0) + raised
-    residual, unit = scale_down(gained - done)
+    kinetic, potential = energies(run, scene)
+    first = np.flatnonzero(np.isfinite(kinetic))[:1]
+    raised = potential - potential[first].sum()
+    done = work(run).sum(axis=1)
+    gained = kinetic - kinetic[first].sum() + raised
+    residual, unit = style.scale_down(gained - done)
     shown = {"kinetic": kinetic, "potential, gained": raised, "work of the actuators": done}
     if not np.nanmax(np.abs(raised), initial=0.0):
         del shown["potential, gained"]  # no gravity, no springs
@@ -168,7 +202,7 @@ def _phase(run: Signals, _: Scene) -> Figure:
     angle, rate = DEGREES * run.legs("gamma"), run.legs("gamma_dot")
     for leg, axes in enumerate(figure.subplots(1, 3)):
         axes.plot(angle[:, leg], rate[:, leg], color=BLUE, linewidth=1.4)
-        mark_ends(axes, angle[:, leg], rate[:, leg])
+        style.mark_ends(axes, angle[:, leg], rate[:, leg])
         axes.set_xlabel(f"{leg_names('γ')[leg]} [deg]")
         axes.set_ylabel(f"{leg_names('γ̇')[leg]} [rad/s]")
     figure.axes[-1].legend(loc="best", fontsize=8)
@@ -184,6 +218,21 @@ def _margins(run: Signals, scene: Scene) -> Figure:
         left = np.minimum(run.legs(name), limit - run.legs(name))
         lines(axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)])
         axes.axhline(0.0, color="black", linewidth=0.8)
+    return figure
+
+
+def directions(run: Signals) -> Array:
+    """Direction of E in {B} at each sample, shape (n, 3)."""
+    return rotation_matrix(run.take(*QUATERNION))[:, :, 2]
+
+
+def _sphere(run: Signals, scene: Scene) -> Figure:
+    """Draw the path of E over how far the best turn of the star keeps from every limit."""
+    figure, axes, view = workspace.ground(scene)
+    x, y = view.flat(directions(run))
+    axes.plot(x, y, color=BLUE, linewidth=1.8, label="path of E")
+    style.mark_ends(axes, x, y)
+    axes.legend(loc="upper left", fontsize=8, frameon=False)
     return figure
 
 
@@ -203,29 +252,18 @@ _POWER = curves(
     ("power τₖ γ̇ₖ [W]", ACTUATORS, _power),
     ("all three [W]", ["sum"], lambda run: _power(run).sum(axis=1)[:, None]),
 )
-_WORK = curves(("work [J]", ACTUATORS, motion.work), height=3.2)
 KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
 _JOINT_ANGLES = curves(*(legs(f"{k} [deg]", name, k, DEGREES) for name, k in KINDS.items()))
 _JOINT_RATES = curves(*(legs(f"{k}̇ [rad/s]", f"{name}_dot", f"{k}̇") for name, k in KINDS.items()))
 JOINTS, ORIENTATION, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
 ERROR, REFERENCE = "tracking_error", "reference"
+_WORK = curves(("work [J]", ACTUATORS, work), height=3.2)
 PICTURES = {
-    "path_of_E": Picture(
-        "Path of point E", (ORIENTATION, S), lambda run, scene: motion.path(scene, [solution(run)])
-    ),
-    "position_of_E": Picture(
-        "Position of point E",
-        (ORIENTATION, S),
-        lambda run, scene: motion.position_of_e(scene, [solution(run)]),
-    ),
-    **{
-        name: Picture(
-            f"The angle {letter}",
-            (ORIENTATION,),
-            lambda run, _, which=which: motion.angle([solution(run)], which),
-        )
-        for which, (name, letter) in enumerate({"theta": "θ", "phi": "φ", "psi": "ψ"}.items())
-    },
+    "path_of_E": Picture("Path of point E", (ORIENTATION, S), _star(motion.path)),
+    "position_of_E": Picture("Position of point E", (ORIENTATION, S), _star(motion.position_of_e)),
+    "theta": Picture("The angle θ", (ORIENTATION,), _star(lambda _, star: motion.angle(star, 0))),
+    "phi": Picture("The angle φ", (ORIENTATION,), _star(lambda _, star: motion.angle(star, 1))),
+    "psi": Picture("The angle ψ", (ORIENTATION,), _star(lambda _, star: motion.angle(star, 2))),
     "tracking": Picture("Desired and measured angles", (JOINTS, REFERENCE), _tracking),
     "tracking_error": Picture("Tracking error", (ERROR,), _TRACKING_ERROR),
     "control_torques": Picture("Torques of the controller", (REFERENCE, ERROR), _CONTROL_TORQUES),
@@ -237,11 +275,11 @@ PICTURES = {
     "joint_rates": Picture("Joint rates", (JOINTS,), _JOINT_RATES),
     "phase": Picture("Phase portraits of the actuators", (JOINTS,), _phase),
     "margins": Picture("Distance to the limits", (JOINTS, S), _margins),
-    "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), workspace.sphere),
+    "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), _sphere),
 }
 
 
-@styled
+@style.styled
 def draw_run(
     run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
 ) -> tuple[list[Path], dict[str, str]]:
@@ -276,26 +314,16 @@ def draw_run(
 def save(
     figure: Figure, title: str, out: Path, stem: str, formats: Sequence[str] = FORMATS
 ) -> list[Path]:
-    """Write a figure under a title, as PDF and PNG if `formats` names no others.
-
-    Raises:
-        InputError: `out` cannot be written.
-
-    """
+    """Write a figure under a title; raises InputError where `out` cannot be written."""
     figure.suptitle(title, fontsize=11)
     paths = [out / f"{stem}.{form}" for form in formats]
     with write_into(out, "plot"):
-        save_figure(figure, *paths)
+        style.save_figure(figure, *paths)
     return paths
 
 
 def known(only: Sequence[str], names: Iterable[str]) -> list[str]:
-    """Return the names that are asked for, all where none is.
-
-    Raises:
-        InputError: one of them is none of `names`.
-
-    """
+    """Return the names that are asked for, all where none is; raises InputError for another."""
     allowed = "must be one of " + ", ".join(names)
     problems = [Problem("only", name, allowed) for name in only if name not in names]
     if problems:

@@ -100,12 +100,6 @@ def save_figure(figure: Figure, *paths: Path) -> None:
         path.write_bytes(drawn.getvalue())
 
 
-def free_figure(width: float, height: float) -> Figure:
-    """Make a figure [inch] whose panels are placed by hand."""
-    with mpl.rc_context({"figure.constrained_layout.use": False}):
-        return Figure(figsize=(width, height))
-
-
 def leg_names(letter: str) -> list[str]:
     """Name a quantity of each leg, as in γ₁, γ₂, γ₃."""
     return [f"{letter}{subscript}" for subscript in "₁₂₃"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The workspace on the sphere: maps, a row of three for each manipulator, and the path of a run.
+"""The workspace on the sphere: maps, a row of three for each manipulator; ground for a path of E.
 
 The sphere is seen from outside along the middle of the base triangle, in the equal-area
 projection of Lambert, so that equal patches are equal solid angles.
@@ -21,11 +21,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_ros.mechanism import workspace
-from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
-from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
-from sst_ros.recording.recording import Signals
+from sst_ros.plot.style import BLUE, GREY, INK, Looks, sides, styled
 from sst_ros.scene.scene import Scene
 
 WORST_COND = 10.0
@@ -191,16 +189,6 @@ LEVELS = (5, 10, 20, 30)
 _DIVISIONS, _TURNS = 40, 72
 
 
-def sphere(run: Signals, scene: Scene) -> Figure:
-    """Draw the path of E over how far the best turn of the star keeps from every limit."""
-    figure, axes, view = ground(scene)
-    x, y = view.flat(directions(run))
-    axes.plot(x, y, color=BLUE, linewidth=1.8, label="path of E")
-    mark_ends(axes, x, y)
-    axes.legend(loc="upper left", fontsize=8, frameon=False)
-    return figure
-
-
 def ground(scene: Scene) -> tuple[Figure, Axes, View]:
     """Draw the base triangle, where E cannot be, and lines of equal distance to the limits."""
     geometry = Geometry.of(scene)
@@ -223,11 +211,6 @@ def ground(scene: Scene) -> tuple[Figure, Axes, View]:
         axes.plot([], [], color=GREY, linewidth=0.7, label="distance to the nearest limit")
     draw_triangle(axes, view)
     return figure, axes, view
-
-
-def directions(run: Signals) -> Array:
-    """Direction of E in {B} at each sample, shape (n, 3)."""
-    return rotation_matrix(run.take("q_x", "q_y", "q_z", "q_w"))[:, :, 2]
 
 
 @lru_cache(maxsize=4)

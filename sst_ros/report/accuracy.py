@@ -16,24 +16,11 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.plot.style import INK, MARKERS, Looks, legend, note, styled
+from sst_ros.report import work_precision as study_of
 from sst_ros.report.reference_solution import EXTENDED
-from sst_ros.report.results import (
-    data_frame,
-    markdown,
-    provenance,
-    publish,
-    records,
-    render,
-)
+from sst_ros.report.results import data_frame, markdown, provenance, publish, records, render
 from sst_ros.report.scene_summary import cost_table
-from sst_ros.report.work_precision import (
-    ABOVE_REFERENCE,
-    ERROR,
-    FIXED,
-    TOLERANCE,
-    WorkPrecision,
-    work_precision,
-)
+from sst_ros.report.work_precision import ERROR, WorkPrecision
 from sst_ros.scene import scene
 
 if TYPE_CHECKING:
@@ -57,7 +44,7 @@ def write_accuracy_report(
     studies: list[WorkPrecision] = []
     terms: list[dict[str, Any]] = []
     for each in [scene.load(name) for name in names]:
-        study = work_precision(each, kind=kind, shown=True)
+        study = study_of.work_precision(each, kind=kind, shown=True)
         studies.append(study)
         terms += cost_table(each)
         print(accuracy_text(study), flush=True)
@@ -131,7 +118,7 @@ def fastest(study: WorkPrecision, target: float = TARGET) -> str:
 
 def setting(row: Series[Any]) -> str:
     """Return method and setting in words."""
-    if row.kind == TOLERANCE:
+    if row.kind == study_of.TOLERANCE:
         return f"{row.method}, tolerance {row.setting:.0e}"
     return f"{row.method}, {1e3 * row.setting:.4g} ms steps"
 
@@ -196,7 +183,7 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
     figure = Figure(figsize=(11.0, 6.4))
     body: Any = figure.subfigures()
     panels = body.subplots(1, 2, sharex=True)
-    rate = ABOVE_REFERENCE * study.reference.own.gamma_dot
+    rate = study_of.ABOVE_REFERENCE * study.reference.own.gamma_dot
     for axes, quantity, least, label in (
         (panels[0], ERROR, floor, "largest error of the orientation [rad]"),
         (panels[1], "largest_gamma_dot_rad_per_s", rate, "largest error of γ̇ [rad/s]"),
@@ -239,7 +226,7 @@ def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None
     drawn = rows[(rows[quantity] >= floor) & (rows[quantity] > 0.0) & (rows.wall_min_s > 0.0)]
     for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
         colour, marker = MARKERS[name]
-        face, line = (colour, "-") if kind == FIXED else ("white", "--")
+        face, line = (colour, "-") if kind == study_of.FIXED else ("white", "--")
         looks: Looks = {"marker": marker, "linestyle": line, "markerfacecolor": face, "zorder": 3}
         x, y = 1e3 * group.wall_min_s, group[quantity]
         axes.plot(x, y, color=colour, markersize=6.5, linewidth=1.5, **looks)

@@ -15,7 +15,7 @@ mechanism of the paper: loads that a scene may have beside it are left out on bo
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
@@ -40,6 +40,10 @@ from sst_ros.state import NANOSECONDS
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+Held: TypeAlias = tuple[Integers, Integers, Array]
+"""Ticks: when each begins and ends, from the start of the run on [ns], shape (m,), and what is held
+over it: torques, and a moment on the star in {B} where the scene takes one [N m], (m, 3 or 6)."""
 
 LONGEST_TICK_NS = 1_000_000
 """Longer ticks are divided [ns]."""
@@ -70,14 +74,11 @@ class TickPropagator(Propagator):
             budget=EvaluationBudget(TICK_BUDGET), limits=False,
         )  # fmt: skip
 
-    def follow(self, start_ns: Integers, end_ns: Integers, drives: Array, starts: Array) -> Array:
+    def follow(self, ticks: Held, starts: Array) -> Array:
         """Propagate through m ticks.
 
         Args:
-            start_ns: begin of each tick, relative to the start of the run [ns], shape (m,).
-            end_ns: its end [ns], shape (m,).
-            drives: held over a tick: torques, and a moment on the star in {B} where the scene takes
-                one [N m], shape (m, 3 or 6).
+            ticks: m of them.
             starts: states (quaternion, body rate, lagged torques) at which ticks begin, shape
                 (m, 7 or 10); NaN where a tick goes on from the one before, and before the first.
 
@@ -86,6 +87,7 @@ class TickPropagator(Propagator):
             [J], shape (m, 2, 8 or 11); NaN from a tick that no step resolves to the next start.
 
         """
+        start_ns, end_ns, drives = ticks
         parts = np.maximum(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
         first = np.cumsum(parts) - parts
         length = np.repeat((end_ns - start_ns) / NANOSECONDS / parts, parts)
@@ -127,18 +129,18 @@ def takes_moment(scene: Scene) -> bool:
     return scene.moment is not None and scene.moment.topic
 
 
-def drives_of(recording: Recording) -> Array:
-    """Torques of the recorded ticks, and their moments where they come from a topic [N m]."""
-    torque, moment = recording.ticks.torque, recording.ticks.moment
-    if moment is None or not takes_moment(recording.scene):
-        return torque
-    return np.hstack([torque, moment])
+def held_torques(recording: Recording) -> Held | None:
+    """Return the recorded ticks; None where the moment came from a topic and is not recorded."""
+    ticks, drives = recording.ticks, recording.ticks.torque
+    if takes_moment(recording.scene):
+        if ticks.moment is None:
+            return None
+        drives = np.hstack([drives, ticks.moment])
+    return ticks.start_ns, ticks.end_ns, drives
 
 
 def initial(scene: Scene) -> tuple[float, ...]:
-    """State at t = 0, seven numbers (quaternion, W in {E} [rad/s]), by the paper's kinematics.
-
-    Actuators that lag add three: they give no torque yet.
+    """State at t = 0 by the paper's kinematics: quaternion, W in {E} [rad/s], lagged torques.
 
     Raises:
         AssemblyError: the initial gamma has no unique admissible assembly.
@@ -262,51 +264,37 @@ def integration(recording: Recording) -> Comparison:
     """Compare with the exact motion under the recorded torques: the error of the integrator.
 
     A sample from which the reference restarts is not compared, and neither are samples between
-    lost torques and the next restart.
-
-    Raises:
-        AssemblyError: the scene's initial gamma has no unique admissible assembly.
-
+    lost torques and the next restart. Raises what `initial` does.
     """
-    ticks = recording.ticks
-    if takes_moment(recording.scene) and ticks.moment is None:
+    held = held_torques(recording)
+    if held is None:
         reason = "the moment on the star came from a topic and is not recorded: nothing is compared"
         nothing = _frame(np.full((len(recording.time_ns), 3), np.nan))
         return Comparison(nothing, nothing, reasons=(reason,))
-    held = ticks.start_ns, ticks.end_ns, drives_of(recording)
-    return _compare(recording, None, *held, known=begins(recording))
+    return _compare(recording, None, held, known=begins(recording))
 
 
 def ideal(recording: Recording) -> Comparison | None:
     """Compare with the motion under continuous torques: the effect of hold and transport.
 
     None where the scene has no torques, its moment comes from a topic, or the recording lacks the
-    start of the run.
-
-    Raises:
-        AssemblyError: the scene's initial gamma has no unique admissible assembly.
-
+    start of the run. Raises what `initial` does.
     """
     torque, time = recording.scene.torque, recording.time_ns
     if torque is None or takes_moment(recording.scene) or not begins(recording):
         return None
-    return _compare(recording, torque, time[:-1], time[1:], np.empty((len(time) - 1, 0)))
+    return _compare(recording, torque, (time[:-1], time[1:], np.empty((len(time) - 1, 0))))
 
 
 def _compare(
-    recording: Recording,
-    torque: SineTorque | None,
-    start_ns: Integers,
-    end_ns: Integers,
-    drives: Array,
-    *,
-    known: bool = True,
+    recording: Recording, torque: SineTorque | None, held: Held, *, known: bool = True
 ) -> Comparison:
     """Propagate a run with a second solution, and compare both at its samples.
 
-    Arguments are those of `TickPropagator`. The state at time zero is `known` or not. Under
-    recorded torques, which may have gaps, the reference begins again at a sample after each.
+    The state at time zero is `known` or not. Under recorded torques, which may have gaps, the
+    reference begins again at a sample after each.
     """
+    start_ns, end_ns, drives = held
     compiled = len(recording.ticks.start_ns) > COMPILED_FROM
     motion = TickPropagator(recording.scene, torque, compiled=compiled)
     tick_ns, count, reasons, restarts = recording.ticks.period_ns, len(start_ns), [], []
@@ -347,7 +335,7 @@ def _compare(
         some = slice(first, min(first + CHUNK, end))
         starts = np.full((some.stop - first, len(start)), np.nan)
         starts[0] = start
-        reached = motion.follow(start_ns[some], end_ns[some], drives[some], starts)[..., :-1]
+        reached = motion.follow((start_ns[some], end_ns[some], drives[some]), starts)[..., :-1]
         done = int(np.isfinite(reached[:, 0, 0]).sum())
         rows = places(recording.time_ns, end_ns[some][:done])
         note(rows[rows >= 0], reached[:done][rows >= 0])
@@ -362,8 +350,7 @@ def _compare(
 
 
 def _frame(distances: Array) -> DataFrame:
-    found: DataFrame = require("pandas").DataFrame(distances, columns=[*QUANTITIES])
-    return found
+    return cast("DataFrame", require("pandas").DataFrame(distances, columns=[*QUANTITIES]))
 
 
 def _outputs(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
@@ -390,15 +377,14 @@ def energy_residual(recording: Recording) -> tuple[Array, str]:
         the balance goes on without them. And the reason why it ends or is not there, "" if neither.
 
     """
-    count, ticks, reason = len(recording.time_ns), recording.ticks, ""
+    count, held, reason = len(recording.time_ns), held_torques(recording), ""
     stored, work = np.full((2, count), np.nan)
-    if takes_moment(recording.scene) and ticks.moment is None:
+    if held is None:
         return stored, "the moment on the star is not recorded: no energy residual"
-    many = len(ticks.start_ns) > COMPILED_FROM
+    many = len(held[0]) > COMPILED_FROM
     motion = TickPropagator(recording.scene, None, compiled=many)
-    held = ticks.start_ns, ticks.end_ns, drives_of(recording)
     if many and not motion.compiled:
-        count = int(np.searchsorted(recording.time_ns, ticks.end_ns[PLAIN_TICKS - 1])) + 1
+        count = int(np.searchsorted(recording.time_ns, held[1][PLAIN_TICKS - 1])) + 1
         until = recording.seconds[count - 1]
         reason = f"energy after {until:g} s: there is no numba to balance it"
     model = motion.dynamics.model
@@ -414,9 +400,7 @@ def energy_residual(recording: Recording) -> tuple[Array, str]:
     return np.where(np.isfinite(stored), np.cumsum(change), np.nan), reason
 
 
-def _work(
-    motion: TickPropagator, held: tuple[Integers, Integers, Array], state: Array, time: Integers
-) -> Array:
+def _work(motion: TickPropagator, held: Held, state: Array, time: Integers) -> Array:
     """Work from each of n samples to the next [J], shape (n - 1,); nan where something is lost."""
     some = slice(*np.searchsorted(held[0], time[[0, -1]]).tolist())
     start_ns, end_ns = held[0][some], held[1][some]
@@ -429,5 +413,5 @@ def _work(
         return np.full(len(whole), np.nan)
     starts = np.full((len(start_ns), state.shape[1]), np.nan)
     starts[first[whole]] = state[:-1][whole]
-    reached = motion.follow(start_ns, end_ns, held[2][some], starts)[:, 0, -1]
+    reached = motion.follow((start_ns, end_ns, held[2][some]), starts)[:, 0, -1]
     return np.where(whole, reached[last], np.nan)

@@ -18,7 +18,7 @@ from matplotlib import image
 
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
-from sst_ros.plot import compare, motion, pictures, style
+from sst_ros.plot import compare, pictures, style
 from sst_ros.plot.compare import differences, draw_comparison
 from sst_ros.plot.pictures import PICTURES, draw_run
 from sst_ros.recording import recording
@@ -97,7 +97,7 @@ def test_tracking_shows_what_was_desired_and_what_was_measured(drawn, run):
 
 def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
     """The states of the bag are exact; the cubic between 2 ms samples errs by h^4."""
-    kinetic, potential = motion.energies(run, run.scene)
+    kinetic, potential = pictures.energies(run, run.scene)
     simulation = Simulation(run.scene)
     zero = (0.0, 0.0, 0.0)
     for tick in range(300):
@@ -108,16 +108,16 @@ def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
             parts = simulation.dynamics.energies(*state.quaternion, *state.body_rate, *zero)
             assert kinetic[sample] == pytest.approx(parts[0], rel=1e-12)
             assert potential[sample] == parts[1] == 0.0
-    left = kinetic - kinetic[0] - motion.work(run).sum(axis=1)
+    left = kinetic - kinetic[0] - pictures.work(run).sum(axis=1)
     assert np.abs(left).max() < 1e-9 * kinetic.max()
-    assert motion.work(run)[0].tolist() == [0.0, 0.0, 0.0]
+    assert pictures.work(run)[0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
     loaded = scene.load("friction")
     run = read_signals(bags.write(tmp_path / "bag", bags.simulated(loaded, 0.1)))
-    kinetic, potential = motion.energies(run, loaded)
-    left = kinetic + potential - kinetic[0] - potential[0] - motion.work(run).sum(axis=1)
+    kinetic, potential = pictures.energies(run, loaded)
+    left = kinetic + potential - kinetic[0] - potential[0] - pictures.work(run).sum(axis=1)
     assert left[-1] < -1e-3 * kinetic.max()
     assert (np.diff(left) < 1e-9).all()
 
@@ -125,7 +125,7 @@ def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
 def test_work_is_not_known_beyond_a_lost_torque(tmp_path, bags, example2):
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.APPLIED, 80)]
     run = read_signals(bags.write(tmp_path / "bag", kept))
-    known = np.isfinite(motion.work(run)).all(axis=1)
+    known = np.isfinite(pictures.work(run)).all(axis=1)
     assert known[:80].all() and not known[80:].any()
 
 
@@ -134,7 +134,7 @@ def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.ORIENTATION, 60)]
     bag = bags.write(tmp_path / "bag", kept)
     run = read_signals(bag)
-    assert np.flatnonzero(np.isnan(motion.energies(run, run.scene)[0])).tolist() == [60]
+    assert np.flatnonzero(np.isnan(pictures.energies(run, run.scene)[0])).tolist() == [60]
     left = reference.energy_residual(recording.read(bag))[0]
     assert np.flatnonzero(np.isnan(left)).tolist() == [60]
     assert np.nanmax(np.abs(left)) < 1e-9
