@@ -116,7 +116,6 @@ def _over_time(
     style.legend(above)
     below.set_yscale("log")
     below.legend(fontsize=8, loc="best", title="largest difference", title_fontsize=8)
-    style.span([above, below], first.seconds)
     return figure
 
 

@@ -18,7 +18,7 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot import motion, style, workspace
-from sst_ros.plot.style import BLUE, GREY, VERMILION, few, leg_names, lines, stack
+from sst_ros.plot.style import BLUE, GREY, VERMILION, leg_names, lines, stack
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 from sst_ros.scene.scene import Scene
@@ -73,7 +73,6 @@ def draw_legs(label: str, series: Sequence[tuple[str, Array, Array, Mapping[str,
         for axes, column in zip(panels, values.T, strict=True):
             axes.plot(seconds, column, label=name, **looks)
     style.legend(panels[0])
-    style.span(panels, np.concatenate([seconds for _, seconds, _, _ in series]))
     return figure
 
 
@@ -83,10 +82,7 @@ def _star(draw: Callable[[Scene, list[motion.Solution]], Figure]) -> Callable[..
     def make(run: Signals, scene: Scene) -> Figure:
         quaternion = run.take(*QUATERNION)
         euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else None
-        both = quaternion.T if euler is None else [*quaternion.T, *euler.T]
-        rows = style.envelope(both, len(quaternion))
-        shown = None if euler is None else euler[rows]
-        return draw(scene, [motion.Solution("run", run.seconds()[rows], quaternion[rows], shown)])
+        return draw(scene, [motion.Solution("run", run.seconds(), quaternion, euler)])
 
     return make
 
@@ -137,7 +133,7 @@ def tick_torques(run: Signals) -> tuple[Array, Array]:
     seconds = np.stack([start, end], axis=1).ravel() / NANOSECONDS
     torques = np.repeat(torque, 2, axis=0)
     gaps = 2 * (np.flatnonzero(start[1:] != end[:-1]) + 1)
-    return few(np.insert(seconds, gaps, seconds[gaps]), np.insert(torques, gaps, np.nan, axis=0))
+    return np.insert(seconds, gaps, seconds[gaps]), np.insert(torques, gaps, np.nan, axis=0)
 
 
 def energies(run: Signals, scene: Scene) -> tuple[Array, Array]:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One style for all figures: colours, lines, sizes, and how a figure is saved.
 
-A function that draws takes data and returns a `Figure`; `styled` gives it the style. Long
-curves are drawn with few points: of every stretch the least and the largest value stay. No spike is
-lost, and a gap (nan) stays a gap; what is left out no picture could show.
+A function that draws takes data and returns a `Figure`; `styled` gives it the style. Of a long
+curve matplotlib leaves out what no picture could show (`path.simplify`).
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import functools
 import io
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeAlias, TypeVar
 
@@ -22,7 +21,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.recording.topic_tables import Integers
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
@@ -113,11 +111,12 @@ def sides(geometry: Geometry, points: int) -> Array:
 
 
 def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes]]:
-    """Make panels one above the other with a common time axis."""
+    """Make panels one above the other with a common time axis, which shows the run and no more."""
     figure = Figure(figsize=(7.0, 1.0 + height * len(labels)))
     grid = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, label in zip(grid, labels, strict=True):
         axes.set_ylabel(label)
+        axes.margins(x=0.0)
     grid[-1].set_xlabel("time t [s]")
     return figure, list(grid)
 
@@ -133,16 +132,12 @@ def widen(axes: Axes, values: Array, least_span: float) -> None:
 def lines(
     axes: Axes, seconds: Array, values: Array, names: Sequence[str], *, least_span: float = 0.0
 ) -> None:
-    """Draw columns over time, the legend above the panel.
-
-    An axis never shows less than `least_span`, so that rounding is a flat line.
-    """
+    """Draw columns over time, the legend above the panel; as `widen` does."""
     for column, name, style in zip(values.T, names, LINES, strict=False):
         axes.plot(seconds, column, label=name, **style)
     widen(axes, values, least_span)
     if len(names) > 1:
         legend(axes)
-    span([axes], seconds)
 
 
 def legend(axes: Axes, **given: Any) -> None:
@@ -158,12 +153,6 @@ def mark_ends(axes: Axes, *path: Array) -> None:
     for at, marker, colour, name in ends:
         place = [column[at] for column in path]
         axes.plot(*place, marker, color=colour, markersize=6, label=name, linestyle="none")
-
-
-def span(panels: Sequence[Axes], seconds: Array) -> None:
-    """Show the whole run and no more."""
-    for axes in panels:
-        axes.set_xlim(float(np.min(seconds)), float(np.max(seconds)))
 
 
 def note(figure: Figure, text: str, width: int) -> None:
@@ -184,33 +173,3 @@ def scale_down(values: Array) -> tuple[Array, str]:
 def hide_zeros(values: Array) -> Array:
     """Return values for a logarithmic axis: nan for what lies below SMALLEST_SHOWN."""
     return np.asarray(np.where(values > SMALLEST_SHOWN, values, np.nan))
-
-
-STRETCHES = 700
-"""Each gives two points or more: a picture is about a thousand pixels wide."""
-
-
-def envelope(curves: Iterable[Array], count: int) -> Integers:
-    """Rows that stay of curves of `count` values each: ascending, the first and the last in it."""
-    size = -(-count // STRETCHES)
-    if size <= 4:
-        return np.arange(count)
-    stay = np.zeros(count, dtype=bool)
-    stay[[0, -1]] = True
-    begins = np.arange(0, count, size)
-    for curve in curves:
-        padded = np.full(len(begins) * size, np.nan)
-        padded[:count] = curve
-        stretches = padded.reshape(-1, size)
-        lost = np.isnan(stretches)
-        for filled in (np.where(lost, -np.inf, stretches), -np.where(lost, np.inf, stretches)):
-            stay[np.minimum(begins + filled.argmax(axis=1), count - 1)] = True
-        gaps = lost.any(axis=1)
-        stay[np.minimum(begins + lost.argmax(axis=1), count - 1)[gaps]] = True
-    return np.flatnonzero(stay)
-
-
-def few(seconds: Array, values: Array) -> tuple[Array, Array]:
-    """Return times (m,) and values (m,) or (m, k) with no more points than can be seen."""
-    rows = envelope(values.T if values.ndim > 1 else [values], len(values))
-    return seconds[rows], values[rows]

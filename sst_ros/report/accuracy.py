@@ -52,8 +52,8 @@ def write_accuracy_report(
         if len(studies) == len(names):
             figures["accuracy"] = draw_fastest(list_fastest(studies), provenance())
         whole = {"studies": [document(one) for one in studies], "terms": terms}
-        said, grids = accuracy_page(studies, terms), join_grids(studies)
-        publish(out, "accuracy", csv=grids, document=whole, page=said, figures=figures)
+        given = {"csv": join_grids(studies), "page": accuracy_page(studies, terms)}
+        publish(out, "accuracy", document=whole, figures=figures, **given)
     return studies
 
 
@@ -81,20 +81,14 @@ def document(study: WorkPrecision) -> dict[str, Any]:
 
 
 def list_fastest(studies: Sequence[WorkPrecision]) -> DataFrame:
-    """Return the fastest setting of each scene for each target: method, setting, time."""
+    """Return method and time, as a share of the motion's, of the fastest setting by target."""
     rows = [
-        {
-            "scene": study.scene,
-            "target": target,
-            "method": best.method,
-            "setting": setting(best),
-            "wall_s": best.wall_min_s,
-            "share": best.wall_min_s / study.seconds,
-        }
+        {"scene": study.scene, "target": target, "method": best.method}
+        | {"share": best.wall_min_s / study.seconds}
         for study in studies
         for target, best in _choose(study).items()
     ]
-    return data_frame(rows, ("scene", "target", "method", "setting", "wall_s", "share"))
+    return data_frame(rows, ("scene", "target", "method", "share"))
 
 
 def _choose(study: WorkPrecision) -> dict[float, Series[Any]]:
@@ -103,17 +97,16 @@ def _choose(study: WorkPrecision) -> dict[float, Series[Any]]:
     return {target: row for target, row in found.items() if row is not None}
 
 
-def fastest(study: WorkPrecision, target: float = TARGET) -> str:
-    """Return the fastest setting for a target as a sentence."""
-    best = study.best(target)
+def fastest(study: WorkPrecision) -> str:
+    """Return the fastest setting for TARGET as a sentence."""
+    best = study.best(TARGET)
     if study.rests:
         return "It rests: it has no torques of its own, a controller drives it along its motion."
-    if best is None:
-        least = study.rows[ERROR].astype(float).min()
-        reached = f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
-        tried = f"No setting that was tried reaches {target:.0e} rad with every finer one"
-        return f"{tried}; {reached}."
-    return f"{target:.0e} rad over {study.seconds:g} s: {setting(best)}, {_time(best.wall_min_s)}."
+    if best is not None:
+        return f"{TARGET:.0e} rad over {study.seconds:g} s: {setting(best)}, {_time(best)}."
+    least = study.rows[ERROR].astype(float).min()
+    reached = f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
+    return f"No setting that was tried reaches {TARGET:.0e} rad with every finer one; {reached}."
 
 
 def setting(row: Series[Any]) -> str:
@@ -123,8 +116,9 @@ def setting(row: Series[Any]) -> str:
     return f"{row.method}, {1e3 * row.setting:.4g} ms steps"
 
 
-def _time(wall_s: float) -> str:
-    return f"{1e3 * wall_s:.2g} ms" if wall_s < 0.0995 else f"{1e3 * wall_s:.0f} ms"
+def _time(row: Series[Any]) -> str:
+    wall_ms = 1e3 * row.wall_min_s
+    return f"{wall_ms:.2g} ms" if wall_ms < 99.5 else f"{wall_ms:.0f} ms"
 
 
 HEADS = {
@@ -158,9 +152,9 @@ def accuracy_page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, An
     """Write studies, and the rows of `cost_table` of their scenes, as one Markdown page."""
     rows = []
     for each in studies:
-        words = {t: f"{setting(row)}: {_time(row.wall_min_s)}" for t, row in _choose(each).items()}
         run = "at rest" if each.rests else f"{each.seconds:g} s"
-        cells = {f"{target:.0e} rad": words.get(target) for target in TARGETS}
+        cells: dict[str, Any] = {f"{target:.0e} rad": None for target in TARGETS}
+        cells |= {f"{t:.0e} rad": f"{setting(x)}: {_time(x)}" for t, x in _choose(each).items()}
         rows.append({"scene": each.scene, "run": run, **cells})
     costs = data_frame({**row, "ns": f"{row['ns']:.0f}"} for row in terms)
     return render(
@@ -194,19 +188,15 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
     for target, row in best.items():
         panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")
         panels[0].plot(1e3 * row.wall_min_s, max(row[ERROR], floor), "o", color=INK, **_RING)
-    marks: list[tuple[str, str, str, Looks]] = [
-        (name, marker, colour, {"linewidth": 1.5})
-        for name, (colour, marker) in MARKERS.items()
-        if name in set(rows.method)
-    ]
-    marks.append(("fixed steps (full)", "o", INK, {}))
-    marks.append(("tolerance (hollow)", "o", INK, {"markerfacecolor": "white", "linestyle": "--"}))
+    used = {name: look for name, look in MARKERS.items() if name in set(rows.method)}
+    handles = [_entry(name, mark, colour, linewidth=1.5) for name, (colour, mark) in used.items()]
+    handles.append(_entry("fixed steps (full)", "o"))
+    handles.append(_entry("tolerance (hollow)", "o", markerfacecolor="white", linestyle="--"))
     if (rows.failure != "").any():
-        marks.append(("failed", "x", INK, {"linestyle": "none"}))
+        handles.append(_entry("failed", "x", linestyle="none"))
     if best:
         name = f"fastest for {', '.join(f'{target:.0e}' for target in best)} rad"
-        marks.append((name, "o", INK, _RING | {"linestyle": ":"}))
-    handles = [_entry(*mark, **looks) for *mark, looks in marks]
+        handles.append(_entry(name, "o", **_RING, linestyle=":"))
     body.legend(handles=handles, fontsize=8, frameon=False, loc="outside lower center", ncol=9)
     figure.suptitle(f"{study.scene}: error against wall time\n{fastest(study)}", fontsize=12)
     note(figure, f"Reference: {study.reference.how}. {provenance()}", 185)
@@ -256,13 +246,7 @@ def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None
 
 @styled
 def draw_fastest(rows: DataFrame, said: str) -> Figure:
-    """Draw the time of the fastest setting for each error, a line of markers for each scene.
-
-    Args:
-        rows: of `list_fastest`.
-        said: footnote.
-
-    """
+    """Draw rows of `list_fastest`, a line of markers for each scene, and a footnote."""
     names = list(dict.fromkeys(rows.scene))
     figure = Figure(figsize=(9.0, 1.7 + 0.36 * len(names)))
     axes = figure.subplots()
@@ -277,8 +261,9 @@ def draw_fastest(rows: DataFrame, said: str) -> Figure:
     axes.set(xscale="log", xlabel="wall time of the integration per time of the motion [%]")
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
-    title = "Fastest setting for an error of the orientation"
-    figure.suptitle(title, fontsize=11, x=0.02, ha="left")
+    figure.suptitle(
+        "Fastest setting for an error of the orientation", fontsize=11, x=0.02, ha="left"
+    )
     used = {name: look for name, look in MARKERS.items() if name in set(rows.method)}
     handles = [_entry(name, mark, colour, **hollow) for name, (colour, mark) in used.items()]
     for target, size in sizes.items():

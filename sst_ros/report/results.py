@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import os
 import platform
+import re
 from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -37,12 +39,7 @@ _templates = jinja2.Environment(
 def data_frame(
     rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> DataFrame:
-    """Return a DataFrame of rows; what is unknown stays None.
-
-    Raises:
-        MissingDependency: pandas is not installed.
-
-    """
+    """Return a DataFrame of rows; what is unknown stays None."""
     listed, names = list(rows), columns and list(columns)
     frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
     for name in frame.columns:  # whole numbers with gaps stay whole numbers
@@ -80,12 +77,7 @@ def publish(
     page: str,
     figures: Mapping[str, Figure],
 ) -> None:
-    """Write NAME.csv, NAME.json, NAME.md and the figures as PNG into the folder `out`.
-
-    Raises:
-        InputError: `out` cannot be written.
-
-    """
+    """Write NAME.csv, NAME.json, NAME.md and figures as PNG into `out`; InputError if it cannot."""
     from sst_ros.plot.style import save_figure  # needs matplotlib, which a summary does not
 
     whole = {**document, "report": made_on()}
@@ -128,9 +120,8 @@ def made_on() -> dict[str, Any]:
 
 def processor() -> str:
     """Return the name of the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, "") or platform.machine()
+    said = ""
+    with contextlib.suppress(OSError):
+        said = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    named = re.search(r"^model name\s*: *(.*\S)", said, re.MULTILINE)
+    return named[1] if named else platform.machine()

@@ -24,7 +24,7 @@ from sst_ros.extras import require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import pictures, style
-from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, Looks, few, hide_zeros
+from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, Looks, hide_zeros
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.report import reference, timing, tracking
@@ -264,7 +264,6 @@ def draw_errors(seconds: Array, panels: Mapping[str, Comparison]) -> Figure:
     for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
         _draw_comparison(axes, seconds, comparison, legend=axes is grid[0])
         axes.set_title(title)
-    style.span(grid, seconds)
     return figure
 
 
@@ -272,13 +271,12 @@ def _draw_comparison(
     axes: Axes, seconds: Array, comparison: Comparison, *, legend: bool = True
 ) -> None:
     """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
-    times, floor = few(seconds, comparison.own.max(axis=1).to_numpy())
-    least = style.SMALLEST_SHOWN
+    least, floor = style.SMALLEST_SHOWN, comparison.own.max(axis=1)
     band: Looks = {"color": GREY, "alpha": 0.3, "linewidth": 0.0, "label": "error of the reference"}
-    axes.fill_between(times, least, np.fmax(floor, least), **band)
+    axes.fill_between(seconds, least, np.fmax(floor, least), **band)
     names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
     for values, name, looks in zip(comparison.error.to_numpy().T, names, LINES, strict=False):
-        axes.plot(*few(seconds, hide_zeros(values)), label=name, **looks)
+        axes.plot(seconds, hide_zeros(values), label=name, **looks)
     axes.set(yscale="log", ylabel="largest difference")
     axes.set_ylim(bottom=least)
     if legend and comparison.compared:
@@ -381,7 +379,7 @@ def _curve(
     def draw(axes: Axes) -> None:
         shown, unit = (values, "") if around is not None else style.scale_down(values)
         axes.set_ylabel(label.replace("[", f"[{unit}"))
-        axes.plot(*few(seconds, shown), color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
+        axes.plot(seconds, shown, color=BLUE, **{"linewidth": 1.4, "markersize": 4} | looks)
         if around is not None:
             axes.axhline(around, color=GREY, linewidth=0.9, linestyle="--")
             style.widen(axes, np.append(shown, around), 0.04)
@@ -439,7 +437,7 @@ def _draw_losses(axes: Axes, measured: Timing, end: float) -> None:
         times, counts = (np.append(0.0, numbers) for numbers in loss)
         times, counts = np.append(times, end), np.append(counts, counts[-1])
         label = f"{name}: {counts[-1]:.0f}"
-        axes.step(*few(times, counts), where="post", label=label, **looks)
+        axes.step(times, counts, where="post", label=label, **looks)
         most = max(most, counts[-1])
     axes.set_ylim(0.0, max(1.0, 1.6 * most))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))

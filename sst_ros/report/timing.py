@@ -35,8 +35,8 @@ REPORTED = (
 )
 """Numbers of the diagnostics that are shown over the run."""
 
-STATISTICS = {"min": 0.0, "mean": None, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
-"""Percentiles of periods and delays, and the mean."""
+STATISTICS = {"min": "min", "mean": "mean", "99%": "p99", "99.9%": "p99_9", "max": "max"}
+"""What is shown of periods and delays, as pandas and as the summary name it."""
 
 
 class Timing(NamedTuple):
@@ -75,17 +75,14 @@ class Timing(NamedTuple):
     def numbers(self) -> dict[str, Any]:
         """Sum it up: flat, units in the names, None for what is not known."""
         delays = {
-            "period": self.period_us,
-            "command_latency": self.commands.received_us.to_numpy(),
-            "command_stamp_to_tick": self.commands.stamped_us.dropna().to_numpy(),
+            "period": require("pandas").Series(self.period_us, dtype=float),
+            "command_latency": self.commands.received_us,
+            "command_stamp_to_tick": self.commands.stamped_us,
         }
         found: dict[str, Any] = {}
         for name, values in delays.items():
-            for word, share in STATISTICS.items():
-                value = None
-                if len(values):
-                    value = values.mean() if share is None else np.percentile(values, share)
-                found[f"{name}_{word}_us"] = None if value is None else float(value)
+            told = values.describe([0.99, 0.999]).dropna()
+            found |= {f"{name}_{word}_us": told.get(key) for key, word in STATISTICS.items()}
         return found | {"commands_followed": len(self.commands), **self.answers}
 
 

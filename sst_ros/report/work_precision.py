@@ -12,7 +12,7 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -90,9 +90,7 @@ class WorkPrecision:
     """Result of a work-precision study of a scene.
 
     Attributes:
-        scene: its name.
-        seconds: time span of the comparison [s].
-        ends: why the span ends before the scene's duration; empty where it does not.
+        scene, seconds, ends: its name, the time span [s], and why that ends before its duration.
         reference: the reference solution.
         rows: the solver grid, columns as in COLUMNS; settings of a method from coarse to fine.
         advice: what `step_advice` recommends, as `scene show` prints it.
@@ -164,15 +162,22 @@ def work_precision(
     grid = solver_grid(problem)
     truth = solve_reference(problem, kind)
     rows: list[dict[str, Any]] = []
-    ends: list[Array] = []
+    best: dict[str, tuple[float, Array]] = {}  # by method: least error, and the last state
     for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
         for row, end in refine(grid[part.start], problem, truth, longest_s):
             rows.append({"scene": scene.name, **row})
-            ends.append(end)
+            found = row.get("final_orientation_rad", math.inf), end
+            best[row["method"]] = min(best.get(row["method"], found), found, key=lambda x: x[0])
     zero = np.zeros((len(problem.times), 3))
     torques = zero if scene.torque is None else scene.torque.values(problem.times)
     along = zip(truth.states.astype(float), torques.tolist(), strict=True)
     difference, _ = compare_with_paper(scene, along)
+    began = time.perf_counter()
+    motion = simulate(scene, duration=problem.seconds, t_eval=problem.times)
+    wall, measured = time.perf_counter() - began, None
+    if len(motion) > problem.count:  # else a limit stops it before
+        states = np.hstack([motion.quaternion, motion.body_rate])
+        measured = problem.errors(states, truth.states)[1].orientation, wall
     return WorkPrecision(
         scene=scene.name,
         seconds=problem.seconds,
@@ -180,41 +185,23 @@ def work_precision(
         reference=truth,
         rows=data_frame(rows, COLUMNS),
         advice=step_advice(scene),
-        measured=_measure_advice(problem, truth),
+        measured=measured,
         formulation=difference,
-        warnings=tuple(_warnings(problem, truth, rows, ends, difference)),
+        warnings=tuple(_warnings(problem, truth, best, difference)),
     )
-
-
-def _measure_advice(
-    problem: InitialValueProblem, truth: ReferenceSolution
-) -> tuple[float, float] | None:
-    """Error and wall time of `simulate` with the method "auto"; None where it stops before."""
-    began = time.perf_counter()
-    motion = simulate(problem.scene, duration=problem.seconds, t_eval=problem.times)
-    wall = time.perf_counter() - began
-    if len(motion) <= problem.count:
-        return None
-    states = np.hstack([motion.quaternion, motion.body_rate])
-    return problem.errors(states, truth.states)[1].orientation, wall
 
 
 def _warnings(
     problem: InitialValueProblem,
     truth: ReferenceSolution,
-    rows: Sequence[dict[str, Any]],
-    ends: Sequence[Array],
+    best: dict[str, tuple[float, Array]],
     difference: float | None,
 ) -> Iterator[str]:
     if difference is not None and difference > SAME_EQUATIONS:
         yield f"the kernel differs from the paper's equations by {difference:.1e}"
     if problem.clamped:
         yield "the torques are clamped to the actuators' limit: no fixed steps are tried"
-    best: dict[str, tuple[float, Array]] = {}
-    for row, end in zip(rows, ends, strict=True):
-        error = row.get("final_orientation_rad", math.inf)
-        if error < best.get(row["method"], (math.inf,))[0]:
-            best[row["method"]] = error, end
+    best = {method: found for method, found in best.items() if found[0] < math.inf}
     for one, two in itertools.combinations(best, 2):
         (error, end), (other_error, other_end) = best[one], best[two]
         apart = problem.errors(end[None], other_end[None].astype(np.longdouble))[0].orientation
@@ -334,17 +321,24 @@ def _result(
 ) -> tuple[dict[str, Any], Array]:
     """Run one setting: its row of the grid, and its last state, nan for a failure."""
     states, evaluations, failure = np.full((1, len(problem.start)), np.nan), None, ""
-    least, median = 0.0, 0.0
+    walls: list[float] = []
     with np.errstate(all="ignore"):
         try:
             states, evaluations = setting.solve()
-            least, median = _measure_time(setting.timed)
+            while len(walls) < 3 or (sum(walls) < _REPEAT_S and len(walls) < _REPEATS):
+                began = time.perf_counter()
+                setting.timed()
+                walls.append(time.perf_counter() - began)
+                if walls[-1] > LONGEST_RUN_S:
+                    break
         except (SstError, ArithmeticError, ValueError) as error:
             failure = str(error).splitlines()[0] if str(error) else "not finite"
+            walls = []
     if not failure and not np.isfinite(states[:, :7]).all():
         failure = "not finite"
     row = {"method": setting.method, "kind": setting.kind, "setting": setting.setting}
-    row |= {"evaluations": evaluations, "wall_min_s": least, "wall_median_s": median}
+    row |= {"evaluations": evaluations, "wall_min_s": min(walls, default=0.0)}
+    row["wall_median_s"] = float(np.median(walls or [0.0]))
     if not failure:
         final, largest = problem.errors(states, truth.states)
         if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
@@ -355,15 +349,3 @@ def _result(
             row["energy_residual_J"] = energy if math.isfinite(energy) else None
             row["below_floor"] = largest.orientation < ABOVE_REFERENCE * truth.own.orientation
     return row | {"failure": failure}, states[-1]
-
-
-def _measure_time(run: Callable[[], object]) -> tuple[float, float]:
-    """Shortest and median wall time of some runs [s]."""
-    walls: list[float] = []
-    while len(walls) < 3 or (sum(walls) < _REPEAT_S and len(walls) < _REPEATS):
-        began = time.perf_counter()
-        run()
-        walls.append(time.perf_counter() - began)
-        if walls[-1] > LONGEST_RUN_S:
-            break
-    return min(walls), float(np.median(walls))

@@ -14,7 +14,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from viser import GuiSliderHandle, GuiUplotHandle, Icon, ViserServer, uplot
+from viser import GuiButtonHandle, GuiSliderHandle, GuiUplotHandle, Icon, ViserServer, uplot
 
 from sst_ros.description.tree import LEG_COLOURS
 from sst_ros.mechanism.geometry import Geometry
@@ -194,13 +194,13 @@ class _Panel:
             return
         rows = (
             ("γ", "deg", np.degrees(state.gamma)),
-            ("γ̇", "rad/s", state.gamma_dot),
-            ("τ", "N m", state.torque),
+            ("γ̇", "rad/s", np.array(state.gamma_dot)),
+            ("τ", "N m", np.array(state.torque)),
             ("μ", "deg", np.degrees(state.mu)),
             ("β", "deg", np.degrees(state.beta)),
         )
         # No minus before a zero.
-        shown = [(name, unit, [float(x) + 0.0 for x in values]) for name, unit, values in rows]
+        shown = [(name, unit, (values + 0.0).tolist()) for name, unit, values in rows]
         self._joints.content = str(_PANEL.joints(_COLOURS, shown))
         values = [
             (label, f"{_format(status.values[key], form)} {unit}")
@@ -261,9 +261,9 @@ class _RunControls:
                 gui.add_slider(f"τ{'₁₂₃'[k]}", -most, most, most / 100.0, 0.0) for k in range(3)
             ]
             self._zero = gui.add_button("Zero", icon=Icon.CIRCLE_OFF)
-        self._pause.on_click(_ask("pause", lambda: run.pause(not self._paused)))
-        self._step.on_click(_ask("step", run.step))
-        reset.on_click(_ask("reset", self._reset))
+        _ask(self._pause, "pause", lambda: run.pause(not self._paused))
+        _ask(self._step, "step", run.step)
+        _ask(reset, "reset", self._reset)
         self._zero.on_click(lambda _: self._release())
         for slider in self._sliders:
             slider.on_update(lambda event: self._apply() if event.client is not None else None)
@@ -273,8 +273,7 @@ class _RunControls:
         paused = status.phase == "paused"
         if paused != self._paused:
             self._paused = paused
-            self._pause.label = "Resume" if paused else "Pause"
-            self._pause.icon = Icon.PLAYER_PLAY if paused else Icon.PLAYER_PAUSE
+            _name(self._pause, "Resume" if paused else "Pause")
             self._step.disabled = not paused
         controller = self._run.controller()
         for handle in (*self._sliders, self._zero):
@@ -320,24 +319,27 @@ class _ReplayControls:
         before, playing = self._playing, self._replay.playing
         if playing != before:
             self._playing = playing
-            self._play.label = "Pause" if playing else "Play"
-            self._play.icon = Icon.PLAYER_PAUSE if playing else Icon.PLAYER_PLAY
+            _name(self._play, "Pause" if playing else "Play")
         if (playing or before) and state is not None and state.time is not None:
             _move(self._time, round(min(state.time, self._replay.length), 6))
+
+
+def _name(button: GuiButtonHandle, label: str) -> None:
+    button.label = label
+    button.icon = Icon.PLAYER_PAUSE if label == "Pause" else Icon.PLAYER_PLAY
 
 
 def _move(slider: GuiSliderHandle[float], value: float) -> None:
     slider.value = value  # type: ignore[misc]  # its setter does not follow its getter at once
 
 
-def _ask(name: str, act: Callable[[], tuple[bool, str]]) -> Callable[[Any], None]:
-    """Return a handler that acts and notifies the client of a refusal."""
+def _ask(button: Any, name: str, act: Callable[[], tuple[bool, str]]) -> None:
+    """Have a button act, and notify the client of a refusal."""
 
     def on_click(event: Any) -> None:
         done, message = act()
         if not done and event.client is not None:
-            event.client.add_notification(
-                f"{name} refused", message, auto_close_seconds=_REFUSAL_S, color="red"
-            )
+            given = {"auto_close_seconds": _REFUSAL_S, "color": "red"}
+            event.client.add_notification(f"{name} refused", message, **given)
 
-    return on_click
+    button.on_click(on_click)

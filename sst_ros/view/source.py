@@ -6,8 +6,8 @@ from __future__ import annotations
 import subprocess
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -24,39 +24,23 @@ _PUBLISH_RATE = 100
 
 @dataclass(frozen=True)
 class ViewState:
-    """The manipulator at one instant.
+    """The manipulator at one instant, by leg."""
 
-    Attributes:
-        time: of the run [s]; None for a state that is shown while there is no run.
-        gamma, mu, beta: joint angles [rad], by leg.
-        gamma_dot: rates of the actuators [rad/s].
-        torque: at the actuators, over the step that ended [N m].
-
-    """
-
-    time: float | None
-    gamma: Sequence[float]
+    time: float | None  # of the run [s]; None for a state that is shown while there is no run
+    gamma: Sequence[float]  # [rad]
     mu: Sequence[float]
     beta: Sequence[float]
-    gamma_dot: Sequence[float]
-    torque: Sequence[float]
+    gamma_dot: Sequence[float]  # [rad/s]
+    torque: Sequence[float]  # at the actuators, over the step that ended [N m]
 
 
 @dataclass(frozen=True)
 class RunStatus:
-    """Phase and diagnostics of a run.
-
-    Attributes:
-        phase: of the run, or of the playback.
-        level: 0 OK, 1 warning, 2 error, as in diagnostic_msgs.
-        message: reason of the level.
-        values: diagnostics by key.
-
-    """
+    """Phase and diagnostics of a run, or of the playback."""
 
     phase: str = ""
-    level: int = 0
-    message: str = ""
+    level: int = 0  # 0 OK, 1 warning, 2 error, as in diagnostic_msgs
+    message: str = ""  # the reason of the level
     values: dict[str, str] = field(default_factory=dict)
 
 
@@ -113,35 +97,30 @@ class Replay:
         self.length = float(self._seconds[-1])
         self._lock = threading.Lock()
         self._now, self._since, self._factor = 0.0, time.monotonic(), 1.0
-        self.playing, self._shown = False, -1
-        self.play(True)
+        self.playing, self._shown = True, -1
 
     def play(self, playing: bool) -> None:
         """Play or pause; play from the beginning at the end."""
-        with self._lock:
-            self._advance()
+        with self._advance():
             if playing and self._now >= self.length:
                 self._now = 0.0
             self.playing = playing
 
     def seek(self, time: float) -> None:
         """Go to a time [s]."""
-        with self._lock:
-            self._advance()
+        with self._advance():
             self._now = min(max(time, 0.0), self.length)
 
     def set_speed(self, factor: float) -> None:
         """Set recorded time per time."""
-        with self._lock:
-            self._advance()
+        with self._advance():
             self._factor = factor
 
     def states(self) -> Sequence[ViewState]:
         """Return the states up to now, from the beginning after a jump back."""
-        with self._lock:
-            self._advance()
-            at = int(np.searchsorted(self._seconds, self._now + 1e-9, side="right")) - 1
-        at = max(at, 0)
+        with self._advance():
+            now = self._now
+        at = max(int(np.searchsorted(self._seconds, now + 1e-9, side="right")) - 1, 0)
         first = self._shown + 1 if at >= self._shown else 0
         self._shown = at
         run, rows = self._run, slice(first, at + 1)
@@ -156,13 +135,16 @@ class Replay:
         phase = "recording" if self.playing else "recording, paused"
         return RunStatus(phase, 2 if fault else 0, fault, values)
 
-    def _advance(self) -> None:
-        now = time.monotonic()
-        if self.playing:
-            self._now += (now - self._since) * self._factor
-            if self._now >= self.length:
-                self._now, self.playing = self.length, False
-        self._since = now
+    @contextmanager
+    def _advance(self) -> Iterator[None]:
+        """Hold the lock, with the time of the recording at what it is now."""
+        with self._lock:
+            now = time.monotonic()
+            if self.playing:
+                self._now = min(self._now + (now - self._since) * self._factor, self.length)
+                self.playing = self._now < self.length
+            self._since = now
+            yield
 
 
 def run_simulator(scene: str, speed: float = 1.0) -> AbstractContextManager[subprocess.Popen[str]]:
