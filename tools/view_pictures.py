@@ -74,7 +74,8 @@ def _build(server: PageServer, scene: Scene) -> None:
     drawing = SceneDrawing(server, scene)
     state = Simulation(scene).state
     at = state.joints
-    drawing.show(ViewState(None, at.gamma, at.mu, at.beta, at.gamma_dot, (0.0, 0.0, 0.0)))
+    shown = ViewState(None, at.gamma, at.mu, at.beta, at.gamma_dot, (0.0, 0.0, 0.0))
+    drawing.show(shown.angles, shown.torque)
     for name in (f"{BASE}/0", f"{STAR}/s", f"{STAR}/E"):
         server.scene.remove_by_name(f"/manipulator/{name}")
     size = max(scene.base.radius, scene.star.radius)

@@ -110,11 +110,11 @@ class Page:
         drawing, panel, controls = self._parts
         with self._server.atomic():
             for state in self._source.states():
-                drawing.add(state)
+                drawing.add(state.time, state.angles)
                 panel.add(state)
                 self._state = state
             if self._state is not None:
-                drawing.show(self._state)
+                drawing.show(self._state.angles, self._state.torque)
             if count % _SHOW_EVERY == 0:
                 for shown in (panel, controls):
                     shown.show(self._state, self._source.status())

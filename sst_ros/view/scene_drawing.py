@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import trimesh
@@ -27,9 +28,7 @@ from sst_ros.description.tree import (
 )
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
-from sst_ros.view.source import ViewState
 
 PATH_POINTS = 400
 _POINT_PERIOD_S = 0.008
@@ -79,21 +78,24 @@ class SceneDrawing:
         """Take it off the page."""
         self._server.scene.remove_by_name(_ROOT)
 
-    def add(self, state: ViewState) -> None:
-        """Add E at a state to the path; a time that goes back begins a new path."""
-        if state.time is None or state.time < self._last:
+    def add(self, time: float | None, angles: Mapping[str, float]) -> None:
+        """Add E at a time [s] and joint angles [rad] to the path.
+
+        A time that goes back begins a new path, and so does None: there is no run.
+        """
+        if time is None or time < self._last:
             self._points.clear()
             self._last = -np.inf
-        if state.time is not None and state.time - self._last >= _POINT_PERIOD_S:
-            self._last = state.time
-            star = rotations(self._joints[:3], _angles(state))[STAR]
-            self._points.append((state.time, end_point(self._scene, star)))
-            while self._points[0][0] < state.time - _PATH_S:
+        if time is not None and time - self._last >= _POINT_PERIOD_S:
+            self._last = time
+            star = rotations(self._joints[:3], angles)[STAR]
+            self._points.append((time, end_point(self._scene, star)))
+            while self._points[0][0] < time - _PATH_S:
                 self._points.popleft()
 
-    def show(self, state: ViewState) -> None:
-        """Move everything to a state."""
-        found = rotations(self._joints, _angles(state))
+    def show(self, angles: Mapping[str, float], torque: Sequence[float]) -> None:
+        """Move everything to joint angles [rad], and show torques [N m], shape (3,)."""
+        found = rotations(self._joints, angles)
         for link, frame in self._frames.items():
             frame.wxyz = wxyz(found[link])
         end = end_point(self._scene, found[STAR])
@@ -101,7 +103,7 @@ class SceneDrawing:
         points = np.concatenate([np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points])
         points *= _LIFT
         self._path.points = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
-        self._show_torques(np.array(state.torque))
+        self._show_torques(np.array(torque))
 
     def _show_torques(self, torques: Array) -> None:
         """Draw tau_k along w_k, outwards where positive; the largest yet has full length."""
@@ -195,7 +197,3 @@ def add_shape(server: ViserServer, name: str, shape: Shape) -> None:
 def wxyz(rotation: Array) -> Array:
     """Quaternion (w, x, y, z), as viser takes it, of a rotation matrix."""
     return np.roll(quaternion_of(rotation), 1)
-
-
-def _angles(state: ViewState) -> dict[str, float]:
-    return dict(zip(JOINTS, (*state.gamma, *state.mu, *state.beta), strict=True))

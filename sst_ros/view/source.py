@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from sst_ros.host import child_process
+from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Vector3
 
@@ -32,6 +33,11 @@ class ViewState:
     beta: Sequence[float]
     gamma_dot: Sequence[float]  # [rad/s]
     torque: Sequence[float]  # at the actuators, over the step that ended [N m]
+
+    @property
+    def angles(self) -> dict[str, float]:
+        """Angle of each joint by its name [rad]."""
+        return dict(zip(JOINTS, (*self.gamma, *self.mu, *self.beta), strict=True))
 
 
 @dataclass(frozen=True)

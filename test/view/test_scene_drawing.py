@@ -67,7 +67,8 @@ def test_links_are_where_the_simulation_has_them(server, name):
     simulation = Simulation(scene)
     state = simulation.step((0.3, -0.2, 0.1), 5_000_000)
     at = state.joints
-    drawing.show(ViewState(0.005, at.gamma, at.mu, at.beta, at.gamma_dot, state.torque))
+    shown = ViewState(0.005, at.gamma, at.mu, at.beta, at.gamma_dot, state.torque)
+    drawing.show(shown.angles, shown.torque)
     star = node(server, f"/manipulator/{STAR}")
     assert turned(star) == pytest.approx(rotation_matrix(state.quaternion), abs=1e-12)
     for link, drawn in shapes(scene).items():
