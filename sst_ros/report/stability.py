@@ -40,7 +40,7 @@ from sst_ros.report.scene_summary import (
     step_advice,
 )
 from sst_ros.scene.scene import Scene, with_initial
-from sst_ros.scene.schema import key_of, sections_of, specs
+from sst_ros.scene.schema import key_of, leaves
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
@@ -184,13 +184,8 @@ def _scale(factor: float, keys: str, absent: str) -> Change:
     """Multiply all numbers of a scene whose key is `keys`, a regular expression."""
 
     def change(scene: Scene, _: Trajectory) -> Scene | str:
-        found = {
-            key: factor * np.array(getattr(section, name))
-            for place, section in sections_of(scene)
-            for name in specs(type(section))
-            if re.fullmatch(keys, key := key_of((*place, name)))
-            and getattr(section, name) is not None
-        }
+        numbers = {key_of(place): value for place, value in leaves(scene).items()}
+        found = {key: factor * x for key, x in numbers.items() if re.fullmatch(keys, key)}
         return scene.with_values(found) if found else f"the scene has no {absent}"
 
     return change
@@ -282,7 +277,7 @@ ROWS: dict[str, tuple[str, Change]] = {
     "as-it-is": ("nothing", lambda scene, _: scene),
     "torque": (
         "ten times the torque",
-        _scale(10.0, r"torque\.amplitude", "torques of its own"),
+        _scale(10.0, r"torque\.amplitude.*", "torques of its own"),
     ),
     "rates": ("ten times the rates at the start", _faster),
     "stiffness": (
