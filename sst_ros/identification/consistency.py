@@ -26,13 +26,12 @@ least-squares problem, so that data without noise are fitted to rounding.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from sst_ros.identification.parameters import STANDARD, bodies_of
+from sst_ros.identification.parameters import STANDARD
 from sst_ros.mechanism.geometry import Array
 
 EXACT = 1e-12
@@ -47,45 +46,35 @@ BARRIERS = tuple(10.0**-k for k in range(0, 11))
 CENTRED = 1e-2
 """Squared decrement, over the barrier, below which Newton's method converges quadratically."""
 
+_PSEUDO = np.zeros((10, 4, 4))
+"""J of each of the ten parameters alone."""
+
+_PSEUDO[0, 3, 3] = 1.0
+for _i in range(3):
+    _PSEUDO[1 + _i, [_i, 3], [3, _i]] = 1.0
+for _row, (_i, _j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4):
+    _PSEUDO[_row, [_i, _j], [_j, _i]] = -1.0
+    if _i == _j:
+        _PSEUDO[_row, :3, :3] += 0.5 * np.eye(3)
+
 _NEWTON_STEPS = 100
 _CLOSE = 0.95
 """Share of the distance to the boundary that a step may cover."""
 
 
-@dataclass(frozen=True)
-class LinearFit:
-    """Estimates of b numbers.
-
-    Attributes:
-        estimate: shape (b,).
-        covariance: shape (b, b).
-        root: R of the weighted regressor, R^T R = covariance^-1, shape (b, b).
-        noise: standard deviation of the residuals of each actuator [N m], shape (3,).
-        residual: measured less predicted torques [N m] of the m equations, shape (m, 3).
-        condition: of the weighted regressor with columns of length one.
-
-    """
-
-    estimate: Array
-    covariance: Array
-    root: Array
-    noise: Array
-    residual: Array
-    condition: float
-
-    @property
-    def deviation(self) -> Array:
-        """Standard deviations, shape (b,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-
-def fit_weighted(columns: Array, torque: Array, noise: Array | None = None) -> LinearFit:
+def fit_weighted(
+    columns: Array, torque: Array, noise: Array | None = None
+) -> tuple[Array, Array, Array]:
     """Fit torque = columns estimate.
 
     Args:
-        columns: regressor of independent columns, shape (m, 3, b).
+        columns: regressor of b independent columns, shape (m, 3, b).
         torque: measured less known torques [N m], shape (m, 3).
         noise: standard deviations of the torques [N m], shape (3,); by default estimated.
+
+    Returns:
+        The estimates, shape (b,); R of the weighted regressor, R^T R = covariance^-1, shape (b, b);
+        and the noise.
 
     """
     floor = EXACT * float(np.sqrt(np.mean(torque**2))) + 1e-300
@@ -97,10 +86,7 @@ def fit_weighted(columns: Array, torque: Array, noise: Array | None = None) -> L
             squares = np.sum((torque - columns @ estimate) ** 2, axis=0)
             noise = np.maximum(np.sqrt(squares / free), floor)
     estimate, root, _ = _solve(columns, torque, noise)
-    condition = float(np.linalg.cond(root / np.linalg.norm(root, axis=0)))
-    inverse = solve_triangular(root, np.eye(len(root)))
-    residual = torque - columns @ estimate
-    return LinearFit(estimate, inverse @ inverse.T, root, noise, residual, condition)
+    return estimate, root, noise
 
 
 def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, Array]:
@@ -232,8 +218,10 @@ def cones_of(names: tuple[str, ...], reach: float) -> Iterator[Cone]:
     index = {name: i for i, name in enumerate(names)}
     # [[m r 1, h], [h^T, m r]] of m and h.
     centre = np.stack([reach * np.eye(4), *_PSEUDO[1:4]])
-    for body in bodies_of(names):
-        inertia = [index[f"{body}.{part}"] for part in STANDARD[4:]]
+    for body in dict.fromkeys(name.partition(".")[0] for name in names):
+        inertia = [index[key] for part in STANDARD[4:] if (key := f"{body}.{part}") in index]
+        if len(inertia) < len(STANDARD[4:]):
+            continue
         if f"{body}.mass" in index:
             moment = [index[f"{body}.{part}"] for part in STANDARD[:4]]
             yield Cone(moment + inertia, _PSEUDO)
@@ -258,19 +246,3 @@ def _lift_into_interior(cones: list[Cone], given: Array) -> Array:
             back = np.linalg.pinv(cone.basis.reshape(len(cone.places), -1).T)
             values[cone.places] = back @ lifted.ravel()
     return np.asarray(values)
-
-
-def _pseudo_basis() -> Array:
-    """J of each of the ten parameters alone, shape (10, 4, 4)."""
-    result = np.zeros((10, 4, 4))
-    result[0, 3, 3] = 1.0
-    for i in range(3):
-        result[1 + i, i, 3] = result[1 + i, 3, i] = 1.0
-    for row, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4):
-        inertia = np.zeros((3, 3))
-        inertia[i, j] = inertia[j, i] = 1.0
-        result[row, :3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    return np.asarray(result)
-
-
-_PSEUDO = _pseudo_basis()

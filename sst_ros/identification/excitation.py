@@ -198,7 +198,7 @@ class _Cost:
             torque = known + columns @ self._values
             posture = np.stack(self._coordinates.postures(*quaternion.T), axis=1)
         excess = np.concatenate(list(self._excesses(gamma, rate, acceleration, torque, posture)))
-        columns = self.base.of_columns(columns).reshape(-1, len(self.base.chosen))
+        columns = columns[..., self.base.chosen].reshape(-1, len(self.base.chosen))
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(excess))):
             return np.ones_like(columns), np.array([1e3])
         return columns, np.maximum(excess, 0.0)

@@ -5,40 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification.measured_motion import Measured, open_data
 from sst_ros.identification.parameters import Identification
-from sst_ros.identification.simulation_fit import SimulationFit, fit_simulation
-from sst_ros.identification.torque_fit import TorqueFit, fit_torques
+from sst_ros.identification.simulation_fit import fit_simulation
+from sst_ros.identification.torque_fit import fit_torques
 from sst_ros.scene.scene import Scene, scene_of
 
 INVERSE_DYNAMICS, SIMULATION = "inverse_dynamics", "simulation"
 Given = Scene | Mapping[str, Any] | str | Path | None
-
-
-@overload
-def identify(
-    data: Measured,
-    scene: Given = None,
-    parameters: Iterable[str] | None = None,
-    method: Literal["inverse_dynamics"] = "inverse_dynamics",
-    *,
-    cutoff: float | None = None,
-    delay: float = 0.0,
-    noise: Iterable[float] | None = None,
-) -> TorqueFit: ...
-
-
-@overload
-def identify(
-    data: Measured,
-    scene: Given = None,
-    parameters: Iterable[str] | None = None,
-    *,
-    method: Literal["simulation"],
-) -> SimulationFit: ...
 
 
 def identify(
@@ -77,6 +54,9 @@ def identify(
             measured, else ten times the bandwidth of the motion.
         delay: time by which the measured torques come late [s].
         noise: standard deviations of the torques [N m], three; by default estimated.
+
+    Returns:
+        A `TorqueFit` by inverse dynamics, a `SimulationFit` by simulation.
 
     Raises:
         InputError: the data are not sound, the motion determines nothing, or an argument is not

@@ -7,20 +7,14 @@ are. Identification by torques takes a `MeasuredMotion`, identification by simul
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_for_arrays, with_jacobian
-from sst_ros.dynamics.traced_dynamics import QUATERNION
 from sst_ros.errors import InputError, Problem
-from sst_ros.mechanism.generic_math import ZERO, atan2, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import (
@@ -47,8 +41,7 @@ OBSERVABLES = ("gamma_1", "gamma_2", "gamma_3", "theta", "phi", "psi", "x", "y",
 """Actuator angles and ZYZ angles [rad], position of E in {B} [m]."""
 
 
-@dataclass(frozen=True)
-class MeasuredMotion:
+class MeasuredMotion(NamedTuple):
     """Samples of the actuators.
 
     Attributes:
@@ -76,6 +69,25 @@ class MeasuredMotion:
         return len(self.torque) == len(self.t) - 1
 
 
+class Readings(NamedTuple):
+    """Measured numbers.
+
+    Attributes:
+        t: times of the readings, ascending from 0 or later [s], shape (n,).
+        columns: numbers of what was read, in `OBSERVABLES`, c of them.
+        values: the readings [rad], [m], shape (n, c); nan where there is none.
+        deviation: their standard deviations, shape (n, c); None where they are unknown.
+        torque: torques of the motion.
+
+    """
+
+    t: Array
+    columns: Sequence[int]
+    values: Array
+    deviation: Array | None
+    torque: TorqueProfile
+
+
 def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) -> MeasuredMotion:
     """Read a motion from a recording, a trajectory, or arrays.
 
@@ -92,11 +104,25 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
     data = open_data(data)
     given = data if isinstance(data, Mapping) else _take_samples(data)
     held = bool(given.get("held", False))
-    arrays, problems = _read_arrays(given, held)
+    allowed = f"must be one of {', '.join(KEYS)}"
+    problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
+    n = np.size(given.get("t", ()))
+    shapes = {"t": (n,), "gamma": (n, 3), "torque": (n, 3), "gamma_dot": (n, 3), "quaternion": (4,)}
+    arrays: dict[str, Array] = {}
+    for key, shape in shapes.items():
+        if given.get(key) is not None:
+            also = (n - 1, 3) if held and key == "torque" else shape
+            arrays |= _read_array(key, given[key], (shape, also), problems)
+        elif key in ("t", "gamma", "torque"):
+            problems.append(Problem(key, None, "must be given"))
+    if np.any(np.diff(arrays.get("t", np.empty(0))) <= 0.0):
+        problems.append(Problem("t", given["t"], "must be rising times [s], shape (n,)"))
+    elif n < FEWEST:
+        problems.append(Problem("t", n, f"must be {FEWEST} samples or more"))
     if problems:
         raise InputError("identify", problems)
     t, torque = arrays["t"], arrays["torque"]
-    if held and len(torque) == len(t):
+    if held and len(torque) == n:
         torque = torque[:-1]
     if delay:
         torque = _shift(t, torque, held, delay)
@@ -104,6 +130,23 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
     saturated = np.abs(torque).max(axis=1) >= (np.inf if limit is None else limit * (1.0 - 1e-9))
     rates, start = arrays.get("gamma_dot"), arrays.get("quaternion")
     return MeasuredMotion(t, arrays["gamma"], rates, torque, start, saturated)
+
+
+def _read_array(
+    key: str, value: Any, shapes: Sequence[tuple[int, ...]], problems: list[Problem]
+) -> dict[str, Array]:
+    """Return finite numbers of one of some shapes by their key, or note a problem."""
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        problems.append(Problem(key, value, "must be numbers"))
+        return {}
+    if array.shape not in shapes:
+        problems.append(Problem(key, array.shape, f"must have the shape {shapes[0]}"))
+        return {}
+    for bad in np.argwhere(~np.isfinite(array))[:1].tolist():
+        problems.append(Problem(f"{key}{bad}", "not finite", "must be finite numbers"))
+    return {key: array}
 
 
 def open_data(data: Measured) -> Recording | Trajectory | Mapping[str, Any]:
@@ -161,83 +204,6 @@ def _shift(t: Array, torque: Array, held: bool, delay: float) -> Array:
         total = np.vstack([np.zeros(3), np.cumsum(torque * np.diff(t)[:, None], axis=0)])
         return np.diff(_shift(t, total, False, delay), axis=0) / np.diff(t)[:, None]
     return np.stack([np.interp(t + delay, t, column) for column in torque.T], axis=1)
-
-
-def _read_arrays(given: Mapping[str, Any], held: bool) -> tuple[dict[str, Array], list[Problem]]:
-    """Arrays of a mapping, and what is wrong with them: first with each, then as a motion."""
-    allowed = f"must be one of {', '.join(KEYS)}"
-    problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
-    arrays: dict[str, Array] = {}
-    for key in ("t", "gamma", "torque", "gamma_dot", "quaternion"):
-        if given.get(key) is None:
-            if key in ("t", "gamma", "torque"):
-                problems.append(Problem(key, None, "must be given"))
-            continue
-        try:
-            arrays[key] = np.asarray(given[key], dtype=float)
-        except (TypeError, ValueError):
-            problems.append(Problem(key, given[key], "must be numbers"))
-            continue
-        for bad in np.argwhere(~np.isfinite(arrays[key]))[:1].tolist():
-            problems.append(Problem(f"{key}{bad}", "not finite", "must be finite numbers"))
-    if problems:
-        return arrays, problems
-    t = arrays["t"]
-    if t.ndim != 1 or np.any(np.diff(t) <= 0.0):
-        return arrays, [Problem("t", t, "must be rising times [s], shape (n,)")]
-    if len(t) < FEWEST:
-        problems.append(Problem("t", len(t), f"must be {FEWEST} samples or more"))
-    for name in [*arrays][1:]:
-        shape = (4,) if name == "quaternion" else (len(t), 3)
-        also = (len(t) - 1, 3) if held and name == "torque" else shape
-        if arrays[name].shape not in (shape, also):
-            problems.append(Problem(name, arrays[name].shape, f"must have the shape {shape}"))
-    return arrays, problems
-
-
-@dataclass(frozen=True)
-class Readings:
-    """Measured numbers.
-
-    Attributes:
-        t: times of the readings, ascending from 0 or later [s], shape (n,).
-        columns: numbers of what was read, in `OBSERVABLES`, shape (c,).
-        values: the readings [rad], [m], shape (n, c); nan where there is none.
-        deviation: their standard deviations, shape (n, c); None where they are unknown.
-        torque: torques of the motion.
-
-    """
-
-    t: Array
-    columns: tuple[int, ...]
-    values: Array
-    deviation: Array | None
-    torque: TorqueProfile
-
-    def residual(self, scene: Scene, states: Array, slopes: Array) -> tuple[Array, Array]:
-        """Return computed less read numbers, in standard deviations, and how they change.
-
-        Args:
-            scene: the manipulator.
-            states: at the times, shape (n, m).
-            slopes: derivatives of the states by p parameters, shape (n, m, p).
-
-        Returns:
-            Residuals of the r readings, shape (r,), and their derivatives, shape (r, p), in order
-            of time; those of a time follow each other.
-
-        """
-        count = len(self.t)
-        found = compile_observables(scene)(*states[:, :4].T)
-        rows = np.stack([np.broadcast_to(row, count) for row in found]).reshape(5, -1, count)
-        value, *by_pose = rows[:, list(self.columns)]
-        off = value.T - self.values
-        angle = np.array(self.columns) < 6
-        off[:, angle] = np.angle(np.exp(1j * off[:, angle]))
-        deviation = np.ones_like(off) if self.deviation is None else self.deviation
-        changes = np.einsum("qcn,nqp->ncp", np.stack(by_pose), slopes[:, :4])
-        there = np.isfinite(self.values)
-        return (off / deviation)[there], (changes / deviation[:, :, None])[there]
 
 
 def take_readings(data: Measured, scene: Scene) -> Readings:
@@ -301,23 +267,3 @@ def _take_figure(data: Mapping[str, Any], scene: Scene) -> Readings:
     values = np.stack([*read.values()], axis=1)
     spread = None if deviation is None else np.broadcast_to(deviation, values.shape)
     return Readings(t, tuple(read), values, spread, SineProfile(scene.torque))
-
-
-@lru_cache(maxsize=8)
-def compile_observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
-    """Return a function of the quaternion: nine `OBSERVABLES`, then their derivatives by it."""
-    model, radius = kernel.model_of(scene), scene.star.radius
-
-    def function(*q: Any) -> tuple[Any, ...]:
-        rows = rotation_rows((q[0], q[1], q[2], q[3]))
-        legs = [(kernel.leg_motion(leg, rows, ZERO), leg) for leg in model.legs]
-        first, second, third = rows
-        return (
-            *(kernel.joint_angle(at, 0) for at, leg in legs),
-            atan2(second[2], first[2]),
-            atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
-            atan2(third[1], -third[0]),
-            *(radius * row[2] for row in rows),
-        )
-
-    return compile_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))

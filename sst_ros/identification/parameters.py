@@ -90,13 +90,6 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
     return tuple(names)
 
 
-def bodies_of(names: Sequence[str]) -> Iterator[str]:
-    """Yield the bodies, as "star" or "actuated_links[0]", whose whole inertia is in `names`."""
-    for body in dict.fromkeys(name.partition(".")[0] for name in names):
-        if all(f"{body}.{part}" in names for part in STANDARD[4:]):
-            yield body
-
-
 def values(scene: Scene, names: Sequence[str]) -> Array:
     """Values of parameters in a scene, zero for what it does not have, shape (len(names),)."""
     return np.array([_value(scene, name) for name in names])
@@ -341,19 +334,15 @@ class BaseParameters:
 
     Attributes:
         names: of the parameters, length p.
-        chosen: the parameters whose columns are independent, length b.
+        chosen: indices of those whose columns are independent, length b.
         transform: shape (b, p); row i has 1 at the chosen parameter i, and the coefficients of
             those whose columns depend on it.
 
     """
 
     names: tuple[str, ...]
-    chosen: tuple[int, ...]
+    chosen: list[int]
     transform: Array
-
-    def of_columns(self, columns: Array) -> Array:
-        """Pick the regressor of the base parameters out of that of all, shape (..., p)."""
-        return columns[..., list(self.chosen)]
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -371,9 +360,16 @@ class BaseParameters:
 
 
 def find_base_parameters(regressor: Regressor, seed: int = 0) -> BaseParameters:
-    """Return the base parameters of the mechanism: those that some motion determines."""
-    states = _draw_states(Geometry.of(regressor.scene), seed)
-    return find_independent(regressor(*states)[1], regressor.names)
+    """Return the base parameters of the mechanism: those that some motion determines.
+
+    The regressor is taken at random admissible poses within the stroke, rates and accelerations.
+    """
+    geometry, rng = Geometry.of(regressor.scene), np.random.default_rng(seed)
+    found = kinematics.direct_many(geometry, rng.uniform(0.1, 0.9, (300, 3)) * geometry.arc)
+    regular = found.admissible & (np.abs(found.det_j2) > 0.05) & np.all(np.sin(found.mu) > 0.1, 1)
+    quaternion = quaternion_of(found.rotation[regular])
+    rate, acceleration = rng.normal(size=(2, len(quaternion), 3)) * [[[2.0]], [[20.0]]]
+    return find_independent(regressor(quaternion, rate, acceleration)[1], regressor.names)
 
 
 def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
@@ -393,14 +389,4 @@ def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
     solved[np.abs(solved) < ROUNDED] = 0.0
     transform = np.zeros((len(chosen), len(names)))
     transform[:, there] = solved * lengths[there] / lengths[there[chosen]][:, None]
-    return BaseParameters(tuple(names), tuple(there[chosen].tolist()), transform)
-
-
-def _draw_states(geometry: Geometry, seed: int) -> tuple[Array, Array, Array]:
-    """Random admissible poses within the stroke, rates and accelerations."""
-    rng = np.random.default_rng(seed)
-    found = kinematics.direct_many(geometry, rng.uniform(0.1, 0.9, (300, 3)) * geometry.arc)
-    regular = found.admissible & (np.abs(found.det_j2) > 0.05) & np.all(np.sin(found.mu) > 0.1, 1)
-    quaternion = quaternion_of(found.rotation[regular])
-    rate, acceleration = rng.normal(size=(2, len(quaternion), 3)) * [[[2.0]], [[20.0]]]
-    return quaternion, rate, acceleration
+    return BaseParameters(tuple(names), there[chosen].tolist(), transform)

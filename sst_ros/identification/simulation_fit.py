@@ -32,7 +32,12 @@ from scipy.optimize import least_squares
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_program, mark_present, with_jacobian
+from sst_ros.dynamics.expression import (
+    compile_for_arrays,
+    compile_program,
+    mark_present,
+    with_jacobian,
+)
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, Dynamics
@@ -42,7 +47,7 @@ from sst_ros.identification.consistency import find_consistent_values, scales
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
 from sst_ros.identification.parameters import STANDARD, Identification, value_of
 from sst_ros.integration.applied_torque import torque_at
-from sst_ros.mechanism.generic_math import quaternion_rate
+from sst_ros.mechanism.generic_math import ZERO, atan2, quaternion_rate, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import TorqueProfile
@@ -186,10 +191,24 @@ class Sensitivities:
         self._state = (*QUATERNION, *RATE, *(LAG if scene.lags else ()))
 
     def compare(self, values: Array, read: Readings) -> tuple[Array, Array]:
-        """Return the residuals of r readings, shape (r,), and their slopes, shape (r, p)."""
+        """Return computed less read numbers, in standard deviations, and how they change.
+
+        Of r readings with values of p parameters these are residuals, shape (r,), and slopes, shape
+        (r, p), in order of time; those of a time follow each other.
+        """
+        count = len(read.t)
         times = read.t if read.t[-1] > 0.0 else np.append(read.t, 1e-9)
-        states, slopes = self.run(values, times)
-        return read.residual(self.scene, states[: len(read.t)], slopes[: len(read.t)])
+        states, slopes = (part[:count] for part in self.run(values, times))
+        found = compile_observables(self.scene)(*states[:, :4].T)
+        rows = np.stack([np.broadcast_to(row, count) for row in found]).reshape(5, -1, count)
+        value, *by_pose = rows[:, list(read.columns)]
+        off = value.T - read.values
+        angle = np.array(read.columns) < 6
+        off[:, angle] = np.angle(np.exp(1j * off[:, angle]))
+        deviation = np.ones_like(off) if read.deviation is None else read.deviation
+        changes = np.einsum("qcn,nqp->ncp", np.stack(by_pose), slopes[:, :4])
+        there = np.isfinite(read.values)
+        return (off / deviation)[there], (changes / deviation[:, :, None])[there]
 
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:
         """Integrate the motion and its sensitivities.
@@ -291,6 +310,25 @@ class Sensitivities:
             # Complex step: exact to rounding, as the map is rational.
             slopes[4:7, column] = body_rate(quaternion + 1e-30j * along, rate).imag / 1e-30
         return state, slopes
+
+
+@lru_cache(maxsize=8)
+def compile_observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
+    """Return a function of the quaternion: nine `OBSERVABLES`, then their derivatives by it."""
+    model, radius = kernel.model_of(scene), scene.star.radius
+
+    def function(*q: Any) -> tuple[Any, ...]:
+        rows = rotation_rows((q[0], q[1], q[2], q[3]))
+        first, second, third = rows
+        return (
+            *(kernel.joint_angle(kernel.leg_motion(leg, rows, ZERO), 0) for leg in model.legs),
+            atan2(second[2], first[2]),
+            atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
+            atan2(third[1], -third[0]),
+            *(radius * row[2] for row in rows),
+        )
+
+    return compile_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))
 
 
 def differentiate_damping(scene: Scene) -> float:

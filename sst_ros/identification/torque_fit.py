@@ -41,17 +41,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dst
 from scipy.interpolate import CubicHermiteSpline, make_interp_spline
+from scipy.linalg import solve_triangular
 from scipy.signal import butter, sosfiltfilt
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.errors import AssemblyError, InputError, Problem
 from sst_ros.identification import parameters
-from sst_ros.identification.consistency import (
-    LinearFit,
-    find_consistent_values,
-    fit_weighted,
-    scales,
-)
+from sst_ros.identification.consistency import find_consistent_values, fit_weighted, scales
 from sst_ros.identification.measured_motion import Measured, MeasuredMotion, read_motion
 from sst_ros.identification.parameters import (
     BaseParameters,
@@ -91,9 +87,11 @@ class TorqueFit(Identification):
     """Constants identified by torques; its estimates are those of the base parameters.
 
     Attributes:
-        base: the combinations of parameters that the motion determines.
-        fit: their estimates, without the constraint that bodies can exist.
-        excess: chi^2 of `values` against these estimates.
+        base: the combinations of parameters that the motion determines; `estimate` is without the
+            constraint that bodies can exist.
+        noise: standard deviations of the torques [N m], shape (3,).
+        condition: condition number of the weighted regressor with columns of length one.
+        excess: chi^2 of `values` against the estimates.
         vague: combinations whose standard deviation exceeds their size.
         samples: of the torques that were fitted.
         band: frequency below which they were [Hz]; None where angles were not filtered.
@@ -102,7 +100,8 @@ class TorqueFit(Identification):
     """
 
     base: BaseParameters
-    fit: LinearFit
+    noise: Array
+    condition: float
     excess: float
     vague: tuple[str, ...]
     samples: int
@@ -127,13 +126,13 @@ class TorqueFit(Identification):
         """
         measured = read_motion(data, self.given)
         known, columns, rows, _ = form_equations(measured, self.regressor, cutoff)
-        return known + self.base.of_columns(columns) @ self.estimate, measured.torque[rows]
+        return known + columns[..., self.base.chosen] @ self.estimate, measured.torque[rows]
 
     def _notes(self) -> Iterator[str]:
-        noise = ", ".join(f"{value:.3g}" for value in self.fit.noise)
+        noise = ", ".join(f"{value:.3g}" for value in self.noise)
         band = "" if self.band is None else f", frequencies up to {self.band:.3g} Hz"
         yield f"{self.samples} samples{band}; noise of the torques {noise} N m (std. dev.)"
-        yield f"condition number {self.fit.condition:.3g} (columns of length one)"
+        yield f"condition number {self.condition:.3g} (columns of length one)"
         pairs = np.abs(np.triu(self.correlation, 1))
         if pairs.size > 1:
             i, j = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
@@ -195,14 +194,13 @@ def fit_torques(
         deviations.shape == (3,) and np.all(np.isfinite(deviations) & (deviations > 0.0))
     ):
         _refuse("noise", noise, "must be three finite standard deviations > 0 [N m]")
-    fit = fit_weighted(base.of_columns(columns), torque, deviations)
+    estimate, root, found_noise = fit_weighted(columns[..., base.chosen], torque, deviations)
+    inverse = solve_triangular(root, np.eye(len(root)))
     given = parameters.values(scene, names)
     reach = max(scene.base.radius, scene.star.radius)
-    values, excess = find_consistent_values(
-        names, given, base.transform, fit.estimate, fit.root, reach
-    )
+    values, excess = find_consistent_values(names, given, base.transform, estimate, root, reach)
     whole = find_base_parameters(regressor)
-    vague = fit.deviation > scales(names, given)[list(base.chosen)]
+    vague = np.linalg.norm(inverse, axis=1) > scales(names, given)[base.chosen]
     note = f"identified from {samples} samples"
     lost = [chosen not in base.chosen for chosen in whole.chosen]
     return TorqueFit(
@@ -212,12 +210,13 @@ def fit_torques(
         values=values,
         labels=base.labels,
         before=np.asarray(base.transform @ given),
-        estimate=fit.estimate,
-        covariance=fit.covariance,
+        estimate=estimate,
+        covariance=inverse @ inverse.T,
         undetermined=tuple(compress(whole.labels, lost)),
         warnings=() if sound.all() else (warning,),
         base=base,
-        fit=fit,
+        noise=found_noise,
+        condition=float(np.linalg.cond(root / np.linalg.norm(root, axis=0))),
         excess=excess,
         vague=tuple(compress(base.labels, vague)),
         samples=samples,

@@ -187,12 +187,12 @@ class Batch:
         steps[code < 0] = 0
         _locate_ends(loop, step, steps, y, given, code, time)
         last = steps * step
-        common = self.model, self.columns, given[:3].T, code >= 0
-        samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
-        states = BatchStates(*common, samples, np.stack(kept)) if keep_every else None
-        return BatchResult(
-            *common, last, y, code=code, fault_time=time, local_error=error, kept=states
-        )
+        facts = self.model, self.columns, given[:3].T, code, time, error
+        result = BatchResult(*facts, last, y)
+        if keep_every:
+            samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
+            result.kept = BatchResult(*facts, samples, np.stack(kept))
+        return result
 
     def start(self, gamma: ArrayLike, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
@@ -296,14 +296,22 @@ def _of_joints(name: str, meaning: str) -> Any:
     return property(lambda states: states._quantity(name), doc=f"{meaning}, shape (..., N, 3).")
 
 
-class BatchStates:
-    """States of N scenarios, at one time or at several. Treat the arrays as read-only.
+class BatchResult:
+    """N scenarios, each in its state at the end, or in its last valid one. Arrays are read-only.
 
     Attributes:
-        t: times of the states [s], shape (N,) or (samples, N): those of the last valid state in a
-            scenario that has ended.
-        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (N, 4) or (samples, N, 4).
-        body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3) or (samples, N, 3).
+        t: times of the states [s], shape (N,).
+        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (N, 4).
+        body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3).
+        status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where it has no
+            start or its numbers ceased to be finite, shape (N,).
+        code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start, shape (N,).
+        fault_time: when a scenario passed a limit [s], the end of the step in which its numbers
+            ceased to be finite, 0 without a start, nan where it reached its end,
+            shape (N,).
+        local_error: largest local error estimate of a quaternion in a step, shape (N,).
+        kept: the same scenarios every `keep_every` steps from the start on, with an axis of samples
+            before that of scenarios in t and in all states; None unless asked for.
 
     """
 
@@ -312,15 +320,20 @@ class BatchStates:
         model: ParametricModel,
         columns: ParameterColumns,
         torque: Array,  # commanded, shape (N, 3); not used under a profile
-        valid: NDArray[np.bool_],  # whether a scenario has started, shape (N,)
-        t: Array,
+        code: NDArray[np.int64],
+        fault_time: Array,
+        local_error: Array,
+        t: Array,  # shape (N,) or (samples, N)
         y: Array,  # state of the integration, shape (state, N) or (samples, state, N)
     ) -> None:
-        self._model, self._columns, self._torque, self._valid = model, columns, torque, valid
-        self._state, self.t = np.moveaxis(y, -2, -1), t
-        self._computed: dict[str, Array] = {}
+        self._model, self._columns, self._torque = model, columns, torque
+        self.code, self.fault_time, self.local_error = code, fault_time, local_error
+        self.status = np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code))
+        self.t, self._state = t, np.moveaxis(y, -2, -1)
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
+        self.kept: BatchResult | None = None
+        self._computed: dict[str, Array] = {}
 
     gamma = _of_joints("gamma", "Angles of the actuators [rad], nan where there is no start")
     mu = _of_joints("mu", "Angles between base arcs and arcs of the star [rad]")
@@ -346,7 +359,7 @@ class BatchStates:
                     numbers = function(*states[..., rows], *inputs[:, rows])
                     for part, number in zip(found, numbers, strict=True):
                         part[..., rows] = number
-            found[..., ~self._valid] = np.nan
+            found[..., self.code < 0] = np.nan
             self._computed[name] = np.moveaxis(found, 0, -1)
         return self._computed[name]
 
@@ -366,44 +379,10 @@ class BatchStates:
         rows = zip(profile.amplitude, profile.frequency, profile.phase, strict=True)
         return np.stack([a * np.sin(f * self.t + p) for a, f, p in rows], axis=-1)
 
-    def to_xarray(self) -> xr.Dataset:
-        """Arrays with the dimension scenario, before it time if there are several; needs xarray."""
-        first = ("time", "scenario") if self.t.ndim == 2 else ("scenario",)
-        arrays = arrays_of(self, *first) | {"t": (first, self.t, {"units": "s"})}
-        coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1])}
-        found: xr.Dataset = require("xarray").Dataset(arrays, coordinates | DIMENSIONS)
-        found.attrs["scene"] = self._model.scene.name
-        return found
-
-
-class BatchResult(BatchStates):
-    """Results of N scenarios: their states at the end, or the last valid ones.
-
-    Attributes:
-        status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where it has no
-            start or its numbers ceased to be finite, shape (N,).
-        code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start, shape (N,).
-        fault_time: when a scenario passed a limit [s], the end of the step in which its numbers
-            ceased to be finite, 0 without a start, nan where it reached its end,
-            shape (N,).
-        local_error: largest local error estimate of a quaternion in a step, shape (N,).
-        kept: states every `keep_every` steps from the start on, arrays (samples, N, ...); None
-            unless asked for.
-
-    """
-
-    def __init__(
-        self,
-        *states: Any,
-        code: NDArray[np.int64],
-        fault_time: Array,
-        local_error: Array,
-        kept: BatchStates | None,
-    ) -> None:
-        super().__init__(*states)
-        self.code = code
-        self.status = np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code))
-        self.fault_time, self.local_error, self.kept = fault_time, local_error, kept
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Whether a scenario reached its end, shape (N,)."""
+        return np.equal(self.status, 0)
 
     @cached_property
     def message(self) -> tuple[str, ...]:
@@ -425,29 +404,27 @@ class BatchResult(BatchStates):
             texts.append(_REASONS.get(code) or limits[code - 1].reason)
         return np.array(texts, dtype=object), index
 
-    def __len__(self) -> int:
-        return len(self.status)
-
-    @property
-    def success(self) -> NDArray[np.bool_]:
-        """Whether a scenario reached its end, shape (N,)."""
-        return np.equal(self.status, 0)
-
     def to_xarray(self) -> xr.Dataset:
-        """Arrays with the dimension scenario; needs the package xarray. See `kept` for times."""
-        found = super().to_xarray()
-        for name in _SCENARIO:
-            found[name] = ("scenario", np.array(getattr(self, name)))
+        """Arrays with the dimension scenario, behind time in `kept`; needs the package xarray."""
+        first = ("time", "scenario") if self.t.ndim == 2 else ("scenario",)
+        arrays = arrays_of(self, *first) | {"t": (first, self.t, {"units": "s"})}
+        arrays |= {name: ("scenario", np.array(getattr(self, name))) for name in _SCENARIO}
+        coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1]), **DIMENSIONS}
+        about = {"scene": self._model.scene.name}
+        found: xr.Dataset = require("xarray").Dataset(arrays, coordinates, about)
         found["fault_time"].attrs["units"] = "s"
         return found
 
     def to_pandas(self) -> pd.DataFrame:
-        """Table with a row a scenario and a column a number, units in its `attrs`."""
+        """Table of the ends with a row a scenario and a column a number, units in its `attrs`."""
         columns: dict[str, Any] = {name: getattr(self, name) for name in _SCENARIO}
         table: pd.DataFrame = require("pandas").DataFrame(columns | columns_of(self))
         table.index.name = "scenario"
         table.attrs = {"units": UNITS | {"fault_time": "s"}, "scene": self._model.scene.name}
         return table
+
+    def __len__(self) -> int:
+        return len(self.status)
 
     def __repr__(self) -> str:
         name, ended = self._model.scene.name, np.count_nonzero(self.status)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.integration.batch import Batch, BatchResult, BatchStates
+from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.mechanism.frames import angle_between
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scenarios
@@ -261,7 +261,7 @@ def _extremes() -> list[tuple[str, str]]:
     return [(name, end) for name in Joints._fields for end in _ENDS]
 
 
-def extremes_of(kept: BatchStates) -> Columns:
+def extremes_of(kept: BatchResult) -> Columns:
     """Least and largest angles and rates of joints at the ends of steps."""
     with np.errstate(all="ignore"):
         return {

@@ -42,7 +42,7 @@ def fitted(target, noise):
 def consistent(names, given, fit, reach):
     """The nearest values of bodies that can exist, and their chi^2."""
     whole = np.eye(len(names))
-    return find_consistent_values(names, given, whole, fit.estimate, fit.root, reach)
+    return find_consistent_values(names, given, whole, *fit[:2], reach)
 
 
 def test_the_pseudo_inertia_is_the_sum_over_mass_of_p_p_t():
@@ -73,7 +73,7 @@ def test_a_body_that_cannot_exist_is_replaced_by_the_nearest():
     size = scales(names, given)
 
     def cost(x):
-        off = fit.root @ (x - fit.estimate)
+        off = fit[1] @ (x - fit[0])
         return 0.5 * off @ off + 0.5 * np.sum(((x - given) / size) ** 2)
 
     def second_moments(x):

@@ -95,8 +95,8 @@ def test_noise_is_found_and_may_be_given():
     found = several[0]
     true = NOISE * np.abs(case.torque).max(axis=0)
     # One estimate, by some 40 equations of an actuator, errs by 11 %, the mean of six by 5 %.
-    assert np.mean([one.fit.noise for one in several], axis=0) == pytest.approx(true, rel=0.1)
-    given = identify(case.recording(0), case.model, noise=2.0 * found.fit.noise)
+    assert np.mean([one.noise for one in several], axis=0) == pytest.approx(true, rel=0.1)
+    given = identify(case.recording(0), case.model, noise=2.0 * found.noise)
     assert given.deviation == pytest.approx(2.0 * found.deviation, rel=1e-9)
     assert given.estimate == pytest.approx(found.estimate, rel=1e-9, abs=1e-12)
     assert found.consistent

@@ -90,7 +90,7 @@ def test_the_columns_of_the_base_parameters_give_all_torques(name):
     regressor = Regressor(scene, parameters.select_names(scene, None))
     base = find_base_parameters(regressor)
     _, columns = regressor(*states(scene, 40, seed=3))
-    rebuilt = base.of_columns(columns) @ base.transform
+    rebuilt = columns[..., base.chosen] @ base.transform
     assert np.abs(rebuilt - columns).max() < 1e-9 * np.abs(columns).max()
     assert find_independent(columns, regressor.names).chosen == base.chosen
 
@@ -117,7 +117,7 @@ def condition(scene):
     times = np.linspace(0.0, motion.duration, 200)
     _, columns = regressor(*manipulators.states(motion, times))
     base = find_independent(columns, regressor.names)
-    matrix = base.of_columns(columns).reshape(-1, len(base.chosen))
+    matrix = columns[..., base.chosen].reshape(-1, len(base.chosen))
     return np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)), base
 
 
