@@ -103,13 +103,7 @@ def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, A
 
 
 class Cone(NamedTuple):
-    """A matrix that must be positive semidefinite: sum of values[places] times basis.
-
-    Attributes:
-        places: of the parameters that it depends on.
-        basis: shape (len(places), n, n).
-
-    """
+    """A matrix that must be positive semidefinite: values at `places` times basis (., n, n)."""
 
     places: list[int]
     basis: Array

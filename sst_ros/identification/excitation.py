@@ -107,38 +107,48 @@ def design(
         problems.append(Problem("harmonics", harmonics, "must be from 3 to 30"))
     if problems:
         raise InputError("identify design", problems)
-    series = _Series(duration, harmonics, np.array(scene.initial.gamma))
-    cost = _Cost(scene, parameters.select_names(scene, requested), series)
-    free = np.random.default_rng(seed).normal(size=series.size)
-    free *= _FIRST / np.abs(series.at(free)[0] - series.centre).max()
-    found = minimize(cost, free, method="L-BFGS-B", options={"maxiter": iterations}).x
+    names = parameters.select_names(scene, requested)
+    trial = _Trial(scene, names, duration, harmonics)
+    free = np.random.default_rng(seed).normal(size=trial.size)
+    free *= _FIRST / np.abs(trial.series(free)[0] - trial.centre).max()
+    found = minimize(trial.cost, free, method="L-BFGS-B", options={"maxiter": iterations}).x
     for _ in range(40):
-        designed = _write_scene(scene, series, found)
+        designed = _write_scene(scene, trial.times, trial.series(found))
         plan = examine_motion(reference_motion(designed), designed)
-        columns, excess = cost.evaluate(found)
+        columns, excess = trial.evaluate(found)
         if not plan.problems and excess.max() <= 0.0:
             # Of 1000 samples a second.
-            information = columns.T @ columns * (1000.0 * duration / len(series.times))
+            information = columns.T @ columns * (1000.0 * duration / len(trial.times))
             deviation = np.sqrt(np.diag(np.linalg.inv(information)))
-            return ExcitingMotion(designed, cost.base, _condition(columns), deviation)
+            return ExcitingMotion(designed, trial.base, _condition(columns), deviation)
         found = 0.95 * found
     room = Problem("initial.gamma", scene.initial.gamma, "leaves no room for a motion about it")
     raise MotionRefused("identify design", plan.problems or [room])
 
 
-class _Series:
-    """Angles of three actuators as a Fourier series of free numbers.
+class _Trial:
+    """Motions of a scene as Fourier series of free numbers, and what they tell of parameters.
 
     Attributes:
         centre: angles at both ends [rad], shape (3,).
         size: number of the free numbers.
         times: samples [s], POINTS in a period of the highest harmonic, shape (n,).
+        base: the parameters that some motion determines.
 
     """
 
-    def __init__(self, duration: float, harmonics: int, centre: Array) -> None:
-        self.centre = centre
-        n = np.arange(1, harmonics + 1)
+    def __init__(
+        self, scene: Scene, names: tuple[str, ...], duration: float, harmonics: int
+    ) -> None:
+        self._regressor = Regressor(scene, names)
+        self.base = find_base_parameters(self._regressor)
+        if not self.base.chosen:
+            allowed = "must determine something: no torque depends on these parameters"
+            raise InputError("identify design", [Problem("parameters", list(names), allowed)])
+        self._scene, self._values = scene, parameters.values(scene, names)
+        self._space = ActuatorSpaceMap(Geometry.of(scene))
+        self._start = np.array(initial_state(scene, self._space.geometry)[:4])
+        self.centre, n = np.array(scene.initial.gamma), np.arange(1, harmonics + 1)
         rest = np.zeros((3, 2 * harmonics))  # gamma, gamma_dot, gamma_ddot at the beginning
         rest[0, harmonics:], rest[1, :harmonics], rest[2, harmonics:] = 1.0, n, n * n
         self._basis = null_space(rest)
@@ -148,7 +158,7 @@ class _Series:
         self._w = 2.0 * np.pi * n / duration
         self._s, self._c = (f(np.outer(self.times, self._w)) for f in (np.sin, np.cos))
 
-    def at(self, free: Array) -> tuple[Array, Array, Array]:
+    def series(self, free: Array) -> tuple[Array, Array, Array]:
         """Angles [rad] and two derivatives at the samples, each shape (n, 3)."""
         sine, cosine = np.split(self._basis @ free.reshape(-1, 3), 2)
         s, c, w = self._s, self._c, self._w
@@ -158,29 +168,8 @@ class _Series:
             -(s * w * w) @ sine - (c * w * w) @ cosine,
         )
 
-
-def _condition(columns: Array) -> float:
-    """Condition number with columns of length one, 1e15 at most."""
-    lengths = np.linalg.norm(columns, axis=0)
-    return min(float(np.linalg.cond(columns / np.maximum(lengths, 1e-300))), 1e15)
-
-
-class _Cost:
-    """What the optimisation minimises, of the free numbers of a series."""
-
-    def __init__(self, scene: Scene, names: tuple[str, ...], series: _Series) -> None:
-        self._scene, self._series = scene, series
-        self._regressor = Regressor(scene, names)
-        self.base = find_base_parameters(self._regressor)
-        self._values = parameters.values(scene, names)
-        self._geometry = Geometry.of(scene)
-        self._coordinates = ActuatorSpaceMap(self._geometry)
-        self._start = np.array(initial_state(scene, self._geometry)[:4])
-        if not self.base.chosen:
-            allowed = "must determine something: no torque depends on these parameters"
-            raise InputError("identify design", [Problem("parameters", list(names), allowed)])
-
-    def __call__(self, free: Array) -> float:
+    def cost(self, free: Array) -> float:
+        """Return what the optimisation minimises."""
         columns, excess = self.evaluate(free)
         information = np.linalg.svd(columns, compute_uv=False) ** 2
         log_deviation = -0.5 * float(np.mean(np.log(np.maximum(information, 1e-300))))
@@ -189,58 +178,55 @@ class _Cost:
 
     def evaluate(self, free: Array) -> tuple[Array, Array]:
         """Return the regressor of b base parameters, shape (3 n, b), and excesses over limits."""
-        gamma, rate, acceleration = self._series.at(free)
+        gamma, rate, acceleration = self.series(free)
+        space, actuators, excess = self._space, self._scene.actuators, []
         with np.errstate(all="ignore"):
-            quaternion = self._orientations(gamma)
-            star = self._coordinates.star_rates(*quaternion.T, *rate.T, *acceleration.T)
-            body = np.stack(star, axis=1)
-            known, columns = self._regressor(quaternion, body[:, :3], body[:, 3:])
+            quaternion = self._follow(gamma)
+            star = np.stack(space.star_rates(*quaternion.T, *rate.T, *acceleration.T), axis=1)
+            known, columns = self._regressor(quaternion, star[:, :3], star[:, 3:])
             torque = known + columns @ self._values
-            posture = np.stack(self._coordinates.postures(*quaternion.T), axis=1)
-        excess = np.concatenate(list(self._excesses(gamma, rate, acceleration, torque, posture)))
-        columns = columns[..., self.base.chosen].reshape(-1, len(self.base.chosen))
-        if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(excess))):
-            return np.ones_like(columns), np.array([1e3])
-        return columns, np.maximum(excess, 0.0)
-
-    def _excesses(
-        self, gamma: Array, rate: Array, acceleration: Array, torque: Array, posture: Array
-    ) -> Iterable[Array]:
-        """Yield how far numbers lie beyond SHARE of their range, over the range."""
-        geometry, actuators = self._geometry, self._scene.actuators
+            posture = np.stack(space.postures(*quaternion.T), axis=1)
         sines, beta, det_j2 = posture[:, :3], posture[:, 3:6], posture[:, 6:]
-        for values, high in ((gamma, geometry.arc), (beta, geometry.beta_max)):
-            yield (np.abs(values / high - 0.5) - 0.5 * SHARE).ravel()
-        yield LEAST_SINE - np.hstack([sines, np.abs(det_j2)]).ravel()
-        for values, name in (
-            (torque, "torque"),
-            (rate, "velocity"),
-            (acceleration, "acceleration"),
-        ):
+        # How far numbers lie beyond SHARE of their range, over the range.
+        for values, high in ((gamma, space.geometry.arc), (beta, space.geometry.beta_max)):
+            excess.append(np.abs(values / high - 0.5) - 0.5 * SHARE)
+        excess.append(LEAST_SINE - np.hstack([sines, np.abs(det_j2)]))
+        reached = {"torque": torque, "velocity": rate, "acceleration": acceleration}
+        for name, values in reached.items():
             if (limit := getattr(actuators, f"{name}_limit", None)) is not None:
-                yield (np.abs(values) / limit - SHARE).ravel()
+                excess.append(np.abs(values) / limit - SHARE)
+        beyond = np.concatenate([part.ravel() for part in excess])
+        columns = columns[..., self.base.chosen].reshape(-1, len(self.base.chosen))
+        if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(beyond))):
+            return np.ones_like(columns), np.array([1e3])
+        return columns, np.maximum(beyond, 0.0)
 
-    def _orientations(self, gamma: Array) -> Array:
+    def _follow(self, gamma: Array) -> Array:
         """Quaternion at each sample, followed from the centre along straight lines, all at once."""
-        found, centre = np.tile(self._start, (len(gamma), 1)), self._series.centre
+        found = np.tile(self._start, (len(gamma), 1))
         for part in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
-            here = centre + part * (gamma - centre)
-            found = self._coordinates.orientations(found, here, 5 if part == 1.0 else 2)
+            here = self.centre + part * (gamma - self.centre)
+            found = self._space.orientations(found, here, 5 if part == 1.0 else 2)
         return found
 
 
-def _write_scene(scene: Scene, series: _Series, free: Array) -> Scene:
+def _condition(columns: Array) -> float:
+    """Condition number with columns of length one, 1e15 at most."""
+    lengths = np.linalg.norm(columns, axis=0)
+    return min(float(np.linalg.cond(columns / np.maximum(lengths, 1e-300))), 1e15)
+
+
+def _write_scene(scene: Scene, times: Array, angles: tuple[Array, Array, Array]) -> Scene:
     """Return the scene with the motion as waypoints, quintic between them."""
     names = ("time", "gamma", "gamma_dot", "gamma_ddot")
-    rows = zip(series.times, *series.at(free), strict=True)
-    points = [dict(zip(names, row, strict=True)) for row in rows]
+    points = [dict(zip(names, row, strict=True)) for row in zip(times, *angles, strict=True)]
     points[-1] |= dict.fromkeys(names[2:], (0.0, 0.0, 0.0))
     return scene.with_values(
         {
             "initial.gamma_dot": 0.0,
             "torque": None,
             "motion": {"waypoints": points},
-            "duration": series.times[-1],
+            "duration": times[-1],
             "provenance.motion": "designed to identify parameters: Fourier series",
         }
     )

@@ -69,9 +69,9 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
 
     """
     if requested is None:
-        return tuple(_own(scene))
+        return tuple(_list_names(scene, more=False))
     names: dict[str, None] = {}
-    problems, known = [], _all(scene)
+    problems, known = [], _list_names(scene, more=True)
     for begin in [requested] if isinstance(requested, str) else requested:
         found = [name for name in known if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)]
         if str(begin) in LINKS:  # the three alike
@@ -92,7 +92,27 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
 
 def values(scene: Scene, names: Sequence[str]) -> Array:
     """Values of parameters in a scene, zero for what it does not have, shape (len(names),)."""
-    return np.array([_value(scene, name) for name in names])
+
+    def value(name: str) -> float:
+        body, _, axis = name.partition(".moment.")
+        mass = (value_of(scene, f"{body}.mass") or 0.0) if axis else 1.0
+        return mass * (value_of(scene, _of_centre(name)) or 0.0)
+
+    return np.array([value(name) for name in names])
+
+
+def value_of(scene: Scene, name: str) -> float | None:
+    """Return a number of a scene by its key, the first of a list; None where there is none."""
+    try:
+        _, value, spec = next(find_fields(scene, name, components=True))
+    except ValueError:
+        return None
+    return None if spec.kind != "number" or value is None else float(np.ravel(value)[0])
+
+
+def _of_centre(name: str) -> str:
+    """Return the key of the component of a centre that a moment has."""
+    return re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
 
 
 def with_symbols(scene: Scene, symbols: Mapping[str, Any], *, moments: bool = False) -> Any:
@@ -130,7 +150,7 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
     for name, number in found.items():
         body, _, part = name.partition(".")
         if part.startswith("moment."):
-            mass = found.get(f"{body}.mass", _value(scene, f"{body}.mass"))
+            mass = found.get(f"{body}.mass", value_of(scene, f"{body}.mass"))
             centre = [found.get(f"{body}.moment.{axis}", 0.0) for axis in "xyz"]
             changed[f"{body}.centre"] = [h / mass for h in centre] if mass else [0.0] * 3
         elif not name.startswith("offset"):
@@ -146,67 +166,36 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
     return build(Scene, document, scene.name, of_row=True)
 
 
-def _own(scene: Scene) -> Iterator[str]:
-    """Names of what the scene has; links that are equal are taken as alike."""
-    yield from _body("star", scene.star, scene)
+def _list_names(scene: Scene, *, more: bool) -> list[str]:
+    """Names of what the scene has, of equal links alike.
+
+    With `more`, behind them, what may be asked for besides: other links, unknown friction, offsets.
+    """
+    own: dict[str, Star | Link] = {"star": scene.star}
+    others: dict[str, Star | Link] = {}
     for kind in LINKS:
         links = getattr(scene, kind)
-        if links[0] == links[1] == links[2]:
-            yield from _body(kind, links[0], scene)
-        else:
-            for k in range(3):
-                yield from _body(f"{kind}[{k}]", links[k], scene)
+        each = {f"{kind}[{k}]": link for k, link in enumerate(links)}
+        own |= {kind: links[0]} if links[0] == links[1] == links[2] else each
+        others |= {**each, kind: links[0]}
+    parts = STANDARD if scene.gravity is not None else STANDARD[4:]
+    whole = [
+        [f"{name}.{part}" for name, body in bodies.items() if body.inertia for part in parts]
+        for bodies in (own, others if more else {})
+    ]
+    names = whole[0]
     for kind in JOINT_KINDS:
         terms = getattr(scene.friction, kind, None)
         present = (part for part in ("viscous", "coulomb", "static") if getattr(terms, part, 0.0))
-        yield from (f"friction.{kind}.{part}" for part in present)
-    yield from (f"springs[{i}].stiffness" for i in range(len(scene.springs)))
-    if scene.actuators is not None and scene.actuators.rotor_inertia:
-        yield "actuators.rotor_inertia"
-
-
-def _all(scene: Scene) -> list[str]:
-    """Names that may be asked for: also separate links, friction not yet known, offsets."""
-    names = list(_own(scene))
-    for kind in LINKS:
-        first, second, third = getattr(scene, kind)
-        bodies = {f"{kind}[0]": first, f"{kind}[1]": second, f"{kind}[2]": third, kind: first}
-        for name, body in bodies.items():
-            names += _body(name, body, scene)
-    for kind in JOINT_KINDS:
-        names += (f"friction.{kind}.{part}" for part in ("viscous", "coulomb"))
-    names += ("actuators.rotor_inertia", *(f"offset[{k}]" for k in range(3)))
+        names += (f"friction.{kind}.{part}" for part in present)
+    names += (f"springs[{i}].stiffness" for i in range(len(scene.springs)))
+    if more or (scene.actuators is not None and scene.actuators.rotor_inertia):
+        names.append("actuators.rotor_inertia")
+    if more:
+        names += whole[1]
+        names += (f"friction.{k}.{part}" for k in JOINT_KINDS for part in ("viscous", "coulomb"))
+        names += (f"offset[{k}]" for k in range(3))
     return list(dict.fromkeys(names))
-
-
-def _body(name: str, body: Star | Link, scene: Scene) -> Iterator[str]:
-    if body.inertia is not None:
-        weighty = scene.gravity is not None
-        yield from (f"{name}.{part}" for part in (STANDARD if weighty else STANDARD[4:]))
-
-
-def _value(scene: Scene, name: str) -> float:
-    body, _, axis = name.partition(".moment.")
-    if axis:
-        mass, centre = value_of(scene, f"{body}.mass"), value_of(scene, _of_centre(name))
-        return (mass or 0.0) * (centre or 0.0)
-    return value_of(scene, name) or 0.0
-
-
-def _of_centre(name: str) -> str:
-    """Return the key of the component of a centre that a moment has."""
-    return re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
-
-
-def value_of(scene: Scene, name: str) -> float | None:
-    """Return a number of a scene by its key, the first of a list; None where there is none."""
-    try:
-        _, value, spec = next(find_fields(scene, name, components=True))
-    except ValueError:
-        return None
-    if spec.kind != "number" or value is None:
-        return None
-    return float(np.ravel(value)[0])
 
 
 @dataclass(frozen=True)

@@ -234,16 +234,13 @@ def form_equations(
 ) -> tuple[Array, Array, NDArray[np.intp], float | None]:
     """Evaluate the equation of motion at the samples, or its means where torques are held.
 
-    Args:
-        measured: the motion.
-        regressor: of the torques, p parameters.
-        cutoff: of the filter [Hz]; None for no filter where rates were measured, else for MARGIN
-            times the bandwidth of the motion.
+    Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at MARGIN times
+    the bandwidth of the motion.
 
     Returns:
-        The known torques [N m], shape (m, 3); the regressor, shape (m, 3, p); the rows of the
-        measured torques that they belong to, shape (m,); and the frequency [Hz] up to which they
-        are sound where angles were filtered, else None.
+        The known torques [N m], shape (m, 3); the regressor of p parameters, shape (m, 3, p); the
+        rows of the measured torques that they belong to, shape (m,); and the frequency [Hz] up to
+        which they are sound where angles were filtered, else None.
 
     Raises:
         InputError: no assembly of the manipulator has these angles, or samples are not evenly

@@ -33,14 +33,10 @@ EARLIEST = 1e-8
 def batch_source(program: Program, distances: Program, tableau: Tableau, size: int) -> str:
     """Text of `batch(h, first, count, begin, end, y, d, code, when, error)`: blocks begin to end.
 
-    Args:
-        program: derivative; inputs t, state, drive, of which the last may be parameters.
-        distances: numbers that are positive as long as the state is valid, then their rates; inputs
-            are the state's first seven, and the parameters.
-        tableau: explicit method.
-        size: numbers in the state.
-
-    Of RK4, ten lines without those of `evaluate_lanes` and `crossings`:
+    The program is the derivative of `size` numbers by t, state and drive, of which the last may be
+    parameters. Distances are positive as long as the state is valid; their rates follow them, and
+    their inputs are the state's first seven, and the parameters. Of RK4, ten lines without those of
+    `evaluate_lanes` and `crossings`:
 
         def batch(h, first, count, begin, end, y, d, code, when, error):
             block = vector(4512)
@@ -52,7 +48,6 @@ def batch_source(program: Program, distances: Program, tableau: Tableau, size: i
                             for x in range(224):
                                 block[224 + x] = block[0 + x] + h * (0.5 * block[992 + x])
                         time = step * h + NODES[stage] * h
-
     """
     drive = len(program.inputs) - 1 - size
     at = Layout(
@@ -64,14 +59,24 @@ def batch_source(program: Program, distances: Program, tableau: Tableau, size: i
     given = ["time", *at.rows("s", size), *outside]
     parameters = outside[drive - (len(distances.inputs) - 7) :]
 
+    def sum_of(weights: tuple[float, ...]) -> str:
+        return combination(weights, lambda m: at.lane("k", m * size, "x"))
+
+    def by_stage(line: Callable[[int], str]) -> list[str]:
+        """Put a line for each stage, over all numbers of the state in one loop."""
+        lines = []
+        for stage in range(len(tableau.b)):
+            lines += [
+                f"{'elif' if stage else 'if'} stage == {stage}:",
+                f"    for x in range({size * SIMD_WIDTH}):",
+                f"        {line(stage)}",
+            ]
+        return lines
+
     def argument(stage: int) -> str:
         """Where a stage evaluates the derivative."""
-        total = combination(tableau.a[stage], lambda m: at.lane("k", m * size, "x"))
-        more = f" + h * ({total})" if stage else ""
+        more = f" + h * ({sum_of(tableau.a[stage])})" if stage else ""
         return f"{at.lane('s', 0, 'x')} = {at.lane('y', 0, 'x')}{more}"
-
-    def kept(stage: int) -> str:
-        return f"{at.lane('k', stage * size, 'x')} = {at.lane('f', 0, 'x')}"
 
     load = load_lanes(at, y=size, d=drive)
     load += [f"    {at.lane(name)} = {name}[n]" for name in ("code", "when", "error")]
@@ -83,11 +88,11 @@ def batch_source(program: Program, distances: Program, tableau: Tableau, size: i
         *indent(8, evaluate_lanes(distances, [*at.rows("y", 7), *parameters], at, "was")),
         "        for step in range(first, first + count):",
         f"            for stage in range({len(tableau.b)}):",
-        *indent(16, _by_stage(tableau, size, argument)),
+        *indent(16, by_stage(argument)),
         *indent(16, ["time = step * h + NODES[stage] * h"]),
         *indent(16, evaluate_lanes(program, given, at, "f")),
-        *indent(16, _by_stage(tableau, size, kept)),
-        *indent(12, _results(tableau, size, at)),
+        *indent(16, by_stage(lambda m: f"{at.lane('k', m * size, 'x')} = {at.lane('f', 0, 'x')}")),
+        *indent(12, _results(tableau, size, at, sum_of)),
         *indent(12, evaluate_lanes(distances, [*at.rows("new", 7), *parameters], at, "far")),
         *indent(12, crossings(limits, at)),
         *indent(12, _accept(size, at)),
@@ -120,38 +125,24 @@ def load_lanes(at: Layout, **rows: int) -> list[str]:
     return lines
 
 
-def _by_stage(tableau: Tableau, size: int, line: Callable[[int], str]) -> list[str]:
-    """Put a line for each stage, over all numbers of the state in one loop."""
-    lines = []
-    for stage in range(len(tableau.b)):
-        lines += [
-            f"{'elif' if stage else 'if'} stage == {stage}:",
-            f"    for x in range({size * SIMD_WIDTH}):",
-            f"        {line(stage)}",
-        ]
-    return lines
-
-
-def _results(tableau: Tableau, size: int, at: Layout) -> list[str]:
+def _results(
+    tableau: Tableau, size: int, at: Layout, sum_of: Callable[[tuple[float, ...]], str]
+) -> list[str]:
     """Write the new state, with a quaternion of length 1, and errors of the quaternion."""
-
-    def total(weights: tuple[float, ...]) -> str:
-        return combination(weights, lambda m: at.lane("k", m * size, "x"))
-
     lines = [
         f"for x in range({size * SIMD_WIDTH}):",
-        f"    {at.lane('new', 0, 'x')} = {at.lane('y', 0, 'x')} + h * ({total(tableau.b)})",
+        f"    {at.lane('new', 0, 'x')} = {at.lane('y', 0, 'x')} + h * ({sum_of(tableau.b)})",
         f"for x in range({4 * SIMD_WIDTH}):",
     ]
     if tableau.damping:
         lines += [
-            f"    fine = {total(tableau.error)}",
-            f"    coarse = {total(tableau.damping)}",
+            f"    fine = {sum_of(tableau.error)}",
+            f"    coarse = {sum_of(tableau.damping)}",
             "    both = fine * fine + 0.01 * (coarse * coarse) + 1e-300",
             f"    {at.lane('e', 0, 'x')} = h * fine * abs(fine) / sqrt(both)",
         ]
     else:
-        lines += [f"    {at.lane('e', 0, 'x')} = h * ({total(tableau.error) or '0.0'})"]
+        lines += [f"    {at.lane('e', 0, 'x')} = h * ({sum_of(tableau.error) or '0.0'})"]
     parts = at.rows("new", 4)
     squares = " + ".join(f"{part} * {part}" for part in parts)
     scaled = [f"{part} = {part} * factor" for part in parts]
@@ -192,10 +183,6 @@ def crossings(count: int, at: Layout) -> list[str]:
     `was` and `far` hold distances and rates at both ends. Few steps pass one, so lanes only test
     the tangents there, which lie below a curve that turns; what is found is examined lane by lane.
 
-    Args:
-        count: number of limits.
-        at: of the block, with rows was, far (2 count each), code, hit, found, share.
-
     Ten lines, the last three of the search:
 
         for i in range(32):
@@ -208,7 +195,6 @@ def crossings(count: int, at: Layout) -> list[str]:
         for k in range(32):
             if block[4416 + k] > 0.0:
                 for j in range(18):
-
     """
     test = ["hit = 0.0"]
     for j in range(count):

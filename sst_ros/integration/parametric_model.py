@@ -91,13 +91,14 @@ class ParametricModel:
                 row[:] = np.where(row == 0.0, numbers[level], row)
             elif place[-1] == "rest":
                 np.nan_to_num(row, copy=False)  # of a spring without stiffness any will do
-        for place in numbers.keys() - self._varied.keys():
-            if not np.all(numbers[place] == self._fixed[place]):
-                allowed = f"must be {self._fixed[place]} in all scenarios of this model"
-                raise self._refusal(str(place), numbers[place], allowed)
+        problems = [
+            Problem(str(place), numbers[place], f"must be {fixed} in all scenarios of this model")
+            for place, fixed in self._fixed.items()
+            if place not in self._varied and not np.all(numbers[place] == fixed)
+        ]
         if np.any(tree.model.time_constant == 0.0):
             allowed = "must be > 0 [s] in every scenario, or in none"
-            raise self._refusal("actuators.time_constant", 0.0, allowed)
+            problems.append(Problem("actuators.time_constant", 0.0, allowed))
         actuators = scenarios.columns().actuators
         given = None if actuators is None else actuators.torque_limit
         limit = np.full(len(which), np.inf if given is None else given)
@@ -109,11 +110,10 @@ class ParametricModel:
                 n = int(clamped[0])
                 where = f"scenario {n}: " if scenarios.count else ""
                 allowed = f"must not be less than the amplitude {largest[n]} of the profile"
-                raise self._refusal(f"{where}actuators.torque_limit", float(limit[n]), allowed)
+                problems.append(Problem(f"{where}actuators.torque_limit", float(limit[n]), allowed))
+        if problems:
+            raise InputError(self.scene.name, problems)
         return ParameterColumns(inputs, geometries, which, limit)
-
-    def _refusal(self, key: str, value: object, allowed: str) -> InputError:
-        return InputError(self.scene.name, [Problem(key, value, allowed)])
 
     def limits(self, geometry: Geometry) -> tuple[Limit, ...]:
         """Return the limits of scenarios with this geometry."""

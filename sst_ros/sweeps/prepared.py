@@ -42,11 +42,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 class PreparedSweep:
-    """A study with its compiled code and its number of steps.
-
-    Args:
-        study: what runs.
-        steps: number of steps of a run, where it has been chosen already.
+    """A study with its compiled code and its number of steps, which may be known already.
 
     Raises:
         InputError: the ends of what varies make no scene, or no number of steps reaches the

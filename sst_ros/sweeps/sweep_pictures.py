@@ -41,10 +41,11 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     if shown := correlate(table, score).index[:MOST_INPUTS].tolist():
         worst = np.argsort(score.to_numpy())[-MOST_RUNS:]
         figures["worst"] = draw_scatter(table[shown], worst, title)
+    paths = {out / f"{name}.png": figure for name, figure in figures.items()}
     with write_into(out, "sweep plot"):
-        for name, figure in figures.items():
-            save_figure(figure, out / f"{name}.png")
-    return [out / f"{name}.png" for name in figures]
+        for path, figure in paths.items():
+            save_figure(figure, path)
+    return list(paths)
 
 
 def _score(table: pd.DataFrame) -> tuple[pd.Series, str]:
@@ -89,30 +90,22 @@ def draw_early_ends(correlations: pd.Series, counts: pd.Series) -> Figure:
 
 @styled
 def draw_scatter(inputs: pd.DataFrame, worst: NDArray[np.intp], title: str) -> Figure:
-    """Scatter matrix of inputs: a sample of all runs, and the worst over it.
-
-    Args:
-        inputs: columns of all runs.
-        worst: positions of the worst runs.
-        title: what worst means.
-
-    """
-    names = list(inputs.columns)
-    size = len(names)
+    """Scatter matrix of inputs: a sample of all runs, and over it the worst, by their positions."""
+    size = len(inputs.columns)
     figure = Figure(figsize=(1.2 + 1.8 * size, 1.2 + 1.8 * size))
-    some = inputs.iloc[:: max(1, len(inputs) // MOST_POINTS)]
-    layers = (some, GREY, 1), (inputs.iloc[worst], VERMILION, 3)
-    for row, vertical in enumerate(names):
-        for column, horizontal in enumerate(names):
-            axes = figure.add_subplot(size, size, row * size + column + 1)
-            for runs, colour, markersize in layers:
-                if row == column:
-                    axes.hist(runs[vertical], 30, color=colour, alpha=0.6, density=True)
-                else:
-                    place = runs[horizontal], runs[vertical]
-                    axes.plot(*place, ".", color=colour, markersize=markersize)
-            axes.set_xlabel(horizontal if row == size - 1 else "", fontsize=7)
-            axes.set_ylabel("" if column else vertical, fontsize=7)
-            axes.tick_params(labelsize=6)
+    grid = figure.subplots(size, size, squeeze=False)
+    sample = inputs.iloc[:: max(1, len(inputs) // MOST_POINTS)]
+    layers = (sample, GREY, 1), (inputs.iloc[worst], VERMILION, 3)
+    for (row, column), axes in np.ndenumerate(grid):
+        vertical, horizontal = inputs.columns[row], inputs.columns[column]
+        for runs, colour, markersize in layers:
+            if row == column:
+                axes.hist(runs[vertical], 30, color=colour, alpha=0.6, density=True)
+            else:
+                place = runs[horizontal], runs[vertical]
+                axes.plot(*place, ".", color=colour, markersize=markersize)
+        axes.set_xlabel(horizontal if row == size - 1 else "", fontsize=7)
+        axes.set_ylabel("" if column else vertical, fontsize=7)
+        axes.tick_params(labelsize=6)
     figure.suptitle(title)
     return figure

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.schema import Section, anything, choice, integer, number, section, specs, texts
+from sst_ros.scene.schema import Section, anything, choice, integer, positive, section, specs, texts
 from sst_ros.scene.yaml_document import build, plain
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
@@ -47,6 +47,7 @@ OUTPUTS = (*QUANTITIES, "energy", "extremes")
 
 MOST = 10_000_000
 
+_count: Any = partial(integer, default=None, least=1, most=MOST)
 _NO_TORQUE = "has no effect: the controller gives the torques"
 
 
@@ -57,12 +58,7 @@ class SampledControl(ControlChannel, ControllerSettings):
 
 @dataclass(frozen=True)
 class SweepStudy(Section):
-    """Many runs of a scene.
-
-    Raises:
-        InputError: a value is not allowed; the message names its key and what is allowed.
-
-    """
+    """Many runs of a scene; raises InputError with the key of a value that is not allowed."""
 
     ORIGIN = "sweep"
 
@@ -70,32 +66,21 @@ class SweepStudy(Section):
     vary: Mapping[str, Any] = anything(
         "distribution or values by key of the scene, see `variations`", default_factory=dict
     )
-    n: int | None = integer(
-        "number of runs; by default that of the grid or of the table",
-        default=None,
-        least=1,
-        most=2**53,
+    n: int | None = _count(
+        "number of runs; by default that of the grid or of the table", most=2**53
     )
     seed: int = integer("of the random numbers", default=0, least=0, most=2**64 - 1)
     sampling: str = choice("of random numbers", SAMPLINGS, default="random")
     table: Any = anything(
         "values by column in place of distributions: DataFrame, mapping or file", default=None
     )
-    duration: float | None = number(
-        "length of a run; by default that of the scene, or of its motion",
-        "s",
-        default=None,
-        above=0.0,
+    duration: float | None = positive(
+        "length of a run; by default that of the scene, or of its motion", "s", default=None
     )
-    tolerance: float = number(
-        "error of the orientation at the end, for the number of steps",
-        "rad",
-        default=1e-9,
-        above=0.0,
+    tolerance: float = positive(
+        "error of the orientation at the end, for the number of steps", "rad", default=1e-9
     )
-    steps: int | None = integer(
-        "number of steps of a run; by default by the tolerance", default=None, least=1, most=MOST
-    )
+    steps: int | None = _count("number of steps of a run; by default by the tolerance")
     torque: Any = anything(
         "None for the scene's own torques if it has some, else zero; three constant torques [N m]; "
         "or a SineTorque as a mapping",
@@ -113,7 +98,7 @@ class SweepStudy(Section):
     trajectory: Mapping[str, int] | None = anything(
         "{rows: m, samples: k}: k + 1 states of each of the first m runs", default=None
     )
-    chunk: int = integer("rows of a task and of a file", default=CHUNK, least=1, most=MOST)
+    chunk: int = _count("rows of a task and of a file", default=CHUNK)
 
     def __post_init__(self) -> None:
         if isinstance(self.control, Mapping):

@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from sst_ros.scene.schema import Place, Section, Spec, key_of, specs
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
 
 KINDS = ("uniform", "normal", "grid", "linspace")
+EXPECTED = {"uniform": "low, high", "normal": "mean, standard deviation[, low, high]"}
 
 SAMPLINGS = ("random", "sobol", "latin_hypercube")
 
@@ -40,8 +41,7 @@ LARGEST_HYPERCUBE = 10_000_000
 _TINY = 2.0**-53
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(NamedTuple):
     """A number of the scene that a variation sets: its key, value in the scene, specification."""
 
     key: str
@@ -69,6 +69,16 @@ class Variation:
     targets: Sequence[Target]
     factor: bool
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if a target must not have a value that a distribution or grid has."""
+        reached = self.numbers[[0, 2, 3]] if self.kind == "normal" else self.numbers
+        for target in self.targets if self.kind != "table" else ():
+            numbers, spec = self.parameters(reached)[target.key], target.spec
+            known = numbers[np.isfinite(numbers)]
+            if not np.all((known > spec.above) & (known >= spec.least) & (known <= spec.most)):
+                words = f"it reaches from {known.min()} to {known.max()}"
+                raise ValueError(f"{spec.refuse()}; {words}")
+
     @cached_property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns of a table, one for each component."""
@@ -93,29 +103,19 @@ class Variation:
 
     def ends(self) -> Array:
         """Return a middle value, and others that differ in every component; all of a grid."""
-        if self.kind == "normal":
-            quantiles = np.repeat([[0.4], [0.6]], len(self.columns), axis=1)
-            return np.vstack([self.numbers[0], self.values(quantiles)])
-        if self.kind == "uniform":
-            return np.vstack([self.numbers.mean(axis=0), self.numbers])
-        return self.numbers
+        if not self.drawn:
+            return self.numbers
+        middle = self.numbers[0] if self.kind == "normal" else self.numbers.mean(axis=0)
+        inner = np.repeat([[0.4], [0.6]], len(self.columns), axis=1)
+        return np.vstack([middle, self.values(inner) if self.kind == "normal" else self.numbers])
 
     def parameters(self, values: Array) -> dict[str, Array]:
         """Arrays (n, ...) by key of the scene for values (n, components)."""
         found = {}
-        for target in self.targets:
-            rows = values * target.nominal.ravel() if self.factor else values
-            found[target.key] = rows.reshape(len(values), *target.nominal.shape)
+        for key, nominal, _ in self.targets:
+            rows = values * nominal.ravel() if self.factor else values
+            found[key] = rows.reshape(len(values), *nominal.shape)
         return found
-
-    def refuse_forbidden(self) -> None:
-        """Raise ValueError if a target must not have a value that is reached."""
-        reached = self.numbers[[0, 2, 3]] if self.kind == "normal" else self.numbers
-        for target, numbers in zip(self.targets, self.parameters(reached).values(), strict=True):
-            known, spec = numbers[np.isfinite(numbers)], target.spec
-            if not np.all((known > spec.above) & (known >= spec.least) & (known <= spec.most)):
-                words = f"it reaches from {known.min()} to {known.max()}"
-                raise ValueError(f"{spec.refuse()}; {words}")
 
 
 def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
@@ -131,12 +131,8 @@ def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
         if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {here}")
         if isinstance(value, Inertia):
-            numbers = {part: getattr(value, part) for part in specs(Inertia)}
-            found += [
-                Target(f"{here}.{part}", np.array(number), specs(Inertia)[part])
-                for part, number in numbers.items()
-                if number != 0.0
-            ]
+            parts = ((part, getattr(value, part), of) for part, of in specs(Inertia).items())
+            found += [Target(f"{here}.{part}", np.array(x), of) for part, x, of in parts if x]
         elif spec.kind == "number":
             found.append(Target(here, np.array(value, dtype=float), spec))
         else:
@@ -174,12 +170,20 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
     if kind == "linspace":
         low, high, count = numbers
         kind, numbers = "grid", np.linspace(low, high, int(count))
-    if kind == "grid":
-        values = np.array(numbers, dtype=float)
-        if values.shape[1:] != nominal.shape or not len(values) or not np.all(np.isfinite(values)):
-            raise ValueError(f"must be a list of values of shape {nominal.shape}")
-    else:
-        values = _read_distribution(kind, numbers, nominal.shape)
+    if kind == "normal" and len(numbers) == 2:
+        numbers = (*numbers, -np.inf, np.inf)
+    expected = EXPECTED.get(kind, "")
+    if expected and len(numbers) != expected.count(",") + 1:
+        raise ValueError(f"{kind} takes {expected}")
+    values = np.array(numbers, dtype=float) if kind == "grid" else _broadcast(numbers, nominal)
+    if kind == "grid" and (values.shape[1:] != nominal.shape or not len(values)):
+        raise ValueError(f"must be a list of values of shape {nominal.shape}")
+    if np.any(np.isnan(values)) or not np.all(
+        np.isfinite(values if kind == "grid" else values[:2])
+    ):
+        raise ValueError("must be finite numbers")
+    if kind != "grid" and not np.all(values[-2] < values[-1]):
+        raise ValueError("the lower end must be less than the upper one")
     if relative and not factor:
         if any(not np.array_equal(one.nominal, nominal) for one in targets):
             raise ValueError("its entries differ in the scene: give each by its index")
@@ -190,25 +194,11 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
             values[-2:] = np.sort(values[-2:], axis=0)
     if kind == "normal" and not np.all(values[1] > 0.0):
         raise ValueError("the standard deviation must be > 0")
-    found = Variation(key, kind, values.reshape(len(values), -1), targets, factor)
-    found.refuse_forbidden()
-    return found
+    return Variation(key, kind, values.reshape(len(values), -1), targets, factor)
 
 
-def _read_distribution(kind: str, numbers: Any, shape: tuple[int, ...]) -> Array:
-    """Numbers of a distribution, broadcast to the shape of the key: (2 or 4, *shape)."""
-    count, words = 2, "low, high"
-    if kind == "normal":
-        count, words = 4, "mean, standard deviation[, low, high]"
-        numbers = (*numbers, -np.inf, np.inf) if len(numbers) == 2 else numbers
-    if len(numbers) != count:
-        raise ValueError(f"{kind} takes {words}")
-    values = np.array([np.broadcast_to(np.array(x, dtype=float), shape) for x in numbers])
-    if np.any(np.isnan(values)) or not np.all(np.isfinite(values[:2])):
-        raise ValueError("must be finite numbers")
-    if not np.all(values[-2] < values[-1]):
-        raise ValueError("the lower end must be less than the upper one")
-    return values
+def _broadcast(numbers: Any, nominal: Array) -> Array:
+    return np.array([np.broadcast_to(np.array(x, dtype=float), nominal.shape) for x in numbers])
 
 
 def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) -> Variation:
@@ -249,15 +239,7 @@ def read_table(given: Any) -> dict[str, Array]:
 
 
 class Sampler:
-    """Values of all varied numbers by row.
-
-    Args:
-        variations: what varies.
-        n: number of rows.
-        seed: of the random numbers.
-        sampling: one of SAMPLINGS, for what has a distribution.
-
-    """
+    """Values of all varied numbers by row, of n rows, by one of SAMPLINGS."""
 
     def __init__(self, variations: Sequence[Variation], n: int, seed: int, sampling: str) -> None:
         self._variations, self._n, self._seed, self._sampling = variations, n, seed, sampling
