@@ -223,19 +223,13 @@ def number_constants(value: Any, origin: Place = ()) -> Any:
 
 @dataclass(frozen=True)
 class Program:
-    """A straight-line program.
+    """A straight-line program."""
 
-    Attributes:
-        inputs: names of the inputs.
-        steps: (op, operands) in order; an operand is a float, or an int: the number of an input or,
-            from len(inputs) on, of a step.
-        outputs: operands that are the results.
-
-    """
-
-    inputs: tuple[str, ...]
+    inputs: tuple[str, ...]  #: names of the inputs
+    #: (op, operands) in order; an operand is a float, or an int: the number of an input or, from
+    #: len(inputs) on, of a step
     steps: tuple[tuple[str, tuple[float | int, ...]], ...]
-    outputs: tuple[float | int, ...]
+    outputs: tuple[float | int, ...]  #: operands that are the results
 
     @property
     def operations(self) -> Counter[str]:

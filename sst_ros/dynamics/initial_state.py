@@ -60,16 +60,9 @@ def initial_states(
 ) -> tuple[Array, NDArray[np.int64]]:
     """States at t = 0 of many runs, of which one that cannot start stops no other.
 
-    Args:
-        geometries: the distinct ones, or one for all.
-        which: index of the geometry of each run, shape (n,).
-        gamma: actuator angles [rad], shape (n, 3).
-        gamma_dot: their rates [rad/s], shape (n, 3).
-
-    Returns:
-        Quaternions and body rates [rad/s], shape (7, n), at rest where there is no start; and
-        codes, shape (n,): 0, NO_ASSEMBLY or NO_RATE.
-
+    They have gamma [rad] and gamma_dot [rad/s], shape (n, 3), and the geometries of index `which`,
+    shape (n,). Returns quaternions and body rates [rad/s], shape (7, n), at rest where there is no
+    start, and codes, shape (n,): 0, NO_ASSEMBLY or NO_RATE.
     """
     y, code = np.zeros((7, len(gamma))), np.full(len(gamma), NO_ASSEMBLY, dtype=np.int64)
     y[3] = 1.0
@@ -126,11 +119,8 @@ def accelerate_by_paper(
 ) -> tuple[Array, Array]:
     """Return W_dot in {E} [rad/s^2] and gamma_dot [rad/s], each shape (3,), by Eqs. 1 to 92.
 
-    Args:
-        mechanism: geometry and inertias.
-        state: quaternion (x, y, z, w) and body rate W in {E} [rad/s], shape (7,).
-        torque: actuator torques [N m], shape (3,).
-        moment: external moment on the star in {B} [N m], shape (3,).
+    The state is quaternion (x, y, z, w) and W in {E} [rad/s]; torques and the external moment on
+    the star in {B} are in N m.
 
     Raises:
         SingularConfiguration: the posture is singular.
@@ -150,9 +140,8 @@ def accelerate_by_paper(
 class VirtualWorkDerivative:
     """Derivative of a scene's state by Eqs. 1 to 92.
 
-    Args:
-        scene: bodies, payload, rotors, torque limits and an external moment, as the paper has them
-            or in its inertias and n_ext.
+    It may have bodies, payload, rotors, torque limits and an external moment, as the paper has them
+    or in its inertias and n_ext.
 
     Raises:
         InputError: the scene has another term; names each.
@@ -173,11 +162,9 @@ class VirtualWorkDerivative:
         self._moment = np.array(value or (0.0, 0.0, 0.0))
 
     def __call__(self, _: float, *inputs: float) -> tuple[float, ...]:
-        """Differentiate the state by time.
+        """Differentiate quaternion, body rate [rad/s] and work [J] by time.
 
-        Args:
-            inputs: quaternion, body rate [rad/s], work [J]; torques [N m], and a moment on the star
-                in {B} [N m] if it comes from a topic.
+        Torques [N m] follow, and a moment on the star in {B} [N m] if it comes from a topic.
 
         Raises:
             ArithmeticError: the posture is singular.

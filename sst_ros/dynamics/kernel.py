@@ -74,15 +74,10 @@ class LegMotion(NamedTuple):
 def derivative(
     model: Model, state: tuple[Scalar, ...], torque: Triple, moment: Triple | None = None
 ) -> tuple[Scalar, ...]:
-    """Time derivative of the state, seven numbers (q, W), and with lag three torques more.
+    """Time derivative of the state: quaternion (x, y, z, w), of any length > 0, W [rad/s] in {E}.
 
-    Args:
-        model: constants.
-        state: quaternion (x, y, z, w), of any length > 0, W [rad/s] in {E}, and where the
-            actuators lag the torques they give [N m].
-        torque: actuator torques [N m]; with lag the commanded ones.
-        moment: external moment on the star in {B} [N m], or None where there is none.
-
+    Where the actuators lag, the torques [N m] that they give follow, and `torque` has the commanded
+    ones. `moment` acts on the star, in {B} [N m].
     """
     x, y, z, w, wx, wy, wz, *given = state
     more: tuple[Scalar, ...] = ()
@@ -115,13 +110,9 @@ def balance(
 ) -> tuple[Symmetric, Triple, Rows]:
     """Reduce everything to the star by virtual work: M W_dot = force in {E}.
 
-    Arguments are those of `derivative`.
-
-    Returns:
-        M (xx, yy, zz, xy, xz, yz) [kg m^2]; the moment of all that acts at W_dot = 0, velocity
-        products included [N m]; and the rows g_k: gamma_dot_k = g_k.W, and a torque at gamma_k
-        acts as tau_k g_k.
-
+    Returns M (xx, yy, zz, xy, xz, yz) [kg m^2]; the moment of all that acts at W_dot = 0, velocity
+    products included [N m]; and the rows g_k: gamma_dot_k = g_k.W, and a torque at gamma_k acts as
+    tau_k g_k.
     """
     rows = rotation_rows(q)
     inertia: tuple[Scalar, ...] = model.star

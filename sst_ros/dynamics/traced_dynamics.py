@@ -35,17 +35,10 @@ BODY_ACCELERATION = ("ax", "ay", "az")
 
 
 class Dynamics:
-    """Programs of a manipulator.
+    """Programs of a manipulator with the constants `model`, numbers or not.
 
-    Args:
-        model: its constants, numbers or not.
-        has_moment_topic: a moment that acts comes from a topic.
-
-    Attributes:
-        model, has_moment_topic: as given.
-        state: names of the state's numbers: quaternion, body rate, lagged torques if any.
-        drive: names of what acts from outside: torques, and a moment if it comes from a topic.
-
+    `state` has the names of the state's numbers: quaternion, body rate, lagged torques if any;
+    `drive` of what acts from outside: torques, and a moment if it comes from a topic.
     """
 
     def __init__(self, model: kernel.Model, *, has_moment_topic: bool = False) -> None:

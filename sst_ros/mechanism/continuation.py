@@ -64,23 +64,14 @@ class BranchEnds(SingularConfiguration):
 
 @dataclass(frozen=True)
 class Branch:
-    """One assembly along a motion of n points. Arrays are read-only.
+    """One assembly along a motion of n points. Arrays are read-only."""
 
-    Attributes:
-        gamma: actuator angles [rad], shape (n, 3).
-        rotation: R, shape (n, 3, 3).
-        mu, beta: passive joint angles [rad], without jumps of 2 pi, shape (n, 3).
-        sigma: least singular value of J2, shape (n,); 0 at a parallel singularity.
-        det_j2: determinant of J2, shape (n,); its sign never changes.
-
-    """
-
-    gamma: Array
-    rotation: Array
-    mu: Array
-    beta: Array
-    sigma: Array
-    det_j2: Array
+    gamma: Array  #: actuator angles [rad], shape (n, 3)
+    rotation: Array  #: R, shape (n, 3, 3)
+    mu: Array  #: passive joint angles [rad], without jumps of 2 pi, shape (n, 3)
+    beta: Array  #: as mu
+    sigma: Array  #: least singular value of J2, shape (n,); 0 at a parallel singularity
+    det_j2: Array  #: determinant of J2, shape (n,); its sign never changes
 
 
 def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = None) -> Branch:

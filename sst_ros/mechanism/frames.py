@@ -42,19 +42,16 @@ def quaternion_of(rotation: ArrayLike) -> Array:
     """
     m = np.asarray(rotation, dtype=float)
     trace = np.trace(m, axis1=-2, axis2=-1)
-    found = []
+    found = np.empty((*m.shape[:-2], 4, 4))  # four times a row's own component times all four
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        parts = [np.empty(0)] * 4
-        parts[i] = 1.0 - trace + 2.0 * m[..., i, i]
-        parts[j] = m[..., j, i] + m[..., i, j]
-        parts[k] = m[..., k, i] + m[..., i, k]
-        parts[3] = m[..., k, j] - m[..., j, k]
-        found.append(np.stack(parts, axis=-1))
-    last = [m[..., k, j] - m[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
-    found.append(np.stack([*last, 1.0 + trace], axis=-1))
+        found[..., i, i] = 1.0 - trace + 2.0 * m[..., i, i]
+        found[..., i, j] = m[..., j, i] + m[..., i, j]
+        found[..., i, k] = m[..., k, i] + m[..., i, k]
+        found[..., i, 3] = found[..., 3, i] = m[..., k, j] - m[..., j, k]
+    found[..., 3, 3] = 1.0 + trace
     diagonal = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2], trace], axis=-1)
     largest = np.argmax(diagonal, axis=-1)
-    q = np.take_along_axis(np.stack(found, axis=-2), largest[..., None, None], axis=-2)[..., 0, :]
+    q = np.take_along_axis(found, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.sqrt(np.sum(q * q, axis=-1, keepdims=True))
     signs = np.sign(np.roll(q, 1, axis=-1))  # w first
     first = np.argmax(signs != 0.0, axis=-1)
@@ -63,16 +60,10 @@ def quaternion_of(rotation: ArrayLike) -> Array:
 
 
 def zyz_angles(rotation: ArrayLike) -> Array:
-    """ZYZ angles (theta, phi, psi) of R = Rz(theta) Ry(phi) Rz(psi), Eqs. 3 and 6 to 8.
+    """ZYZ angles [rad], (..., 3), of R = Rz(theta) Ry(phi) Rz(psi), (..., 3, 3), Eqs. 3, 6 to 8.
 
-    Args:
-        rotation: R, shape (..., 3, 3).
-
-    Returns:
-        Angles [rad], shape (..., 3): theta, psi in (-pi, pi], phi in [0, pi]. Where sin(phi) = 0
-        only theta + psi (phi = 0) or theta - psi (phi = pi) exists; there theta is 0 and psi
-        carries it all.
-
+    theta and psi are in (-pi, pi], phi in [0, pi]. Where sin(phi) = 0 only theta + psi (phi = 0) or
+    theta - psi (phi = pi) exists; there theta is 0 and psi carries it all.
     """
     r = np.asarray(rotation, dtype=float)
     sine = np.hypot(r[..., 0, 2], r[..., 1, 2])
@@ -87,21 +78,13 @@ def zyz_angles(rotation: ArrayLike) -> Array:
 
 
 def unwrap_zyz(angles: ArrayLike) -> Array:
-    """ZYZ angles of a trajectory without jumps.
+    """ZYZ angles [rad] of a trajectory without jumps, shape (n, 3), as from `zyz_angles`.
 
     (theta, phi, psi) and (theta + pi, -phi, psi + pi) are the same rotation, so a motion straight
     through the pole is smooth in angles if phi may change its sign. Each sample takes that of the
-    two forms, give or take full turns, that is nearest to the sample before. At the pole itself
-    (sin(phi) = 0 as `zyz_angles` gives it, theta = 0) theta stays what it was and psi takes the
-    rest, so theta + psi at phi = 0 and theta - psi at phi = pi are kept.
-
-    Args:
-        angles: (theta, phi, psi) by sample [rad], as from `zyz_angles`, shape (n, 3).
-
-    Returns:
-        Angles [rad], shape (n, 3); the first sample off the pole as given, phi no longer in
-        [0, pi] only.
-
+    two forms, give or take full turns, that is nearest to the sample before; the first one off the
+    pole is as given. At the pole itself (sin(phi) = 0, theta = 0) theta stays what it was and psi
+    takes the rest, so theta + psi at phi = 0 and theta - psi at phi = pi are kept.
     """
     result = np.array(angles, dtype=float)
     off = np.flatnonzero(~np.isin(result[:, 1], (0.0, np.pi)))

@@ -43,23 +43,15 @@ class Geometry:
     """Base triangle and star; rows belong to legs. All arrays are read-only.
 
     Many geometries are one object whose arrays have one more axis in front.
-
-    Attributes:
-        v: unit vectors O P_k in {B}, shape (3, 3).
-        w: actuator axes, Eq. 1, shape (3, 3).
-        e: axes t_k of the star's arcs in {E}, shape (3, 3); t_k = R e_k.
-        alpha: angles between the arcs [rad], shape (3,).
-        arc: lengths of the base arcs P_k P_k+1, the upper ends of the stroke [rad], shape (3,).
-        beta_max: largest admissible beta_k [rad].
-
     """
 
-    v: Array
-    w: Array
-    e: Array
-    alpha: Array
+    v: Array  #: unit vectors O P_k in {B}, shape (3, 3)
+    w: Array  #: actuator axes, Eq. 1, shape (3, 3)
+    e: Array  #: axes t_k of the star's arcs in {E}, shape (3, 3); t_k = R e_k
+    alpha: Array  #: angles between the arcs [rad], shape (3,)
+    #: lengths of the base arcs P_k P_k+1, the upper ends of the stroke [rad], shape (3,)
     arc: Array
-    beta_max: Any
+    beta_max: Any  #: largest admissible beta_k [rad]
 
     @classmethod
     def of(cls, scene: _Shapes) -> Geometry:

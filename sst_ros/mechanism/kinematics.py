@@ -45,22 +45,15 @@ _STEPS, _LONGEST_TURN, _LAST_STEP, _REGULAR = 40, 0.3, 1e-9, 1e-5
 
 @dataclass(frozen=True)
 class Assemblies:
-    """The assemblies of many gamma at once; m of them for n configurations. Read-only arrays.
+    """The assemblies of many gamma at once; m of them for n configurations. Read-only arrays."""
 
-    Attributes:
-        configuration: row of gamma that each assembly belongs to, ascending, shape (m,).
-        rotation, mu, beta, det_j2, admissible: as in `Assembly`, with m first.
-        isolated: shape (n,); False where gamma has a continuum of assemblies, of which none is
-            listed.
-
-    """
-
-    configuration: Index
-    rotation: Array
+    configuration: Index  #: row of gamma that each assembly belongs to, ascending, shape (m,)
+    rotation: Array  #: this and what follows as in `Assembly`, with m first
     mu: Array
     beta: Array
     det_j2: Array
     admissible: Mask
+    #: shape (n,); False where gamma has a continuum of assemblies, of which none is listed
     isolated: Mask
 
 
@@ -178,11 +171,7 @@ def describe_assemblies(
 ) -> tuple[Array, Array, Array, Mask]:
     """Passive angles mu, beta (..., 3) [rad], det J2 and admissibility (...) of assemblies.
 
-    Args:
-        geometry: base triangle and star.
-        r: carriage directions in rows, shape (..., 3, 3).
-        rotation: R, shape (..., 3, 3), with r_k . R e_k = 0.
-
+    They have the carriage directions r in rows and R, (..., 3, 3) each, with r_k . R e_k = 0.
     """
     t, s = geometry.e @ np.swapaxes(rotation, -1, -2), rotation[..., None, :, 2]
     mu = np.arctan2(dot(cross(t, geometry.w), r), dot(geometry.w, t))
@@ -196,17 +185,11 @@ def describe_assemblies(
 
 
 def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
-    """Solve r_k . R e_k = 0 for many configurations at once.
+    """Solve r_k . R e_k = 0 for n configurations with r (n, 3, 3) and e (3, 3), or (n, 3, 3).
 
-    Args:
-        r: unit vectors r_k in rows, shape (n, 3, 3), one block a configuration.
-        e: axes e_k of the star in {E} in rows, e_1 = (0, 1, 0), shape (3, 3), or (n, 3, 3).
-
-    Returns:
-        The configuration that each root belongs to, ascending, shape (m,); the rotations, (m, 3,
-        3), pairs R, R Rot(z, pi) side by side, pairs in the order of (s_z, s_y, s_x); and whether
-        the roots of a configuration are isolated, (n,): where they are not, none is given.
-
+    Rows are unit vectors, e_1 = (0, 1, 0). Returns the configuration of each root, ascending, (m,);
+    the rotations, (m, 3, 3), in the order of `direct`; and whether the roots of a configuration are
+    isolated, (n,): where they are not, none is given.
     """
     r0, rest = r[:, 0], r[:, 1:]
     n = cross(r0, np.eye(3)[np.argmin(np.abs(r0), axis=1)])

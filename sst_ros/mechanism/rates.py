@@ -40,28 +40,19 @@ from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture
 
 @dataclass(frozen=True)
 class BodyRates:
-    """Velocities and accelerations of all nine joints and seven links. Read-only, rows by leg.
+    """Velocities and accelerations of all nine joints and seven links. Read-only, rows by leg."""
 
-    Attributes:
-        omega, omega_dot: star, in {B} [rad/s], [rad/s^2], shape (3,).
-        gamma_dot, mu_dot, beta_dot: joint rates [rad/s], shape (3,).
-        gamma_ddot, mu_ddot, beta_ddot: joint accelerations [rad/s^2], shape (3,).
-        omega_a, omega_a_dot: actuated links, in {1k}, Eqs. 53 to 57, shape (3, 3).
-        omega_ipl, omega_ipl_dot: intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3).
-
-    """
-
-    omega: Array
-    omega_dot: Array
-    gamma_dot: Array
+    omega: Array  #: of the star, in {B} [rad/s], shape (3,)
+    omega_dot: Array  #: [rad/s^2]
+    gamma_dot: Array  #: joint rates [rad/s], shape (3,)
     mu_dot: Array
     beta_dot: Array
-    gamma_ddot: Array
+    gamma_ddot: Array  #: joint accelerations [rad/s^2], shape (3,)
     mu_ddot: Array
     beta_ddot: Array
-    omega_a: Array
+    omega_a: Array  #: of actuated links, in {1k} [rad/s], Eqs. 53 to 57, shape (3, 3)
     omega_a_dot: Array
-    omega_ipl: Array
+    omega_ipl: Array  #: of intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3)
     omega_ipl_dot: Array
 
 
@@ -82,14 +73,10 @@ def of_star(
     omega_dot: ArrayLike = (0.0, 0.0, 0.0),
     gamma: ArrayLike | None = None,
 ) -> BodyRates:
-    """Everything from omega [rad/s] and omega_dot [rad/s^2] in {B}, each shape (3,).
+    """Everything from omega [rad/s] and omega_dot [rad/s^2] of the star in {B}, each shape (3,).
 
-    Args:
-        geometry: base triangle and star.
-        rotation: R of {E} in {B}, shape (3, 3).
-        omega: angular velocity of the star.
-        omega_dot: its rate of change.
-        gamma: actuator angles that choose the branch of each leg; None takes mu_k in (0, pi).
+    The rotation R of {E} in {B} has the shape (3, 3); the actuator angles gamma [rad] choose the
+    branch of each leg, by default mu_k in (0, pi).
 
     Raises:
         SingularConfiguration: some c_k = 0 (serial).
@@ -170,25 +157,16 @@ class Reactions:
 
     A moment is what the link nearer the base exerts on the next one; the next one answers with
     the opposite. In the frame of its own joint the component along the axis is 0.
-
-    Attributes:
-        actuated: base on actuated link k, across w_k, in {B}; the torque tau_k w_k not included.
-        revolute: actuated on intermediate link, across r_k, in {B}.
-        prismatic: intermediate link on the star, across t_k, in {B}.
-        actuated_local: in {1k} = [r, w x r, w]; z is 0.
-        revolute_local: in {2k} = [r, t x r, t]; x is 0.
-        prismatic_local: in {2k}; z is 0.
-        torque: actuator torques that belong to this motion [N m], shape (3,).
-
     """
 
+    #: base on actuated link k, across w_k, in {B}; the torque tau_k w_k not included
     actuated: Array
-    revolute: Array
-    prismatic: Array
-    actuated_local: Array
-    revolute_local: Array
-    prismatic_local: Array
-    torque: Array
+    revolute: Array  #: actuated on intermediate link, across r_k, in {B}
+    prismatic: Array  #: intermediate link on the star, across t_k, in {B}
+    actuated_local: Array  #: in {1k} = [r, w x r, w]; z is 0
+    revolute_local: Array  #: in {2k} = [r, t x r, t]; x is 0
+    prismatic_local: Array  #: in {2k}; z is 0
+    torque: Array  #: actuator torques that belong to this motion [N m], shape (3,)
 
 
 def of_torque(

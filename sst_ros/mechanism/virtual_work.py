@@ -42,59 +42,35 @@ class Mechanism:
 
 @dataclass(frozen=True)
 class Posture:
-    """Everything that follows from gamma and the assembly R, Eqs. 1 to 23.
+    """Everything that follows from gamma and the assembly R, Eqs. 1 to 23."""
 
-    Attributes:
-        gamma: actuator angles [rad], shape (3,).
-        rotation: R of {E} in {B}, shape (3, 3).
-        r, t, w: unit vectors by leg, shape (3, 3).
-        c: c_k = (r_k x t_k) . w_k, diagonal of J1, Eq. 14, shape (3,).
-        j2: Eq. 13, shape (3, 3).
-        j: J = -J2^-1 J1, omega = J gamma_dot, Eq. 15.
-        a: mu_dot = a gamma_dot, Eq. 20, rows by leg.
-        b: beta_dot = b gamma_dot, Eq. 23, rows by leg.
-        u: beta_ddot = u gamma_ddot + u_k with the scalars u_k of Eq. 49, Eq. 48, rows by leg.
-
-    """
-
-    gamma: Array
-    rotation: Array
-    r: Array
+    gamma: Array  #: actuator angles [rad], shape (3,)
+    rotation: Array  #: R of {E} in {B}, shape (3, 3)
+    r: Array  #: unit vectors by leg, shape (3, 3)
     t: Array
     w: Array
-    c: Array
-    j2: Array
-    j: Array
-    a: Array
-    b: Array
-    u: Array
+    c: Array  #: c_k = (r_k x t_k) . w_k, diagonal of J1, Eq. 14, shape (3,)
+    j2: Array  #: Eq. 13, shape (3, 3)
+    j: Array  #: J = -J2^-1 J1, omega = J gamma_dot, Eq. 15
+    a: Array  #: mu_dot = a gamma_dot, Eq. 20, rows by leg
+    b: Array  #: beta_dot = b gamma_dot, Eq. 23, rows by leg
+    u: Array  #: beta_ddot = u gamma_ddot + u_k of Eq. 49; Eq. 48, rows by leg
 
 
 @dataclass(frozen=True)
 class Bias:
-    """Velocity products, Eqs. 26 to 49; accelerations are these plus Jacobians times gamma_ddot.
+    """Velocity products, Eqs. 26 to 49; accelerations are these plus Jacobians times gamma_ddot."""
 
-    Attributes:
-        omega: angular velocity of the star [rad/s], Eq. 15.
-        omega_dot: J2^-1 (M gamma_dot + n) with its sign, Eq. 40 [rad/s^2].
-        mu_ddot: f_k, Eq. 45 [rad/s^2].
-        beta_ddot: u_k, Eq. 49 [rad/s^2].
-
-    """
-
-    omega: Array
-    omega_dot: Array
-    mu_ddot: Array
-    beta_ddot: Array
+    omega: Array  #: angular velocity of the star [rad/s], Eq. 15
+    omega_dot: Array  #: J2^-1 (M gamma_dot + n) with its sign, Eq. 40 [rad/s^2]
+    mu_ddot: Array  #: f_k, Eq. 45 [rad/s^2]
+    beta_ddot: Array  #: u_k, Eq. 49 [rad/s^2]
 
 
 def posture(geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None) -> Posture:
-    """Velocity analysis, Eqs. 1 to 23, at the admissible assembly or at the given one.
+    """Velocity analysis at gamma [rad], shape (3,), Eqs. 1 to 23.
 
-    Args:
-        geometry: base triangle and star.
-        gamma: actuator angles [rad], shape (3,).
-        rotation: R of an assembly at gamma; None takes the admissible one.
+    It is that of the assembly with the rotation R, shape (3, 3), or of the admissible one.
 
     Raises:
         AssemblyError: rotation is None and there is no unique admissible assembly.
@@ -159,20 +135,10 @@ def link_jacobians(at: Posture) -> tuple[Array, Array]:
 def equation_of_motion(
     mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0)
 ) -> tuple[Array, Array]:
-    """T1 and T2 of T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
+    """T1 (3, 3) [kg m^2] and T2 (3,) [N m] of T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
 
-    M = -T1 is the mass matrix; h = -T2 without a moment has the velocity products. Inertia tensors
-    may be full.
-
-    Args:
-        mechanism: geometry and inertias.
-        at: posture.
-        gamma_dot: actuator rates [rad/s], shape (3,).
-        moment: external moment n_ext on the star in {B} [N m], shape (3,).
-
-    Returns:
-        T1 (3, 3) [kg m^2], negative definite, and T2 (3,) [N m].
-
+    M = -T1 is the mass matrix, positive definite; -T2 without a moment has the velocity products.
+    gamma_dot is in rad/s, the moment n_ext on the star in {B} in N m. Inertia tensors may be full.
     """
     rate = np.asarray(gamma_dot, dtype=float)
     products = bias(at, rate)

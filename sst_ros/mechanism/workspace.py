@@ -19,7 +19,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
 from sst_ros.host.output import slices
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import columns, cross
@@ -30,29 +30,18 @@ _BLOCK, _BISECTIONS = 20_000, 55
 
 @dataclass(frozen=True)
 class Measures:
-    """What a designer asks of poses; arrays share the shape (...) of the poses. Read-only.
+    """What a designer asks of poses; arrays share the shape (...) of the poses. Read-only."""
 
-    Attributes:
-        gamma, mu, beta: joint angles [rad], shape (..., 3).
-        admissible: the manipulator can be there.
-        stroke: distance of the nearest gamma_k to an end of its stroke [rad], negative beyond.
-        edge: smallest beta_k [rad]: distance to the edge of the workspace, negative beyond.
-        reach: smallest beta_max - beta_k [rad].
-        det_j1, det_j2: determinants; 0 at a serial and at a parallel singularity.
-        cond_j: condition number of J = -J2^-1 J1, infinite at both.
-
-    """
-
-    gamma: Array
+    gamma: Array  #: joint angles [rad], shape (..., 3)
     mu: Array
     beta: Array
-    admissible: NDArray[np.bool_]
-    stroke: Array
-    edge: Array
-    reach: Array
-    det_j1: Array
-    det_j2: Array
-    cond_j: Array
+    admissible: NDArray[np.bool_]  #: the manipulator can be there
+    stroke: Array  #: distance of the nearest gamma_k to an end of its stroke [rad], negative beyond
+    edge: Array  #: smallest beta_k [rad]: distance to the edge of the workspace, negative beyond
+    reach: Array  #: smallest beta_max - beta_k [rad]
+    det_j1: Array  #: 0 at a serial singularity
+    det_j2: Array  #: 0 at a parallel singularity
+    cond_j: Array  #: condition number of J = -J2^-1 J1, infinite at both
 
     @property
     def margin(self) -> Array:
@@ -62,20 +51,12 @@ class Measures:
 
 @dataclass(frozen=True)
 class OrientationMap:
-    """Measures over m directions of s and n turns psi. Arrays are read-only.
+    """Measures over m directions of s and n turns psi. Arrays are read-only."""
 
-    Attributes:
-        geometry: what was mapped.
-        s: directions in {B}, shape (m, 3).
-        psi: third ZYZ angle [rad], evenly over a full turn, shape (n,).
-        measures: shape (m, n).
-
-    """
-
-    geometry: Geometry
-    s: Array
-    psi: Array
-    measures: Measures
+    geometry: Geometry  #: what was mapped
+    s: Array  #: directions in {B}, shape (m, 3)
+    psi: Array  #: third ZYZ angle [rad], evenly over a full turn, shape (n,)
+    measures: Measures  #: shape (m, n)
 
     @property
     def turn(self) -> Array:
@@ -139,9 +120,8 @@ def workspace(
 
     """
     counts = {"divisions": divisions, "turns": turns}
-    problems = [Problem(name, n, "must be at least 1") for name, n in counts.items() if n < 1]
-    if problems:
-        raise InputError("workspace", problems)
+    checks = ((name, n, n >= 1, "must be at least 1") for name, n in counts.items())
+    refuse_unless("workspace", *checks)
     return over_orientations(geometry, triangle_directions(geometry, divisions)[0], turns, progress)
 
 
@@ -198,24 +178,15 @@ def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array,
 
 @dataclass(frozen=True)
 class SingularPoses:
-    """Poses of one kind. Arrays are read-only.
+    """Poses of one kind. Arrays are read-only."""
 
-    Attributes:
-        kind: "parallel" or "serial".
-        rotation: R, shape (m, 3, 3).
-        gamma, beta: joint angles [rad], shape (m, 3); at a serial one gamma_k and beta_k of the
-            singular leg have no value: NaN.
-        leg: index k of the singular leg, shape (m,); -1 for parallel ones, which involve all.
-        determinant: det J2 or c_k that was found, shape (m,): 0 up to rounding.
-
-    """
-
-    kind: str
-    rotation: Array
+    kind: str  #: "parallel" or "serial"
+    rotation: Array  #: R, shape (m, 3, 3)
+    #: joint angles [rad], shape (m, 3); NaN of the singular leg at a serial one
     gamma: Array
     beta: Array
-    leg: Array
-    determinant: Array
+    leg: Array  #: index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
+    determinant: Array  #: det J2 or c_k that was found, shape (m,): 0 up to rounding
 
     def __len__(self) -> int:
         """Count the poses."""

@@ -225,15 +225,11 @@ def build_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
 
 
 def build(cls: type[S], values: Any, origin: str, *, path: str = "", of_row: bool = False) -> S:
-    """Build a section from nested dicts and lists.
+    """Build a section from nested dicts and lists, in which arrays are allowed.
 
-    Args:
-        cls: the section.
-        values: by name; arrays are allowed.
-        origin: of the values, for messages.
-        path: key of the section in a larger document, for messages.
-        of_row: leave out what has no effect, as a friction whose coefficients are zero; a document
-            that says such a thing is refused.
+    Messages are headed by `origin`, and `path` is the section's key in a larger document. A
+    document that says what has no effect is refused, as a friction whose coefficients are zero;
+    with `of_row` that is left out.
 
     Raises:
         InputError: lists every fault.
@@ -329,11 +325,8 @@ def find_fields(
 ) -> Iterator[tuple[Place, Any, Spec]]:
     """Yield the place of each field that a key names, its value, and what it allows.
 
-    Args:
-        tree: the document.
-        key: of a field.
-        components: an index may also pick a component of a vector.
-        place: of the tree in a larger one.
+    With `components` an index may also pick a component of a vector. `place` is that of the tree in
+    a larger one.
 
     Raises:
         ValueError: there is no such field, or it is not in this scene.
