@@ -4,12 +4,9 @@
 from __future__ import annotations
 
 import math
-import os
-import select
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -47,11 +44,7 @@ def record_feedforward(
     """Follow a scene's motion in lockstep, a run for each mode; yield bags and folders of results.
 
     The first of the default modes is the paper's double check: nothing but the torques of the
-    inverse dynamics. Each run lies in `out`/mode.
-
-    Raises:
-        SstError: the scene's motion is refused, or a node failed; names it.
-
+    inverse dynamics. Each run lies in `out`/mode. An SstError says what was refused or has failed.
     """
     seconds = reference_motion(scene.load(name)).duration + HOLD_S
     for mode in modes:
@@ -64,11 +57,8 @@ def record_feedforward(
 def follow(name: str, bag: Path, mode: str, seconds: float, *, model: str | None = None) -> None:
     """Have the controller node follow a scene's motion for some time [s], and record the run.
 
-    The controller's model and motion are those of the scene `model`, by default the plant's own.
-
-    Raises:
-        SstError: a node failed or did not end in time; names it.
-
+    The controller's model and motion are those of the scene `model`, by default the plant's own. An
+    SstError names a node that failed or did not end in time.
     """
     run = {"scene": name, "sync": "lockstep", "duration": seconds, "real_time_factor": 0.0}
     with _record(bag, publish_rate=CONTROL_RATE, **run):
@@ -82,17 +72,10 @@ def follow(name: str, bag: Path, mode: str, seconds: float, *, model: str | None
 def record(name: str, bag: Path, *, rate: int = 0, hold: str = "middle") -> None:
     """Play a scene's torques to its simulator, in processes of their own, and record the run.
 
-    It goes by the clock, and in lockstep: to the same bits however busy the machine is.
-
-    Args:
-        name: of the scene.
-        bag: folder of the recording.
-        rate: steps, samples and commands per second; 0 for the defaults of the nodes.
-        hold: instant of the hold whose torque is commanded.
-
-    Raises:
-        SstError: a node failed or did not end in time; names it.
-
+    It goes by the clock, and in lockstep: to the same bits however busy the machine is. Steps,
+    samples and commands have this rate a second, 0 for the defaults of the nodes; `hold` is the
+    instant of a hold whose torque is commanded. An SstError names a node that failed or did not end
+    in time.
     """
     duration = scene.load(name).duration or 1.0
     run = {"rate": rate, "publish_rate": rate} if rate else {}
@@ -107,9 +90,12 @@ def record(name: str, bag: Path, *, rate: int = 0, hold: str = "middle") -> None
 @contextmanager
 def _record(bag: Path, **run: object) -> Iterator[None]:
     """Record a run of the simulator, which ends by itself after what the block does."""
-    with _node("recorder", output=str(bag)) as recorder:
+    with _node("recorder", output=str(bag), timeout=_READY_S) as recorder:
         with _node("simulator", **run) as simulator:
-            _wait_until_ready(recorder)
+            # One line when it receives all topics, none where it gives up.
+            if not (recorder.stdout and recorder.stdout.readline()):
+                text = f"the recorder received nothing from a simulator within {_READY_S:g} s"
+                raise SstError(text)
             yield
             _wait_for_end("simulator", simulator, _END_S)
         recorder.send_signal(signal.SIGINT)
@@ -127,18 +113,6 @@ def empty_bag(folder: Path, name: str = "bag") -> Path:
 
 def _node(command: str, **given: object) -> AbstractContextManager[subprocess.Popen[str]]:
     return child_process.run_beside(command, given, stdout=subprocess.PIPE)
-
-
-def _wait_until_ready(recorder: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + _READY_S
-    assert recorder.stdout is not None
-    output, printed = recorder.stdout.fileno(), b""
-    while b"ready" not in printed:
-        left = max(0.0, deadline - time.monotonic())
-        more = os.read(output, 4096) if select.select([output], [], [], left)[0] else b""
-        if not more:
-            raise SstError(f"the recorder received nothing from a simulator within {_READY_S:g} s")
-        printed += more
 
 
 def _wait_for_end(command: str, process: subprocess.Popen[str], timeout: float) -> None:

@@ -34,12 +34,7 @@ class MissingDependency(SstError, ImportError):
 
 
 def require(module: str) -> Any:
-    """Import an optional dependency.
-
-    Raises:
-        MissingDependency: it is not installed.
-
-    """
+    """Import an optional dependency; MissingDependency says how to install it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -52,15 +47,9 @@ def require(module: str) -> Any:
 def explanation(error: ModuleNotFoundError) -> str | None:
     """Return how to install what is missing; None for a module that is no optional dependency."""
     module = (error.name or "").partition(".")[0]
-    if module in _ROS or module.endswith(_ROS_SUFFIXES):
-        return (
-            f"{module} is not installed: source a ROS 2 installation, or "
-            "pip install 'sst_ros[ros]' (in the source folder: pip install '.[ros]')"
-        )
-    if module not in EXTRAS:
+    ros = module in _ROS or module.endswith(_ROS_SUFFIXES)
+    if not ros and module not in EXTRAS:
         return None
-    extra = EXTRAS[module]
-    return (
-        f"{module} is not installed: pip install 'sst_ros[{extra}]' "
-        f"(in the source folder: pip install '.[{extra}]')"
-    )
+    extra = "ros" if ros else EXTRAS[module]
+    how = f"pip install 'sst_ros[{extra}]' (in the source folder: pip install '.[{extra}]')"
+    return f"{module} is not installed: {'source a ROS 2 installation, or ' * ros}{how}"

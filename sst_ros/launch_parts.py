@@ -63,13 +63,9 @@ def recording_arguments(name: str) -> dict[str, tuple[str, str]]:
 def description(
     file: str, arguments: Mapping[str, tuple[str, str]], actions: Callable[[Given], list[Action]]
 ) -> LaunchDescription:
-    """Describe a launch.
+    """Describe a launch: `actions` makes its nodes from the values of its launch arguments.
 
-    Args:
-        file: path of the launch file.
-        arguments: default and description by name; empty defaults are left to the nodes.
-        actions: makes the nodes from the values of the arguments.
-
+    Arguments are default and description by name; empty defaults are left to the nodes.
     """
     every = {**arguments, **_SHARED}
 
@@ -93,12 +89,8 @@ def description(
 def node(given: Given, executable: str, parameters: Given, *, ends: bool = True) -> Node:
     """Describe a node of this package, which ends with the launch, however that ends.
 
-    Args:
-        given: the launch arguments.
-        executable: name of the node.
-        parameters: of the node; those that are empty are left to params_file or the default.
-        ends: whether its end is that of the launch; its failure always is.
-
+    Parameters that are empty are left to params_file or the default. Where it `ends`, its end is
+    that of the launch; its failure always is.
     """
     return Node(
         package="sst_ros",
@@ -167,11 +159,8 @@ def rviz(given: Given, scene_name: str) -> list[Action]:
 def ros2_control(given: Given, controller: str, controllers: str) -> list[Action]:
     """Describe a controller manager whose hardware is the simulator, and the controllers.
 
-    Args:
-        given: the launch arguments.
-        controller: name of the controller that is started beside joint_state_broadcaster.
-        controllers: file of parameters; config/controllers.yaml where empty.
-
+    Beside joint_state_broadcaster it starts the controller of this name, by the file of parameters
+    `controllers`, config/controllers.yaml where empty.
     """
     hardware = "joint_state_topic_hardware_interface"
     require("robot_state_publisher", "controller_manager", "joint_state_broadcaster", hardware)
@@ -215,12 +204,7 @@ def _foreign(
 
 
 def require(*packages: str) -> None:
-    """Refuse a launch for which a ROS package is missing, before anything is started.
-
-    Raises:
-        RuntimeError: names the missing packages.
-
-    """
+    """Refuse a launch for which a ROS package is missing, before anything is started."""
     missing = []
     for package in packages:
         try:

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 
 from sst_ros.cli.commands import free_out, function
 from sst_ros.control.plan import examine_motion, plan_json, plan_table, time_scaling, write_torques
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
 from sst_ros.host.output import require_free, write_into
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
@@ -26,9 +27,8 @@ PLOT, DESIGN = "plot", "design"
 
 def check_plan(options: argparse.Namespace) -> int:
     """Print what a reference motion requires; write the torques that follow it."""
-    if not 1e-9 <= options.period < float("inf"):
-        problem = Problem("--period", options.period, "must be a finite number >= 1e-9 [s]")
-        raise InputError("plan check", [problem])
+    valid, allowed = 1e-9 <= options.period < math.inf, "must be a finite number >= 1e-9 [s]"
+    refuse_unless("plan check", ("--period", options.period, valid, allowed))
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
     scene, read_motion = load(options.scene), "recording.recording:read_run_motion"
@@ -73,21 +73,22 @@ def run_identification(options: argparse.Namespace) -> None:
     """Identify a scene from a recorded run, or design a motion that determines its parameters."""
     designing = options.bag == DESIGN
     ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene", "method")
-    form = DESIGN if designing else "BAG"
-    wrong = [
-        Problem(f"--{name}", getattr(options, name), f"is no option of identify {form}")
-        for name in (others if designing else ours)
-        if getattr(options, name) is not None
-    ]
-    if designing != (options.designed is not None):
-        allowed = "must be given after design, and only there"
-        wrong.append(Problem("SCENE", options.designed, allowed))
-    if wrong:
-        raise InputError("identify", wrong)
+    given = {
+        name: value for name in (*ours, *others) if (value := getattr(options, name)) is not None
+    }
+    chosen = {name: given.pop(name) for name in (ours if designing else others) if name in given}
+    absent = f"is no option of identify {DESIGN if designing else 'BAG'}"
+    after = (
+        designing == (options.designed is not None),
+        "must be given after design, and only there",
+    )
+    refuse_unless(
+        "identify",
+        *((f"--{name}", value, False, absent) for name, value in given.items()),
+        ("SCENE", options.designed, *after),
+    )
     if options.out is not None:
         free_out(options, options.out)
-    names = ours if designing else others
-    chosen = {name: value for name in names if (value := getattr(options, name)) is not None}
     if designing:
         motion = design(load(options.designed), options.parameters, **chosen)
         lines, scene = motion.table(), motion.scene

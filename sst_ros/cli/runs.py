@@ -61,9 +61,7 @@ def check_files(options: argparse.Namespace) -> int:
 def check(name_or_path: str | Path) -> Scene:
     """Read a scene and assemble it at its initial state, which `load` does not; faults have lines.
 
-    Raises:
-        InputError: it cannot be read, is refused, or cannot start; lists every fault.
-
+    Every fault is in one InputError.
     """
     source, origin = text_of(name_or_path)
     scene = read(Scene, source, origin)

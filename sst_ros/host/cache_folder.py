@@ -22,14 +22,10 @@ from sst_ros.host.output import replace_file
 
 
 def cache_folder() -> Path:
-    """Return the folder of compiled code, made if it was not there.
+    """Return the folder of compiled code, made if it was not there; an OSError if it cannot be.
 
     It is SST_ROS_CACHE, or sst_ros in the user's cache folder. Where that is another user's, or
     open to others, it is a private temporary folder, and a warning is given.
-
-    Raises:
-        OSError: it cannot be made.
-
     """
     folder = configured_folder()
     if folder is None:

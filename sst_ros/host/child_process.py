@@ -78,12 +78,7 @@ def own_domain() -> Iterator[int]:
 
 
 def _lock_domain() -> tuple[int, int]:
-    """Return the number of a domain, and the descriptor that keeps it until it is closed.
-
-    Raises:
-        SstError: all domains from 1 to 100 are in use.
-
-    """
+    """Return the number of a domain, and the descriptor that keeps it until it is closed."""
     for _ in range(_DOMAINS):
         number = 1 + next(_next) % _DOMAINS
         path = Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}"

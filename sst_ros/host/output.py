@@ -53,12 +53,7 @@ def require_free(out: Path, origin: str, *, force: bool = False, option: str = "
 
 @contextmanager
 def write_into(out: Path, origin: str) -> Iterator[None]:
-    """Make the folder `out` for a block that writes into it.
-
-    Raises:
-        InputError: it cannot be written; `origin` names the command.
-
-    """
+    """Make the folder `out` for a block that writes into it, or raise an InputError of `origin`."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         yield

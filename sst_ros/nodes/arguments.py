@@ -49,9 +49,7 @@ def help_text(command: str) -> str:
 def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
     """Return the words (without the program's name) as ROS arguments.
 
-    Raises:
-        InputError: lists every word that is no argument of the node, with the closest one.
-
+    An InputError lists every word that is no argument of the node, with the closest one.
     """
     known = _specs_of(command)
     plain, ros = _split(words)
@@ -208,12 +206,7 @@ def _advice(word: str, known: dict[str, Spec]) -> str:
 
 
 def _as_yaml(spec: Spec, word: str) -> str:
-    """Return a value as rcl reads it.
-
-    Raises:
-        ValueError: it is none of the parameter.
-
-    """
+    """Return a value as rcl reads it, or raise ValueError."""
     value: Any = word
     if spec.kind == "flag":
         value = {"true": True, "false": False}.get(word.lower(), word)

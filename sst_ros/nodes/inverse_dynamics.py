@@ -55,12 +55,7 @@ _SPIN_S = 0.01
 
 
 class InverseDynamicsController(Worker[ControllerNodeParameters]):
-    """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`.
-
-    Attributes:
-        follower: follows the motion.
-
-    """
+    """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`."""
 
     def __init__(self) -> None:
         super().__init__("sst_inverse_dynamics", ControllerNodeParameters)
@@ -197,12 +192,7 @@ class InverseDynamicsController(Worker[ControllerNodeParameters]):
 
 
 def _measure(state: JointState) -> Measurement:
-    """Read the actuators, which may come in any order, among others.
-
-    Raises:
-        SstError: one is missing; nothing can be controlled by such messages.
-
-    """
+    """Read the actuators, which may come in any order, among others; refuse what has not all."""
     names = list(state.name)
     if absent := [name for name in ACTUATORS if name not in names]:
         raise SstError(f"joint_states has no {', '.join(absent)}: its names are {names}")

@@ -67,21 +67,10 @@ P = TypeVar("P", bound=Section)
 
 
 class Worker(Generic[P]):
-    """What a process runs: a node with parameters, `done` when its work is.
+    """What a process runs: a node with checked `parameters`, `done` when its work is.
 
-    Fields of `cls` are read-only, except those of `cls.CHANGEABLE`.
-
-    Args:
-        node: name of the node.
-        cls: its parameters.
-        more_defaults: defaults that depend on the values given at the start.
-
-    Attributes:
-        parameters: those of the node, checked.
-
-    Raises:
-        InputError: values given at the start are refused, or names are unknown; lists all of them.
-
+    Fields of `cls` are read-only, except those of `cls.CHANGEABLE`; some defaults depend on the
+    values given at the start. An InputError lists all that are refused, and all unknown names.
     """
 
     def __init__(
@@ -177,14 +166,9 @@ def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
 def run(words: Sequence[str]) -> int:
     """Run a node until SIGINT, SIGTERM, its end or the end of its parent.
 
-    The signal handlers of rclpy would cut the connection at once; ours let the worker close.
-
-    Args:
-        words: a key of `arguments.COMMANDS` and the arguments behind it.
-
-    Returns:
-        The exit status: 0, 1 for a failure, 2 for arguments that are refused.
-
+    The signal handlers of rclpy would cut the connection at once; ours let the worker close. Words
+    are a key of `arguments.COMMANDS` and the arguments behind it. The exit status is 0, 1 for a
+    failure, 2 for arguments that are refused.
     """
     signals.handle()
     command, *given = words
@@ -263,12 +247,7 @@ class _Callbacks(threading.Thread):
 
 
 def spin(worker: Worker[Any]) -> None:
-    """Run a worker until it is done or asked to end, then close it.
-
-    Raises:
-        Exception: that of a callback, or of closing the worker.
-
-    """
+    """Run a worker until it is done or asked to end, or a callback raises; then close it."""
     callbacks = _Callbacks(worker.node)
     callbacks.start()
     try:

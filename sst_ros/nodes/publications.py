@@ -27,7 +27,7 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from sst_ros.description.urdf import urdf
-from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.errors import SstError, refuse_unless
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import COUNT_NS
@@ -92,12 +92,7 @@ class NotFinite(SstError):
 
 
 def finite(y: Sequence[float], joints: Sequence[float], torque: Sequence[float]) -> Numbers:
-    """Return the numbers of a state, for numbers y that begin with the quaternion.
-
-    Raises:
-        NotFinite: one of them is not finite.
-
-    """
+    """Return the numbers of a state, or raise NotFinite; y begins with the quaternion."""
     quaternion = y[:4]
     # One number that is not finite makes the sum so.
     if not math.isfinite(sum(joints) + sum(quaternion) + sum(torque)):
@@ -205,33 +200,21 @@ def follows_clock(node: Node) -> bool:
 
 
 class PublishedClock:
-    """Publishes /clock; there must be no other publisher.
-
-    Raises:
-        InputError: /clock is published already, or the node itself follows it.
-
-    """
+    """Publishes /clock; refused where it is published already, or the node itself follows it."""
 
     def __init__(self, node: Node) -> None:
-        self._node, allowed = node, ""
-        if follows_clock(node):
-            allowed = "a node with use_sim_time follows /clock and cannot be its source"
-        elif others := self._find_others():
-            allowed = f"/clock is published already, by {', '.join(others)}"
-        if allowed:
-            problem = Problem("publish_clock", True, allowed)
-            raise InputError(node.get_fully_qualified_name(), [problem])
+        own, parameter = node.get_fully_qualified_name(), "publish_clock"
+        allowed = "a node with use_sim_time follows /clock and cannot be its source"
+        refuse_unless(own, (parameter, True, not follows_clock(node), allowed))
+        others: list[str] = []
+        deadline = time.monotonic() + _DISCOVERY_S  # until then, or one is found by its name
+        while time.monotonic() < deadline and (not others or topics.UNNAMED in others):
+            others = topics.publishers(node, "/clock")
+            time.sleep(0.02)
+        allowed = f"/clock is published already, by {', '.join(others)}"
+        refuse_unless(own, (parameter, True, not others, allowed))
         self._publisher = topics.SIMULATOR["clock"].publisher(node)
         self.now_ns = node.get_clock().now().nanoseconds
-
-    def _find_others(self) -> list[str]:
-        """Wait until discovery has had its time, or one is found by its name."""
-        deadline = time.monotonic() + _DISCOVERY_S
-        others: list[str] = []
-        while time.monotonic() < deadline and (not others or topics.UNNAMED in others):
-            others = topics.publishers(self._node, "/clock")
-            time.sleep(0.02)
-        return others
 
     def publish(self, now_ns: int | None = None) -> None:
         """Publish the time; without one the last again, for late subscribers."""
@@ -240,12 +223,7 @@ class PublishedClock:
 
 
 class SimulatorTopics:
-    """Publishers of the simulator: the `RunOutput` of its run.
-
-    Raises:
-        InputError: /clock has another publisher; wait_for_subscribers names a foreign topic.
-
-    """
+    """Publishers of the simulator: the `RunOutput` of its run."""
 
     def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:
         self._node, own = node, topics.SIMULATOR
@@ -294,9 +272,7 @@ class SimulatorTopics:
     def sample(self, simulation: Simulation, stamp_ns: int) -> None:
         """Publish a sample of the run, and from time to time the torques logged up to it.
 
-        Raises:
-            NotFinite: nothing has been published.
-
+        Where a number is not finite, NotFinite is raised and nothing is published.
         """
         logged = len(self._log)
         self._count_subscribers(COUNT_NS if logged else 0)  # the first of a run goes to all
@@ -366,8 +342,8 @@ class SimulatorTopics:
     def _find_publishers(self, names: tuple[str, ...]) -> list[Publisher[Any]]:
         own = {publisher.topic_name: publisher for publisher in self._node.publishers}
         found = [self._node.resolve_topic_name(name) for name in names if name]
-        if unknown := [name for name in found if name not in own]:
-            allowed = f"must be topics that the node publishes: {', '.join(sorted(own))}"
-            problem = Problem("wait_for_subscribers", unknown, allowed)
-            raise InputError(self._node.get_fully_qualified_name(), [problem])
+        unknown = [name for name in found if name not in own]
+        allowed = f"must be topics that the node publishes: {', '.join(sorted(own))}"
+        problem = "wait_for_subscribers", unknown, not unknown, allowed
+        refuse_unless(self._node.get_fully_qualified_name(), problem)
         return [own[name] for name in found]

@@ -92,10 +92,7 @@ class Recorder(Worker[RecorderParameters]):
     def close(self) -> None:
         """Take what has arrived and close the bag.
 
-        Raises:
-            RecordingIncomplete: names the topics without messages, and those that lost some.
-            SstError: the bag could not be written.
-
+        RecordingIncomplete names the topics without messages, and those that lost some.
         """
         self._take()
         if self._failure is not None:

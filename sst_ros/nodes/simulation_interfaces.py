@@ -211,10 +211,7 @@ class SimulationInterfaces:
     def _actuators(self, quaternion: Quaternion, rate: Vector3) -> tuple[Vector3, Vector3]:
         """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
 
-        Raises:
-            AssemblyError: the manipulator has no or another assembly mode there.
-            ArithmeticError: serial singularity.
-
+        At a serial singularity an ArithmeticError is raised.
         """
         matrix = rotation_matrix(quaternion)
         x, y, z = (matrix.T @ rate).tolist()

@@ -82,12 +82,7 @@ class Simulator(Worker[SimulatorParameters]):
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
 
     def close(self) -> None:
-        """End the run, publish the last diagnostics.
-
-        Raises:
-            SstError: the run has failed.
-
-        """
+        """End the run, publish the last diagnostics; raise the reason where the run has failed."""
         self._loop.stop()
         self.done.set()
         self._thread.join(_END_S)
@@ -237,14 +232,10 @@ def serve(node: Node, loop: RunLoop) -> None:
 
 
 class CodeCompiler:
-    """Finds the compiled code of a scene, or has it made for the next start.
+    """Finds the compiled code of a scene, which is `available`, or has it made for the next start.
 
     To compile in this process would delay the run by half a minute, at the start or when the
     integrator changes its method.
-
-    Attributes:
-        available: all code of the scene is there.
-
     """
 
     def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:

@@ -149,22 +149,14 @@ _UNKNOWN = "_UNKNOWN_"
 
 
 class Endpoint(NamedTuple):
-    """One topic, service or action of a node: a row of the table.
+    """One topic, service or action of a node: a row of the table."""
 
-    Attributes:
-        use: PUBLISHES, SUBSCRIBES, SERVES, CALLS or EXECUTES, the last of an action.
-        depth: messages kept for slow readers; 0 for two seconds of them.
-        latched: the last message is kept for late joiners.
-        when: the condition under which it exists; always where empty.
-
-    """
-
-    use: str
+    use: str  # PUBLISHES, SUBSCRIBES, SERVES, CALLS or EXECUTES, the last of an action
     name: str
     type_name: str
-    depth: int
-    latched: bool
-    when: str
+    depth: int  # messages kept for slow readers; 0 for two seconds of them
+    latched: bool  # the last message is kept for late joiners
+    when: str  # condition under which it exists; always where empty
     doc: str
 
     @property
@@ -284,9 +276,7 @@ def take(subscription: Subscription[Any]) -> tuple[bytes, dict[str, Any]] | None
 class Reader:
     """Messages of a topic, each as soon as it has arrived.
 
-    Attributes:
-        waiting: a message is known that arrived after the time last given to `read`.
-
+    One is `waiting` that is known and arrived after the time last given to `read`.
     """
 
     def __init__(self, node: Node, topic: Endpoint) -> None:
@@ -374,12 +364,7 @@ class TorqueCommands:
 
 
 class ActionGoal:
-    """An accepted goal of an action that runs until `end`, which any thread may call.
-
-    Attributes:
-        handle: rclpy's handle of the goal.
-
-    """
+    """An accepted goal of an action, by its handle: it runs until `end`, in any thread."""
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle

@@ -137,11 +137,9 @@ class RunDiagnostics:
     def status(self, values: dict[str, Any], warnings: list[str]) -> tuple[int, str, list[str]]:
         """Return the level, the status in a few words, and what is new to warn of.
 
-        Args:
-            values: as `values` has just read them. What the thread of the run counts meanwhile is
-                reported the next time: words and values of one message never contradict each other.
-            warnings: of the graph.
-
+        Values are as `values` has just read them. What the thread of the run counts meanwhile is
+        reported the next time: words and values of one message never contradict each other.
+        Warnings are of the graph.
         """
         running, fault = values["phase"] == Phase.RUNNING.value, values["fault"]
         said = {

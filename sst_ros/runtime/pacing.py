@@ -16,30 +16,17 @@ _TOGETHER_NS = 2_000_000
 
 @dataclass
 class RunSettings:
-    """Numbers of a run, of a node or not; the times may change between two ticks.
+    """Numbers of a run, of a node or not; the times may change between two ticks."""
 
-    Attributes:
-        period_ns: length of a tick [ns].
-        ticks_per_sample: ticks between two published samples; this is the control period.
-        last_tick: tick after which the run ends; sys.maxsize for no end.
-        lockstep: each sample is answered before the next tick.
-        waits: a command starts the run.
-        partial_commands: an effort that is nan means zero torque.
-        command_timeout_ns: age at which a command is no longer held [ns]; 0 for never.
-        lockstep_timeout: longest wait for the answer to a sample [s]; 0 for no end.
-        subscriber_timeout: longest wait for subscribers [s].
-
-    """
-
-    period_ns: int
-    ticks_per_sample: int = 1
-    last_tick: int = sys.maxsize
-    lockstep: bool = False
-    waits: bool = False
-    partial_commands: bool = False
-    command_timeout_ns: float = 0.0
-    lockstep_timeout: float = 0.0
-    subscriber_timeout: float = 0.0
+    period_ns: int  # of a tick
+    ticks_per_sample: int = 1  # from one published sample to the next: the control period
+    last_tick: int = sys.maxsize  # after which the run ends, if at all
+    lockstep: bool = False  # each sample is answered before the next tick
+    waits: bool = False  # a command starts the run
+    partial_commands: bool = False  # an effort that is nan means zero torque
+    command_timeout_ns: float = 0.0  # age at which a command is no longer held; 0 for never
+    lockstep_timeout: float = 0.0  # longest wait for the answer to a sample [s]; 0 for no end
+    subscriber_timeout: float = 0.0  # longest wait for subscribers [s]
 
 
 class TimeSource(Protocol):

@@ -7,7 +7,7 @@ import contextlib
 import math
 import threading
 import time
-from typing import Protocol
+from typing import Any, TypeAlias
 
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.mechanism.generic_math import ZERO, add, axpy
@@ -15,7 +15,7 @@ from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import State, Vector3
+from sst_ros.state import Vector3
 
 _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4
@@ -26,33 +26,8 @@ _LONGEST_WAIT_S = 0.1
 """Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
 
 
-class RunOutput(Protocol):
-    """Where a run publishes: the topics of the node."""
-
-    def now_ns(self) -> int:
-        """Return the ROS time [ns]; 0 as long as a followed clock has none."""
-
-    def missing_subscribers(self) -> list[str]:
-        """Return the topics whose subscribers the run has to wait for."""
-
-    @property
-    def unread(self) -> bool:
-        """Whether nothing receives samples, so that only the last of several has to be made."""
-
-    def ticks(self, torque: Vector3, moment: Vector3, count: int) -> None:
-        """Log the torque [N m] and external moment [N m] of some ticks."""
-
-    def sample(self, simulation: Simulation, stamp_ns: int) -> None:
-        """Publish a sample of the run, and from time to time the torques logged up to it."""
-
-    def flush(self) -> None:
-        """Publish the torques that are logged and not published."""
-
-    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
-        """Publish a state that is no sample; `at_rest` with zero rates and efforts."""
-
-    def publish_phase(self, phase: str) -> None:
-        """Publish the phase, with the reason of a fault."""
+RunOutput: TypeAlias = Any
+"""Where a run publishes: what has the methods of `nodes.publications.SimulatorTopics`."""
 
 
 class Counters:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import RunSettings
@@ -21,15 +21,8 @@ MOST_WAITING = 50
 held up for 50 ms loses none at 1 kHz, and what a flood costs a tick is bounded."""
 
 
-class Arrivals(Protocol):
-    """Messages of a topic."""
-
-    @property
-    def waiting(self) -> bool:
-        """Whether a message is known that arrived after the time last given to `read`."""
-
-    def read(self, until_ns: float) -> Sequence[Any]:
-        """Return the next messages that arrived until this monotonic time [ns], within bounds."""
+Arrivals: TypeAlias = Any
+"""Messages of a topic: what has `waiting` and `read` as `nodes.topics.Reader`."""
 
 
 class MessageRefused(Exception):
@@ -158,7 +151,7 @@ class TorqueInput:
 
     def _read_stamped(self, until_ns: float) -> Iterable[Any]:
         """Read stamped commands; with partial_commands nan is zero torque, all nan no command."""
-        found = self._stamped.read(until_ns)
+        found: Sequence[Any] = self._stamped.read(until_ns)
         if not self._run.partial_commands:
             return found
         given = [one for one in found if not (one.effort and all(map(math.isnan, one.effort)))]
@@ -215,12 +208,7 @@ def torque_by_name(message: Any) -> Vector3:
 
 
 def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3:
-    """Return one value for each actuator, gamma_1 to gamma_3, which may come in any order.
-
-    Raises:
-        MessageRefused: names or values are not those of the three actuators.
-
-    """
+    """Return one value for each actuator, gamma_1 to gamma_3, which may come in any order."""
     if sorted(names) != list(ACTUATORS):
         allowed = ", ".join(ACTUATORS)
         reason = f"names {list(names)[:6]} must be {allowed}, each once"

@@ -12,7 +12,7 @@ import dataclasses
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from enum import Enum, IntEnum
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from sst_ros.control.plan import check_motion
 from sst_ros.control.reference import Reference, ReferenceMotion, slow_down
 from sst_ros.control.reference_motions import reference_motion, through_points
 from sst_ros.control.tracking import TrackingMetrics, track_of
-from sst_ros.errors import InputError, Problem, SingularConfiguration
+from sst_ros.errors import InputError, Problem, SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO, axpy
@@ -46,22 +46,29 @@ _NUMBERS = 256 * 22
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
     """Take over a trajectory_msgs/JointTrajectory; its joints may come in any order.
 
-    It begins immediately and continues the reference, which may be moving.
-
-    Args:
-        message: the trajectory; positions are needed, velocities and accelerations may be left
-            out.
-        geometry: of the manipulator.
-        begin: the reference now.
+    It begins immediately and continues the reference `begin`, which may be moving. Positions are
+    needed, velocities and accelerations may be left out.
 
     Raises:
         InputError: lists every fault.
         SingularConfiguration: the path crosses a parallel singularity.
 
     """
-    if problems := [*_trajectory_faults(message, begin)]:
-        raise InputError("joint_trajectory", problems)
-    places = [list(message.joint_names).index(name) for name in ACTUATORS]
+    names, stamp = list(message.joint_names), nanoseconds(message.header.stamp)
+    times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points]
+    late = not any(begin.gamma_dot) or not times or times[0] > 0.0
+    one_each = f"must be {', '.join(ACTUATORS)}, each once"
+    refuse_unless(
+        "joint_trajectory",
+        ("joint_names", names, sorted(names) == list(ACTUATORS), one_each),
+        ("header.stamp", stamp, stamp == 0, "must be zero: a trajectory begins immediately"),
+        *(
+            (f"points[{i}].effort", [*at.effort], not at.effort, "must be left out: it is computed")
+            for i, at in enumerate(message.points)
+        ),
+        ("points[0].time_from_start", 0.0, late, "must be > 0 s while the reference is moving"),
+    )
+    places = [names.index(name) for name in ACTUATORS]
 
     def by_leg(quantity: str) -> list[list[float]]:
         """Sort by leg what is whole; what is not is refused as it is."""
@@ -71,28 +78,12 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
     return through_points(
         geometry,
         begin.quaternion,
-        [nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points],
+        times,
         by_leg("positions"),
         by_leg("velocities"),
         by_leg("accelerations"),
         begin=(begin.gamma_dot, begin.gamma_ddot),
     )
-
-
-def _trajectory_faults(message: Any, begin: Reference) -> Iterator[Problem]:
-    names = list(message.joint_names)
-    if sorted(names) != list(ACTUATORS):
-        yield Problem("joint_names", names, f"must be {', '.join(ACTUATORS)}, each once")
-    if stamp := nanoseconds(message.header.stamp):
-        yield Problem("header.stamp", stamp, "must be zero: a trajectory begins immediately")
-    for index, point in enumerate(message.points):
-        if len(point.effort):
-            allowed = "must be left out: it is computed"
-            yield Problem(f"points[{index}].effort", list(point.effort), allowed)
-    first = message.points[0] if any(begin.gamma_dot) and message.points else None
-    if first is not None and not nanoseconds(first.time_from_start):
-        allowed = "must be > 0 s while the reference is moving"
-        yield Problem("points[0].time_from_start", 0.0, allowed)
 
 
 class ErrorCode(IntEnum):
@@ -116,18 +107,11 @@ Tolerances = dict[tuple[str, str], float]
 
 
 class TrajectoryGoal:
-    """Tolerances of a goal, and its outcome.
+    """Tolerances of a goal, a FollowJointTrajectory.Goal, and its outcome.
 
-    Args:
-        message: the goal, a FollowJointTrajectory.Goal; its trajectory is checked elsewhere. A
-            tolerance of 0 means the default, -1 that there is none. Tolerances of accelerations,
-            which are not measured, have no effect.
-        defaults: of the tolerances.
-
-    Raises:
-        InputError: a tolerance is of another joint or not allowed, or the goal has joints of
-            several degrees of freedom.
-
+    A tolerance of 0 means the default, -1 that there is none. Tolerances of accelerations, which
+    are not measured, have no effect. An InputError lists tolerances of other joints or values that
+    are not allowed, and joints of several degrees of freedom; the trajectory is checked elsewhere.
     """
 
     def __init__(self, message: Any, defaults: ControllerNodeParameters) -> None:
@@ -186,11 +170,7 @@ class TrajectoryGoal:
     def outcome(self, time: float, error: Vector3, error_rate: Vector3) -> Outcome | None:
         """Return the end of the goal at a sample; None as long as it goes on.
 
-        Args:
-            time: of the motion [s].
-            error: desired - measured [rad].
-            error_rate: the same of the rates [rad/s].
-
+        The time is that of the motion [s], the errors are desired - measured [rad], [rad/s].
         """
         late = time - self._times[-1]
         kind, tolerances = ("path", self._path) if late < 0.0 else ("goal", self._goal)
@@ -242,7 +222,7 @@ class TrajectoryFollower:
             actuators = dataclasses.replace(actuators, torque_limit=limit)
             self._model = dataclasses.replace(model, actuators=actuators)
         self._geometry = Geometry.of(model)
-        self._period_ns = NANOSECONDS // settings.rate
+        self._period_ns = settings.period_ns
         self._planned: ReferenceMotion | None = None
         if settings.motion == "scene":
             self._planned = reference_motion(model, _read_motion)
@@ -263,21 +243,17 @@ class TrajectoryFollower:
         """Take a trajectory_msgs/JointTrajectory in place of what is followed now.
 
         It goes on from the reference of the last sample; before there was one, from where the
-        manipulator is, at rest. A reference that moves is replaced in lockstep only.
-
-        Raises:
-            InputError, AssemblyError, SingularConfiguration: it is refused; nothing has changed.
-
+        manipulator is, at rest. A reference that moves is replaced in lockstep only. Where an error
+        is raised, nothing has changed.
         """
-        if self._settings.motion != "topic":
-            allowed = "must be topic, for trajectories to be taken"
-            raise InputError("joint_trajectory", [Problem("motion", "scene", allowed)])
+        origin, given = "joint_trajectory", self._settings
+        allowed = "must be topic, for trajectories to be taken"
+        refuse_unless(origin, ("motion", given.motion, given.motion == "topic", allowed))
         begin = self._reference_at_rest(seen) if self._last is None else self._last.desired
         moving = any(begin.gamma_dot) or any(begin.gamma_ddot)
-        if moving and not self._settings.stamped:
-            # The check takes longer than a control period; in lockstep the plant waits.
-            allowed = "must come when the motion has ended, outside lockstep"
-            raise InputError("joint_trajectory", [Problem("points", "", allowed)])
+        # The check takes longer than a control period; in lockstep the plant waits.
+        allowed = "must come when the motion has ended, outside lockstep"
+        refuse_unless(origin, ("points", "", given.stamped or not moving, allowed))
         motion = motion_of(message, self._geometry, begin)
         check_motion(motion, self._model)
         if self._last is None:
@@ -308,12 +284,9 @@ class TrajectoryFollower:
     def answer(self, stamp_ns: int, measured: Measurement) -> Command | None:
         """Answer a sample of the run; None where there is nothing to answer.
 
-        The end of the scene's motion is answered with zero torque: then the work is done.
-
-        Raises:
-            InputError: the manipulator is not where the motion begins.
-            ControlStopped: see `Controller.command`.
-
+        The end of the scene's motion is answered with zero torque: then the work is done. An
+        InputError says that the manipulator is not where the motion begins; ControlStopped is the
+        controller's.
         """
         if stamp_ns <= self._last_ns or self.stage in (Stage.WAITING, Stage.ENDED):
             return None
@@ -335,7 +308,11 @@ class TrajectoryFollower:
             self.stage = Stage.ENDED
             command = dataclasses.replace(command, torque=ZERO)
         if passed_ns <= end_ns:
-            self._log(time, command)
+            desired, errors = command.desired, (*command.error, *command.error_rate)
+            torques = *command.feedforward, *command.feedback, *command.torque
+            self._rows.extend((time, *desired.gamma, *desired.gamma_dot, *errors, *torques))
+            if len(self._rows) >= _NUMBERS:
+                self._add_rows()
         self.samples += 1
         self._last, self._last_ns = command, stamp_ns
         return command
@@ -359,8 +336,8 @@ class TrajectoryFollower:
         return float(np.sqrt(np.mean(rms**2))), float(largest.max())
 
     def _prepare(self, motion: ReferenceMotion) -> None:
-        period_s = self._period_ns / NANOSECONDS
-        self._controller = Controller(self._model, motion, self._settings, period_s)
+        period = self._period_ns / NANOSECONDS
+        self._controller = Controller(self._model, motion, self._settings, period)
         self._begin(motion, None)
         self.stage = Stage.READY
 
@@ -369,13 +346,6 @@ class TrajectoryFollower:
         self._motion, self._start_ns = motion, start_ns
         self._rows, self._metrics = array("d"), TrackingMetrics()
         self.limited = 0
-
-    def _log(self, time: float, command: Command) -> None:
-        desired, errors = command.desired, (*command.error, *command.error_rate)
-        torques = *command.feedforward, *command.feedback, *command.torque
-        self._rows.extend((time, *desired.gamma, *desired.gamma_dot, *errors, *torques))
-        if len(self._rows) >= _NUMBERS:
-            self._add_rows()
 
     def _add_rows(self) -> None:
         """Add the samples since the last call to the metrics."""
@@ -400,11 +370,10 @@ class TrajectoryFollower:
 
     def _refuse_elsewhere(self, measured: Measurement) -> None:
         begin, tolerance = self._motion.at(0.0).gamma, self._settings.start_tolerance
-        off = axpy(1.0, begin, -1.0, measured.gamma)
-        if not max(map(abs, off)) <= tolerance:
-            said = ", ".join(f"{angle:.6f}" for angle in begin)
-            allowed = f"must be within {tolerance:g} rad of ({said}), where the motion begins"
-            raise InputError("joint_states", [Problem("position", measured.gamma, allowed)])
+        near = max(map(abs, axpy(1.0, begin, -1.0, measured.gamma))) <= tolerance
+        said = ", ".join(f"{angle:.6f}" for angle in begin)
+        allowed = f"must be within {tolerance:g} rad of ({said}), where the motion begins"
+        refuse_unless("joint_states", ("position", measured.gamma, near, allowed))
 
 
 def _read_motion(bag: str) -> Trajectory:

@@ -153,7 +153,7 @@ def shown():
     """A function that shows a state, and the last messages of all topics, by their names."""
     made = []
     create = lambda *given: made.append(Topic(*given)) or made[-1]  # noqa: E731
-    node = SimpleNamespace(publishers=made, create_publisher=create)
+    node = SimpleNamespace(publishers=made, create_publisher=create, get_fully_qualified_name=str)
     simulated = SimulatorTopics(node, load_scene("example2"), SimulatorParameters())
 
     def show(state, *, at_rest=False):
