@@ -105,21 +105,15 @@ def reference_motion(
     return move_actuators(geometry, straight_path(gamma, motion.to_angles), pieces, start)
 
 
-def minimum_jerk(u: float) -> tuple[float, float, float]:
-    """s(u) from 0 to 1 for u in [0, 1], at rest at both ends, with its two derivatives by u."""
-    rest = 1.0 - u
-    square = u * u
+def minimum_jerk(time: float, duration: float = 1.0) -> tuple[float, float, float]:
+    """From 0 to 1 over a duration, at rest at both ends, with its two derivatives by time."""
+    u = time / duration
+    rest, square = 1.0 - u, u * u
     return (
         square * u * (10.0 + u * (6.0 * u - 15.0)),
-        30.0 * square * rest * rest,
-        60.0 * u * rest * (rest - u),
+        30.0 * square * rest * rest / duration,
+        60.0 * u * rest * (rest - u) / (duration * duration),
     )
-
-
-def minimum_jerk_over(time: float, duration: float) -> tuple[float, float, float]:
-    """Minimum jerk from 0 to 1 over a duration, with derivatives by time."""
-    s, rate, acceleration = minimum_jerk(time / duration)
-    return s, rate / duration, acceleration / (duration * duration)
 
 
 def move_star(
@@ -130,7 +124,7 @@ def move_star(
     begin = x / length, y / length, z / length, w / length
 
     def inside(time: float) -> Reference:
-        s, rate, acceleration = minimum_jerk_over(time, duration)
+        s, rate, acceleration = minimum_jerk(time, duration)
         turned, u, slope = path(s)
         body_acceleration = axpy(acceleration, u, rate * rate, slope)
         return space.of_star(
@@ -256,7 +250,7 @@ def straight_path(start: Vector3, goal: ToAngles) -> ActuatorPath:
     span = axpy(1.0, goal.gamma, -1.0, start)
 
     def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
-        s, rate, acceleration = minimum_jerk_over(time, goal.duration)
+        s, rate, acceleration = minimum_jerk(time, goal.duration)
         return axpy(1.0, start, s, span), multiply(rate, span), multiply(acceleration, span)
 
     return path
@@ -271,7 +265,7 @@ def sweep_path(sweep: Sweep, centre: Vector3) -> tuple[ActuatorPath, tuple[float
     def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
         e, e1, e2 = 1.0, 0.0, 0.0  # the fading, and its derivatives by time
         if not fade <= time <= duration - fade:
-            e, e1, e2 = minimum_jerk_over(min(time, duration - time), fade)
+            e, e1, e2 = minimum_jerk(min(time, duration - time), fade)
             e1 = e1 if time < fade else -e1
         p, v, a = [], [], []
         for middle, amplitude, first, slope in rows:

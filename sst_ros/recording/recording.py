@@ -8,6 +8,7 @@ what is not a whole run.
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -67,6 +68,12 @@ class Signals:
     topic_series: dict[str, Series]
     idle_states: int
     statuses: tuple[Status, ...]
+
+    def rows(self, table: TopicTable) -> Series:
+        """Rows of a topic; none where it was not recorded."""
+        none = np.empty(0, dtype=np.int64)
+        empty = Series(table.columns, none, none, np.empty((0, len(table.columns))))
+        return self.topic_series.get(table.key, empty)
 
     @cached_property
     def tables(self) -> dict[str, Series]:
@@ -140,25 +147,33 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
     """
     path = Path(path)
     bag = Bag(path, [*topics.TOPIC_TABLES, topics.SCENE, topics.DIAGNOSTICS], damaged=damaged)
-    collected = {table.key: topics.CollectedRows(table) for table in topics.TOPIC_TABLES}
+    tables = {table.key: table for table in topics.TOPIC_TABLES}
+    # Compact: an hour at 500 Hz has 1.8 million rows.
+    times, numbers = {key: array("q") for key in tables}, {key: array("d") for key in tables}
     scenes: set[str] = set()
     statuses: list[Status] = []
+    idle = 0
     for key, received_ns, content in bag.messages():
         if key == topics.SCENE.key:
             scenes.add(content.data)
         elif key == topics.DIAGNOSTICS.key:
             for status in content.status:
-                values = {pair.key: pair.value for pair in status.values}
-                statuses.append(Status(received_ns, status.name, values))
+                texts = {pair.key: pair.value for pair in status.values}
+                statuses.append(Status(received_ns, status.name, texts))
         else:
             try:
-                collected[key].add(received_ns, content)
+                rows = tables[key].rows(content)
             except topics.InvalidMessage as error:
                 raise refusal(path, key, *error.args) from None
-    idle = collected[topics.JOINT_STATES.key].skipped
-    # Each is let go when it is a series: an hour takes some hundred megabytes.
-    series = {key: collected.pop(key).series(path) for key in list(collected)}
-    found = {key: one for key, one in series.items() if len(one)}
+            idle += key == topics.JOINT_STATES.key and not rows
+            for stamp, values in rows:
+                times[key].extend((stamp, received_ns))
+                numbers[key].extend(values)
+    found = {
+        key: topics.sort_rows(table, times.pop(key), numbers.pop(key), path)
+        for key, table in tables.items()
+        if times[key]
+    }
     if not found:
         allowed = "must have at least one of " + ", ".join(t.ending for t in topics.TOPIC_TABLES)
         raise refusal(path, "topics", None, allowed)
@@ -270,7 +285,7 @@ class Recording:
             allowed = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), allowed)
         self.ticks = _ticks(self.path, ticks, self.start_ns)
-        parts = [_rows(found, one) for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
+        parts = [found.rows(one) for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
         order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
         names = ("stamp_ns", "received_ns", "values")
         columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
@@ -331,16 +346,9 @@ class Recording:
         )
 
 
-def _rows(found: Signals, table: TopicTable) -> Series:
-    """Return the rows of a topic; none where it was not recorded."""
-    none = np.empty(0, dtype=np.int64)
-    empty = Series(table.columns, none, none, np.empty((0, len(table.columns))))
-    return found.topic_series.get(table.key, empty)
-
-
 def _finite_rows(found: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
-    series = _rows(found, table)
+    series = found.rows(table)
     bad = ~np.isfinite(series.values[:, : 4 if table is topics.TICKS else None]).all(axis=1)
     if bad.any():
         stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
