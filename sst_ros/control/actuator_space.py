@@ -4,11 +4,12 @@
 One equation serves both directions: gamma_dot_k = g_k.W and its derivative gamma_ddot_k =
 g_k.W_dot + (acceleration at W_dot = 0), which is Eq. 40 solved for gamma_ddot. The orientation at
 given actuator angles comes from Newton's method, started so close that it stays in the assembly
-mode. The observer sees to that from one set of encoder angles to the next, however far apart.
+mode; `ActuatorSpaceMap.follow` sees to that from one set of angles to the next, however far apart.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from functools import cached_property
@@ -111,6 +112,32 @@ class ActuatorSpaceMap:
             raise ArithmeticError("the loops do not close")
         return best
 
+    def follow(
+        self, known: Quaternion, here: Vector3, gamma: Vector3, sigma: float | None = None
+    ) -> Quaternion:
+        """Quaternion at gamma of the assembly mode that is known at other angles, however far.
+
+        It is found in the steps that `continuation` proves to stay in the mode. The proof needs
+        sigma, the least singular value of J2. The rows of J2 are unit vectors, so its squared
+        singular values sum to 3, the product of the larger two is at most 3/2, and
+        sigma >= 2/3 abs(det J2): enough for most steps, and cheap.
+
+        Raises:
+            BranchEnds: a parallel singularity lies between, or no assembly has these angles.
+
+        """
+        step = math.dist(gamma, here)
+        with contextlib.suppress(ArithmeticError):
+            if sigma is None:
+                sigma = 2.0 / 3.0 * abs(self.posture(known)[-1])
+            if step <= continuation.SAFE * sigma * sigma:
+                found = self.orientation(known, gamma)
+                # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle / 2).
+                half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, known)) ** 2))
+                if half <= 0.25 * (sigma - step):
+                    return found
+        return follow_assembly(self.geometry, known, here, gamma)
+
     def carriages(self, gamma: Any) -> list[Any]:
         """Return the unit vectors r_k of the carriages at angles of any kind, nine numbers."""
         found: list[Any] = []
@@ -211,53 +238,6 @@ def follow_assembly(
 ) -> Quaternion:
     """Follow the assembly from one gamma straight to another; raises as `continuation.advance`."""
     rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
-    x, y, z, w = quaternion_of(rotation).tolist()
+    found = quaternion_of(rotation)
+    x, y, z, w = (found if found @ start >= 0.0 else -found).tolist()  # the sign of the start
     return (x, y, z, w)
-
-
-class OrientationObserver:
-    """Tracks one assembly mode, however far apart successive angles are.
-
-    Its steps are those that `continuation` proves to stay in the mode. The proof needs sigma, the
-    least singular value of J2. The rows of J2 are unit vectors, so its squared singular values sum
-    to 3, the product of the larger two is at most 3/2, and sigma >= 2/3 abs(det J2): enough for
-    most steps, and cheap. Where a step is too long for that, `continuation` divides it.
-
-    It begins at an orientation (x, y, z, w), with the actuator angles gamma [rad] there.
-    """
-
-    def __init__(self, geometry: Geometry, quaternion: Quaternion, gamma: Vector3) -> None:
-        self.coordinates, self._begin = ActuatorSpaceMap(geometry), (quaternion, gamma)
-        self.reset()
-
-    def reset(self) -> None:
-        """Return to the initial orientation."""
-        self._quaternion, self._gamma = self._begin
-
-    def update(self, gamma: Vector3) -> Quaternion:
-        """Return the quaternion (x, y, z, w) at the next angles [rad].
-
-        Raises:
-            BranchEnds: a parallel singularity lies between, or no assembly has these angles.
-
-        """
-        found = self._step(gamma)
-        if found is None:
-            geometry = self.coordinates.geometry
-            found = follow_assembly(geometry, self._quaternion, self._gamma, gamma)
-        self._quaternion, self._gamma = found, gamma
-        return found
-
-    def _step(self, gamma: Vector3) -> Quaternion | None:
-        """Newton's method in one step; None where it might reach another assembly mode."""
-        step = math.dist(gamma, self._gamma)
-        try:
-            sigma = 2.0 / 3.0 * abs(self.coordinates.posture(self._quaternion)[-1])
-            if step > continuation.SAFE * sigma * sigma:
-                return None
-            found = self.coordinates.orientation(self._quaternion, gamma)
-        except ArithmeticError:
-            return None
-        # The theorem holds in a ball about R; chords of rotations are 2 sqrt(2) sin(angle / 2).
-        half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, self._quaternion)) ** 2))
-        return found if half <= 0.25 * (sigma - step) else None

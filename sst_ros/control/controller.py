@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.control.actuator_space import OrientationObserver
+from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import (
     Command,
@@ -73,7 +73,7 @@ class Controller:
         self._motion, self._settings, self._period_s = motion, settings, period_s
         geometry, start = Geometry.of(model), motion.at(0.0)
         self._inverse = InverseDynamics(model)
-        self._observer = OrientationObserver(geometry, start.quaternion, start.gamma)
+        self._space, self._begin = ActuatorSpaceMap(geometry), (start.quaternion, start.gamma)
         posture = virtual_work.posture(
             geometry, np.array(start.gamma), rotation_matrix(start.quaternion)
         )
@@ -92,7 +92,7 @@ class Controller:
         self._law = ControlLaw(
             settings,
             self._inverse.torque,
-            self._observer.coordinates.star_motion,
+            self._space.star_motion,
             kp,
             kd,
             self.inertia,
@@ -103,8 +103,8 @@ class Controller:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the integral, the observer and a failure."""
-        self._observer.reset()
+        """Clear the integral, the orientation that was observed last, and a failure."""
+        self._known = self._begin
         self._integral: Vector3 = ZERO
         self._failure: ControlStopped | None = None
 
@@ -122,19 +122,21 @@ class Controller:
         """
         if self._failure is not None:
             raise self._failure
-        gamma, gamma_dot = measured
+        gamma, gamma_dot = measured.gamma, measured.gamma_dot
         settings, motion = self._settings, self._motion
         try:
             _require_finite((*gamma, *gamma_dot), "measured")
             desired, instant = motion.at(time), time + 0.5 * self._period_s
             torques = feedforward_torques(settings, self._inverse, motion, desired, instant)
-            observed = self._observer.update(gamma) if settings.observes else ()
+            observed: Any = self._space.follow(*self._known, gamma) if settings.observes else ()
             command = self._law.answer(desired, torques, gamma, gamma_dot, observed, self._integral)
             _require_finite(command.total, "torque")
         except (SstError, ArithmeticError, ValueError) as error:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
         self._integral = command.integral
+        if settings.observes:
+            self._known = observed, gamma
         return command
 
     def __call__(self, time: float, state: State) -> Vector3:

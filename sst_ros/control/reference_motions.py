@@ -204,16 +204,12 @@ def move_actuators(
     except continuation.BranchEnds as error:
         said = f"parallel singularity before t = {times[error.row]:.9g} s"
         raise SingularConfiguration(f"{said}, least singular value of J2", error.measure) from error
-    reach = (continuation.SAFE * branch.sigma**2).tolist()
-    known = _align(quaternion_of(branch.rotation), start)
+    sigma, known = branch.sigma.tolist(), _align(quaternion_of(branch.rotation), start)
 
     def inside(time: float) -> Reference:
         gamma, gamma_dot, gamma_ddot = path(time)
         index = max(bisect_right(times, time) - 1, 0)
-        near = known[index]
-        if math.dist(gamma, gammas[index]) > reach[index]:
-            there = follow_assembly(geometry, near, gammas[index], gamma)
-            (near,) = _align(np.array([there]), near)
+        near = space.follow(known[index], gammas[index], gamma, sigma[index])
         return space.of_actuators(near, gamma, gamma_dot, gamma_ddot)
 
     return ReferenceMotion(inside, pieces)
