@@ -36,6 +36,7 @@ import numpy as np
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.errors import Problem
+from sst_ros.mechanism import generic_math
 from sst_ros.mechanism.generic_math import (
     ZERO,
     Quadruple,
@@ -46,7 +47,6 @@ from sst_ros.mechanism.generic_math import (
     axpy,
     cross3,
     dot3,
-    positive,
     relative_quaternion,
     rotation_rows,
     sqrt,
@@ -54,7 +54,7 @@ from sst_ros.mechanism.generic_math import (
 )
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section, choice, integer, number
+from sst_ros.scene.schema import Section, choice, coefficient, integer, number, positive
 from sst_ros.state import Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
@@ -91,32 +91,22 @@ class ControllerSettings(Section):
         SPACES,
         default="gamma",
     )
-    bandwidth: float = number(
-        "natural frequency of the error", "rad/s", default=30.0, above=0.0, most=1e6
-    )
-    damping_ratio: float = number(
-        "damping ratio of the error", "1", default=1.0, above=0.0, most=1e3
-    )
+    bandwidth: float = positive("natural frequency of the error", "rad/s", default=30.0, most=1e6)
+    damping_ratio: float = positive("damping ratio of the error", "1", default=1.0, most=1e3)
     stiffness: Vector3 = _joint_gain("stiffness", "N m/rad", "bandwidth")
     damping: Vector3 = _joint_gain("damping", "N m s/rad", "damping_ratio")
-    integral_rate: float = number(
+    integral_rate: float = coefficient(
         "integral action: stiffness times this is the torque per sum of errors; 0 for none",
         "1/s",
-        default=0.0,
-        least=0.0,
         most=1e6,
     )
-    torque_limit: float = number(
+    torque_limit: float = coefficient(
         "largest torque that is commanded, beside that of the scene's actuators; 0 for none",
         "N m",
-        default=0.0,
-        least=0.0,
         most=1e9,
     )
     feedforward_at: str = choice(
-        "instant of a control period whose feedforward is held over it",
-        INSTANTS,
-        default="start",
+        "instant of a control period whose feedforward is held over it", INSTANTS, default="start"
     )
 
     def check(self) -> Iterator[Problem]:
@@ -156,12 +146,8 @@ class ControlChannel(Section):
     counts: int = integer(
         "encoder steps per turn; 0 for exact angles and rates", "1", default=0, least=0, most=2**31
     )
-    angle_noise: float = number(
-        "standard deviation of noise on gamma", "rad", default=0.0, least=0.0, most=1.0
-    )
-    rate_noise: float = number(
-        "standard deviation of noise on gamma_dot", "rad/s", default=0.0, least=0.0, most=1e3
-    )
+    angle_noise: float = coefficient("standard deviation of noise on gamma", "rad", most=1.0)
+    rate_noise: float = coefficient("standard deviation of noise on gamma_dot", "rad/s", most=1e3)
 
     def count(self, angle: Scalar) -> Scalar:
         """Round an angle [rad] to the steps of the encoders."""
@@ -345,7 +331,10 @@ def bound(values: Triple, limit: Scalar) -> Triple:
     """Clamp three numbers to the interval from -limit to limit."""
     if isinstance(limit, float):
         return clamp(values, limit)
-    return triple(value - positive(value - limit) + positive(-limit - value) for value in values)
+    return triple(
+        value - generic_math.positive(value - limit) + generic_math.positive(-limit - value)
+        for value in values
+    )
 
 
 def is_above(value: Scalar) -> Scalar:

@@ -24,21 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.description.tree import (
-    BASE,
-    LEGS,
-    STAR,
-    Arc,
-    Ball,
-    Box,
-    Colour,
-    Joint,
-    Shape,
-    name_actuated,
-    name_intermediate,
-    shapes,
-    tree,
-)
+from sst_ros.description import tree
 from sst_ros.dynamics.model import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import JOINTS, Friction
@@ -72,7 +58,7 @@ def _text(root: ET.Element) -> str:
 
 def _robot(scene: Scene) -> ET.Element:
     geometry = Geometry.of(scene)
-    joints, drawn = tree(geometry), shapes(scene)
+    joints, drawn = tree.tree(geometry), tree.shapes(scene)
     own = {body.name: body for body in bodies(scene)}
     # An XML name has no spaces.
     name = "".join(letter if letter.isalnum() else "_" for letter in scene.name)
@@ -80,7 +66,7 @@ def _robot(scene: Scene) -> ET.Element:
     root.append(ET.Comment(_NOTE.format(name=name)))
     if assumed := ", ".join(body.name for body in own.values() if body.assumed):
         root.append(ET.Comment(_ASSUMED.format(bodies=assumed)))
-    for name in (BASE, *(joint.child for joint in joints)):
+    for name in (tree.BASE, *(joint.child for joint in joints)):
         _link(root, name, own.pop(name, None), drawn.get(name, ()))
     for body in own.values():
         _link(root, body.name, body, ())
@@ -140,16 +126,16 @@ class Body:
 def bodies(scene: Scene) -> list[Body]:
     """All bodies that have mass or inertia."""
     star, base = scene.star, scene.base
-    found = [_body(STAR, star.mass, star.centre, star.tensor, star.radius)]
+    found = [_body(tree.STAR, star.mass, star.centre, star.tensor, star.radius)]
     if scene.payload is not None:
         own = scene.payload.inertia
         tensor = np.zeros((3, 3)) if own is None else own.matrix
         centre = np.array(scene.payload.centre)
-        found.append(Body(PAYLOAD, STAR, scene.payload.mass, centre, tensor))
-    for k, leg in enumerate(LEGS):
+        found.append(Body(PAYLOAD, tree.STAR, scene.payload.mass, centre, tensor))
+    for k, leg in enumerate(tree.LEGS):
         for name, link, radius in (
-            (name_actuated(leg), scene.actuated_links[k], base.radius),
-            (name_intermediate(leg), scene.intermediate_links[k], star.radius),
+            (tree.name_actuated(leg), scene.actuated_links[k], base.radius),
+            (tree.name_intermediate(leg), scene.intermediate_links[k], star.radius),
         ):
             if link.mass or link.inertia is not None:
                 found.append(_body(name, link.mass, link.centre, link.tensor, radius))
@@ -157,7 +143,7 @@ def bodies(scene: Scene) -> list[Body]:
             # A thin disc behind its gear: only its inertia about w matters.
             behind = motor.gear_ratio**2 * motor.rotor_inertia
             tensor = np.diag([behind / 2.0, behind / 2.0, behind])
-            found.append(_massless(f"rotor_{leg}", name_actuated(leg), tensor, base.radius))
+            found.append(_massless(f"rotor_{leg}", tree.name_actuated(leg), tensor, base.radius))
     return found
 
 
@@ -185,7 +171,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     return np.array([roll, pitch, yaw])
 
 
-def _link(root: ET.Element, name: str, body: Body | None, drawn: Iterable[Shape]) -> None:
+def _link(root: ET.Element, name: str, body: Body | None, drawn: Iterable[tree.Shape]) -> None:
     link = ET.SubElement(root, "link", name=name)
     if body is not None:
         inertial = ET.SubElement(link, "inertial")
@@ -199,7 +185,7 @@ def _link(root: ET.Element, name: str, body: Body | None, drawn: Iterable[Shape]
         _draw(link, shape)
 
 
-def _joint(root: ET.Element, scene: Scene, joint: Joint, ends: tuple[float, float]) -> None:
+def _joint(root: ET.Element, scene: Scene, joint: tree.Joint, ends: tuple[float, float]) -> None:
     limited = bool(np.all(np.isfinite(ends)))
     kind = "revolute" if limited else "continuous"
     element = ET.SubElement(root, "joint", name=joint.name, type=kind)
@@ -218,15 +204,15 @@ def _joint(root: ET.Element, scene: Scene, joint: Joint, ends: tuple[float, floa
         ET.SubElement(element, "dynamics", {key: _exact([x]) for key, x in values.items()})
 
 
-def _draw(link: ET.Element, shape: Shape) -> None:
+def _draw(link: ET.Element, shape: tree.Shape) -> None:
     straight = np.zeros(3)
-    if isinstance(shape, Ball):
+    if isinstance(shape, tree.Ball):
         size = {"radius": _short([shape.radius])}
         _visual(link, "sphere", size, shape.centre, straight, shape.colour, shape.opacity)
-    elif isinstance(shape, Box):
+    elif isinstance(shape, tree.Box):
         _visual(link, "box", {"size": _short(shape.size)}, shape.centre, straight, shape.colour)
     else:
-        ends = shape.points() if isinstance(shape, Arc) else (shape.begin, shape.end)
+        ends = shape.points() if isinstance(shape, tree.Arc) else (shape.begin, shape.end)
         for begin, end in pairwise(ends):
             x, y, z = end - begin
             # The cylinder's axis is z; it ends a little late, so that no gap shows at the bends.
@@ -242,7 +228,7 @@ def _visual(
     size: dict[str, str],
     at: Array,
     turn: Array,
-    colour: Colour,
+    colour: tree.Colour,
     opacity: float = 1.0,
 ) -> None:
     visual = ET.SubElement(link, "visual")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -149,23 +149,19 @@ def join(parts: Sequence[Series]) -> Series:
     return Series(columns, stamps, received, np.hstack([part.at(stamps) for part in parts]))
 
 
-def _joints(joints: Sequence[str]) -> Callable[[Any], Rows]:
-    """Read positions, velocities and the efforts of actuators from JointState messages."""
-
-    def rows(message: Any) -> Rows:
-        stamp = nanoseconds(message.header.stamp)
-        if is_idle(stamp, message.header.frame_id):
-            return []
-        at = _places(joints, tuple(message.name))
-        parts = message.position, message.velocity, message.effort
-        sizes = {len(message.name), *map(len, parts)}
-        if len(sizes) > 1:
-            allowed = "name, position, velocity and effort must be equally long"
-            raise InvalidMessage(sorted(sizes), allowed)
-        position, velocity, effort = (part[at].tolist() for part in parts)
-        return [(stamp, position + velocity + effort[: len(ACTUATED)])]
-
-    return rows
+def _read_joints(joints: Sequence[str], message: Any) -> Rows:
+    """Read positions, velocities and the efforts of actuators of a JointState message."""
+    stamp = nanoseconds(message.header.stamp)
+    if is_idle(stamp, message.header.frame_id):
+        return []
+    at = _places(joints, tuple(message.name))
+    parts = message.position, message.velocity, message.effort
+    sizes = {len(message.name), *map(len, parts)}
+    if len(sizes) > 1:
+        allowed = "name, position, velocity and effort must be equally long"
+        raise InvalidMessage(sorted(sizes), allowed)
+    position, velocity, effort = (part[at].tolist() for part in parts)
+    return [(stamp, position + velocity + effort[: len(ACTUATED)])]
 
 
 def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
@@ -245,7 +241,7 @@ _MOMENT = "external moment on the star in {B}"
 JOINT_STATES = _table(
     "joint_states",
     _JOINT_STATE,
-    _joints(JOINTS),
+    partial(_read_joints, JOINTS),
     *((_legs(kind), "rad", f"joint angle {kind}") for kind in ("gamma", "mu", "beta")),
     *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in ("gamma", "mu", "beta")),
     (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
@@ -265,7 +261,7 @@ EULER = _table(
 REFERENCE = _table(
     "reference",
     _JOINT_STATE,
-    _joints(ACTUATED),
+    partial(_read_joints, ACTUATED),
     (_legs("gamma_desired"), "rad", "desired angle of the actuator"),
     (_legs("gamma_dot_desired"), "rad/s", "desired rate of the actuator"),
     (_legs("tau_feedforward"), "N m", "torque of the model for the desired motion"),
@@ -273,7 +269,7 @@ REFERENCE = _table(
 TRACKING_ERROR = _table(
     "tracking_error",
     _JOINT_STATE,
-    _joints(ACTUATED),
+    partial(_read_joints, ACTUATED),
     (_legs("gamma_error"), "rad", "desired less measured angle"),
     (_legs("gamma_dot_error"), "rad/s", "desired less measured rate"),
     (_legs("tau_feedback"), "N m", "torque of the feedback"),
