@@ -22,8 +22,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
-from sst_ros.integration.compiled_method import Method
-from sst_ros.integration.methods import METHODS, Rosenbrock
+from sst_ros.integration.methods import METHODS, Method, Rosenbrock
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records
 from sst_ros.report.scene_summary import FAR, eigenvalues, stability_function, step_advice

@@ -58,7 +58,10 @@ def rows(m, n):
 
 # Compiled functions alone call these. What Python would need to call them - which without it is a
 # segmentation fault - takes a fifth of the time to compile.
-_INNER = "angles_and_rates joints_of normalise all_far evaluate linearise factorise substitute"
+_INNER = (
+    "angles_and_rates joints_of normalise all_far copy step_factor next_length "
+    "evaluate linearise factorise substitute"
+)
 
 # A call hands on each array as seven words on the stack and counts its readers by two atomic
 # operations: as a call, a step takes 5 to 20 % longer, and a second less to compile.

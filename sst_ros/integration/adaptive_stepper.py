@@ -1,51 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error-controlled steps through one period, with the method that suits the motion.
-
-A second solution goes through each step by two of half the length: its distance is the error. No
-order is assumed, as none holds where a torque jumps, a clamp or a contact bends the motion, or
-friction is sharp. Where the method has its order, the second solution is nearly exact, and the
-distance is the error; where each step loses its order, the error halves, and the distance is half
-of the error.
-"""
+"""Error-controlled steps through one period, with the method that suits the motion."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import ODE, Function
+from sst_ros.integration import step_loops
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.compiled_method import (
     JACOBIAN_COST,
     CompiledMethod,
     JointRanges,
-    Method,
-    Place,
+    Most,
     Vector,
     methods_of,
 )
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RODAS5P, Rosenbrock
+from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RODAS5P, Method, Rosenbrock
+from sst_ros.integration.point import MethodChange, Point
 from sst_ros.mechanism.geometry import Array
 
-GROW = 5.0
-"""Largest factor by which a step grows."""
-
-_SAFETY, _SHRINK = 0.9, 0.2
 _STIFF, _EASY = 2.0, 0.5
 """Step times fastest decay above which an explicit method is left, and step times fastest rate
 below which an implicit one is; explicit methods are stable to about 3."""
-
-
-def step_factor(error: float, error_order: int) -> float:
-    """Factor for the next step after one with a local error, relative to the tolerance."""
-    if error == 0.0:
-        return GROW
-    if not error < float("inf"):
-        return _SHRINK
-    return float(min(max(_SAFETY * error ** (-1.0 / (error_order + 1)), _SHRINK), GROW))
 
 
 def better_method(
@@ -112,61 +93,6 @@ class EvaluationBudget:
 _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3
 
-_MARGIN, _FLOOR = 2.0, 8 * 2.220446049250313e-16
-"""Of the distance: an error that halves with the steps is twice as large; of rounding, a step."""
-
-
-class MethodChange(NamedTuple):
-    """A change of method."""
-
-    time: float  # [s]
-    method: str  # the new one
-    reason: str
-
-
-class Point(NamedTuple):
-    """Where a run stands: all that its next step depends on."""
-
-    y: list[float]  # the solution
-    z: list[float]  # the second one, by steps of half the length
-    joints: tuple[float, ...]  # nine angles and nine rates of y
-    method: Method
-    h: float = math.inf  # longest next step [s]
-    attempts: int = 0  # since the method was chosen
-    steps: int = 0  # accepted since the start
-    changes: tuple[MethodChange, ...] = ()
-
-    @property
-    def error(self) -> float:
-        """Estimated global error of the orientation [rad]."""
-        return estimate_error(orientation_distance(self.y, self.z), self.steps)
-
-    @property
-    def rate_error(self) -> float:
-        """Estimated global error of the body rate [rad/s]."""
-        speed = max(1.0, math.hypot(*self.y[4:7]))
-        return speed * estimate_error(math.dist(self.y[4:7], self.z[4:7]) / speed, self.steps)
-
-
-def estimate_error(distance: float, steps: int) -> float:
-    """Estimate the error of a solution by that of a second one, by steps of half the length."""
-    return max(_MARGIN * distance, _FLOOR * math.sqrt(steps + 1.0))
-
-
-def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
-    """Angle between the orientations of two states that are near [rad]; q and -q are the same."""
-    return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
-
-
-def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
-    """Distance of orientations [rad], or that of the rest relative to the rate if it is larger.
-
-    Rates below 1 rad/s count as 1 rad/s; infinite where a number is not finite.
-    """
-    speed = max(1.0, math.hypot(*z[4:7]))
-    distance = max(orientation_distance(y, z), math.dist(y[4:], z[4:]) / speed)
-    return distance if math.isfinite(distance) else math.inf
-
 
 class Step(NamedTuple):
     """An accepted step, or the part of it before an event."""
@@ -217,6 +143,8 @@ class AdaptiveStepper:
         self.tolerance, self.budget = tolerance, budget
         self._ode, self._law, self._max_step = ode, law, max_step
         self._methods, self._compiled = methods_of(method), compiled
+        self._chooses = len(self._methods) > 1
+        self._most_attempts = _CHOOSE_EVERY - 1 if self._chooses else math.inf
         self._derivative = derivative if law is None else law.derivative
         self._linearise = None if law is None or not law.is_traced else law.linearise
         self._ranges, self._joints = ranges, joints
@@ -226,10 +154,6 @@ class AdaptiveStepper:
         """Return the point at which a run begins; numbers that y lacks at its end are zero."""
         full = [*y, *(0.0,) * (len(self._ode.state) - len(y))]
         return Point(full, list(full), self._joints(*full[:7]), self._methods[0])
-
-    @property
-    def _chooses(self) -> bool:
-        return len(self._methods) > 1
 
     def load(self) -> None:
         """Have the code of all methods that a run may turn to loaded, or made."""
@@ -267,13 +191,13 @@ class AdaptiveStepper:
             machine = self._machine(at.method)
             self.budget.charge(3 * machine.cost)
             y, z, size = machine.step_pair(t, h, at.y, at.z, d)
-            factor = self._factor(at, size)
+            error, order = size / self.tolerance, at.method.error_order
             if size > self.tolerance:
                 stops = self._jump_in(t, h, at.y, origin)
                 if stops:
                     at = at._replace(h=h)
                     continue
-                at = at._replace(h=h * min(factor, 1.0))
+                at = at._replace(h=h * min(step_loops.step_factor(error, order), 1.0))
                 if at.h < 1e-15 * max(abs(t), end - t) or at.h < 1e-200:
                     raise CannotStep(f"steps of {at.h:.1e} s do not resolve it")
                 rejected += 1
@@ -281,9 +205,7 @@ class AdaptiveStepper:
                 continue
             rejected = 0
             stopped = bool(stops) and h == stops[0] - t
-            longest = h * factor
-            if stopped or h == left:  # too short to say that the next must be short
-                longest = max(at.h, longest) if factor < 1.0 or at.h < math.inf else at.h
+            longest = step_loops.next_length(at.h, h, error, order, stopped or h == left)
             begin = at
             at = at._replace(y=y, z=z, joints=self._joints(*y[:7]), h=longest, steps=at.steps + 1)
             if h < left or isinstance(at.method, Rosenbrock):
@@ -294,56 +216,40 @@ class AdaptiveStepper:
             t = stops.pop(0) if stopped else t + h
 
     def step_many(self, h: float, count: int, at: Point, d: Vector) -> tuple[int, Point]:
-        """Do what `accepted_steps` does for up to `count` periods of h, one step a period.
+        """Do what `accepted_steps` does for up to `count` periods of h, with the same bits.
 
-        Returns how many were done, and where the last one ended: the next may need several steps or
-        another method, or leave `ranges`. The bits are those of `accepted_steps`. One call takes at
-        most the evaluations of one period's budget.
+        Returns how many were done, and where the last one ended: in the next a step is rejected,
+        the method is looked at, or `ranges` may be left. One call takes at most the evaluations of
+        one period's budget.
         """
-        if min(at.h, self._max_step) < h or self._derivative is not None:
+        if self._derivative is not None:
             return 0, at
         machine = self._machine(at.method)
-        count = min(count, max(self.budget.per_period // (3 * machine.cost), 1))
-        implicit = isinstance(at.method, Rosenbrock)
-        if implicit and self._chooses:
-            count = min(count, _CHOOSE_EVERY - 1 - at.attempts)
-        done, place = machine.step_many(h, count, self.tolerance, Place(*at[:3]), d)
-        if not done:
-            return 0, at
-        self.budget.spent += 3 * done * machine.cost
-        longest = at.h
-        if longest < GROW * h:
-            for size in machine.sizes[:done]:
-                longest = max(longest, h * self._factor(at, float(size)))
-        attempts = at.attempts + (done if implicit else 0)
-        end = at._replace(
-            y=place.y, z=place.z, joints=place.joints,
-            h=longest, attempts=attempts, steps=at.steps + done,
-        )  # fmt: skip
+        most = self._most(at, machine, 1)
+        done, end = machine.step_many(h, count, self.tolerance, most, at, d)
+        self.budget.spent += 3 * (end.steps - at.steps) * machine.cost
         return done, end
 
     def step_sequence(
         self, first: int, periods: tuple[Any, Any, Any], at: Point, reached: Any
     ) -> tuple[int, Point]:
-        """Advance through periods that take one step each, from the first on.
-
-        Arguments and results are those of `CompiledMethod.step_sequence`.
-        """
+        """Advance through periods from the first on, as `CompiledMethod.step_sequence`."""
         machine, last = self._machine(at.method), len(periods[0])
-        done, end = machine.step_sequence(
-            first, last, periods, Place(*at[:3]), self.tolerance, reached
-        )
-        self.budget.spent += 3 * (done - first) * machine.cost
-        return done, at._replace(y=end.y, z=end.z, joints=end.joints)
+        most = self._most(at, machine, last - first)
+        done, end = machine.step_sequence(first, last, periods, at, self.tolerance, most, reached)
+        self.budget.spent += 3 * (end.steps - at.steps) * machine.cost
+        return done, end
+
+    def _most(self, at: Point, machine: CompiledMethod, periods: int) -> Most:
+        """Bound what a call takes by the budget of periods and the next look at the method."""
+        steps = max(periods * self.budget.per_period // (3 * machine.cost), 1)
+        return Most(self._max_step, self._most_attempts, at.steps + steps)
 
     def part(self, step: Step, x: float) -> Point:
         """Return the point x [s] after the begin of an accepted step, by a shorter one."""
         self.budget.charge(3 * step.machine.cost)
         y, z, _ = step.machine.step_pair(step.t, x, step.begin.y, step.begin.z, step.drive)
         return step.end._replace(y=y, z=z, joints=self._joints(*y[:7]))
-
-    def _factor(self, at: Point, size: float) -> float:
-        return step_factor(size / self.tolerance, at.method.error_order)
 
     def _choose_method(
         self, t: float, h: float, at: Point, d: Vector, origin: float, rejected: int = 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import inspect
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from types import ModuleType
@@ -26,12 +27,13 @@ from sst_ros.integration.methods import (
     DORMAND_PRINCE,
     METHODS,
     RODAS5P,
+    Method,
     Rosenbrock,
     Tableau,
 )
+from sst_ros.integration.point import Point
 from sst_ros.scene.scene import Scene
 
-Method = Tableau | Rosenbrock
 Vector = Sequence[float]
 Function = Callable[..., tuple[float, ...]]
 Linearisation = Callable[[float, Vector, Vector, Any, Any, Any, Any], None]
@@ -44,7 +46,14 @@ _LANES = 4
 """The loop over the columns of a Jacobian is a multiple of this long: numbers in a register."""
 
 
-_SHARED = (step_loops.size_of, step_loops.normalise, step_loops.all_far)
+_SHARED = (
+    step_loops.size_of,
+    step_loops.normalise,
+    step_loops.all_far,
+    step_loops.copy,
+    step_loops.step_factor,
+    step_loops.next_length,
+)
 _LOOPS = (step_loops.step_pair, step_loops.step_fixed, step_loops.step_many)
 _IMPLICIT = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
 
@@ -55,12 +64,12 @@ def methods_of(integrator: str) -> tuple[Method, ...]:
     return (named,) if named else (DORMAND_PRINCE, DOP853, RODAS5P)
 
 
-class Place(NamedTuple):
-    """Solution y, second solution z, nine angles and nine rates of y."""
+class Most(NamedTuple):
+    """What the periods of one call may take, for another method or bound to come in between."""
 
-    y: list[float]
-    z: list[float]
-    joints: tuple[float, ...]
+    h: float = math.inf  # a step [s]
+    attempts: float = math.inf  # since the method was chosen
+    steps: float = math.inf  # since the start of the run
 
 
 class _MethodSource(NamedTuple):
@@ -89,7 +98,6 @@ class CompiledMethod:
     Attributes:
         system, method, compiled: as given.
         cost: evaluations of a step; `step_pair` takes three.
-        sizes: local error estimates of the periods of the last `step_many`.
 
     """
 
@@ -127,7 +135,7 @@ class CompiledMethod:
         size, drive = len(system.state), len(system.drive)
         self._place = [self._vector([0.0] * n) for n in (size, size, 18)]
         self._error = self._vector([0.0] * size)
-        self.sizes: Any = self._vector([])
+        self._run = self._vector([0.0] * 7)
         self._length: Any = self._vector([0.0])
         self._drive: Any = np.zeros((1, drive)) if compiled else [[0.0] * drive]
         self._no_start: Any = np.empty((0, size)) if compiled else []
@@ -139,7 +147,7 @@ class CompiledMethod:
         size, drive = len(self.system.state), (0.0,) * len(self.system.drive)
         y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
         self.step_pair(0.0, 1e-3, y, y, drive)
-        self.step_many(1e-3, 1, 1.0, Place(y, y, (0.0,) * 18), drive)
+        self.step_many(1e-3, 1, 1.0, Most(), Point(y, y, (0.0,) * 18, self.method), drive)
 
     def step_pair(
         self, t: float, h: float, y: Vector, z: Vector, d: Vector
@@ -167,27 +175,24 @@ class CompiledMethod:
         return found
 
     def step_many(
-        self, h: float, count: int, tolerance: float, at: Place, d: Vector
-    ) -> tuple[int, Place]:
-        """Advance by up to `count` periods of h [s], a step each, as long as that suffices.
-
-        Returns how many were done, and where the last one ended.
-        """
+        self, h: float, count: int, tolerance: float, most: Most, at: Point, d: Vector
+    ) -> tuple[int, Point]:
+        """Advance by up to `count` periods of h [s], as `step_sequence`."""
         self._length[0], self._drive[0][:] = h, d
-        return self.step_sequence(
-            0, count, (self._length, self._drive, self._no_start), at, tolerance, self._not_kept
-        )
+        periods = self._length, self._drive, self._no_start
+        return self.step_sequence(0, count, periods, at, tolerance, most, self._not_kept)
 
     def step_sequence(
         self,
         first: int,
         end: int,
         periods: tuple[Any, Any, Any],
-        at: Place,
+        at: Point,
         tolerance: float,
+        most: Most,
         reached: Any,
-    ) -> tuple[int, Place]:
-        """Advance from period `first` to `end`, a step each; stop before one that needs more.
+    ) -> tuple[int, Point]:
+        """Advance from period `first` to `end`; stop before one that needs more than steps.
 
         Args:
             first: number of the period that begins.
@@ -195,27 +200,31 @@ class CompiledMethod:
             periods: of n periods the lengths [s], shape (n,), the drives, (n, m), and the states
                 (n, size) at which they begin, NaN where they continue; lists in plain Python.
             at: where the first one begins.
-            tolerance: largest local error estimate of a period.
+            tolerance: largest local error estimate of a step.
+            most: what they may take.
             reached: takes both solutions at the ends, shape (n, 2, size).
 
         Returns:
-            The first period that was not done, and where it begins. `sizes` has the local error
-            estimate of each.
+            The first period that was not done, and where it begins.
 
         """
-        if len(self.sizes) < end or not self.compiled:
-            self.sizes = self._vector([-1.0] * end)
         y, z, joints = self._place
-        y[:], z[:], joints[:] = at
+        run = self._run
+        y[:], z[:], joints[:] = at[:3]
+        run[0], run[1], run[2], run[3] = at.h, at.attempts, at.steps, first
+        run[4], run[5], run[6] = most
         try:
             done = self._module.step_many(
                 first, end, *periods, self._numbers, tolerance, y, z, self._ranges, joints,
-                self.sizes, reached,
+                run, reached,
             )  # fmt: skip
         except (ArithmeticError, ValueError):  # plain Python, of a number without a value
-            done = first + sum(size >= 0.0 for size in self.sizes[first:end])
-        listed = self._listed
-        return done, Place(listed(y), listed(z), tuple(listed(joints)))
+            done = int(run[3])
+        listed, (h, attempts, steps, *_) = self._listed, self._listed(run)
+        return done, at._replace(
+            y=listed(y), z=listed(z), joints=tuple(listed(joints)),
+            h=h, attempts=int(attempts), steps=int(steps),
+        )  # fmt: skip
 
     def step_fixed(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
         """Advance by `count` steps of h, errors unseen.
@@ -258,8 +267,14 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
     p = ["p"] if by_structure else []
     lag = 3 if set(LAG) <= set(system.state) else 0
     common = {"SIZE": size, "LAG": lag}
+    common |= {name: getattr(step_loops, name) for name in ("GROW", "SHRINK", "SAFETY")}
     doubling = isinstance(method, Tableau) and not method.error
-    constants: dict[str, Any] = {"SIZE": size, "DOUBLING": doubling}
+    constants: dict[str, Any] = {
+        "SIZE": size,
+        "DOUBLING": doubling,
+        "IMPLICIT": isinstance(method, Rosenbrock),
+        "ERROR_ORDER": method.error_order,
+    }
     inputs = ", ".join(["t", *y, *d, *p])
     joints = _assign(
         [f"joints[{i}]" for i in range(18)], f"angles_and_rates({', '.join(y[:7] + p)})"

@@ -189,6 +189,8 @@ RODAS5P = Rosenbrock(
     ),
 )
 
-METHODS: dict[str, Tableau | Rosenbrock] = {
+Method = Tableau | Rosenbrock
+
+METHODS: dict[str, Method] = {
     method.name: method for method in (RK4, DORMAND_PRINCE, DOP853, RODAS5P)
 }

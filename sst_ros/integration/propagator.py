@@ -16,7 +16,6 @@ from sst_ros.integration.adaptive_stepper import (
     AdaptiveStepper,
     CannotStep,
     EvaluationBudget,
-    Point,
     Step,
 )
 from sst_ros.integration.applied_torque import AppliedTorque, Torque
@@ -29,6 +28,7 @@ from sst_ros.integration.events import (
     load_root_finder,
     may_occur,
 )
+from sst_ros.integration.point import Point
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene

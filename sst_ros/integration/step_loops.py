@@ -13,6 +13,11 @@ from collections.abc import Callable, Sequence
 
 from sst_ros.integration.methods import Tableau
 
+INFINITE = float("inf")
+
+GROW, SHRINK, SAFETY = 5.0, 0.2, 0.9
+"""Largest and least factor by which a step changes; share of the step that the error allows."""
+
 
 def step_pair(t, h, y, z, d, p, new_y, new_z, error):
     """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
@@ -83,45 +88,82 @@ def step_fixed(t, h, count, y, d, p, new_y):
 
 
 def step_many(
-    first, end, lengths, drives, starts, p, tolerance, y, z, ranges, joints, sizes, reached
+    first, end, lengths, drives, starts, p, tolerance, y, z, ranges, joints, run, reached
 ):
-    """Go on from period `first` to `end`, a step each; return the first that was not done.
+    """Go on from period `first` to `end`; leave off before one that asks for more, and return it.
 
-    That is one that asks for more: whose error is beyond the tolerance, or in which a limit may be
-    met. One row of `lengths` and `drives` is for all periods. Where starts[k] has numbers and not
-    NaN, period k begins there. y, z and joints (nine angles, nine rates) become those at the end of
-    the last period that was done; reached[k] the solutions at the end of period k, and sizes[k] its
-    local error estimate.
+    That is one in which a step is rejected, a limit may be met, or more is done than is allowed.
+    One row of `lengths` and `drives` is for all periods. Where starts[k] has numbers and not NaN,
+    period k begins there. y, z, joints (nine angles, nine rates) and `run` become those at the end
+    of the last period that was done, and reached[k] the solutions at the end of period k. `run` has
+    the longest next step [s], attempts and steps so far, and the period that comes next; then what
+    is allowed: longest step [s], attempts until the method is looked at, and steps.
     """
-    new_y = vector(SIZE)
-    new_z = vector(SIZE)
-    error = vector(SIZE)
-    found = vector(18)
+    now_y, now_z, new_y, new_z = vector(SIZE), vector(SIZE), vector(SIZE), vector(SIZE)
+    error, now_joints, new_joints = vector(SIZE), vector(18), vector(18)
     for k in range(first, end):
-        h = lengths[k % len(lengths)]
-        d = drives[k % len(drives)]
+        h, d = lengths[k % len(lengths)], drives[k % len(drives)]
+        longest, attempts, steps = run[0], run[1], run[2]
         if len(starts) > 0 and starts[k][0] == starts[k][0]:
-            for i in range(SIZE):
-                y[i] = starts[k][i]
-                z[i] = starts[k][i]
-            joints_of(y, p, joints)
-        size = step_pair(0.0, h, y, z, d, p, new_y, new_z, error)
-        if not size <= tolerance:
-            return k
-        joints_of(new_y, p, found)
-        if not all_far(ranges, joints, found, h):
-            return k
-        for i in range(SIZE):
-            y[i] = new_y[i]
-            z[i] = new_z[i]
-        for i in range(18):
-            joints[i] = found[i]
-        sizes[k] = size
+            copy(starts[k], now_y)
+            copy(starts[k], now_z)
+            joints_of(now_y, p, now_joints)
+        else:
+            copy(y, now_y)
+            copy(z, now_z)
+            copy(joints, now_joints)
+        t, last = 0.0, False
+        while not last:
+            length = min(longest, run[4], h - t)
+            last = (h - t) - length < 1e-3 * length
+            if last:
+                length = h - t
+            counted = 1.0 if IMPLICIT or not last else 0.0
+            if attempts + counted > run[5] or steps >= run[6]:
+                return k
+            size = step_pair(t, length, now_y, now_z, d, p, new_y, new_z, error)
+            if not size <= tolerance:
+                return k
+            joints_of(new_y, p, new_joints)
+            if not all_far(ranges, now_joints, new_joints, length):
+                return k
+            copy(new_y, now_y)
+            copy(new_z, now_z)
+            copy(new_joints, now_joints)
+            longest = next_length(longest, length, size / tolerance, ERROR_ORDER, last)
+            steps, attempts, t = steps + 1.0, attempts + counted, t + length
+        copy(now_y, y)
+        copy(now_z, z)
+        copy(now_joints, joints)
+        run[0], run[1], run[2], run[3] = longest, attempts, steps, k + 1.0
         if len(reached) > 0:
-            for i in range(SIZE):
-                reached[k][0][i] = y[i]
-                reached[k][1][i] = z[i]
+            copy(y, reached[k][0])
+            copy(z, reached[k][1])
     return end
+
+
+def copy(values, place):
+    """Put values into a place of the same length."""
+    place[:] = values
+
+
+def next_length(longest: float, h: float, error: float, error_order: int, cut: bool) -> float:
+    """Longest step after an accepted one of h with a local error, relative to the tolerance.
+
+    A step that was cut does not say that the next must be shorter than the `longest` of before.
+    """
+    length = h * step_factor(error, error_order)
+    return max(longest, length) if cut else length
+
+
+def step_factor(error: float, error_order: int) -> float:
+    """Factor for the next step after one with a local error, relative to the tolerance."""
+    if error == 0.0:
+        return GROW
+    if not error < INFINITE:
+        return SHRINK
+    factor: float = SAFETY * error ** (-1.0 / (error_order + 1))
+    return min(max(factor, SHRINK), GROW)
 
 
 def all_far(ranges, begin, end, h):

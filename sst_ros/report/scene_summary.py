@@ -28,8 +28,8 @@ from sst_ros.dynamics.model import damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, SstError
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.integration.compiled_method import CompiledMethod, Method
-from sst_ros.integration.methods import DORMAND_PRINCE, RK4, Rosenbrock
+from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.methods import DORMAND_PRINCE, RK4, Method, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.results import WHOLE_RUN_S, render
 from sst_ros.scene.scene import Scene

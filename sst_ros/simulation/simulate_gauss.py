@@ -15,13 +15,9 @@ from sst_ros.dynamics.expression import number_constants, trace
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, QUATERNION, RATE, Dynamics, limit_distances
-from sst_ros.integration.adaptive_stepper import (
-    estimate_error,
-    orientation_distance,
-    state_distance,
-)
 from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import Collocation, PreparedMotion
+from sst_ros.integration.point import estimate_error, orientation_distance, state_distance
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.stepped_motion import Task

@@ -20,11 +20,10 @@ from sst_ros.integration.adaptive_stepper import (
     BudgetSpent,
     CannotStep,
     EvaluationBudget,
-    MethodChange,
-    Point,
 )
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
+from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import rotation_matrix

@@ -17,10 +17,10 @@ from sst_ros.integration.adaptive_stepper import (
     CannotStep,
     EvaluationBudget,
     Step,
-    state_distance,
 )
 from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.compiled_method import CompiledMethod, has_step_code
+from sst_ros.integration.point import state_distance
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene

@@ -14,10 +14,10 @@ from scipy.integrate import solve_ivp
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.host import compiled_module
-from sst_ros.integration.adaptive_stepper import orientation_distance as apart
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.gauss import Collocation, PreparedMotion, tables
 from sst_ros.integration.methods import DOP853
+from sst_ros.integration.point import orientation_distance as apart
 from sst_ros.integration.simd_source import flat_sin
 from sst_ros.scene.scene import load
 
