@@ -25,7 +25,7 @@ from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import METHODS, Method, Rosenbrock
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records
-from sst_ros.report.scene_summary import FAR, eigenvalues, stability_function, step_advice
+from sst_ros.report.scene_summary import eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Array
@@ -42,6 +42,10 @@ FACTOR = 10.0
 ROUNDING = 1e-12
 """True errors below this [rad], or 100 times the estimate of the run at the default tolerance, are
 not resolved: then the estimate must not be above FACTOR times that either."""
+
+
+FAR = -1e12
+"""Where the stability function of an L-stable method has vanished."""
 
 
 class CaseRun(NamedTuple):

@@ -114,12 +114,10 @@ def draw_comparison(
 def differences(runs: Sequence[Signals]) -> DataFrame:
     """Compare each run with the first one, at the stamps that both have.
 
-    Returns:
-        A row a run, by the labels of runs: samples in common, of how many; largest difference of an
-        angle gamma_k, and root of the mean square over samples and legs [rad]; the same of the
-        rates [rad/s]; largest angle between the orientations of the star [rad]; nan for what
-        cannot be compared.
-
+    A row of the table is a run, by its label: samples in common, of how many; largest difference of
+    an angle gamma_k, and root of the mean square over samples and legs [rad]; the same of the rates
+    [rad/s]; largest angle between the orientations of the star [rad]; nan for what cannot be
+    compared.
     """
     from pandas import DataFrame, Series
 

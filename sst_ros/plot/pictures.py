@@ -89,14 +89,10 @@ def _star(draw: Callable[[Scene, list[motion.Solution]], Figure]) -> Callable[..
 
 def _tracking(run: Signals, _: Scene) -> Figure:
     """Draw the desired angle of each actuator, and the measured one over it."""
-    shown = {
-        "desired": ("gamma_desired", {"color": GREY, "linewidth": 3.2}),
-        "measured": ("gamma", {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}),
-    }
-    series = [
-        (name, run.seconds(), DEGREES * run.legs(quantity), looks)
-        for name, (quantity, looks) in shown.items()
-    ]
+    seconds, below = run.seconds(), {"color": GREY, "linewidth": 3.2}
+    above = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
+    desired, measured = (DEGREES * run.legs(name) for name in ("gamma_desired", "gamma"))
+    series = ("desired", seconds, desired, below), ("measured", seconds, measured, above)
     return draw_legs("γ [deg]", series)
 
 
@@ -196,11 +192,10 @@ def _phase(run: Signals, _: Scene) -> Figure:
     """Draw each actuator's rate over its angle, from the circle to the square."""
     figure = Figure(figsize=(10.5, 3.8))
     angle, rate = DEGREES * run.legs("gamma"), run.legs("gamma_dot")
-    for leg, axes in enumerate(figure.subplots(1, 3)):
-        axes.plot(angle[:, leg], rate[:, leg], color=BLUE, linewidth=1.4)
-        style.mark_ends(axes, angle[:, leg], rate[:, leg])
-        axes.set_xlabel(f"{leg_names('γ')[leg]} [deg]")
-        axes.set_ylabel(f"{leg_names('γ̇')[leg]} [rad/s]")
+    for k, axes, x, y in zip("₁₂₃", figure.subplots(1, 3), angle.T, rate.T, strict=True):
+        axes.plot(x, y, color=BLUE, linewidth=1.4)
+        style.mark_ends(axes, x, y)
+        axes.set(xlabel=f"γ{k} [deg]", ylabel=f"γ̇{k} [rad/s]")
     figure.axes[-1].legend(loc="best", fontsize=8)
     return figure
 
@@ -279,19 +274,12 @@ PICTURES = {
 def draw_run(
     run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of a run into the folder `out`.
+    """Write the pictures of a run, those that `only` names or all, into the folder `out`.
 
-    Args:
-        run: the recorded topics.
-        out: folder, made if it is not there.
-        only: names of PICTURES; none for all that the bag allows.
-        formats: suffixes of the files.
-
-    Returns:
-        The paths written, and for each picture that could not be drawn what is missing.
+    Returns the paths written, and for each picture that could not be drawn what is missing.
 
     Raises:
-        InputError: a name is unknown, or `out` cannot be written.
+        InputError: a name is none of PICTURES, or `out` cannot be written.
 
     """
     paths: list[Path] = []

@@ -85,12 +85,7 @@ def styled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 
 @styled
 def save_figure(figure: Figure, *paths: Path) -> None:
-    """Write a figure into files; their suffixes name the formats.
-
-    Raises:
-        OSError: a file cannot be written.
-
-    """
+    """Write a figure into files, whose suffixes name the formats; raises OSError if it cannot."""
     for path in paths:
         # Not straight into the file: on a full disk the PDF backend fails without an OSError.
         drawn = io.BytesIO()

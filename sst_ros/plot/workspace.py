@@ -39,10 +39,7 @@ _ALARM = "#d1182b"
 def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figure:
     """Draw maps of `workspace`: free turn, condition of J and distance to the nearest limit.
 
-    Args:
-        charts: a row of pictures each.
-        titles: a name for each; by default none.
-
+    Each map is a row of pictures, with a title if there are any.
     """
     figure = Figure(figsize=(13.5, 4.3 * len(charts)))
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]

@@ -197,11 +197,8 @@ def compare_with_paper(
 ) -> tuple[float | None, int]:
     """Compare W_dot at states (seven numbers or more) under torques [N m]; loads are left out.
 
-    Returns:
-        The largest difference as a part of the largest W_dot of all states, None where no state
-        could be compared; and the number of states compared, without those at a singularity of
-        the paper's J2.
-
+    Returns the largest difference as a part of the largest W_dot of all states, None where no state
+    could be compared, and the number of those that were: without those at a singularity of J2.
     """
     bare = Scene(**{name: getattr(scene, name) for name in PAPER})
     mechanism, model = virtual_work.Mechanism.of(bare), kernel.model_of(bare)
@@ -234,25 +231,16 @@ QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
 
 
 class Comparison(NamedTuple):
-    """A recording against a reference.
-
-    Attributes:
-        error: distance of the recording from the reference, a row a sample, nan where there is
-            none: gamma and gamma_dot, the largest difference of the actuator angles [rad] and rates
-            [rad/s]; orientation, the angle between the orientations of {E} [rad].
-        own: the reference's own error, in the same columns.
-        restarts_ns: instants at which the reference had to begin again from a recorded sample,
-            because torques before it were lost [ns].
-        steps: least number of steps a tick of the reference.
-        reasons: why samples are not compared; empty where all are, or only torques are missing.
-
-    """
+    """A recording against a reference."""
 
     error: DataFrame
-    own: DataFrame
-    restarts_ns: tuple[int, ...] = ()
-    steps: int = 0
-    reasons: tuple[str, ...] = ()
+    """Distance of the recording from the reference, a row a sample, nan where there is none: gamma
+    and gamma_dot, the largest difference of the actuator angles [rad] and rates [rad/s];
+    orientation, the angle between the orientations of {E} [rad]."""
+    own: DataFrame  # the reference's own error, in the same columns
+    restarts_ns: tuple[int, ...] = ()  # where torques were lost: it begins at a sample again [ns]
+    steps: int = 0  # least number of steps a tick of the reference
+    reasons: tuple[str, ...] = ()  # why samples are not compared, but for lost torques
 
     @property
     def compared(self) -> int:
@@ -309,7 +297,12 @@ def _compare(
 
     def note(rows: Integers, reached: Array) -> None:
         """Write down how far samples are from the solution, and the second one, (n, 2, m)."""
-        first, second = (_outputs(motion.dynamics.model, reached[:, i]) for i in range(2))
+        found = []
+        for states in (reached[:, 0], reached[:, 1]):
+            unit = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
+            joints = joint_columns(motion.dynamics.model, states)
+            found.append((unit, joints[:, :3], joints[:, 9:12]))
+        first, second = found
         distances[0, rows] = _measure([values[rows] for values in samples], first)
         distances[1, rows] = _measure(second, first)
 
@@ -353,13 +346,6 @@ def _frame(distances: Array) -> DataFrame:
     return cast("DataFrame", require("pandas").DataFrame(distances, columns=[*QUANTITIES]))
 
 
-def _outputs(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
-    """Compute unit quaternions (n, 4), gamma [rad] and gamma_dot [rad/s] (n, 3) of n states."""
-    quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
-    joints = joint_columns(model, states)
-    return quaternion, joints[:, :3], joints[:, 9:12]
-
-
 def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
     """Distances of quaternions, gamma and gamma_dot, in the columns QUANTITIES, shape (n, 3)."""
     # Recorded angles may count whole turns, computed ones do not.
@@ -372,10 +358,8 @@ def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
 def energy_residual(recording: Recording) -> tuple[Array, str]:
     """Return the balance of energy: what the samples have, less the work put in between.
 
-    Returns:
-        Residual since the start [J], shape (n,), nan where it is not known: where ticks are lost,
-        the balance goes on without them. And the reason why it ends or is not there, "" if neither.
-
+    It is the residual since the start [J], shape (n,), nan where it is not known; where ticks are
+    lost, it goes on without them. Beside it is the reason why it ends or is not there, or "".
     """
     count, held, reason = len(recording.time_ns), held_torques(recording), ""
     stored, work = np.full((2, count), np.nan)

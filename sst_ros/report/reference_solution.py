@@ -76,19 +76,6 @@ class StateError(NamedTuple):
 class InitialValueProblem:
     """A scene as an initial value problem.
 
-    Attributes:
-        torque: the sine of the scene, or three zeros [N m].
-        system: right-hand side, torques and work included; `drive` are its inputs, all zero.
-        start: state at time zero, shape (n,).
-        interval_ns, interval: time between the instants of comparison, 1, 2 or 5 times a power of
-            ten [ns], [s].
-        count: number of intervals.
-        times: instants of comparison [s], shape (count + 1,).
-        seconds: time span [s].
-        ends: why the span ends before the scene's duration; empty where it does not.
-        clamped: the torques exceed the limit of the actuators.
-        kinked: the right-hand side has kinks.
-
     Raises:
         AssemblyError: the initial gamma has no unique admissible assembly.
         InputError: the scene cannot start, or stops at once.
@@ -97,25 +84,26 @@ class InitialValueProblem:
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.dynamics = scene, Dynamics.of(scene)
-        self.torque = scene.torque or (0.0, 0.0, 0.0)
+        self.torque = scene.torque or (0.0, 0.0, 0.0)  # [N m]
         self.system = ODE(self.dynamics, scene.torque, work=True)
-        self.drive = (0.0,) * len(self.system.drive)
-        self.start = (*initial(scene), 0.0)
+        self.drive = (0.0,) * len(self.system.drive)  # its inputs
+        self.start = (*initial(scene), 0.0)  # the state at time zero, the work in it
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = scene.torque_limit is not None and largest > scene.torque_limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"
         motion = simulate(scene, duration=scene.duration or WHOLE_RUN_S)
         whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
-        self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
+        self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""  # before the duration
         if whole * NANOSECONDS < 1000 * INTERVALS:
             allowed = f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
             raise InputError(scene.name, [Problem("initial", whole, allowed)])
+        # Instants of comparison lie 1, 2 or 5 times a power of ten apart.
         whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)  # may be a little less than it is called
         lengths = (f * 10**n for n in range(18) for f in (1, 2, 5))
         self.interval_ns = max(x for x in lengths if x * INTERVALS <= whole_ns)
-        self.interval = self.interval_ns / NANOSECONDS
+        self.interval = self.interval_ns / NANOSECONDS  # [s]
         self.count = math.floor(whole_ns / self.interval_ns)
-        self.times: Array = self.interval_ns * np.arange(self.count + 1) / NANOSECONDS
+        self.times: Array = self.interval_ns * np.arange(self.count + 1) / NANOSECONDS  # [s]
         self.seconds = float(self.times[-1])
 
     def errors(
@@ -158,12 +146,7 @@ class InitialValueProblem:
         )  # fmt: skip
 
     def run_simulation(self, simulation: Simulation) -> Array:
-        """States at the instants from a simulation, begun again.
-
-        Raises:
-            RunStopped: a limit is met.
-
-        """
+        """States at the instants from a simulation, begun again; raises RunStopped at a limit."""
         simulation.reset()
         rows = [self.start]
         for _ in range(self.count):
@@ -181,11 +164,7 @@ class ReferenceSolution(NamedTuple):
 
 
 def solve_reference(problem: InitialValueProblem, kind: str = EXTENDED) -> ReferenceSolution:
-    """Solve a problem as accurately as possible.
-
-    Args:
-        problem: what is solved.
-        kind: EXTENDED or MPMATH.
+    """Solve a problem as accurately as possible, in numbers of a kind, EXTENDED or MPMATH.
 
     Raises:
         InputError: there is no finite motion, or mpmath is asked for and not installed.
@@ -239,12 +218,7 @@ def _finest(problem: InitialValueProblem, machine: CompiledMethod) -> tuple[int,
 
 
 class ExtendedSolver:
-    """DOP853 with fixed steps on long doubles or mpmath's numbers; `numbers` says which.
-
-    Raises:
-        MissingDependency: mpmath is asked for and not installed.
-
-    """
+    """DOP853 with fixed steps on long doubles or mpmath's numbers; `numbers` says which."""
 
     def __init__(self, problem: InitialValueProblem, kind: str) -> None:
         library: Any = np

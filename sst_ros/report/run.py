@@ -59,12 +59,7 @@ class RunEvaluation(NamedTuple):
 
 
 def evaluate_run(run: Recording) -> RunEvaluation:
-    """Evaluate a recorded run.
-
-    Raises:
-        AssemblyError: the scene's initial gamma has no unique admissible assembly.
-
-    """
+    """Evaluate a recorded run; raises as `write_run_report` does."""
     measured = timing.measure(run)
     energy, missing = reference.energy_residual(run)
     # Compiled loops release the interpreter lock: the two comparisons run in parallel.
@@ -87,13 +82,8 @@ def evaluate_run(run: Recording) -> RunEvaluation:
 def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
     """Evaluate a recorded run; write summary.json, the page and the pictures into `out`.
 
-    Args:
-        bag: a rosbag2 recording of a run.
-        out: folder, made if it is not there.
-        damaged: evaluate what is intact of a damaged recording.
-
-    Returns:
-        The summary, as written; `summary_text` makes a short text of it, `summary_table` the whole.
+    Of a `damaged` recording what is intact is evaluated. The summary is returned; `summary_text`
+    makes a short text of it, `summary_table` the whole.
 
     Raises:
         InputError: the bag is no whole recording of a run, or `out` cannot be written.
@@ -103,18 +93,11 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
     run = recording.read(bag, damaged=damaged)
     with write_into(out, "report"):
         found = evaluate_run(run)
-        result, errors = (
-            found.summary,
-            {"(a) integration error, against the same torques": found[2]},
-        )
-        if found.ideal is not None:
-            errors["(b) sample-and-hold error, against continuous torques"] = found.ideal
         drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
         title = f"Error against run time, {run.scene.name}"
-        drawn += pictures.save(draw_errors(run.seconds, errors), title, out, "error", ["png"])
+        drawn += pictures.save(draw_errors(run.seconds, found), title, out, "error", ["png"])
         style.save_figure(draw_overview(run, found), out / PAGE)
-        result["pictures"] = [path.name for path in drawn]
-        result["page"] = [PAGE, HTML]
+        result = found.summary | {"pictures": [path.name for path in drawn], "page": [PAGE, HTML]}
         page = render(
             "run.html",
             s=result,
@@ -258,8 +241,11 @@ def hold_order(run: Recording) -> int | None:
 
 
 @style.styled
-def draw_errors(seconds: Array, panels: Mapping[str, Comparison]) -> Figure:
+def draw_errors(seconds: Array, found: RunEvaluation) -> Figure:
     """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
+    panels = {"(a) integration error, against the same torques": found.integration}
+    if found.ideal is not None:
+        panels["(b) sample-and-hold error, against continuous torques"] = found.ideal
     figure, grid = style.stack(["largest difference"] * len(panels), 3.1)
     for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
         _draw_comparison(axes, seconds, comparison, legend=axes is grid[0])
@@ -326,9 +312,9 @@ def _panels(run: Recording, found: RunEvaluation) -> Iterator[Panel]:
     looks: Looks = {"around": 1.0, "marker": ".", "linewidth": 1.2}
     times, pace = measured.pace.index.to_numpy(), measured.pace.to_numpy()
     yield _curve("Real-time factor (recorder clock)", "real-time factor", times, pace, **looks)
-    title, periods = "Period between received samples", measured.period_us
-    draw = partial(_draw_periods, period_us=periods, nominal_us=measured.nominal_us)
-    yield Panel(title, draw, _missing(periods), over_time=False)
+    title, missing = "Period between received samples", _missing(measured.period_us)
+    draw = partial(_draw_periods, measured=measured, summary=found.summary)
+    yield Panel(title, draw, missing, over_time=False)
     yield Panel("Cumulative losses", lambda axes: _draw_losses(axes, measured, seconds[-1]))
     title = "Latency: reception of a command to the step that applies it"
     dots: Looks = {"around": 0.0, "linestyle": "none", "marker": ".", "markersize": 3}
@@ -389,8 +375,7 @@ def _curve(
 
 def _draw_used(axes: Axes, estimates: Mapping[str, tuple[Array, Array]]) -> None:
     """Draw errors [rad] over computing time [s] by name; what was reported is marked."""
-    axes.set_xlabel("computing time of all steps [ms]")
-    axes.set_ylabel("error of the orientation [rad]")
+    axes.set(xlabel="computing time of all steps [ms]", ylabel="error of the orientation [rad]")
     for (name, (used, values)), looks in zip(estimates.items(), LINES, strict=False):
         marker = "" if name == "integration error" else "o"
         axes.plot(1e3 * used, hide_zeros(values), label=name, marker=marker, markersize=4, **looks)
@@ -398,22 +383,20 @@ def _draw_used(axes: Axes, estimates: Mapping[str, tuple[Array, Array]]) -> None
     axes.legend(fontsize=8, loc="best")
 
 
-def _draw_periods(axes: Axes, period_us: Array, nominal_us: float) -> None:
+def _draw_periods(axes: Axes, measured: Timing, summary: dict[str, Any]) -> None:
     """Draw the histogram of periods between received samples around the nominal one [us]."""
-    axes.set_xlabel("deviation from the nominal period [µs]")
-    axes.set_ylabel("samples")
-    off = period_us - nominal_us
+    axes.set(xlabel="deviation from the nominal period [µs]", ylabel="samples")
+    off = measured.period_us - measured.nominal_us
     reach = max(1.0, 1.05 * float(np.abs(off).max()))
     axes.hist(off, bins=np.linspace(-reach, reach, 81).tolist(), color=BLUE, log=True)
     axes.set_ylim(bottom=0.5)
-    numbers = {"nominal": nominal_us, "min": period_us.min(), "mean": period_us.mean()}
-    numbers["max"] = period_us.max()
-    for share, colour, line in ((99.0, VERMILION, "--"), (99.9, GREEN, ":")):
-        name = f"p{share:g}"
-        numbers[name] = np.percentile(period_us, share)
-        place = numbers[name] - nominal_us
+    words = {"min": "min", "mean": "mean", "max": "max", "p99": "p99", "p99_9": "p99.9"}
+    numbers = {name: summary[f"period_{word}_us"] for word, name in words.items()}
+    for name, colour, line in (("p99", VERMILION, "--"), ("p99.9", GREEN, ":")):
+        place = numbers[name] - measured.nominal_us
         axes.axvline(place, color=colour, linestyle=line, linewidth=1.5, label=name)
-    text = "\n".join(f"{name} {value:.1f} µs" for name, value in numbers.items())
+    lines = [("nominal", measured.nominal_us), *numbers.items()]
+    text = "\n".join(f"{name} {value:.1f} µs" for name, value in lines)
     axes.text(0.02, 0.96, text, transform=axes.transAxes, va="top", fontsize=8.5)
     axes.legend(fontsize=8, loc="upper right")
 
@@ -422,18 +405,14 @@ def _draw_losses(axes: Axes, measured: Timing, end: float) -> None:
     """Draw running counts of losses over time [s]."""
     axes.set_ylabel("count")
     missed = measured.reported.dropna(subset="ticks_missed")
-    losses = {
-        name: (np.sort(times), np.arange(1.0, len(times) + 1.0))
-        for name, times in {
-            "samples lost": measured.lost_s,
-            "gaps between applied torques": measured.gaps_s,
-        }.items()
-    } | {"ticks missed": (missed.time_s, missed.ticks_missed)}
+    events = {"samples lost": measured.lost_s, "gaps between applied torques": measured.gaps_s}
+    losses = {name: (np.sort(at), np.arange(1.0, len(at) + 1.0)) for name, at in events.items()}
+    if len(missed):
+        losses["ticks missed"] = missed.time_s.to_numpy(), missed.ticks_missed.to_numpy()
+    else:
+        axes.plot([], [], " ", label="ticks missed: not recorded")
     most = 0.0
     for (name, loss), looks in zip(losses.items(), LINES, strict=False):
-        if name == "ticks missed" and missed.empty:
-            axes.plot([], [], " ", label=f"{name}: not recorded")
-            continue
         times, counts = (np.append(0.0, numbers) for numbers in loss)
         times, counts = np.append(times, end), np.append(counts, counts[-1])
         label = f"{name}: {counts[-1]:.0f}"

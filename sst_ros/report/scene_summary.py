@@ -156,9 +156,6 @@ LONGEST_S = 10.0
 TOLERANCE = 1e-9
 """Error of the orientation that the advice is for [rad]: the default of `simulate`."""
 
-FAR = -1e12
-"""Where the stability function of an L-stable method has vanished."""
-
 GROWTH = 1e-6
 """abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i."""
 
@@ -194,11 +191,8 @@ def eigenvalues(
 ) -> NDArray[np.complex128]:
     """Eigenvalues of the linearised dynamics [1/s], shape (7,) or (10,).
 
-    Args:
-        scene: a scene.
-        state: quaternion, body rate [rad/s] and lagged torques, if any; by default the start.
-        torque: that acts [N m], shape (3,).
-
+    They are of a state - quaternion, body rate [rad/s], lagged torques - by default the start, and
+    of the torque that acts there [N m], shape (3,).
     """
     ode = _ode(Dynamics.of(scene))
     y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
@@ -212,10 +206,7 @@ _ode = lru_cache(maxsize=4)(ODE)  # whose Jacobian is traced once
 def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
     """Return the longest step [s] below which all are stable; inf where every one is.
 
-    Args:
-        method: of integration.
-        eigenvalues: of the linearised dynamics [1/s], shape (n,); growing ones are left out.
-
+    Of the eigenvalues [1/s], shape (n,), growing ones are left out.
     """
     values = np.asarray(eigenvalues, dtype=complex)
     fastest = float(np.abs(values).max(initial=0.0))

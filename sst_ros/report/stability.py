@@ -69,25 +69,19 @@ Change: TypeAlias = "Callable[[Scene, Trajectory], Scene | str]"
 
 
 class StabilityReport(NamedTuple):
-    """Steps along the motion, and the runs.
-
-    Attributes:
-        scene: its name.
-        steps: a row an instant: t_s, decay and oscillation, the largest -Re and abs(Im) of the
-            eigenvalues [1/s], and the longest stable step of each method [s], inf for every one.
-        advice: that of `step_advice`.
-        runs: a row each. name, change: of the row, and what is other than in the scene. passed: it
-            ended with a value within its estimate, or with a named reason; None where the scene has
-            nothing to change. result: in words. method: what `auto` took. error, estimate: distance
-            of the orientation at the end from a finer run, and what the run estimated [rad], nan
-            if unknown. wall_s: computing time of both runs [s].
-
-    """
+    """Steps along the motion, and the runs."""
 
     scene: str
     steps: DataFrame
+    """A row an instant: t_s, decay and oscillation, the largest -Re and abs(Im) of the eigenvalues
+    [1/s], and the longest stable step of each method [s], inf for every one."""
     advice: str
     runs: DataFrame
+    """A row each. name, change: of the row, and what is other than in the scene. passed: it ended
+    with a value within its estimate, or with a named reason; None where the scene has nothing to
+    change. result: in words. method: what `auto` took. error, estimate: distance of the orientation
+    at the end from a finer run, and what the run estimated [rad], nan if unknown. wall_s: computing
+    time of both runs [s]."""
 
     @property
     def passed(self) -> bool:
@@ -231,10 +225,8 @@ def _first_zeros(
 ) -> tuple[Array, Array, Array]:
     """Turn the star from its start about many axes up to where a measure becomes zero.
 
-    Returns:
-        Axes (n, 3) and angles (n,) [rad] where it does, and the poses (n, 3, 3) there, or by an
-        angle `before` it.
-
+    Returns axes (n, 3) and angles (n,) [rad] where it does, and the poses (n, 3, 3) there, or by an
+    angle `before` it.
     """
     geometry, start = Geometry.of(scene), rotation_matrix(motion.quaternion[0])
     axes = np.array([u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)])

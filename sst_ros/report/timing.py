@@ -40,37 +40,27 @@ STATISTICS = {"min": "min", "mean": "mean", "99%": "p99", "99.9%": "p99_9", "max
 
 
 class Timing(NamedTuple):
-    """Timing of a recording by its clocks.
-
-    Attributes:
-        late_us: how much later each sample was received than the fastest one, by its stamp, which
-            grows where the simulator falls behind [us], shape (n,).
-        period_us: time between receptions of samples that follow each other [us], shape (p,).
-        nominal_us: what it should be [us].
-        lost_s: times of lost samples [s], shape (l,).
-        gaps_s: times at which a tick does not begin where the one before ended [s].
-        pace: simulated time per time on the recorder's clock, over time [s].
-        reported: a row for each of the simulator's reports: time_s of the run, and the numbers
-            of REPORTED, nan where one was not reported.
-        commands: a row for each command that was followed: time_s, when the tick begins that
-            applied it; received_us, from its reception to the step; stamped_us, from its stamp to
-            the beginning of the tick, nan where it has none; tick, its number.
-        answers: samples_answered_percent, the share of the samples after which a new command was
-            received, and command_age_mean_s, for which ticks have held theirs; None without any.
-        missing: what is not known, and why.
-
-    """
+    """Timing of a recording by its clocks."""
 
     late_us: Array
-    period_us: Array
-    nominal_us: float
-    lost_s: Array
-    gaps_s: Array
-    pace: Series[float]
+    """How much later each sample was received than the fastest one, by its stamp [us], shape (n,):
+    it grows where the simulator falls behind."""
+    period_us: Array  # between receptions of samples that follow each other [us], shape (p,)
+    nominal_us: float  # what it should be [us]
+    lost_s: Array  # times of lost samples [s], shape (l,)
+    gaps_s: Array  # times at which a tick does not begin where the one before ended [s]
+    pace: Series[float]  # simulated time per time on the recorder's clock, over time [s]
     reported: DataFrame
+    """A row for each of the simulator's reports: time_s of the run, and the numbers of REPORTED,
+    nan where one was not reported."""
     commands: DataFrame
+    """A row for each command that was followed: time_s, when the tick begins that applied it;
+    received_us, from its reception to the step; stamped_us, from its stamp to the beginning of the
+    tick, nan where it has none; tick, its number."""
     answers: dict[str, float | None]
-    missing: list[str]
+    """samples_answered_percent, the share of the samples after which a new command was received,
+    and command_age_mean_s, for which ticks have held theirs; None without any."""
+    missing: list[str]  # what is not known, and why
 
     def numbers(self) -> dict[str, Any]:
         """Sum it up: flat, units in the names, None for what is not known."""
@@ -88,7 +78,7 @@ class Timing(NamedTuple):
 
 def measure(recording: Recording) -> Timing:
     """Measure a recording."""
-    missing: list[str] = []
+    pandas, missing = require("pandas"), list[str]()
     time, received_ns, ticks = recording.time_ns, recording.received_ns, recording.ticks
     spacing, period = np.diff(time), recording.period_ns
     period_us = np.diff(received_ns)[spacing == period] / 1e3
@@ -112,29 +102,24 @@ def measure(recording: Recording) -> Timing:
         missing.append("no commands are recorded: their latency is not known")
     elif commands.empty:
         missing.append("no recorded command is found among the applied torques")
-    late = received_ns - time
+    late, first = received_ns - time, int(received_ns[0])
+    told = [values for _, values in recording.reports]
+    reported = pandas.DataFrame(told, columns=REPORTED).replace("", None).astype(float)
+    at = [when_ns - first for when_ns, _ in recording.reports]
+    since = (received_ns - first).astype(float)
+    reported.insert(0, "time_s", np.interp(at, since, recording.seconds))
     return Timing(
         late_us=(late - late.min()) / 1e3,
         period_us=period_us,
         nominal_us=period / 1e3,
         lost_s=np.concatenate([np.empty(0), *lost]) / NANOSECONDS,
         gaps_s=ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]] / NANOSECONDS,
-        pace=require("pandas").Series(pace[good], middle[good]),
-        reported=_read_reports(recording),
+        pace=pandas.Series(pace[good], middle[good]),
+        reported=reported,
         commands=commands,
         answers=_measure_answers(recording, commands),
         missing=missing,
     )
-
-
-def _read_reports(recording: Recording) -> DataFrame:
-    """Return times of the run [s] and the numbers of REPORTED, from the simulator's reports."""
-    rows = [values for _, values in recording.reports]
-    table: DataFrame = require("pandas").DataFrame(rows, columns=REPORTED)
-    since = recording.received_ns - recording.received_ns[0]
-    at = [received_ns - int(recording.received_ns[0]) for received_ns, _ in recording.reports]
-    table.insert(0, "time_s", np.interp(at, since.astype(float), recording.seconds))
-    return table.replace("", None).astype(float)
 
 
 def pair_commands(recording: Recording) -> DataFrame:

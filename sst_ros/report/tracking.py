@@ -29,18 +29,11 @@ KEYS = (REFERENCE.key, TRACKING_ERROR.key)
 
 @dataclass(frozen=True)
 class TrackedRun:
-    """A recorded run that followed a reference; rows belong to the samples that have one.
-
-    Attributes:
-        recording: the run.
-        track: reference, tracking error and torques.
-        rows: which samples of the recording these are, shape (n,).
-
-    """
+    """A recorded run that followed a reference; rows belong to the samples that have one."""
 
     recording: Recording
-    track: Track
-    rows: np.ndarray[Any, np.dtype[np.intp]]
+    track: Track  # reference, tracking error and torques
+    rows: np.ndarray[Any, np.dtype[np.intp]]  # which samples of the recording these are, (n,)
 
     @property
     def metrics(self) -> TrackingMetrics:

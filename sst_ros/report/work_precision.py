@@ -87,30 +87,20 @@ SAME_EQUATIONS = 1e-10
 
 @dataclass(frozen=True)
 class WorkPrecision:
-    """Result of a work-precision study of a scene.
-
-    Attributes:
-        scene, seconds, ends: its name, the time span [s], and why that ends before its duration.
-        reference: the reference solution.
-        rows: the solver grid, columns as in COLUMNS; settings of a method from coarse to fine.
-        advice: what `step_advice` recommends, as `scene show` prints it.
-        measured: error [rad] and wall time [s] of `simulate` with that advice; None where a limit
-            stops it before.
-        formulation: largest difference of W_dot from the paper's equations along the reference,
-            relative to the largest W_dot; None where it cannot be compared.
-        warnings: contradictions.
-
-    """
+    """Result of a work-precision study of a scene."""
 
     scene: str
-    seconds: float
-    ends: str
+    seconds: float  # time span [s]
+    ends: str  # why it ends before the scene's duration; empty where it does not
     reference: ReferenceSolution
-    rows: DataFrame
-    advice: StepAdvice
+    rows: DataFrame  # the solver grid, columns as in COLUMNS; settings from coarse to fine
+    advice: StepAdvice  # as `scene show` prints it
     measured: tuple[float, float] | None
+    """Error [rad] and wall time [s] of `simulate` with that advice; None where a limit stops it."""
     formulation: float | None
-    warnings: tuple[str, ...]
+    """Largest difference of W_dot from the paper's equations along the reference, relative to the
+    largest W_dot; None where it cannot be compared."""
+    warnings: tuple[str, ...]  # contradictions
 
     @property
     def floor(self) -> float:
@@ -147,16 +137,9 @@ def work_precision(
 ) -> WorkPrecision:
     """Solve a scene with every method and setting and compare with the reference.
 
-    Args:
-        scene: what is solved.
-        kind: arithmetic of the reference, reference_solution.EXTENDED or MPMATH.
-        shown: draw a progress bar on the terminal.
-        longest_s: no finer settings are tried after a run that took longer than this [s].
-
-    Raises:
-        AssemblyError: the initial gamma has no unique admissible assembly.
-        InputError: the scene cannot start, or mpmath is asked for and not installed.
-
+    The reference has numbers of a kind; progress is `shown` on the terminal; no finer settings are
+    tried after a run that took longer than `longest_s`. Raises what the problem and its reference
+    do.
     """
     problem = InitialValueProblem(scene)
     grid = solver_grid(problem)
@@ -215,20 +198,15 @@ def _warnings(
 
 
 class SolverSetting(NamedTuple):
-    """One point of the grid: name of the method, FIXED or TOLERANCE, step [s] or tolerance.
-
-    Attributes:
-        solve: returns the states at the instants, and the evaluations of the right-hand side.
-            Raises SstError, ArithmeticError or ValueError.
-        timed: does the same work with the least overhead.
-
-    """
+    """One point of the grid."""
 
     method: str
-    kind: str
-    setting: float
+    kind: str  # FIXED or TOLERANCE
+    setting: float  # step [s] or tolerance
     solve: Callable[[], tuple[Array, int]]
-    timed: Callable[[], object]
+    """Returns the states at the instants, and the evaluations of the right-hand side. Raises
+    SstError, ArithmeticError or ValueError."""
+    timed: Callable[[], object]  # does the same work with the least overhead
 
 
 def solver_grid(problem: InitialValueProblem) -> list[Iterator[SolverSetting]]:

@@ -58,10 +58,7 @@ _PANEL: Any = _templates.get_template("panel.html").module
 
 
 class Page:
-    """One source on one page. `close` ends it.
-
-    Attributes:
-        url: its address, with the access token.
+    """One source on one page, at `url`, which has the access token; `close` ends it.
 
     Raises:
         InputError: the host is no address of this machine, or no port is free.
@@ -116,8 +113,9 @@ class Page:
             if self._state is not None:
                 drawing.show(self._state.angles, self._state.torque)
             if count % _SHOW_EVERY == 0:
-                for shown in (panel, controls):
-                    shown.show(self._state, self._source.status())
+                status = self._source.status()
+                panel.show(self._state, status)
+                controls.show(self._state, status)
             if count % _DRAW_EVERY == 0:
                 panel.draw()
 
@@ -138,13 +136,10 @@ class Page:
         middle = Geometry.of(scene).v.sum(axis=0)
         middle /= np.linalg.norm(middle)
         size = max(scene.base.radius, scene.star.radius)
-        camera = server.initial_camera
-        camera.fov = np.radians(35.0)
-        camera.look_at = 0.28 * size * middle
-        camera.position = size * (3.9 * middle + np.array([0.35, -0.55, 0.5]))
-        for client in server.get_clients().values():
-            client.camera.position, client.camera.look_at = camera.position, camera.look_at
-            client.camera.fov = camera.fov
+        cameras: list[Any] = [client.camera for client in server.get_clients().values()]
+        for camera in (server.initial_camera, *cameras):
+            camera.position = size * (3.9 * middle + np.array([0.35, -0.55, 0.5]))
+            camera.look_at, camera.fov = 0.28 * size * middle, np.radians(35.0)
 
 
 def _arrange(server: PageServer) -> None:
@@ -207,8 +202,7 @@ class _Panel:
             for key, (label, unit, form) in _DIAGNOSTICS.items()
             if status.values.get(key)
         ]
-        text = _PANEL.status(_LEVELS[status.level], status.message, values)
-        self._status.content = str(text)
+        self._status.content = str(_PANEL.status(_LEVELS[status.level], status.message, values))
 
     def draw(self) -> None:
         """Draw the plots."""
@@ -223,8 +217,8 @@ class _Panel:
 def _plot(server: ViserServer, label: str, range_: tuple[float, float]) -> GuiUplotHandle:
     """Add a plot of three legs whose axis shows a range at least."""
     lines: list[uplot.Series] = [{"label": "t [s]"}]
-    for k, colour in enumerate(_COLOURS):
-        lines.append({"label": f"{label[0]}{'₁₂₃'[k]}", "stroke": colour, "width": 2.0})
+    for k, colour in zip("₁₂₃", _COLOURS, strict=True):
+        lines.append({"label": f"{label[0]}{k}", "stroke": colour, "width": 2.0})
     low, high = ({"soft": value, "mode": 1, "pad": 0.1} for value in range_)
     return server.gui.add_uplot(
         (np.array([0.0, 1.0]), *np.zeros((3, 2))),
@@ -249,17 +243,14 @@ class _RunControls:
     def __init__(self, server: ViserServer, scene: Scene, run: RunControl) -> None:
         self._run, self._paused = run, False
         gui = server.gui
-        limit = scene.torque_limit
-        most = limit or _LARGEST_TORQUE
+        most = scene.torque_limit or _LARGEST_TORQUE
         with gui.add_folder("run", order=1.0):
             self._pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
             self._step = gui.add_button("Step", icon=Icon.PLAYER_SKIP_FORWARD, disabled=True)
             reset = gui.add_button("Reset", icon=Icon.REFRESH)
         with gui.add_folder("manual torques [N m]", order=5.0):
             self._note = gui.add_html("")
-            self._sliders = [
-                gui.add_slider(f"τ{'₁₂₃'[k]}", -most, most, most / 100.0, 0.0) for k in range(3)
-            ]
+            self._sliders = [gui.add_slider(f"τ{k}", -most, most, most / 100.0, 0.0) for k in "₁₂₃"]
             self._zero = gui.add_button("Zero", icon=Icon.CIRCLE_OFF)
         _ask(self._pause, "pause", lambda: run.pause(not self._paused))
         _ask(self._step, "step", run.step)
@@ -276,12 +267,11 @@ class _RunControls:
             _name(self._pause, "Resume" if paused else "Pause")
             self._step.disabled = not paused
         controller = self._run.controller()
-        for handle in (*self._sliders, self._zero):
-            if handle.disabled != bool(controller):
-                handle.disabled = bool(controller)
         note = str(_PANEL.commanded(controller)) if controller else ""
         if note != self._note.content:
             self._note.content = note
+            for handle in (*self._sliders, self._zero):
+                handle.disabled = bool(controller)
 
     def _apply(self) -> None:
         first, second, third = (float(slider.value) for slider in self._sliders)
@@ -339,7 +329,7 @@ def _ask(button: Any, name: str, act: Callable[[], tuple[bool, str]]) -> None:
     def on_click(event: Any) -> None:
         done, message = act()
         if not done and event.client is not None:
-            given = {"auto_close_seconds": _REFUSAL_S, "color": "red"}
+            given: Any = {"auto_close_seconds": _REFUSAL_S, "color": "red"}
             event.client.add_notification(f"{name} refused", message, **given)
 
     button.on_click(on_click)

@@ -140,18 +140,12 @@ class SceneDrawing:
         v = self._geometry.v
         outwards = v - v.mean(axis=0)
         outwards /= np.linalg.norm(outwards, axis=1)[:, None]
-        places = {
-            f"{BASE}/P{k + 1}": (f"P{'₁₂₃'[k]}", self._scene.base.radius * (v[k] + at))
-            for k, at in enumerate(0.13 * outwards)
-        }
-        places[f"{STAR}/E"] = ("E", self._scene.star.radius * np.array([0.0, 0.0, 1.36]))
-        for name, (text, position) in places.items():
+        points = self._scene.base.radius * (v + 0.13 * outwards)
+        places = [(f"{BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at) for k, at in enumerate(points, 1)]
+        places.append((f"{STAR}/E", "E", self._scene.star.radius * np.array([0.0, 0.0, 1.36])))
+        for name, text, at in places:
             self._server.scene.add_label(
-                f"{_ROOT}/{name}",
-                text,
-                position=position,
-                anchor="center-center",
-                font_screen_scale=2.0,
+                f"{_ROOT}/{name}", text, position=at, anchor="center-center", font_screen_scale=2.0
             )
 
 
@@ -159,16 +153,11 @@ def add_shape(server: ViserServer, name: str, shape: Shape) -> None:
     """Add a shape to viser's scene under a name."""
     scene = server.scene
     if isinstance(shape, Ball):
-        opacity = shape.opacity if shape.opacity < 1.0 else None
-        subdivisions = 3 if shape.radius < 0.1 else 20  # of an edge of the icosahedron
         scene.add_icosphere(
-            name,
-            shape.radius,
-            shape.colour,
-            subdivisions=subdivisions,
-            opacity=opacity,
-            position=shape.centre,
-        )
+            name, shape.radius, shape.colour, position=shape.centre,
+            subdivisions=3 if shape.radius < 0.1 else 20,  # of an edge of the icosahedron
+            opacity=shape.opacity if shape.opacity < 1.0 else None,
+        )  # fmt: skip
     elif isinstance(shape, Box):
         scene.add_box(name, shape.colour, shape.size, position=shape.centre)
     elif isinstance(shape, Arc):
@@ -183,15 +172,10 @@ def add_shape(server: ViserServer, name: str, shape: Shape) -> None:
             add_shape(server, f"{name}/{index}", Ball(end, shape.thickness, shape.colour))
     else:
         along = shape.end - shape.begin
-        length = float(np.linalg.norm(along))
-        scene.add_cylinder(
-            name,
-            shape.thickness,
-            length,
-            shape.colour,
-            position=(shape.begin + shape.end) / 2.0,
-            wxyz=wxyz(Rotation.align_vectors(along, [0.0, 0.0, 1.0])[0].as_matrix()),
-        )
+        middle, length = (shape.begin + shape.end) / 2.0, float(np.linalg.norm(along))
+        turn = wxyz(Rotation.align_vectors(along, [0.0, 0.0, 1.0])[0].as_matrix())
+        size = shape.thickness, length
+        scene.add_cylinder(name, *size, shape.colour, position=middle, wxyz=turn)
 
 
 def wxyz(rotation: Array) -> Array:

@@ -57,8 +57,7 @@ class AccessCheck:
         self.installed = True
 
         def handler(connection: ServerConnection, request: Request) -> Response | None:
-            reason = self.refusal(connection.local_address, request)
-            if reason:
+            if reason := self.refusal(connection.local_address, request):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
             if urlsplit(request.path).path == "/":
                 request.headers.pop("Accept-Encoding", None)  # the title is in the page's text
@@ -72,7 +71,8 @@ class AccessCheck:
     def refusal(self, local: tuple[str, int], request: Request) -> str:
         """Return why a request at a local address is refused; empty if it is not."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if len(hosts) != 1 or _name(hosts[0]) not in self._own_names(local[0]):
+        names = self._names | {local[0]} | ({"localhost"} if _loopback(local[0]) else set())
+        if len(hosts) != 1 or _name(hosts[0]) not in names:
             return "This page answers only to its own address."
         if any(origin not in (f"http://{hosts[0]}", f"https://{hosts[0]}") for origin in origins):
             return "Another page must not use this one."
@@ -80,15 +80,12 @@ class AccessCheck:
         with contextlib.suppress(http.cookies.CookieError):
             cookies.load("; ".join(request.headers.get_all("Cookie")))
         query = parse_qs(urlsplit(request.path).query)
-        morsel = cookies.get(_cookie(local[1]))
-        given = [*query.get("token", []), *([morsel.value] if morsel is not None else [])]
+        given = query.get("token", [])
+        if (morsel := cookies.get(_cookie(local[1]))) is not None:
+            given.append(morsel.value)
         if not any(secrets.compare_digest(one.encode(), self.token.encode()) for one in given):
             return "Open the address that `view` has printed: it contains the access token."
         return ""
-
-    def _own_names(self, address: str) -> set[str]:
-        """Names of the address at which a request arrived."""
-        return self._names | {address} | ({"localhost"} if _loopback(address) else set())
 
     def _complete(self, response: Response, port: int) -> None:
         """Set the cookie, and the title of the browser's tab; forbid frames and referrers."""
@@ -96,22 +93,14 @@ class AccessCheck:
             b"<title>Viser</title>", f"<title>{TITLE}</title>".encode(), 1
         )
         del response.headers["Content-Length"]
-        rules = "HttpOnly; SameSite=Strict; Path=/"
-        response.headers.update(
-            {
-                "Content-Length": str(len(response.body)),
-                "Set-Cookie": f"{_cookie(port)}={self.token}; {rules}",
-                "X-Frame-Options": "DENY",
-                "Referrer-Policy": "no-referrer",
-            }
-        )
+        headers = response.headers
+        headers["Content-Length"] = str(len(response.body))
+        headers["Set-Cookie"] = f"{_cookie(port)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        headers["X-Frame-Options"], headers["Referrer-Policy"] = "DENY", "no-referrer"
 
 
 class PageServer(ViserServer):
-    """viser's server with the check, a bounded search for a port, and no public share.
-
-    Attributes:
-        url: address of the page, with its token.
+    """viser's server at `url` with the check, a bounded search for a port, and no public share.
 
     Raises:
         InputError: the host is no address of this machine, or no port is free.

@@ -83,12 +83,9 @@ class RunControl(Protocol):
 
 
 class Replay:
-    """Plays a bag; has `scene`, `states` and `status` as a run; used from two threads of the page.
+    """Plays a bag of `length` [s]; has `scene`, `states` and `status` as a run.
 
-    Attributes:
-        scene: that was recorded.
-        length: of the run [s].
-        playing: whether it is.
+    It is used from two threads of the page.
 
     Raises:
         InputError: the bag is no whole recording of a run.
