@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rates and accelerations of every joint and link, and the moments that their joints transmit.
 
-One leg equation, Eqs. 9 and 24 to 27, serves both ways; with c_k = (r x t).w = (w x r).t::
+One leg equation, Eqs. 9 and 24 to 27, serves both directions; with c_k = (r x t).w = (w x r).t::
 
     omega     = w gamma_dot - r mu_dot - t beta_dot
     omega_dot = w gamma_ddot - r mu_ddot - t beta_ddot

@@ -352,5 +352,5 @@ class DesiredMotion(Section):
         for index, (before, here) in enumerate(pairwise(self.waypoints), start=1):
             early = np.less(here.time, before.time + NANOSECOND)
             allowed = "must be > {:g} s, that of the point before, by 1e-9 s"
-            told = partial(allowed.format, before.time)
-            yield early, f"waypoints[{index}].time", here.time, told
+            text = partial(allowed.format, before.time)
+            yield early, f"waypoints[{index}].time", here.time, text

@@ -39,6 +39,7 @@ from sst_ros.scene.schema import (
     key_of,
     notes,
     positive,
+    rebuild,
     section,
     sections,
     specs,
@@ -48,7 +49,6 @@ from sst_ros.scene.schema import (
 from sst_ros.scene.yaml_document import (
     NO_NUMBER,
     build,
-    build_unchecked,
     find_fields,
     plain,
     read,
@@ -269,16 +269,10 @@ def share_directory() -> Path:
 class Scenarios:
     """Scenarios of a scene by row.
 
-    Args:
-        scene: the document.
-        parameters: numbers by their keys in the document, as in "star.mass", "springs[0].rest" or
-            "gravity.acceleration": first the row, then what one scene has, so shape (N,), (N, 3) or
-            (N, 3, 3). A list without an index means all of its entries.
-
-    Attributes:
-        document: the scene.
-        rows: the arrays by key.
-        count: number of rows N; None where nothing varies.
+    `parameters` are arrays by keys of numbers in the document, as in "star.mass",
+    "springs[0].rest" or "gravity.acceleration": first the row, then what one scene has, so shape
+    (N,), (N, 3) or (N, 3, 3). A list without an index means all of its entries. `rows` has these
+    arrays; the `count` N is None where nothing varies.
 
     Raises:
         InputError: a key names no number of the scene, or an array has another shape.
@@ -286,20 +280,19 @@ class Scenarios:
     """
 
     def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:
-        self.document, self._values = scene, plain(scene)
+        self.document = scene
         self.count: int | None = None
         self.rows: dict[str, Matrix] = {}
-        self._specs: dict[str, Spec] = {}
-        problems, taken = [], set[Place]()
+        self._fields: dict[Place, tuple[str, Spec]] = {}
+        problems = []
         for key, value in parameters.items():
             try:
                 for place, _, spec in find_fields(scene, key):
                     if spec.kind != "number":
                         raise ValueError(NO_NUMBER)
-                    if place in taken:
+                    if place in self._fields:
                         raise ValueError("is given twice")
-                    taken.add(place)
-                self._specs[key] = spec
+                    self._fields[place] = key, spec
                 self.rows[key] = rows = _rows(value, spec, self.count)
                 self.count = len(rows)
             except ValueError as error:
@@ -314,17 +307,17 @@ class Scenarios:
             InputError: the numbers of this row make no scene; names each and what is allowed.
 
         """
-        values = {key: rows[row].tolist() for key, rows in self.rows.items()}
+        values = {place: self.rows[key][row].tolist() for place, (key, _) in self._fields.items()}
         try:
-            return build(Scene, replace_values(self._values, values), "", of_row=True)
+            return build(Scene, rebuild(self.document, values), "", of_row=True)
         except InputError as error:
             faults = [replace(one, key=f"scenario {row}: {one.key}") for one in error.problems]
             raise InputError(self.document.name, faults) from None
 
     def columns(self) -> Any:
         """Return the scene, unchecked, with columns (N,) for the numbers that vary."""
-        columns = {key: _columns(rows) for key, rows in self.rows.items()}
-        return build_unchecked(Scene, replace_values(self._values, columns))
+        columns = {place: _columns(self.rows[key]) for place, (key, _) in self._fields.items()}
+        return rebuild(self.document, columns)
 
     def faults(self, most: int = 10) -> dict[int, InputError]:
         """Rows that make no scene, and why; no more than `most` rows are looked for."""
@@ -341,8 +334,8 @@ class Scenarios:
     def _doubtful(self) -> NDArray[np.bool_]:
         """Rows whose scene may be refused: a zero may refuse a number, or leave its section out."""
         doubtful: Any = np.zeros(self.count or 0, dtype=bool)
-        for key, values in self.rows.items():
-            spec, flat = self._specs[key], values.reshape(len(values), -1)
+        for key, spec in self._fields.values():
+            flat = self.rows[key].reshape(len(self.rows[key]), -1)
             least = max(SMALLEST if spec.above == 0.0 else spec.least, -LARGEST)
             fits = (flat >= least) & (flat <= min(spec.most, LARGEST))  # a nan is neither
             doubtful = doubtful | ~fits.all(axis=1)

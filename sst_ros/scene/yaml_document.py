@@ -244,7 +244,7 @@ def build(cls: type[S], values: Any, origin: str, *, path: str = "", of_row: boo
 
 @dataclass
 class _Builder:
-    """Builds sections; what it cannot build is None, and told."""
+    """Builds sections; what it cannot build is None, with a problem."""
 
     of_row: bool
     problems: list[Problem]
