@@ -171,7 +171,15 @@ def view(options: argparse.Namespace) -> int:
     if options.bag is not None:
         if options.scene is not None:
             refuse(options, "--scene", options.scene, "give a bag or a scene, not both")
-        return _replay(options)
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        page = function("view.page:Page")(Replay(options.bag), options.host, options.port)
+        page.announce(opened=options.open)
+        while not stop.wait(1.0):  # a wait without end could not be interrupted
+            pass
+        page.close()
+        return 0
     require("rclpy")
     if options.scene is not None:
         load(options.scene)  # refused before a process of its own would be
@@ -180,18 +188,6 @@ def view(options: argparse.Namespace) -> int:
     with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
         status: int = function("nodes.process:run")([*words, *child_process.words(given)])
     return status
-
-
-def _replay(options: argparse.Namespace) -> int:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    page = function("view.page:Page")(Replay(options.bag), options.host, options.port)
-    page.announce(opened=options.open)
-    while not stop.wait(1.0):  # a wait without end could not be interrupted
-        pass
-    page.close()
-    return 0
 
 
 def write_tables(options: argparse.Namespace) -> None:

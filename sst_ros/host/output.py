@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, refuse_unless
 
 TEMPORARY = ".part-"
 """How the name of a file begins that is not whole yet, or that a killed process has left."""
@@ -33,21 +33,16 @@ def results_folder(bag: Path, kind: str) -> Path:
 def require_free(out: Path, origin: str, *, force: bool = False, option: str = "--out") -> Path:
     """Return `out`, a file or a folder to be written, if nothing there would be overwritten.
 
-    `origin` is the command that writes, `option` that which gave `out`: the message names both.
-
-    Raises:
-        InputError: `out` is a file, or a folder that is not empty, and `force` is not set; or it
-            cannot be read.
-
+    An InputError names `origin`, the command that writes, and `option`, which gave `out`: that is
+    a file, or a folder that is not empty, and `force` is not set; or it cannot be read.
     """
     try:
         taken = any(out.iterdir()) if out.is_dir() else out.exists()
     except OSError as error:
         allowed = f"must be a path that can be written ({error})"
         raise InputError(origin, [Problem(option, str(out), allowed)]) from None
-    if taken and not force:
-        allowed = f"exists already: choose another {option}, or overwrite it with --force"
-        raise InputError(origin, [Problem(option, str(out), allowed)])
+    allowed = f"exists already: choose another {option}, or overwrite it with --force"
+    refuse_unless(origin, (option, str(out), force or not taken, allowed))
     return out
 
 

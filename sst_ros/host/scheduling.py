@@ -17,16 +17,10 @@ NO_LIMIT = "no limit"
 def schedule(priority: int, thread: int) -> str:
     """Ask for SCHED_FIFO for all threads (0: for the usual scheduling); return what was granted.
 
-    Args:
-        priority: from 0 to 99.
-        thread: native id of the thread that gets the priority. The others of this process get half
-            of it: they hold locks that it waits for, the interpreter's and those of DDS, and must
-            not be preempted meanwhile. What they begin later, threads or processes, is scheduled as
-            usual until the next call.
-
-    Raises:
-        ProcessLookupError: the thread has ended.
-
+    The thread of this native id gets the priority, 0 to 99. The others of this process get half
+    of it: they hold locks that it waits for, the interpreter's and those of DDS, and must not be
+    preempted meanwhile. What they begin later, threads or processes, is scheduled as usual until
+    the next call. If the thread has ended, a ProcessLookupError is raised.
     """
     if not hasattr(os, "sched_setscheduler"):
         return "usual: this system has no SCHED_FIFO"

@@ -31,18 +31,11 @@ def write_table(
     about: Mapping[str, Mapping[str, str]],
     texts: Mapping[str, str] | None = None,
 ) -> None:
-    """Write columns of equal length; nan is no value in Parquet and CSV.
+    """Write columns of equal length, shape (n,), whole numbers or doubles.
 
-    Args:
-        columns: by name, shape (n,), whole numbers or doubles.
-        path: of the file; its suffix, one of SUFFIXES, says what it is.
-        about: texts about each column, as its unit, for Parquet.
-        texts: texts about the table, for Parquet and NPZ.
-
-    Raises:
-        OSError: it cannot be written.
-        MissingDependency: pandas (CSV) or pyarrow (Parquet) is not installed.
-
+    The suffix of the path, one of SUFFIXES, says what the file is. Parquet keeps texts about each
+    column, as its unit, and about the table, NPZ the latter; nan is no value in Parquet and CSV,
+    which need pyarrow and pandas.
     """
     texts = dict(texts or {})
     texts[_CHECKSUM] = _checksum(texts, columns)
@@ -70,15 +63,9 @@ def write_table(
 def load_table(
     path: Path, columns: Sequence[str], texts: Sequence[str]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Read a Parquet or NPZ file of any name; Parquet of earlier versions has no checksum.
+    """Read columns, shape (n,), and texts of a Parquet or NPZ file of any name.
 
-    Args:
-        path: of the file.
-        columns: names of those that are read.
-        texts: names of those that are read.
-
-    Returns:
-        The columns, shape (n,), and the texts by name.
+    Parquet of earlier versions has no checksum.
 
     Raises:
         KeyError: a column or a text is not in the file.

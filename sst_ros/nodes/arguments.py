@@ -21,7 +21,7 @@ from sst_ros.runtime import settings
 from sst_ros.scene.schema import Section, Spec, accept, specs
 
 USE_SIM_TIME = "use_sim_time"
-_FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
+FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Parameters (or their beginning) that rclpy itself declares."""
 
 _ROS = (
@@ -82,18 +82,13 @@ def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
     full = f"/{space}/{name}".replace("//", "/")
     lines = []
     for path in given.params_file:
-        patterns = [*_nodes_of(_document(path))]
+        patterns = [*_nodes_of(path)]
         # ** stands for any number of names, * for one.
         forms = [re.escape(one).replace(r"/\*\*", "(/[^/]+)*") for one in patterns]
         if not any(re.fullmatch(form.replace(r"/\*", "/[^/]+"), full) for form in forms):
             names = ", ".join(patterns)
             lines.append(f"{path} has no parameters for {full}, only for {names} (/** is any node)")
     return lines
-
-
-def is_foreign(name: str) -> bool:
-    """Whether rclpy itself declares a parameter of this name."""
-    return name.startswith(_FOREIGN)
 
 
 def unknown_parameter(name: str, known: Sequence[str]) -> Problem:
@@ -165,11 +160,11 @@ def _ros_faults(ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]
         key = key.rpartition(":")[2]
         if not assigned:
             yield Problem("-p", value, "must be NAME:=VALUE")
-        elif key not in known and not is_foreign(key):
+        elif key not in known and not key.startswith(FOREIGN):
             yield unknown_parameter(key, [*known])
     for path in filter(None, given.params_file):
         try:
-            if not [*_nodes_of(_document(path))]:
+            if not [*_nodes_of(path)]:
                 raise ValueError("no ros__parameters")
         except (OSError, ValueError, yaml.YAMLError) as error:
             reason = str(error).splitlines()[0]
@@ -177,20 +172,20 @@ def _ros_faults(ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]
             yield Problem("--params-file", path, f"{allowed} ({reason})")
 
 
-def _document(path: str) -> Any:
-    return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-
-
-def _nodes_of(document: Any, prefix: str = "") -> Iterator[str]:
+def _nodes_of(path: str) -> Iterator[str]:
     """Names of the nodes that a parameter file has parameters for."""
+
+    def names(of: dict[Any, Any], prefix: str = "") -> Iterator[str]:
+        for key, value in of.items():
+            name = f"{prefix}/{str(key).strip('/')}"
+            if isinstance(value, dict):
+                own = isinstance(value.get("ros__parameters"), dict)
+                yield from [name] if own else names(value, name)
+
+    document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     if not isinstance(document, dict):
         raise ValueError("no mapping")
-    for key, value in document.items():
-        name = f"{prefix}/{str(key).strip('/')}"
-        if isinstance(value, dict) and isinstance(value.get("ros__parameters"), dict):
-            yield name
-        elif isinstance(value, dict):
-            yield from _nodes_of(value, name)
+    return names(document)
 
 
 def _advice(word: str, known: dict[str, Spec]) -> str:

@@ -135,7 +135,7 @@ def _declare(
     for name in sorted(given.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")
-        elif not arguments.is_foreign(name):
+        elif not name.startswith(arguments.FOREIGN):
             problems.append(arguments.unknown_parameter(name, [*values]))
     try:
         if problems:

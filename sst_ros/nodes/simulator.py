@@ -258,9 +258,13 @@ class CodeCompiler:
             return
         self._node.destroy_timer(self._timer)
         self._timer = None
-        if _is_compiling():
-            self._node.get_logger().info("another process compiles: this one does not")
-            return
+        try:  # the lock of `compiled_method.make_code`, not there before the first time
+            with (cache_folder() / "lock").open("r") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if isinstance(error, BlockingIOError):
+                self._node.get_logger().info("another process compiles: this one does not")
+                return
         given = self._given
         words = ["compile", given.scene, "--integrator", given.integrator]
         compiler = subprocess.Popen(
@@ -273,18 +277,6 @@ class CodeCompiler:
         )
         text = f"process {compiler.pid} compiles the scene for the next start"
         self._node.get_logger().info(text)
-
-
-def _is_compiling() -> bool:
-    """Whether a process has the lock of `compiled_method.make_code`."""
-    try:
-        with (cache_folder() / "lock").open("r") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # not compiled yet
-        return False
-    return False
 
 
 class FollowedClock:

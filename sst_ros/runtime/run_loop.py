@@ -54,10 +54,6 @@ class Reply(NamedTuple):
 _NOT_DONE = Reply(False, "not done: the run has ended or failed")
 
 
-class NoSubscribers(SstError):
-    """A topic of wait_for_subscribers has no subscriber."""
-
-
 class RunLoop(TickLoop):
     """State machine of one node's run, whose ticks are those of a `TickLoop`.
 
@@ -152,9 +148,6 @@ class RunLoop(TickLoop):
                 elif self.phase in (Phase.PAUSED, Phase.FAULT):
                     self.show(fault=bool(self.fault))
                     self.requested.wait(IDLE_PERIOD_S)
-            except NoSubscribers as missing:
-                self._fail(str(missing))
-                self.failed = True
             except (RunStopped, NoAnswer) as stopped:
                 self._fail(str(stopped))
             except Exception as error:
@@ -248,7 +241,8 @@ class RunLoop(TickLoop):
             if missing := self._output.missing_subscribers():
                 if time.monotonic() - self._missing_since > self._run.subscriber_timeout:
                     reason = f"within {self._run.subscriber_timeout:g} s (wait_for_subscribers)"
-                    raise NoSubscribers(f"no subscriber of {', '.join(missing)} {reason}")
+                    self.failed = True
+                    raise NoAnswer(f"no subscriber of {', '.join(missing)} {reason}")
                 return False
             self._missing_since = None
         if (self._run.waits and not self._input.starts_run()) or not self.begin():

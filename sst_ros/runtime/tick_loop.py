@@ -146,7 +146,7 @@ class HeldTorques:
 
 
 class NoAnswer(SstError):
-    """No command answered a sample in lockstep."""
+    """No command answered a sample in lockstep, or no subscriber came."""
 
 
 class TickLoop:

@@ -144,10 +144,10 @@ def test_it_begins_only_near_the_start_of_the_motion():
 def test_what_is_not_finite_is_nowhere_near():
     follower = follow()
     with pytest.raises(InputError, match="where the motion begins"):
-        follower.preview(dataclasses.replace(HERE, gamma=(np.nan,) * 3))
+        follower.preview(HERE._replace(gamma=(np.nan,) * 3))
     answers(follower, [0])
     with pytest.raises(ControlStopped, match="must be finite"):
-        answers(follower, [1], dataclasses.replace(HERE, gamma_dot=(np.nan,) * 3))
+        answers(follower, [1], HERE._replace(gamma_dot=(np.nan,) * 3))
 
 
 def test_a_stop_comes_to_rest_on_the_path_and_holds():
