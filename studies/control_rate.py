@@ -289,7 +289,7 @@ def figure(study: ControlStudy) -> Figure:
                   linewidth=float(hold == EXACT), **look)  # fmt: skip
         right.plot(100.0 * group.core_share, error, markersize=7, linewidth=1.0, **look)
     for hold, power in ORDERS.items():
-        colour, group = HOLD_NAMES[hold][0], loop[loop.hold == hold].sort_values("rate_Hz")
+        colour, group = HOLD_NAMES[hold][0], study.resolved(hold).sort_values("rate_Hz")
         period = 1e3 / group.rate_Hz.to_numpy()
         line = group.largest_rad.to_numpy()[0] * (period / period[0]) ** power
         left.plot(period, line, color=colour, linewidth=1.6, zorder=1)
