@@ -40,7 +40,7 @@ SLOWEST, FASTEST = 1e-4, 1e8
 """Factors of speed between which the ends of what is feasible are looked for."""
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 """Of the peaks of an `ActuatorDemand`."""
-_GRID, _HALVINGS = 360, 45
+_GRID = 360
 _ROUNDING = 1e-13
 
 
@@ -278,46 +278,39 @@ class TimeScaling:
 def time_scaling(plan: MotionPlan) -> TimeScaling:
     """Find the highest feasible factor of speed.
 
-    The factors that torques allow are found on a grid first, then to rounding by bisection; a
+    The factors that torques allow are found on a grid first, then to rounding; a
     feasible range narrower than the grid, between others that are not, may be overlooked.
     """
-    caps, torque_limit = {"torque": math.inf}, plan.scene.torque_limit
-    for name, limit in limits(plan.scene.actuators).items():
+    known, torque_limit = limits(plan.scene.actuators), plan.scene.torque_limit
+    caps = {"torque": math.inf}
+    for name, power in (("velocity", 1.0), ("acceleration", 0.5)):
         largest = max(abs(getattr(demand, name).value) for demand in plan.demands)
-        if name != "torque":
-            ratio = limit / largest if largest else math.inf
-            caps[name] = ratio if name == "velocity" else math.sqrt(ratio)
+        if name in known and largest:
+            caps[name] = (known[name] / largest) ** power
     binding = min(caps, key=lambda name: caps[name])
     cap = caps[binding]
     if torque_limit is None:
         return TimeScaling(cap, 0.0, binding if math.isfinite(cap) else "")
-    fits = _torque_test(plan, torque_limit)
-
-    def bisect(good: float, bad: float) -> float:
-        """Return the feasible end of a change between two factors."""
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (good + bad)
-            good, bad = (middle, bad) if fits(middle) else (good, middle)
-        return good
-
+    excess = _excess(plan, torque_limit)
+    find_end = partial(brentq, excess, xtol=1e-300, rtol=4.0 * np.finfo(float).eps)
     grid = np.geomspace(SLOWEST * min(cap, 1.0), min(cap, FASTEST), _GRID).tolist()
-    good = np.array(list(map(fits, grid)))
-    if not good.any():
+    fits = np.array(list(map(excess, grid))) <= 0.0
+    if not fits.any():
         return TimeScaling(None, 0.0, "torque")
-    last = int(np.flatnonzero(good)[-1])
+    last = int(np.flatnonzero(fits)[-1])
     highest = grid[last]
     if last < _GRID - 1:
-        highest, binding = bisect(highest, grid[last + 1]), "torque"
+        highest, binding = find_end(grid[last], grid[last + 1]), "torque"
     elif math.isinf(cap):
         highest, binding = math.inf, ""
-    slow = np.flatnonzero(~good[:last])
+    slow = np.flatnonzero(~fits[:last])
     if len(slow):
-        return TimeScaling(highest, bisect(grid[slow[-1] + 1], grid[slow[-1]]), binding)
-    return TimeScaling(highest, 0.0 if fits(0.0) else grid[0], binding)
+        return TimeScaling(highest, find_end(grid[slow[-1]], grid[slow[-1] + 1]), binding)
+    return TimeScaling(highest, 0.0 if excess(0.0) <= 0.0 else grid[0], binding)
 
 
-def _torque_test(plan: MotionPlan, limit: float) -> Callable[[float], bool]:
-    """Return whether no torque exceeds the limit, between samples too, by the factor of speed."""
+def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
+    """Return by how much a torque exceeds the limit [N m] at a factor of speed; <= 0 for none."""
     model, inverse = kernel.model_of(plan.scene), InverseDynamics(plan.scene)
     star = [(at.quaternion, at.body_rate, at.body_acceleration) for at in plan.references]
     quaternion, rate, acceleration = (np.array(part).T for part in zip(*star, strict=True))
@@ -327,19 +320,19 @@ def _torque_test(plan: MotionPlan, limit: float) -> Callable[[float], bool]:
         moving = multiply(factor, at.body_rate), multiply(factor * factor, at.body_acceleration)
         return sign * inverse.torque(at.quaternion, *moving)[leg]
 
-    def fits(factor: float) -> bool:
+    def excess(factor: float) -> float:
         moving: Any = [tuple(factor * rate), tuple(factor * factor * acceleration)]
         rows, _ = kernel.actuator_torque(model, tuple(quaternion), *moving)
         sampled = np.stack(np.broadcast_arrays(*rows))
-        if np.abs(sampled).max() > limit:
-            return False
-        peaks = (
-            maximum(partial(torque, factor, leg, sign), plan.times, sign * sampled[leg], limit)
-            for leg, sign in product(range(3), (1.0, -1.0))
-        )
-        return all(peak.value <= limit for peak in peaks)
+        largest = float(np.abs(sampled).max())
+        for leg, sign in product(range(3), (1.0, -1.0)):
+            if largest <= limit:  # not above it yet
+                at = partial(torque, factor, leg, sign)
+                peak = maximum(at, plan.times, sign * sampled[leg], limit)
+                largest = max(largest, peak.value)
+        return largest - limit
 
-    return fits
+    return excess
 
 
 def plan_table(plan: MotionPlan, fastest: TimeScaling) -> str:

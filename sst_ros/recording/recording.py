@@ -56,7 +56,7 @@ class Signals:
         bag: the recording: its path, topics, damage.
         scene: what was simulated; None where it was not recorded.
         start_ns: stamp of the start of the run [ns].
-        topic_series: rows of each topic that was recorded, by its key.
+        topic_series: rows of each topic, by its key; none of one that was not recorded.
         idle_states: number of joint states that are no samples of the run.
         statuses: diagnostics, in order of reception.
 
@@ -69,18 +69,12 @@ class Signals:
     idle_states: int
     statuses: tuple[Status, ...]
 
-    def rows(self, table: TopicTable) -> Series:
-        """Rows of a topic; none where it was not recorded."""
-        none = np.empty(0, dtype=np.int64)
-        empty = Series(table.columns, none, none, np.empty((0, len(table.columns))))
-        return self.topic_series.get(table.key, empty)
-
     @cached_property
     def tables(self) -> dict[str, Series]:
         """Rows by the names of `TABLES`; only what was recorded."""
         found = {}
         for name, listed in topics.TABLES.items():
-            parts = [self.topic_series[one.key] for one in listed if one.key in self.topic_series]
+            parts = [one for table in listed if len(one := self.topic_series[table.key])]
             if parts:
                 found[name] = topics.join(parts) if len(parts) > 1 else parts[0]
         return found
@@ -88,7 +82,7 @@ class Signals:
     @cached_property
     def missing(self) -> tuple[str, ...]:
         """Keys of the topics that are not in the recording, or without a row of the run."""
-        missing = [one.key for one in topics.TOPIC_TABLES if one.key not in self.topic_series]
+        missing = [key for key, series in self.topic_series.items() if not len(series)]
         return (*missing, *([] if self.scene else [topics.SCENE.key]))
 
     def time_ns(self, table: str) -> Integers:
@@ -172,20 +166,19 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
     found = {
         key: topics.sort_rows(table, times.pop(key), numbers.pop(key), path)
         for key, table in tables.items()
-        if times[key]
     }
-    if not found:
+    if not any(map(len, found.values())):
         allowed = "must have at least one of " + ", ".join(t.ending for t in topics.TOPIC_TABLES)
         raise refusal(path, "topics", None, allowed)
     if len(scenes) > 1:
         raise refusal(path, topics.SCENE.key, len(scenes), "the recording must hold one scene")
     stamped = [one.key for one in (*topics.TABLES["samples"], topics.TICKS)]
-    starts = [int(found[key].stamp_ns[0]) for key in stamped if key in found]
+    starts = [int(found[key].stamp_ns[0]) for key in stamped if len(found[key])]
     origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
     return Signals(
         bag=bag,
         scene=yaml_document.read(Scene, scenes.pop(), origin) if scenes else None,
-        start_ns=min(starts or [int(one.received_ns[0]) for one in found.values()]),
+        start_ns=min(starts or [int(one.received_ns[0]) for one in found.values() if len(one)]),
         topic_series=found,
         idle_states=idle,
         statuses=tuple(sorted(statuses, key=lambda status: status.received_ns)),
@@ -284,8 +277,8 @@ class Recording:
         if len(wrong):
             allowed = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), allowed)
-        self.ticks = _ticks(self.path, ticks, self.start_ns)
-        parts = [found.rows(one) for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
+        self.ticks, series = _ticks(self.path, ticks, self.start_ns), found.topic_series
+        parts = [series[one.key] for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
         order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
         names = ("stamp_ns", "received_ns", "values")
         columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
@@ -348,7 +341,7 @@ class Recording:
 
 def _finite_rows(found: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
-    series = found.rows(table)
+    series = found.topic_series[table.key]
     bad = ~np.isfinite(series.values[:, : 4 if table is topics.TICKS else None]).all(axis=1)
     if bad.any():
         stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
