@@ -40,7 +40,8 @@ SLOWEST, FASTEST = 1e-4, 1e8
 """Factors of speed between which the ends of what is feasible are looked for."""
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 """Of the peaks of an `ActuatorDemand`."""
-_GRID = 360
+_GRID, _BEYOND = 360, 27
+"""Factors that are tried, and how many infeasible ones (three doublings) end the search."""
 _ROUNDING = 1e-13
 
 
@@ -294,8 +295,12 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     excess = _excess(plan, torque_limit)
     find_end = partial(brentq, excess, xtol=1e-300, rtol=4.0 * np.finfo(float).eps)
     grid = np.geomspace(SLOWEST * min(cap, 1.0), min(cap, FASTEST), _GRID).tolist()
-    fits = np.array(list(map(excess, grid))) <= 0.0
-    if not fits.any():
+    fits: list[bool] = []
+    for factor in grid:
+        fits.append(excess(factor) <= 0.0)
+        if any(fits) and not any(fits[-_BEYOND:]):
+            break
+    if not any(fits):
         return TimeScaling(None, 0.0, "torque")
     last = int(np.flatnonzero(fits)[-1])
     highest = grid[last]
@@ -303,7 +308,7 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
         highest, binding = find_end(grid[last], grid[last + 1]), "torque"
     elif math.isinf(cap):
         highest, binding = math.inf, ""
-    slow = np.flatnonzero(~fits[:last])
+    slow = np.flatnonzero(np.logical_not(fits[:last]))
     if len(slow):
         return TimeScaling(highest, find_end(grid[slow[-1]], grid[slow[-1] + 1]), binding)
     return TimeScaling(highest, 0.0 if excess(0.0) <= 0.0 else grid[0], binding)
