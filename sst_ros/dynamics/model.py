@@ -120,7 +120,7 @@ def _loads(scene: Scene, geometry: Geometry, k: int, damping: Any) -> LegLoads |
     stops = None
     if scene.stroke.stiffness is not None:
         stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
-    heavy = any(np.any(x) for x in (*drive, *link))
+    heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
     if not (any(friction) or any(springs) or heavy or stops):
         return None
     return LegLoads(friction, springs, drive, link, stops)

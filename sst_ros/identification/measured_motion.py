@@ -89,17 +89,10 @@ class Readings(NamedTuple):
 
 
 def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) -> MeasuredMotion:
-    """Read a motion from a recording, a trajectory, or arrays.
+    """Read a motion from a recording, a trajectory, or arrays, see `identify`, or refuse it.
 
-    Args:
-        data: see `identify`; held torques act from sample k to the next (n or n - 1 rows).
-        scene: the manipulator, for the limit of its actuators.
-        delay: time by which measured torques come late [s].
-
-    Raises:
-        InputError: shapes do not fit, numbers are not finite, times do not rise, or there are
-            too few samples.
-
+    Held torques act from sample k to the next (n or n - 1 rows); measured ones come `delay` [s]
+    late. The scene is for the limit of its actuators.
     """
     data = open_data(data)
     given = data if isinstance(data, Mapping) else _take_samples(data)
@@ -207,17 +200,10 @@ def _shift(t: Array, torque: Array, held: bool, delay: float) -> Array:
 
 
 def take_readings(data: Measured, scene: Scene) -> Readings:
-    """Take measured angles from a motion, or readings off a figure.
+    """Take measured angles from a motion as for `read_motion`, or readings off a figure.
 
-    Args:
-        data: as for `read_motion`; or a mapping with t [s] and any of OBSERVABLES, shape (n,), nan
-            where nothing was read, and deviation, their standard deviation. The torques are then
-            those of the scene.
-        scene: the manipulator.
-
-    Raises:
-        InputError: the data are not sound, or the scene has no torques.
-
+    Those are a mapping with t [s] and any of OBSERVABLES, shape (n,), nan where nothing was read,
+    and deviation, their standard deviation. The torques are then those of the scene.
     """
     if isinstance(data, Mapping) and "torque" not in data:
         return _take_figure(data, scene)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -60,18 +60,13 @@ NEGLIGIBLE = 1e-12
 def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ...]:
     """Names of parameters: all that the scene has, or those that begin as one of `requested`.
 
-    Args:
-        scene: the manipulator.
-        requested: names, or the beginnings of names, as in ("star", "friction.gamma", "offset").
-
-    Raises:
-        InputError: no parameter begins like that.
-
+    Names begin as in ("star", "friction.gamma", "offset"); a beginning of none is refused.
     """
+    own, others = _list_names(scene)
     if requested is None:
-        return tuple(_list_names(scene, more=False))
+        return tuple(own)
     names: dict[str, None] = {}
-    problems, known = [], _list_names(scene, more=True)
+    problems, known = [], dict.fromkeys(own + others)
     for begin in [requested] if isinstance(requested, str) else requested:
         found = [name for name in known if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)]
         if str(begin) in LINKS:  # the three alike
@@ -115,36 +110,8 @@ def _of_centre(name: str) -> str:
     return re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
 
 
-def with_symbols(scene: Scene, symbols: Mapping[str, Any], *, moments: bool = False) -> Any:
-    """Return an object like the scene with other values, of any kind, which are not checked.
-
-    Args:
-        scene: the manipulator.
-        symbols: values by name; a list without index means all of its entries.
-        moments: bodies have mass 1, so that "centre" is mass times centre.
-
-    """
-    values = plain(scene)
-    if moments:
-        for body in (values["star"], *values["actuated_links"], *values["intermediate_links"]):
-            body["centre"] = [body["mass"] * part for part in body["centre"]]
-            body["mass"] = 1.0
-    # Torques depend on mass times centre alone.
-    used = {
-        _of_centre(name): symbol
-        for name, symbol in symbols.items()
-        if not (moments and name.endswith(".mass"))
-    }
-    return build_unchecked(Scene, replace_values(values, used))
-
-
 def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: str) -> Scene:
-    """Return the scene with identified values; `note` is their provenance.
-
-    Raises:
-        InputError: the values make no scene.
-
-    """
+    """Return the scene with identified values and a note of their provenance, or refuse them."""
     found = dict(zip(names, (float(number) for number in numbers), strict=True))
     changed: dict[str, Any] = {}
     for name, number in found.items():
@@ -166,36 +133,32 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
     return build(Scene, document, scene.name, of_row=True)
 
 
-def _list_names(scene: Scene, *, more: bool) -> list[str]:
-    """Names of what the scene has, of equal links alike.
+def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
+    """Names of what the scene has, of equal links alike, and of what may be asked for besides.
 
-    With `more`, behind them, what may be asked for besides: other links, unknown friction, offsets.
+    That are links alone or alike, friction that is not yet known, and offsets.
     """
-    own: dict[str, Star | Link] = {"star": scene.star}
-    others: dict[str, Star | Link] = {}
+    parts = STANDARD if scene.gravity is not None else STANDARD[4:]
+
+    def name_parts(name: str, body: Star | Link) -> list[str]:
+        return [f"{name}.{part}" for part in parts] if body.inertia else []
+
+    own, others = name_parts("star", scene.star), list[str]()
     for kind in LINKS:
         links = getattr(scene, kind)
-        each = {f"{kind}[{k}]": link for k, link in enumerate(links)}
-        own |= {kind: links[0]} if links[0] == links[1] == links[2] else each
-        others |= {**each, kind: links[0]}
-    parts = STANDARD if scene.gravity is not None else STANDARD[4:]
-    whole = [
-        [f"{name}.{part}" for name, body in bodies.items() if body.inertia for part in parts]
-        for bodies in (own, others if more else {})
-    ]
-    names = whole[0]
+        each = [key for k in range(3) for key in name_parts(f"{kind}[{k}]", links[k])]
+        alike = name_parts(kind, links[0])
+        own += alike if links[0] == links[1] == links[2] else each
+        others += each + alike
     for kind in JOINT_KINDS:
         terms = getattr(scene.friction, kind, None)
         present = (part for part in ("viscous", "coulomb", "static") if getattr(terms, part, 0.0))
-        names += (f"friction.{kind}.{part}" for part in present)
-    names += (f"springs[{i}].stiffness" for i in range(len(scene.springs)))
-    if more or (scene.actuators is not None and scene.actuators.rotor_inertia):
-        names.append("actuators.rotor_inertia")
-    if more:
-        names += whole[1]
-        names += (f"friction.{k}.{part}" for k in JOINT_KINDS for part in ("viscous", "coulomb"))
-        names += (f"offset[{k}]" for k in range(3))
-    return list(dict.fromkeys(names))
+        own += (f"friction.{kind}.{part}" for part in present)
+        others += (f"friction.{kind}.viscous", f"friction.{kind}.coulomb")
+    own += (f"springs[{i}].stiffness" for i in range(len(scene.springs)))
+    if scene.actuators is not None and scene.actuators.rotor_inertia:
+        own.append("actuators.rotor_inertia")
+    return own, [*others, "actuators.rotor_inertia", *(f"offset[{k}]" for k in range(3))]
 
 
 @dataclass(frozen=True)
@@ -262,13 +225,7 @@ ROUNDED = 1e-10
 
 
 class Regressor:
-    """Y and the known part of the torques of a scene.
-
-    Args:
-        scene: the manipulator; what is not among the parameters is known.
-        names: the parameters, see `parameters`.
-
-    """
+    """Y and the known part of the torques of a scene: what is not among the parameters is known."""
 
     def __init__(self, scene: Scene, names: Sequence[str]) -> None:
         self.scene, self.names = scene, tuple(names)
@@ -276,16 +233,9 @@ class Regressor:
         self._traced = [n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"]
 
     def __call__(self, quaternion: Array, rate: Array, acceleration: Array) -> tuple[Array, Array]:
-        """Evaluate at n states.
+        """Return the known torques [N m], shape (n, 3), and Y, shape (n, 3, len(names)), at n states.
 
-        Args:
-            quaternion: of {E} in {B}, (x, y, z, w), shape (n, 4).
-            rate: W in {E} [rad/s], shape (n, 3).
-            acceleration: W_dot in {E} [rad/s^2], shape (n, 3).
-
-        Returns:
-            The known torques [N m], shape (n, 3), and Y, shape (n, 3, len(names)).
-
+        Those are quaternions (x, y, z, w) of {E} in {B}, W [rad/s] and W_dot [rad/s^2] in {E}.
         """
         count = len(quaternion)
         # A stiffness of zero leaves no rest angle: springs are evaluated at 1 N m/rad.
@@ -303,18 +253,25 @@ class Regressor:
     @cached_property
     def _function(self) -> Any:
         """Three torques, then their derivatives by each parameter of the dynamics."""
+        document = plain(self.scene)
+        # Torques depend on mass times centre alone: bodies of mass 1 have it as their centre.
+        for body in (
+            document["star"],
+            *document["actuated_links"],
+            *document["intermediate_links"],
+        ):
+            body["centre"] = [body["mass"] * part for part in body["centre"]]
+            body["mass"] = 1.0
+
+        def torques(*inputs: Any) -> tuple[Any, ...]:
+            varied = zip(map(_of_centre, self._traced), map(mark_present, inputs[10:]), strict=True)
+            opened = build_unchecked(Scene, replace_values(document, dict(varied)))
+            model = kernel.model_of(opened, self._geometry)
+            return kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])[0]
+
         symbols = tuple(f"p{i}" for i in range(len(self._traced)))
         inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
-        return compile_for_arrays(with_jacobian(self._torques, inputs, symbols))
-
-    def _torques(self, *inputs: Any) -> tuple[Any, ...]:
-        varied = [mark_present(symbol) for symbol in inputs[10:]]
-        opened = with_symbols(
-            self.scene, dict(zip(self._traced, varied, strict=True)), moments=True
-        )
-        model = kernel.model_of(opened, self._geometry)
-        torque, _ = kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])
-        return torque
+        return compile_for_arrays(with_jacobian(torques, inputs, symbols))
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,7 @@ from sst_ros.integration.applied_torque import torque_at
 from sst_ros.mechanism.generic_math import ZERO, atan2, quaternion_rate, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import build_unchecked, plain, replace_values
 from sst_ros.simulation.torque_profile import TorqueProfile
 
 NOT_DETERMINED = 1.0
@@ -162,31 +163,21 @@ def _is_positive(name: str) -> bool:
 
 
 class Sensitivities:
-    """Motions of a scene and their derivatives by parameters.
+    """Motions of a scene under torques over time, and their derivatives by parameters.
 
-    Args:
-        scene: what moves.
-        names: numbers of the scene by key, as "friction.gamma.smoothing", "initial.gamma_dot[0]"
-            or "actuators.time_constant"; a list without index means all of its entries.
-        torque: torques over time.
-
-    Raises:
-        InputError: a key is not a number of the scene, or one of its geometry.
-
+    Those are numbers of the scene by key, as "friction.gamma.smoothing", "initial.gamma_dot[0]" or
+    "actuators.time_constant", but not of its geometry; a list without index means all its entries.
     """
 
     def __init__(self, scene: Scene, names: Sequence[str], torque: TorqueProfile) -> None:
         self.scene, self.names = scene, tuple(names)
         self._torque, self._geometry = torque, Geometry.of(scene)
-        problems = [
-            Problem("parameters", name, "must be the key of a number that the scene has")
-            if value_of(scene, name) is None
-            else Problem("parameters", name, "is geometry, which is taken as known")
-            for name in self.names
-            if value_of(scene, name) is None or name.startswith(GEOMETRY)
-        ]
-        if problems:
-            raise InputError("identify", problems)
+        for name in self.names:
+            allowed = "is geometry, which is taken as known" if name.startswith(GEOMETRY) else ""
+            if value_of(scene, name) is None:
+                allowed = "must be the key of a number that the scene has"
+            if allowed:
+                raise InputError("identify", [Problem("parameters", name, allowed)])
         self._inner = [i for i, name in enumerate(self.names) if not name.startswith("initial")]
         self._state = (*QUATERNION, *RATE, *(LAG if scene.lags else ()))
 
@@ -211,18 +202,10 @@ class Sensitivities:
         return (off / deviation)[there], (changes / deviation[:, :, None])[there]
 
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:
-        """Integrate the motion and its sensitivities.
+        """Integrate the motion and its sensitivities with values of the parameters, shape (p,).
 
-        Args:
-            values: of the parameters, shape (p,).
-            t: times [s], ascending from 0 on, shape (n,).
-
-        Returns:
-            States (q, W and lagged torques), shape (n, m), and their derivatives, (n, m, p).
-
-        Raises:
-            InputError: the motion cannot be integrated with these values.
-
+        Returns states (q, W and lagged torques) at times t [s], shape (n,), ascending from 0 on, of
+        shape (n, m), and their derivatives, (n, m, p); raises InputError where there is no motion.
         """
         # Inertias between iterations of a fit need not be those of bodies that can exist.
         outer = [i for i, name in enumerate(self.names) if name.startswith(("initial", "stroke"))]
@@ -270,20 +253,19 @@ class Sensitivities:
     @cached_property
     def _derivatives(self) -> Callable[..., tuple[float, ...]]:
         """y', then its derivatives by each component of y and by each parameter."""
-        symbols = tuple(f"p{i}" for i in range(len(self._inner)))
-        program = with_jacobian(
-            self._derivative, (*self._state, *TORQUE, *symbols), (*self._state, *symbols)
-        )
-        return compile_program(program)
+        size, names = len(self._state), [self.names[i] for i in self._inner]
 
-    def _derivative(self, *inputs: Any) -> tuple[Any, ...]:
-        size = len(self._state)
-        names = [self.names[i] for i in self._inner]
-        symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
-        if RESTITUTION in symbols:  # its number is that of the damping
-            symbols |= {"stroke.damping": symbols[RESTITUTION], RESTITUTION: None}
-        model = kernel.model_of(parameters.with_symbols(self.scene, symbols), self._geometry)
-        return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
+        def derivative(*inputs: Any) -> tuple[Any, ...]:
+            symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
+            if RESTITUTION in symbols:  # its number is that of the damping
+                symbols |= {"stroke.damping": symbols[RESTITUTION], RESTITUTION: None}
+            opened = build_unchecked(Scene, replace_values(plain(self.scene), symbols))
+            model = kernel.model_of(opened, self._geometry)
+            return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
+
+        varied = tuple(f"p{i}" for i in range(len(names)))
+        inputs, by = (*self._state, *TORQUE, *varied), (*self._state, *varied)
+        return compile_program(with_jacobian(derivative, inputs, by))
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:
         """Return the initial state, and its derivatives by the parameters, shape (m, p)."""
@@ -353,31 +335,24 @@ def _make_possible_scene(
 ) -> tuple[Scene, Array, tuple[str, ...]]:
     """Scene with fitted numbers by key; where its bodies cannot exist, that with the nearest ones.
 
-    Returns:
-        The scene, the values in it, and a warning where they are others.
-
-    Raises:
-        InputError: other numbers than those of inertias make no scene.
-
+    Returns it, the values in it, and a warning where they are others.
     """
-    values = dict(zip(names, numbers.tolist(), strict=True))
-    sections = sorted({re.split(r"[.\[]", name)[0] for name in names})
-    notes = {f"provenance.{section}": "identified by simulation" for section in sections}
+    note = "identified by simulation"
     try:
-        return scene.with_values({**values, **notes}), numbers, ()
+        return parameters.with_parameters(scene, names, numbers, note), numbers, ()
     except InputError:
-        inertias = {name: values.pop(name) for name in names if ".inertia." in name}
-        if not inertias:
+        fitted = [name for name in names if ".inertia." in name]
+        if not fitted:
             raise
-    changed = scene.with_values(values)
+    values = dict(zip(names, numbers, strict=True))
     # All entries of the inertias to which those that were fitted belong.
-    bodies = dict.fromkeys(name.partition(".inertia")[0] for name in inertias)
+    bodies = dict.fromkeys(name.partition(".inertia")[0] for name in fitted)
     entries = tuple(f"{body}.{part}" for body in bodies for part in STANDARD[4:])
-    chosen, given = [entries.index(name) for name in inertias], parameters.values(changed, entries)
+    chosen, given = [entries.index(name) for name in fitted], parameters.values(scene, entries)
     root = np.diag(1e6 / scales(entries, given)[chosen])
-    kept, estimate = np.eye(len(entries))[chosen], np.array(list(inertias.values()))
-    found, _ = find_consistent_values(entries, given, kept, estimate, root, 1.0)
-    nearest = dict(zip(entries, found.tolist(), strict=True))
-    adjusted = changed.with_values({**nearest, **notes})
+    kept, estimate = np.eye(len(entries))[chosen], np.array([values[name] for name in fitted])
+    nearest, _ = find_consistent_values(entries, given, kept, estimate, root, 1.0)
+    values |= zip(entries, nearest, strict=True)
+    found = parameters.with_parameters(scene, tuple(values), np.array([*values.values()]), note)
     warning = "no bodies have the inertias that fit best: the scene has the nearest"
-    return adjusted, np.array([value_of(adjusted, name) for name in names], dtype=float), (warning,)
+    return found, parameters.values(found, names), (warning,)

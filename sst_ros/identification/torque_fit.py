@@ -237,15 +237,10 @@ def form_equations(
     Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at MARGIN times
     the bandwidth of the motion.
 
-    Returns:
-        The known torques [N m], shape (m, 3); the regressor of p parameters, shape (m, 3, p); the
-        rows of the measured torques that they belong to, shape (m,); and the frequency [Hz] up to
-        which they are sound where angles were filtered, else None.
-
-    Raises:
-        InputError: no assembly of the manipulator has these angles, or samples are not evenly
-            spaced where they are filtered.
-
+    Returns the known torques [N m], shape (m, 3); the regressor of p parameters, shape (m, 3, p);
+    the rows of the measured torques that they belong to, shape (m,); and the frequency [Hz] up to
+    which they are sound where angles were filtered, else None. Angles that no assembly has, and
+    uneven samples where they are filtered, are refused.
     """
     t = measured.t
     path, unsettled = _interpolate(measured, cutoff)
@@ -304,9 +299,7 @@ def _interpolate(
 def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, int]:
     """Angles after a zero-phase filter, and the samples at both ends that it has not settled for.
 
-    Raises:
-        InputError: samples are not evenly spaced, or the cut-off is not below half their rate.
-
+    Samples must be evenly spaced, and the cut-off be below half their rate.
     """
     spacing = np.diff(t)
     period = float(np.median(spacing))

@@ -142,21 +142,10 @@ def control_source(program: Program, sizes: Mapping[str, int]) -> str:
 
 
 class ControlledBatch:
-    """A batch whose torques come from a controller with zero-order hold.
+    """A batch of plants whose torques come from the controller of a study, with zero-order hold.
 
-    The controller's model of the plant is the scene of the study, which does not vary.
-
-    Args:
-        batch: of the plants, without torques of their own.
-        study: with a controller.
-
-    Attributes:
-        samples: control periods in a run.
-
-    Raises:
-        InputError: the length is no whole number of periods, a period none of steps, or the gains
-            are not allowed.
-
+    The controller's model of the plant is the scene of the study, which does not vary. A run has
+    `samples` control periods; a length or a number of steps that does not fit them is refused.
     """
 
     def __init__(self, batch: Batch, study: SweepStudy) -> None:
@@ -269,15 +258,10 @@ class ControlledBatch:
         steps: int,
         kept: int = 0,
     ) -> tuple[BatchResult, dict[str, Array]]:
-        """Run scenarios; return their results and tracking figures.
+        """Run the scenarios of a batch; return their results and tracking figures.
 
-        Args:
-            batch: of the scenarios.
-            given: initial states and gains that differ, by key.
-            rows: numbers of the scenarios in their study, which the noise depends on.
-            steps: number of steps, a multiple of `samples`.
-            kept: keep the states every so many steps; 0 keeps none.
-
+        Initial states and gains that differ are given by key. The noise depends on the rows of the
+        scenarios in their study; `steps` is a multiple of `samples`.
         """
         count, hold, drawn_for = len(rows), steps // self.samples, rows
         start, control = self._motion.at(0.0), self._control

@@ -80,12 +80,7 @@ def run_chunk(study: SweepStudy, steps: int, folder: Path | None, index: int) ->
 
 
 def run_local(compute: Compute, chunks: Sequence[int], done: Done, workers: int) -> None:
-    """Compute chunks on threads; the compiled code releases the interpreter's lock.
-
-    Raises:
-        SweepFailed: a file cannot be written.
-
-    """
+    """Compute chunks on threads; raises SweepFailed where a file cannot be written."""
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(compute, index) for index in chunks]
         try:
@@ -98,12 +93,7 @@ def run_local(compute: Compute, chunks: Sequence[int], done: Done, workers: int)
 
 
 def connect(address: str) -> Any:
-    """Return a client of the scheduler at an address.
-
-    Raises:
-        InputError: no scheduler answers there.
-
-    """
+    """Return a client of the scheduler at an address; raises InputError if none answers there."""
     distributed = require("distributed")
     try:
         return distributed.Client(address, timeout=NO_SCHEDULER, set_as_default=False)
@@ -140,10 +130,8 @@ def run_on_cluster(
 ) -> None:
     """Compute chunks on the workers of a client; print what it finds out about them.
 
-    Raises:
-        SweepFailed: chunks are not done: no worker takes them, they end their workers, or the
-            scheduler is gone. All others are.
-
+    Raises SweepFailed where chunks are not done, when all others are: no worker takes them, they
+    end their workers, or the scheduler is gone.
     """
     # A worker of another version may not be able to read a study: it is asked by text first.
     check = f"find_unfit({list_versions()!r}, {None if folder is None else str(folder)!r})"

@@ -44,10 +44,7 @@ Columns = dict[str, NDArray[Any]]
 class PreparedSweep:
     """A study with its compiled code and its number of steps, which may be known already.
 
-    Raises:
-        InputError: the ends of what varies make no scene, or no number of steps reaches the
-            tolerance.
-
+    Refuses one whose ranges end in no scene, and one whose tolerance no number of steps reaches.
     """
 
     def __init__(self, study: SweepStudy, steps: int | None = None) -> None:

@@ -36,12 +36,7 @@ def name_part(index: int, kind: str = "part") -> str:
 
 
 def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) -> None:
-    """Write a table as a file that is there whole or not at all.
-
-    Raises:
-        OSError: it cannot be written; nothing of it is left.
-
-    """
+    """Write a table as a file that is there whole or not at all."""
     names = set(table.column_names)
     units = {name: unit for name, unit in about["units"].items() if name in names}
     metadata = json.dumps({**about, "units": units}).encode()
@@ -65,12 +60,7 @@ def read_about(path: Path) -> dict[str, Any] | None:
 
 
 def find_complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
-    """Return the chunks whose files are there.
-
-    Raises:
-        InputError: a file is that of another study or version.
-
-    """
+    """Return the chunks whose files are there; raises InputError at one of another study."""
     expected = {"digest": study.digest, "steps": steps, "version": VERSION}
     found = set()
     for path in folder.glob("part-*.parquet"):
@@ -89,12 +79,7 @@ def find_complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
 
 
 def read_sweep(folder: Path, kind: str = "part") -> pd.DataFrame:
-    """Read the results in a folder as one table, units and study in its `attrs`.
-
-    Raises:
-        InputError: there are none.
-
-    """
+    """Read the results in a folder as one table, units and study in its `attrs`, or refuse it."""
     paths = sorted(folder.glob(f"{kind}-*.parquet"))
     about = next(filter(None, map(read_about, paths)), None)
     if about is None:

@@ -119,12 +119,7 @@ class Variation:
 
 
 def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
-    """Return what a key of a scene, or of settings at a place of the study, names.
-
-    Raises:
-        ValueError: it names nothing that can vary.
-
-    """
+    """Return what a key of a scene, or of settings at a place of the study, names, or refuse it."""
     found = []
     for at, value, spec in find_fields(tree, key, place=place):
         here = key_of(at)
@@ -146,12 +141,7 @@ def _scales_tensor(key: str, targets: Sequence[Target]) -> bool:
 
 
 def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
-    """Read one entry of `vary`, whose key names the targets.
-
-    Raises:
-        ValueError: it is no distribution, or its numbers are not allowed.
-
-    """
+    """Read one entry of `vary`, whose key names the targets; raises ValueError where it is none."""
     kind, numbers, relative = "grid", given, False
     if isinstance(given, Mapping):
         words = dict(given)
@@ -202,12 +192,7 @@ def _broadcast(numbers: Any, nominal: Array) -> Array:
 
 
 def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) -> Variation:
-    """Return the variation of a key whose values are columns of a table.
-
-    Raises:
-        ValueError: columns of its components are missing.
-
-    """
+    """Return the variation of a key whose values are columns of a table, which must be complete."""
     if len(set(map(len, columns.values()))) > 1:
         raise ValueError("must have columns of equal length")
     numbers = np.stack(list(columns.values()), axis=1)
@@ -218,12 +203,7 @@ def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) 
 
 
 def read_table(given: Any) -> dict[str, Array]:
-    """Read the columns of a DataFrame, a mapping, or a CSV or Parquet file.
-
-    Raises:
-        InputError: it is not readable, or holds more than numbers.
-
-    """
+    """Read columns of numbers from a DataFrame, a mapping, or a CSV or Parquet file."""
     try:
         if isinstance(given, Path):
             pandas = require("pandas")
