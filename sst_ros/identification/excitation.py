@@ -28,7 +28,7 @@ from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.plan import examine_motion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.errors import InputError, MotionRefused, Problem
+from sst_ros.errors import MotionRefused, Problem, refuse_unless
 from sst_ros.identification import parameters
 from sst_ros.identification.parameters import BaseParameters, Regressor, find_base_parameters
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -100,13 +100,11 @@ def design(
         MotionRefused: no motion about the initial pose keeps within the limits.
 
     """
-    problems = []
-    if not (np.isfinite(duration) and duration >= 0.1):
-        problems.append(Problem("duration", duration, "must be a number >= 0.1 [s]"))
-    if not 3 <= harmonics <= 30:
-        problems.append(Problem("harmonics", harmonics, "must be from 3 to 30"))
-    if problems:
-        raise InputError("identify design", problems)
+    refuse_unless(
+        "identify design",
+        ("duration", duration, 0.1 <= duration < np.inf, "must be a number >= 0.1 [s]"),
+        ("harmonics", harmonics, 3 <= harmonics <= 30, "must be from 3 to 30"),
+    )
     names = parameters.select_names(scene, requested)
     trial = _Trial(scene, names, duration, harmonics)
     free = np.random.default_rng(seed).normal(size=trial.size)
@@ -142,9 +140,9 @@ class _Trial:
     ) -> None:
         self._regressor = Regressor(scene, names)
         self.base = find_base_parameters(self._regressor)
-        if not self.base.chosen:
-            allowed = "must determine something: no torque depends on these parameters"
-            raise InputError("identify design", [Problem("parameters", list(names), allowed)])
+        allowed = "must determine something: no torque depends on these parameters"
+        found = "parameters", list(names), bool(self.base.chosen), allowed
+        refuse_unless("identify design", found)
         self._scene, self._values = scene, parameters.values(scene, names)
         self._space = ActuatorSpaceMap(Geometry.of(scene))
         self._start = np.array(initial_state(scene, self._space.geometry)[:4])

@@ -233,9 +233,9 @@ class Regressor:
         self._traced = [n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"]
 
     def __call__(self, quaternion: Array, rate: Array, acceleration: Array) -> tuple[Array, Array]:
-        """Return the known torques [N m], shape (n, 3), and Y, shape (n, 3, len(names)), at n states.
+        """Return the known torques [N m], shape (n, 3), and Y, shape (n, 3, len(names)).
 
-        Those are quaternions (x, y, z, w) of {E} in {B}, W [rad/s] and W_dot [rad/s^2] in {E}.
+        States are quaternions (x, y, z, w) of {E} in {B}, W [rad/s] and W_dot [rad/s^2] in {E}.
         """
         count = len(quaternion)
         # A stiffness of zero leaves no rest angle: springs are evaluated at 1 N m/rad.

@@ -35,7 +35,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import compress
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,17 +44,11 @@ from scipy.linalg import solve_triangular
 from scipy.signal import butter, sosfiltfilt
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.errors import AssemblyError, InputError, Problem
+from sst_ros.errors import AssemblyError, InputError, Problem, refuse_unless
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, fit_weighted, scales
 from sst_ros.identification.measured_motion import Measured, MeasuredMotion, read_motion
-from sst_ros.identification.parameters import (
-    BaseParameters,
-    Identification,
-    Regressor,
-    find_base_parameters,
-    find_independent,
-)
+from sst_ros.identification.parameters import BaseParameters, Identification, Regressor
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -161,12 +154,16 @@ def fit_torques(
     names = parameters.select_names(scene, requested)
     measured = read_motion(data, scene, delay)
     reached = float(np.ptp(measured.gamma, axis=0).max())
-    if reached < STILL and scene.gravity is None:
-        _refuse(
-            "gamma",
-            reached,
-            f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia",
-        )
+    allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
+    weights = None if noise is None else np.asarray(list(noise), dtype=float)
+    three = weights is None or (
+        weights.shape == (3,) and np.all((weights > 0.0) & (weights < np.inf))
+    )
+    refuse_unless(
+        "identify",
+        ("gamma", reached, reached >= STILL or scene.gravity is not None, allowed),
+        ("noise", noise, bool(three), "must be three finite standard deviations > 0 [N m]"),
+    )
     regressor = Regressor(scene, names)
     known, columns, rows, band = form_equations(measured, regressor, cutoff)
     sound = ~measured.saturated[rows]
@@ -176,30 +173,23 @@ def fit_torques(
     )
     torque, columns = (measured.torque[rows] - known)[sound], columns[sound]
     samples = len(torque)
-    if samples <= len(names):
-        allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
-        _refuse("t", samples, allowed)
+    allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
+    refuse_unless("identify", ("t", samples, samples > len(names), allowed))
     if band is not None:
         period = float(np.median(np.diff(measured.t)))
         sines = max(int(np.ceil(2.0 * band * period * samples)), len(names))
         torque, columns = (
             np.asarray(dst(one, type=1, norm="ortho", axis=0)[:sines]) for one in (torque, columns)
         )
-    base = find_independent(columns, names)
-    if not base.chosen:
-        allowed = "must determine something: no torque depends on these parameters here"
-        _refuse("parameters", list(names), allowed)
-    deviations = None if noise is None else np.asarray(list(noise), dtype=float)
-    if deviations is not None and not (
-        deviations.shape == (3,) and np.all(np.isfinite(deviations) & (deviations > 0.0))
-    ):
-        _refuse("noise", noise, "must be three finite standard deviations > 0 [N m]")
-    estimate, root, found_noise = fit_weighted(columns[..., base.chosen], torque, deviations)
+    base = parameters.find_independent(columns, names)
+    allowed = "must determine something: no torque depends on these parameters here"
+    refuse_unless("identify", ("parameters", list(names), bool(base.chosen), allowed))
+    estimate, root, deviations = fit_weighted(columns[..., base.chosen], torque, weights)
     inverse = solve_triangular(root, np.eye(len(root)))
     given = parameters.values(scene, names)
     reach = max(scene.base.radius, scene.star.radius)
     values, excess = find_consistent_values(names, given, base.transform, estimate, root, reach)
-    whole = find_base_parameters(regressor)
+    whole = parameters.find_base_parameters(regressor)
     vague = np.linalg.norm(inverse, axis=1) > scales(names, given)[base.chosen]
     note = f"identified from {samples} samples"
     lost = [chosen not in base.chosen for chosen in whole.chosen]
@@ -215,7 +205,7 @@ def fit_torques(
         undetermined=tuple(compress(whole.labels, lost)),
         warnings=() if sound.all() else (warning,),
         base=base,
-        noise=found_noise,
+        noise=deviations,
         condition=float(np.linalg.cond(root / np.linalg.norm(root, axis=0))),
         excess=excess,
         vague=tuple(compress(base.labels, vague)),
@@ -223,10 +213,6 @@ def fit_torques(
         band=band,
         regressor=regressor,
     )
-
-
-def _refuse(name: str, value: object, allowed: str) -> NoReturn:
-    raise InputError("identify", [Problem(name, value, allowed)]) from None
 
 
 def form_equations(
@@ -274,7 +260,7 @@ def _follow_orientations(
         coarse = continuation.follow(coordinates.geometry, points, start).rotation
     except (AssemblyError, continuation.BranchEnds) as error:
         allowed = f"must be angles of this manipulator ({error})"
-        _refuse("gamma", first[0].tolist(), allowed)
+        raise InputError("identify", [Problem("gamma", first[0].tolist(), allowed)]) from None
     nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
     return coordinates.orientations(quaternion_of(coarse)[nearest], gamma)
 
@@ -303,18 +289,20 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
     """
     spacing = np.diff(t)
     period = float(np.median(spacing))
-    if np.abs(spacing - period).max() > 1e-3 * period:
-        _refuse("t", spacing, "must be evenly spaced (to 0.1 %) for angles to be filtered")
+    even = np.abs(spacing - period).max() <= 1e-3 * period
     if cutoff is None:
         cutoff = min(MARGIN * find_bandwidth(period, gamma), 0.4 / period)
-    if not 0.0 < cutoff < 0.5 / period:
-        allowed = f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz"
-        _refuse("cutoff", cutoff, allowed)
+    allowed = f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz"
+    refuse_unless(
+        "identify",
+        ("t", spacing, even, "must be evenly spaced (to 0.1 %) for angles to be filtered"),
+        ("cutoff", cutoff, 0.0 < cutoff < 0.5 / period, allowed),
+    )
     sections = butter(4, cutoff, fs=1.0 / period, output="sos")
     settled = int(np.ceil(1.0 / (cutoff * period)))
-    if len(t) < 4 * settled + 10:
-        allowed = f"must last {(4 * settled + 10) * period:g} s or more at {cutoff:g} Hz"
-        _refuse("t", float(t[-1] - t[0]), allowed)
+    least = 4 * settled + 10
+    allowed = f"must last {least * period:g} s or more at {cutoff:g} Hz"
+    refuse_unless("identify", ("t", float(t[-1] - t[0]), len(t) >= least, allowed))
     smooth = sosfiltfilt(sections, gamma, axis=0, padlen=min(3 * settled, len(t) - 1))
     return np.asarray(smooth), settled
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.traced_dynamics import TORQUE
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
 from sst_ros.extras import require
 from sst_ros.host import compiled_module
 from sst_ros.host.output import slices
@@ -95,17 +95,15 @@ class Batch:
     ) -> None:
         if compiled_module.numba_version() is None:
             require("numba")
-            raise InputError(scene.name, [Problem("SST_ROS_NUMBA", "0", "must not be set to 0")])
+            refuse_unless(scene.name, ("SST_ROS_NUMBA", "0", False, "must not be set to 0"))
         unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
-        problems = [
-            Problem(key, "given", unused[section])
-            for key in parameters or ()
-            if (section := key.partition(".")[0]) in unused
-        ]
-        if profile and scene.torque is None:
-            problems.append(Problem("torque", None, "must be given in the scene for its profile"))
-        if problems:
-            raise InputError(scene.name, problems)
+        given = {key: unused.get(key.partition(".")[0], "") for key in parameters or ()}
+        torque = not profile or scene.torque is not None
+        refuse_unless(
+            scene.name,
+            *((key, "given", not allowed, allowed) for key, allowed in given.items()),
+            ("torque", None, torque, "must be given in the scene for its profile"),
+        )
         self.scene, self._method = scene, method
         own = {key: copy.copy(values) for key, values in (parameters or {}).items()}
         self._scenarios = Scenarios(scene, own)
@@ -159,15 +157,12 @@ class Batch:
             InputError: an argument is not allowed; names it and what is.
 
         """
-        problems = []
-        if not (np.isfinite(step) and step > 0.0):
-            problems.append(Problem("step", step, "must be finite and > 0 [s]"))
-        for name, value in (("count", count), ("keep_every", keep_every), ("threads", threads)):
-            if value < 0:
-                problems.append(Problem(name, value, "must be >= 0"))
-        if problems:
-            raise InputError("batch", problems)
-
+        whole = {"count": count, "keep_every": keep_every, "threads": threads}
+        refuse_unless(
+            "batch",
+            ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
+            *((name, value, value >= 0, "must be >= 0") for name, value in whole.items()),
+        )
         loop = advance or partial(self.advance, threads=threads)
         y, code = self.start(gamma, gamma_dot)
         number = y.shape[1]
@@ -283,12 +278,14 @@ def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
     if count is not None and rows.shape == (3,):
         rows = np.tile(rows, (count, 1))
     expected = "(N, 3)" if count is None else f"(3,) or ({count}, 3)"
-    if rows.ndim != 2 or rows.shape[1] != 3 or (count is not None and len(rows) != count):
-        raise InputError("batch", [Problem(name, rows.shape, f"must have the shape {expected}")])
-    if not np.all(np.isfinite(rows)):
-        raise InputError("batch", [Problem(name, rows, "must be finite")])
-    if name == "gamma" and np.any(np.abs(rows) > TURN):
-        raise InputError("batch", [Problem(name, rows, "must not exceed 2 pi: in rad?")])
+    fits = rows.ndim == 2 and rows.shape[1] == 3 and count in (None, len(rows))
+    most = TURN if name == "gamma" else np.inf
+    refuse_unless(
+        "batch",
+        (name, rows.shape, fits, f"must have the shape {expected}"),
+        (name, rows, bool(np.isfinite(rows).all()), "must be finite"),
+        (name, rows, not np.any(np.abs(rows) > most), "must not exceed 2 pi: in rad?"),
+    )
     return rows
 
 

@@ -18,17 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import Controller
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.law import (
-    ControlLaw,
-    bound,
-    command_limit,
-    feedback_gains,
-    feedforward_torques,
-    is_above,
-)
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
@@ -232,15 +225,15 @@ class ControlledBatch:
             desired = Reference(**{name: given[name] for name in _DESIRED})
             limit = gains["limit"][0] if self._limited else None
             numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
-            law = ControlLaw(control, torque, accelerate, *numbers, control.period)
+            scheme = law.ControlLaw(control, torque, accelerate, *numbers, control.period)
             ahead = given["feedforward"], given["held"]
-            found = law.answer(desired, ahead, gamma, gamma_dot, observed, memory["integral"])
+            found = scheme.answer(desired, ahead, gamma, gamma_dot, observed, memory["integral"])
             first, queue = given["first"][0], memory["queue"]
             sent, new["queue"] = control.transmit(found.torque, queue, first)
             if self._limited:
                 cut = axpy(1.0, found.total, -1.0, found.torque)
-                new["limited"] = (memory["limited"][0] + is_above(dot3(cut, cut)),)
-                sent = bound(sent, gains["plant_limit"][0])
+                new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
+                sent = law.bound(sent, gains["plant_limit"][0])
             off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
             sums, most = (zip(memory[name], off, strict=True) for name in ("squares", "largest"))
             new |= {"observed": observed, "integral": found.integral}
@@ -316,7 +309,9 @@ class ControlledBatch:
         for k in range(self.samples + 1):
             time = k * round(period * 1e9) / 1e9
             at = self._motion.at(time)
-            torques = feedforward_torques(control, inverse, self._motion, at, time + 0.5 * period)
+            torques = law.feedforward_torques(
+                control, inverse, self._motion, at, time + 0.5 * period
+            )
             desired = (number for name in _DESIRED for number in getattr(at, name))
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)
@@ -331,10 +326,10 @@ class ControlledBatch:
 
         varies = {"control.stiffness", "control.damping"} & given.keys()
         rows = (
-            *feedback_gains(self._inertia, value, self._control.direct or bool(varies)),
+            *law.feedback_gains(self._inertia, value, self._control.direct or bool(varies)),
             self._inertia,
             value("integral_rate"),
-            command_limit(value("torque_limit"), self._scene),
+            law.command_limit(value("torque_limit"), self._scene),
             batch.columns.torque_limit,
             value("angle_noise"),
             value("rate_noise"),

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
 from sst_ros.extras import require
 from sst_ros.host.output import TEMPORARY, Bar, require_free, write_into
 from sst_ros.scene.scene import scene_of
@@ -95,11 +95,12 @@ def run_study(
     """Run a study and return its table; see `sweep`."""
     for module in ("pandas", "pyarrow"):
         require(module)
-    if type(workers) is not int or not 0 <= workers <= 1024:
-        allowed = "must be a whole number from 0 to 1024"
-        raise InputError("sweep", [Problem("workers", workers, allowed)])
-    if resume and out is None:
-        raise InputError("sweep", [Problem("resume", True, "needs out")])
+    whole = type(workers) is int and 0 <= workers <= 1024
+    refuse_unless(
+        "sweep",
+        ("workers", workers, whole, "must be a whole number from 0 to 1024"),
+        ("resume", resume, out is not None or not resume, "needs out"),
+    )
     steps = None
     if out is not None:
         out = out.resolve()
