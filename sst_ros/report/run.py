@@ -20,6 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from sst_ros.control.tracking import tracking_table
 from sst_ros.extras import require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
-"""Pictures of `plot` that a report has, too."""
+TRACKING_DRAWN = ("tracking", "tracking_error", "control_torques")
+"""Pictures of `plot` that the reports have, too."""
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
 
@@ -114,6 +116,28 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
 
 def _encode(picture: Path) -> str:
     return base64.b64encode(picture.read_bytes()).decode("ascii")
+
+
+def write_tracking_report(bag: Path, out: Path) -> str:
+    """Evaluate how a recorded run followed its reference: write table and pictures into `out`.
+
+    The table is returned.
+
+    Raises:
+        InputError: the bag is no whole recording of a run that tracked a reference, or `out`
+            cannot be written.
+
+    """
+    tracked = tracking.read_tracking(bag)
+    title = f"Tracking of {tracked.recording.scene.name}, from {bag}"
+    lines = [title, "", tracking_table(tracked.metrics)]
+    if (worst := largest(tracked.orientation_error)) is not None:
+        lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
+    text = "\n".join(lines)
+    with write_into(out, "report"):
+        (out / "tracking.txt").write_text(text, encoding="utf-8")
+    pictures.draw_run(tracked.recording.signals, out, TRACKING_DRAWN, ["png"])
+    return text
 
 
 def summary_text(summary: dict[str, Any], folder: str) -> str:

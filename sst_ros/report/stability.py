@@ -31,14 +31,8 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, legend, note, styled
+from sst_ros.report import scene_summary as advised
 from sst_ros.report.results import WHOLE_RUN_S, data_frame, provenance, publish, records, render
-from sst_ros.report.scene_summary import (
-    LONGEST_S,
-    TOLERANCE,
-    eigenvalues,
-    largest_stable_step,
-    step_advice,
-)
 from sst_ros.scene.scene import Scene, with_initial
 from sst_ros.scene.schema import key_of, leaves
 from sst_ros.simulation.simulate import simulate
@@ -118,9 +112,9 @@ def examine_stability(
             allowed = f"must be one of {', '.join(ROWS)}{suggestion(name, ROWS)}"
             raise InputError("report stability", [Problem("--only", name, allowed)])
     chosen = [name for name in ROWS if name in only or not only]
-    seconds = min(scene.duration or WHOLE_RUN_S, LONGEST_S)
+    seconds = min(scene.duration or WHOLE_RUN_S, advised.LONGEST_S)
     began = time.perf_counter()
-    motion = simulate(scene, duration=seconds, tolerance=TOLERANCE)
+    motion = simulate(scene, duration=seconds, tolerance=advised.TOLERANCE)
     if shown:
         about = max(1.0, 2.0 * (time.perf_counter() - began)) * len(chosen)
         print(f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about {about:.0f} s")
@@ -130,7 +124,7 @@ def examine_stability(
         what, change = ROWS[name]
         rows.append({"name": name, "change": what} | _run(change(scene, motion), seconds))
     steps = _steps(scene, motion)
-    return StabilityReport(scene.name, steps, step_advice(scene).text, data_frame(rows))
+    return StabilityReport(scene.name, steps, advised.step_advice(scene).text, data_frame(rows))
 
 
 def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
@@ -140,9 +134,11 @@ def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
     for k, t in enumerate(instants.t.tolist()):
         state = (*instants.quaternion[k].tolist(), *instants.body_rate[k].tolist())
         torque = instants.torque[k].tolist()
-        values = eigenvalues(scene, (*state, *torque) if scene.lags else state, torque)
+        values = advised.eigenvalues(scene, (*state, *torque) if scene.lags else state, torque)
         decay, oscillation = max(0.0, -values.real.min()), np.abs(values.imag).max()
-        limits = {name: largest_stable_step(method, values) for name, method in METHODS.items()}
+        limits = {
+            name: advised.largest_stable_step(method, values) for name, method in METHODS.items()
+        }
         rows.append({"t_s": t, "decay": float(decay), "oscillation": float(oscillation), **limits})
     return data_frame(rows)
 
@@ -157,7 +153,7 @@ def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
         with np.errstate(all="ignore"):
             run, fine = (
                 simulate(changed, duration=seconds, tolerance=tolerance)
-                for tolerance in (TOLERANCE, FINER * TOLERANCE)
+                for tolerance in (advised.TOLERANCE, FINER * advised.TOLERANCE)
             )
     except SstError as fault:
         result, passed = f"{type(fault).__name__}: {str(fault).splitlines()[0]}", True

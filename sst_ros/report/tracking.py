@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a recorded run followed its reference, from the bag alone: figures, table, picture."""
+"""How well a recorded run followed its reference, from the bag alone."""
 
 from __future__ import annotations
 
@@ -10,20 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.control.tracking import Track, TrackingMetrics, track_of, tracking_table
+from sst_ros.control.tracking import Track, TrackingMetrics, track_of
 from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.host.output import write_into
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, places
 from sst_ros.state import NANOSECONDS
 
-PICTURES = ("tracking", "tracking_error", "control_torques")
 KEYS = (REFERENCE.key, TRACKING_ERROR.key)
 
 
@@ -101,24 +98,3 @@ def of(run: Recording) -> TrackedRun | None:
     seconds = times[:, None] / NANOSECONDS
     columns = seconds, reference[:, :6], error[:, :6], feedforward, feedback, torque
     return TrackedRun(run, track_of(np.hstack(columns)), rows)
-
-
-def write_tracking_report(bag: Path, out: Path) -> str:
-    """Evaluate a recorded run: write the table and the pictures into `out`, return the table.
-
-    Raises:
-        InputError: the bag is no whole recording of a run that tracked a reference, or `out`
-            cannot be written.
-
-    """
-    tracked = read_tracking(bag)
-    title = f"Tracking of {tracked.recording.scene.name}, from {bag}"
-    lines = [title, "", tracking_table(tracked.metrics)]
-    if np.isfinite(tracked.orientation_error).any():
-        worst = float(np.nanmax(tracked.orientation_error))
-        lines.append(f"{'orientation, largest [rad]':26}{worst:10.3e}\n")
-    text = "\n".join(lines)
-    with write_into(out, "report"):
-        (out / "tracking.txt").write_text(text, encoding="utf-8")
-    pictures.draw_run(tracked.recording.signals, out, PICTURES, ["png"])
-    return text

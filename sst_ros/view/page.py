@@ -35,18 +35,6 @@ _WINDOW_S = 10.0
 _POINTS = 500
 _COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in LEG_COLOURS)
 _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
-_DIAGNOSTICS = {
-    "error_estimate": ("error estimate", "rad", ".1e"),
-    "energy_residual_J": ("energy residual", "J", ".1e"),
-    "closure_residual": ("loop-closure error", "", ".1e"),
-    "real_time_factor_now": ("real-time factor", "", ".3f"),
-    "step_mean_us": ("mean step", "µs", ".0f"),
-    "ticks_missed": ("missed ticks", "", ".0f"),
-    "commands_dropped": ("commands dropped", "", ".0f"),
-    "integrator": ("integrator", "", ""),
-    "fault": ("fault", "", ""),
-}
-"""Diagnostics that are shown: label, unit, format."""
 
 _templates = jinja2.Environment(
     loader=jinja2.PackageLoader("sst_ros.view"),
@@ -197,12 +185,8 @@ class _Panel:
         # No minus before a zero.
         shown = [(name, unit, (values + 0.0).tolist()) for name, unit, values in rows]
         self._joints.content = str(_PANEL.joints(_COLOURS, shown))
-        values = [
-            (label, f"{_format(status.values[key], form)} {unit}")
-            for key, (label, unit, form) in _DIAGNOSTICS.items()
-            if status.values.get(key)
-        ]
-        self._status.content = str(_PANEL.status(_LEVELS[status.level], status.message, values))
+        shown = _PANEL.status(_LEVELS[status.level], status.message, status.values)
+        self._status.content = str(shown)
 
     def draw(self) -> None:
         """Draw the plots."""
@@ -228,13 +212,6 @@ def _plot(server: ViserServer, label: str, range_: tuple[float, float]) -> GuiUp
         legend={"show": False},
         height=130,
     )
-
-
-def _format(text: str, form: str) -> str:
-    try:
-        return format(float(text), form) if form else text
-    except ValueError:
-        return text
 
 
 class _RunControls:

@@ -23,6 +23,7 @@ from sst_ros.report.run import (
     summary_table,
     summary_text,
     write_run_report,
+    write_tracking_report,
 )
 from sst_ros.scene import scene
 
@@ -455,7 +456,7 @@ def test_the_last_report_says_how_often_a_torque_was_limited(bags, followed, wri
 
 
 def test_the_report_writes_a_table_and_a_picture(followed, written, tmp_path):
-    told = tracking.write_tracking_report(written(followed), tmp_path)
+    told = write_tracking_report(written(followed), tmp_path)
     assert (tmp_path / "tracking.txt").read_text(encoding="utf-8") == told
     assert "error, largest" in told and "nan" not in told
     for name in ("tracking", "tracking_error", "control_torques"):
@@ -466,7 +467,7 @@ def test_a_recording_without_a_reference_or_of_other_joints_is_refused(
     bags, followed, written, tmp_path
 ):
     with pytest.raises(InputError, match="reference"):
-        tracking.write_tracking_report(written(bags.without(followed, bags.DESIRED)), tmp_path)
+        write_tracking_report(written(bags.without(followed, bags.DESIRED)), tmp_path)
     names = {"name": ["a", "b", "c"]}
     renamed = bags.edited(followed, bags.ERROR, 3, lambda one: dataclasses.replace(one, **names))
     with pytest.raises(InputError, match="tracking_error"):
