@@ -7,13 +7,12 @@ curve matplotlib leaves out what no picture could show (`path.simplify`).
 
 from __future__ import annotations
 
-import functools
 import io
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ParamSpec, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
@@ -68,19 +67,8 @@ STYLE: Any = {
 SMALLEST_SHOWN = 1e-17
 """Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
 
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
-
-def styled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Give a function that makes a figure the style."""
-
-    @functools.wraps(function)
-    def within(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        with mpl.rc_context(STYLE):
-            return function(*args, **kwargs)
-
-    return within
+styled = mpl.rc_context(STYLE)
+"""Gives a function that makes a figure the style, as a decorator."""
 
 
 @styled
