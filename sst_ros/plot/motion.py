@@ -26,9 +26,7 @@ NUMBERS = {
     "example2": {"path_of_E": 10, "position_of_E": 11, "theta": 12, "phi": 13, "psi": 14},
 }
 """Number of a picture in the paper, by the name of the scene."""
-
 ASSUMPTION = "assumed inertias: the paper's are lost"
-
 LEAST_POSITION_M, LEAST_ANGLE_DEG = 0.05, 1.0
 """An axis never shows less than this, so that rounding is a flat line."""
 

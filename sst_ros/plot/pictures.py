@@ -25,10 +25,7 @@ from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 
 FORMATS = ("pdf", "png")
-
-DEGREES = float(np.degrees(1.0))
-"""Angles are drawn in degrees, their errors in radians."""
-
+DEGREES = float(np.degrees(1.0))  # angles are drawn in degrees, their errors in radians
 QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
 

@@ -26,12 +26,8 @@ from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
 from sst_ros.plot.style import BLUE, GREY, INK, Looks, sides, styled
 from sst_ros.scene.scene import Scene
 
-WORST_COND = 10.0
-"""cond J from which on the colour stays the same."""
-
-LABEL_INSET = math.radians(5.0)
-"""Distance from a side of the triangle below which a contour has no label."""
-
+WORST_COND = 10.0  # from this cond J on the colour stays the same
+LABEL_INSET = math.radians(5.0)  # less far from a side of the triangle a contour has no label
 _ALARM = "#d1182b"
 
 

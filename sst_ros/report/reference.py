@@ -45,16 +45,12 @@ Held: TypeAlias = tuple[Integers, Integers, Array]
 """Ticks: when each begins and ends, from the start of the run on [ns], shape (m,), and what is held
 over it: torques, and a moment on the star in {B} where the scene takes one [N m], (m, 3 or 6)."""
 
-LONGEST_TICK_NS = 1_000_000
-"""Longer ticks are divided [ns]."""
-TICK_TOLERANCE, TICK_BUDGET = 1e-13, 3600
-"""Largest local error estimate of a step; evaluations that a tick may take: a hundred steps."""
-COMPILED_FROM = 10_000
-"""From this number of ticks on compilation costs less than it saves."""
-PLAIN_TICKS = 60_000
-"""So many ticks are compared in plain Python, a minute's work."""
-CHUNK = 25_000
-"""So many ticks at a time, which bounds the memory."""
+LONGEST_TICK_NS = 1_000_000  # longer ticks are divided [ns]
+TICK_TOLERANCE = 1e-13  # largest local error estimate of a step
+TICK_BUDGET = 3600  # evaluations that a tick may take: a hundred steps
+COMPILED_FROM = 10_000  # from this number of ticks on compilation costs less than it saves
+PLAIN_TICKS = 60_000  # so many are compared in plain Python, a minute's work
+CHUNK = 25_000  # so many ticks at a time, which bounds the memory
 SAME_START = 1e-9
 """Largest difference [rad], [rad/s] between a first sample and the start that its scene asks for,
 where samples are lost and the first one may belong to a later time."""
@@ -215,10 +211,10 @@ def compare_with_paper(
     return (max(differences) / (max(sizes) or 1.0) if sizes else None), len(sizes)
 
 
-def check_with_paper(recording: Recording, count: int = 20) -> tuple[float | None, int]:
-    """Compare at samples spread over the run, under the torques recorded there."""
+def check_with_paper(recording: Recording) -> tuple[float | None, int]:
+    """Compare at twenty samples spread over the run, under the torques recorded there."""
     whole = np.flatnonzero(np.isfinite(recording.quaternion).all(axis=1))
-    chosen = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(whole) - 1, 20).round().astype(int))
     samples = whole[chosen] if len(whole) else whole
     # The torque that acts, lagged or not.
     acting = recording.effort[samples].tolist()

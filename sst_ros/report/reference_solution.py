@@ -43,17 +43,12 @@ from sst_ros.state import NANOSECONDS
 LongArray: TypeAlias = NDArray[np.longdouble]
 EXTENDED, MPMATH = "long double", "mpmath"
 
-DIGITS = 30
-"""Decimal digits of mpmath's numbers."""
-
+DIGITS = 30  # decimal digits of mpmath's numbers
 LONGEST_S = 20.0
 """The reference stays in double precision where extended precision would take more than this [s]:
 a work-precision study of one scene then stays below a minute."""
-
 _MOST_STEPS = 200_000
-
-INTERVALS = 20
-"""Solutions are compared at this many instants or more."""
+INTERVALS = 20  # solutions are compared at this many instants or more
 
 EXACT = replace(
     DOP853,

@@ -43,10 +43,8 @@ TRACKING_DRAWN = ("tracking", "tracking_error", "control_torques")
 
 SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
 
-ERROR_LIMIT_RAD = 1e-9
-"""Integration error above which a run is warned of, where its tolerance was not recorded."""
-ANSWERED_PERCENT = 90.0
-"""Share of samples that a controller at the sample rate answers."""
+ERROR_LIMIT_RAD = 1e-9  # of the integration, where the tolerance of the run was not recorded
+ANSWERED_PERCENT = 90.0  # share of samples that a controller at the sample rate answers
 FORMULATION_LIMIT = 1e-9
 
 

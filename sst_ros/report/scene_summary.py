@@ -150,14 +150,9 @@ def cost_table(scene: Scene) -> list[dict[str, Any]]:
     return [dict(zip(names, (scene.name, *row), strict=True)) for row in rows]
 
 
-LONGEST_S = 10.0
-"""The advice is for a run of the scene's duration, but not of more than this [s]."""
-
-TOLERANCE = 1e-9
-"""Error of the orientation that the advice is for [rad]: the default of `simulate`."""
-
-GROWTH = 1e-6
-"""abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i."""
+LONGEST_S = 10.0  # the advice is for a run of the scene's duration, but not of more [s]
+TOLERANCE = 1e-9  # error of the orientation that it is for [rad]: the default of `simulate`
+GROWTH = 1e-6  # abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i
 
 
 class StepAdvice(NamedTuple):

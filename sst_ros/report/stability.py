@@ -42,21 +42,13 @@ from sst_ros.state import Array
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-INSTANTS = 50
-"""The motion is linearised at this many instants."""
-
+INSTANTS = 50  # at which the motion is linearised
 FINER, FACTOR, ROUNDING = 1e-2, 10.0, 1e-13
 """A run is checked by one for FINER times the tolerance. Its estimate holds if the true error is at
 most FACTOR times as large, or ROUNDING [rad]."""
-
-TURNS = 181
-"""Turns of the star about each axis, up to pi, among which limits and singularities are found."""
-
-SPIN = 1.0
-"""Angular velocity with which a run goes from a limit into it [rad/s]."""
-
-BESIDE = 1e-3
-"""Angle between a singular pose and the start beside it [rad]."""
+TURNS = 181  # of the star about each axis, up to pi: limits and singularities lie between them
+SPIN = 1.0  # angular velocity with which a run goes from a limit into it [rad/s]
+BESIDE = 1e-3  # angle between a singular pose and the start beside it [rad]
 
 Change: TypeAlias = "Callable[[Scene, Trajectory], Scene | str]"
 """Makes another scene of one and its motion, or gives the reason why there is none."""

@@ -46,25 +46,15 @@ FIXED, TOLERANCE = "fixed steps", "tolerance"
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 _TOLERANCES = tuple(10.0**-n for n in range(4, 14))
 
-ABOVE_REFERENCE = 100.0
-"""Errors are reported only if they are so many times larger than the reference's own."""
-
-USELESS = 0.1
-"""An orientation error above this [rad] is a failure."""
-
-ROUNDING = 2e-14
-"""Finer steps are not expected to give less than this [rad]."""
-
-LONGEST_RUN_S = 0.4
-"""No finer settings are tried after a run that took longer than this [s]."""
-
+ABOVE_REFERENCE = 100.0  # errors are reported if they are so many times the reference's own
+USELESS = 0.1  # an orientation error above this [rad] is a failure
+ROUNDING = 2e-14  # finer steps are not expected to give less than this [rad]
+LONGEST_RUN_S = 0.4  # no finer settings are tried after a run that took longer than this [s]
 LEAST_SETTINGS = 3
 """So many settings of each method are tried even where they take longer: a busy machine slows one
 run, but must not empty the grid."""
-
-SLOWER = 5.0
-"""`Simulation` under torques that are clamped is plain Python and may take so much longer."""
-
+SLOWER = 5.0  # so much longer `Simulation` may take under clamped torques, in plain Python
+SAME_EQUATIONS = 1e-10  # kernel and the paper's equations must agree to this part
 _REPEAT_S, _REPEATS = 0.15, 15
 
 ERROR = "largest_orientation_rad"
@@ -80,9 +70,6 @@ COLUMNS = (
 """Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
 `evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
 for a failure, and `failure` for a success."""
-
-SAME_EQUATIONS = 1e-10
-"""Kernel and the paper's equations must agree to this part."""
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,9 @@ from sst_ros.view.server import LOCAL, PORT, PageServer
 from sst_ros.view.source import Replay, RunControl, RunStatus, ViewState
 
 PERIOD_S = 1.0 / 30.0
-_SHOW_EVERY, _DRAW_EVERY = 3, 6
-"""Frames between two updates of the numbers, and of the plots."""
+_SHOW_EVERY, _DRAW_EVERY = 3, 6  # frames between two updates of the numbers, and of the plots
 _PANEL_WIDTH = 400.0
-_LARGEST_TORQUE = 5.0
-"""Range of the torque sliders where the scene has no limit [N m]."""
+_LARGEST_TORQUE = 5.0  # range of the torque sliders where the scene has no limit [N m]
 _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
 _REFUSAL_S = 4.0
 _WINDOW_S = 10.0

@@ -24,8 +24,7 @@ _LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
 """The path lies a little outside the star, which would hide it; newer parts above older ones."""
 _OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
 _ROOT = "/manipulator"
-_SIDES = 20
-"""Corners of an arc's cross-section."""
+_SIDES = 20  # corners of an arc's cross-section
 
 
 class SceneDrawing:

@@ -35,8 +35,7 @@ LOCAL = "127.0.0.1"
 PORT = 8080
 TITLE = "sst_ros"
 _PORTS = (1024, 65535)
-_TRIED = 100
-"""Ports that are tried from the given one on."""
+_TRIED = 100  # ports, from the given one on
 
 Handler = Callable[[ServerConnection, Request], Response | None]
 _starting = threading.Lock()

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,12 +19,10 @@ from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Vector3
 
-_PUBLISH_RATE = 100
-"""Samples a second of a simulator that is only looked at [Hz]: more than a screen shows."""
+_PUBLISH_RATE = 100  # of a simulator that is only looked at [Hz]: more than a screen shows
 
 
-@dataclass(frozen=True)
-class ViewState:
+class ViewState(NamedTuple):
     """The manipulator at one instant, by leg."""
 
     time: float | None  # of the run [s]; None for a state that is shown while there is no run
