@@ -203,17 +203,16 @@ class ODE:
 
     def derivative(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative at the time, the state and the drive given, of any kind."""
-        return self._slope(self._dynamics.model, self._torque, self._limit, time, inputs)
+        return self._slope((self._dynamics.model, self._torque, self._limit), time, *inputs)
 
-    def _of_numbers(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
+    def _of_numbers(self, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative with numbers that may be others in another scene."""
         torque = number_constants(self._torque, ("torque",))
         limit = number_constants(self._limit, ("limit",))
-        return self._slope(self._dynamics.numbers, torque, limit, time, inputs)
+        return self._slope((self._dynamics.numbers, torque, limit), *inputs)
 
-    def _slope(
-        self, model: Any, sine: Any, limit: Any, time: Any, inputs: tuple[Any, ...]
-    ) -> tuple[Any, ...]:
+    def _slope(self, constants: tuple[Any, Any, Any], time: Any, *inputs: Any) -> tuple[Any, ...]:
+        model, sine, limit = constants
         state, drive = inputs[: len(self._dynamics.state)], inputs[len(self.state) :]
         torque, moment = drive[:3], drive[3:]
         if sine is not None:

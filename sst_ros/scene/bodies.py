@@ -103,25 +103,20 @@ class Base(Section):
     )
     radius: float = positive("radius of the base sphere", "m")
 
-    def __post_init__(self) -> None:
-        """Check, and replace arcs by directions."""
-        super().__post_init__()
-        if self.arcs_deg is not None:
-            object.__setattr__(self, "v", directions_of(*np.radians(self.arcs_deg).tolist()))
-            object.__setattr__(self, "arcs_deg", None)
-            super().__post_init__()
-
-    def check(self) -> Iterator[Problem]:
-        """Refuse arcs that close no triangle."""
-        arcs = self.arcs_deg
-        if self.v is not None:
-            yield from super().check()
-        elif arcs is not None and not 2.0 * max(arcs) < sum(arcs) < 360.0:
-            allowed = "must close: each less than the sum of the others, their sum less than 360"
-            yield Problem("arcs_deg", arcs, f"{allowed} deg")
+    def settle(self) -> Iterator[Problem]:
+        """Replace arcs by directions; refuse those that close no triangle."""
+        if (arcs := self.arcs_deg) is not None and self.v is None:
+            if 2.0 * max(arcs) < sum(arcs) < 360.0:
+                object.__setattr__(self, "v", _directions_of(*np.radians(arcs).tolist()))
+                object.__setattr__(self, "arcs_deg", None)
+            else:
+                allowed = "must close: each less than the sum of the others, their sum less than"
+                yield Problem("arcs_deg", arcs, f"{allowed} 360 deg")
 
     def rules(self) -> Rules:
         """Refuse triangles without area and left-handed ones."""
+        if self.v is None:
+            return
         v = np.moveaxis(np.asarray(self.v), (0, 1), (-2, -1))
         lengths = np.linalg.norm(v, axis=-1)
         unit = v / lengths[..., None]
@@ -142,7 +137,7 @@ class Base(Section):
             yield broken, "v", self.v, allowed
 
 
-def directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3, Vector3]:
+def _directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3, Vector3]:
     """Directions of the corners of a spherical triangle with these arcs [rad], as in `Base`."""
     half = 0.5 * (a12 + a23 + a31)
     product = math.sin(half) * math.sin(half - a12) * math.sin(half - a23) * math.sin(half - a31)
@@ -178,23 +173,15 @@ class Link(Section):
         """The inertia, shape (3, 3) [kg m^2], zero without one."""
         return _matrix_of(entries_of(self.inertia))
 
-    def __post_init__(self) -> None:
-        """Check, and replace an inertia about the centre of mass by that about O."""
-        super().__post_init__()
-        if self.inertia_about == ABOUT_CENTRE and self.inertia is not None:
-            point = point_inertia(self.mass, self.centre)
-            about_o = (
-                own + part for own, part in zip(entries_of(self.inertia), point, strict=True)
-            )
-            object.__setattr__(self, "inertia", _inertia_of(about_o))
+    def settle(self) -> Iterator[Problem]:
+        """Replace an inertia about the centre of mass by that about O."""
+        if self.inertia_about == ABOUT_CENTRE:
+            if self.mass == 0.0 or self.inertia is None:
+                yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
+                return
+            shifted = _shift(self.inertia, self.mass, self.centre)
+            object.__setattr__(self, "inertia", _inertia_of(shifted))
             object.__setattr__(self, "inertia_about", ABOUT_O)
-
-    def check(self) -> Iterator[Problem]:
-        """Refuse an inertia about no centre of mass."""
-        if self.inertia_about == ABOUT_O:
-            yield from super().check()
-        elif self.mass == 0.0 or self.inertia is None:
-            yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
 
     def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
@@ -254,8 +241,7 @@ class Payload(Section):
     @property
     def entries(self) -> list[Any]:
         """Inertia about O in {E}: xx, yy, zz, xy, xz, yz [kg m^2]."""
-        point = point_inertia(self.mass, self.centre)
-        return [own + part for own, part in zip(entries_of(self.inertia), point, strict=True)]
+        return _shift(self.inertia, self.mass, self.centre)
 
     @property
     def about_o(self) -> NDArray[np.float64]:
@@ -278,6 +264,12 @@ def point_inertia(mass: Any, centre: Any) -> list[Any]:
     """Return the six numbers of a point about O, which may be columns or symbols."""
     square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
     return [mass * (square * float(i == j) - centre[i] * centre[j]) for i, j in PLACES]
+
+
+def _shift(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
+    """Six numbers about O of an inertia about the centre of mass (parallel axes)."""
+    point = point_inertia(mass, centre)
+    return [own + part for own, part in zip(entries_of(inertia), point, strict=True)]
 
 
 def _matrix_of(entries: Iterable[Any]) -> NDArray[np.float64]:

@@ -336,8 +336,9 @@ class Scenarios:
         doubtful: Any = np.zeros(self.count or 0, dtype=bool)
         for key, spec in self._fields.values():
             flat = self.rows[key].reshape(len(self.rows[key]), -1)
-            least = max(SMALLEST if spec.above == 0.0 else spec.least, -LARGEST)
-            fits = (flat >= least) & (flat <= min(spec.most, LARGEST))  # a nan is neither
+            fits = spec.allows(flat) & (abs(flat) <= LARGEST)
+            if spec.above == 0.0:
+                fits &= flat >= SMALLEST
             doubtful = doubtful | ~fits.all(axis=1)
         with np.errstate(all="ignore"):
             for _, part in walk(self.columns()):

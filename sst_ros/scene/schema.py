@@ -60,6 +60,10 @@ class Spec:
     needs: str = ""
     default: Any = REQUIRED
 
+    def allows(self, x: Any) -> Any:
+        """Whether numbers keep the bounds; a nan does not."""
+        return (x > self.above) & (x >= self.least) & (x <= self.most)
+
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
         return self.describe() + (": in rad?" if self.most == TURN else "")
@@ -159,7 +163,7 @@ class Section:
                     object.__setattr__(self, name, accept(spec, value))
                 except ValueError:
                     problems.append(Problem(name, value, spec.refuse()))
-        problems = problems or [*self._find_idle(), *self.check()]
+        problems = problems or [*self.settle()] or [*self._find_idle(), *self.check()]
         if problems:
             raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
 
@@ -183,6 +187,10 @@ class Section:
 
     def _has_any(self, names: tuple[str, ...]) -> bool:
         return any(has_effect(getattr(self, name)) for name in names)
+
+    def settle(self) -> Iterator[Problem]:
+        """Put what may be given in several forms into one; yield what forbids that."""
+        return iter(())
 
     def check(self) -> Iterator[Problem]:
         """Yield the faults that no single field shows; override where rules are not enough."""
@@ -303,7 +311,7 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if isinstance(value, bool) or (isinstance(value, str) and not _NUMBER.fullmatch(value)):
         raise ValueError
     result = float(value)
-    if not math.isfinite(result) or not spec.least <= result <= spec.most or result <= spec.above:
+    if not (math.isfinite(result) and spec.allows(result)):
         raise ValueError
     return result
 

@@ -75,7 +75,7 @@ class Variation:
         for target in self.targets if self.kind != "table" else ():
             numbers, spec = self.parameters(reached)[target.key], target.spec
             known = numbers[np.isfinite(numbers)]
-            if not np.all((known > spec.above) & (known >= spec.least) & (known <= spec.most)):
+            if not np.all(spec.allows(known)):
                 words = f"it reaches from {known.min()} to {known.max()}"
                 raise ValueError(f"{spec.refuse()}; {words}")
 
