@@ -42,8 +42,6 @@ are zero before."""
 JointRanges = Sequence[tuple[int, float, float]]
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
-_LANES = 4
-"""The loop over the columns of a Jacobian is a multiple of this long: numbers in a register."""
 
 
 _SHARED = (
@@ -292,7 +290,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
         constants |= method.constants
         slope = [f"slope[{i}]" for i in range(size)]
         if slots is not None:
-            texts.append(_linearise(system, slots))
+            texts.append(system.linearise_by_columns(slots))
         else:  # without a compiler the columns in a row take less time
             texts.append(system.jacobian.source("jacobian"))
             texts.append(inspect.getsource(step_loops.linearise))
@@ -305,54 +303,6 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
     texts += [inspect.getsource(function) for function in _LOOPS]
     base = compiled_module.SharedFunctions(tuple(shared), common)
     return _MethodSource(base, texts, constants, slots.values if slots else [])
-
-
-def _linearise(system: ODE, slots: Slots) -> str:
-    """Source of `linearise` for numba: all columns of the Jacobian in a loop over directions.
-
-    It is half as long as the operations of each column in a row, which takes half the time to
-    compile, and the compiler takes four columns at once; the digits are those of the columns.
-
-        def linearise(t, state, d, p, slope, by_time, matrix):
-            x = state[0]
-            t1 = d[0]
-            c0 = p[0]
-            v0 = x * x
-            slope[0] = v7
-            columns = vector(64)
-            for k in range(8):
-                d_x = 1.0 if k == 0 else 0.0
-                v8 = d_x * v0
-                columns[0 + k] = v9
-            for i in range(8):
-                by_time[i] = columns[8 * i + 7]
-                for k in range(7):
-                    matrix[i][k] = columns[8 * i + k]
-    """
-    size, variables, program = len(system.state), system.variables, system.directional
-    directions = [f"d_{name}" for name in variables]
-    lines, results = program.body(slots)
-    inner = program.steps_of(directions)
-    width = -(-len(variables) // _LANES) * _LANES
-    states = len(variables) - ("t" in variables)
-    body = [
-        *(f"{name} = state[{i}]" for i, name in enumerate(system.state)),
-        *(f"{name} = d[{i}]" for i, name in enumerate(system.drive)),
-        *slots.reads([*lines, *results]),
-        *(line for line, along in zip(lines, inner, strict=True) if not along),
-        *(f"slope[{i}] = {result}" for i, result in enumerate(results[:size])),
-        f"columns = vector({size * width})",
-        f"for k in range({width}):",
-        *(f"    {name} = 1.0 if k == {k} else 0.0" for k, name in enumerate(directions)),
-        *(f"    {line}" for line, along in zip(lines, inner, strict=True) if along),
-        *(f"    columns[{i * width} + k] = {result}" for i, result in enumerate(results[size:])),
-        f"for i in range({size}):",
-        *([f"    by_time[i] = columns[{width} * i + {states}]"] if "t" in variables else []),
-        f"    for k in range({states}):",
-        f"        matrix[i][k] = columns[{width} * i + k]",
-    ]
-    head = "def linearise(t, state, d, p, slope, by_time, matrix):"
-    return "\n    ".join([head, *body]) + "\n"
 
 
 def _assign(places: list[str], call: str) -> str:
