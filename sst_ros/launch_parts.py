@@ -92,38 +92,50 @@ def node(given: Given, executable: str, parameters: Given, *, ends: bool = True)
     Parameters that are empty are left to params_file or the default. Where it `ends`, its end is
     that of the launch; its failure always is.
     """
-    return Node(
-        package="sst_ros",
-        executable=executable,
-        namespace=given["namespace"],
-        output="screen",
-        arguments=[
-            f"--{key.replace('_', '-')}={value}" for key, value in parameters.items() if value != ""
-        ],
-        parameters=[given["params_file"]] if given["params_file"] else [],
+    options = {key.replace("_", "-"): value for key, value in parameters.items() if value != ""}
+    return _node(
+        given,
+        "sst_ros",
+        executable,
+        [f"--{option}={value}" for option, value in options.items()],
+        [given["params_file"]] if given["params_file"] else [],
+        ends=ends,
         ros_arguments=["--log-level", given["log_level"]],
         additional_env={child_process.PARENT: str(os.getpid())},
         sigterm_timeout=_CLOSING_S,
-        on_exit=_exit_handler(executable, ends),
     )
+
+
+def _node(
+    given: Given,
+    package: str,
+    executable: str,
+    arguments: Sequence[str] = (),
+    parameters: Sequence[Any] = (),
+    *,
+    ends: bool = True,
+    **more: Any,
+) -> Node:
+    more["output"], more["on_exit"] = "screen", _exit_handler(executable, ends)
+    more["arguments"], more["parameters"] = [*arguments], [*parameters]
+    return Node(package=package, executable=executable, namespace=given["namespace"], **more)
+
+
+def _in_namespace(given: Given, topic: str) -> str:
+    return ("/" + given["namespace"].strip("/")).rstrip("/") + topic
 
 
 def simulator(given: Given, parameters: Given, *, recorded: bool) -> Node:
     """Describe a simulator, which does not start its run before it is recorded."""
-    if recorded:
-        waits = {
-            "wait_for_subscribers": ",".join(topics.SAMPLED),
-            "subscriber_timeout": _WAIT_S,
-        }
-        parameters = {**parameters, **waits}
-    return node(given, "simulator", parameters)
+    waits = {"wait_for_subscribers": ",".join(topics.SAMPLED), "subscriber_timeout": _WAIT_S}
+    return node(given, "simulator", {**parameters, **waits} if recorded else parameters)
 
 
 def recorder(given: Given) -> Action:
     """Describe what records the topics of config/topics.txt into `output`."""
-    inside = ("/" + given["namespace"].strip("/")).rstrip("/")
+    shared = topics.SIMULATOR["diagnostics"].name
     names = {
-        topic: topic if topic == topics.SIMULATOR["diagnostics"].name else inside + topic
+        topic: topic if topic == shared else _in_namespace(given, topic)
         for topic in default_topics()
     }
     if given["bag"] == "sst":
@@ -152,7 +164,7 @@ def rviz(given: Given, scene_name: str) -> list[Action]:
     layout = str(share_directory() / "config" / "sst_ros.rviz")
     return [
         _state_publisher(given, urdf(scene.load(scene_name))),
-        _foreign(given, "rviz2", "rviz2", ["-d", layout]),
+        _node(given, "rviz2", "rviz2", ["-d", layout]),
     ]
 
 
@@ -164,43 +176,21 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
     """
     hardware = "joint_state_topic_hardware_interface"
     require("robot_state_publisher", "controller_manager", "joint_state_broadcaster", hardware)
-    space = ("/" + given["namespace"].strip("/")).rstrip("/")
-    names = f"{space}/sst_simulator/commands_stamped", f"{space}/joint_states"
+    topics_used = "/sst_simulator/commands_stamped", "/joint_states"
+    names = (_in_namespace(given, topic) for topic in topics_used)
     document = urdf_with_ros2_control(scene.load(given["scene"]), *names)
     path = controllers or str(share_directory() / "config" / "controllers.yaml")
     spawned = ["joint_state_broadcaster", controller, "--param-file", path]
     return [
         _state_publisher(given, document),
-        _foreign(given, "controller_manager", "ros2_control_node", parameters=[path]),
-        _foreign(given, "controller_manager", "spawner", spawned, ends=False),
+        _node(given, "controller_manager", "ros2_control_node", parameters=[path]),
+        _node(given, "controller_manager", "spawner", spawned, ends=False),
     ]
 
 
 def _state_publisher(given: Given, document: str) -> Node:
-    model = ParameterValue(document, value_type=str)
-    package = "robot_state_publisher"
-    return _foreign(given, package, package, parameters=[{"robot_description": model}])
-
-
-def _foreign(
-    given: Given,
-    package: str,
-    executable: str,
-    arguments: Sequence[str] = (),
-    parameters: Sequence[Any] = (),
-    *,
-    ends: bool = True,
-) -> Node:
-    """Describe a node of another package."""
-    return Node(
-        package=package,
-        executable=executable,
-        namespace=given["namespace"],
-        output="screen",
-        arguments=[*arguments],
-        parameters=[*parameters],
-        on_exit=_exit_handler(executable, ends),
-    )
+    model, package = ParameterValue(document, value_type=str), "robot_state_publisher"
+    return _node(given, package, package, parameters=[{"robot_description": model}])
 
 
 def require(*packages: str) -> None:

@@ -124,14 +124,12 @@ class InverseDynamicsController(Worker[ControllerNodeParameters]):
             self.done.set()
 
     def _has_subscribers(self) -> bool:
-        """Whether the subscribers are there that the parameters ask for."""
         if self._began or not self._commands.has_subscribers():
             return self._began
         recorded = (self._reference, self._error) if self.parameters.wait_for_recorder else ()
         return all(publisher.get_subscription_count() for publisher in recorded)
 
     def _publish(self, state: JointState, command: Command) -> None:
-        """Publish reference and tracking error under the stamp of the sample."""
         at = command.desired
         for publisher, *numbers in (
             (self._reference, at.gamma, at.gamma_dot, command.feedforward),
@@ -174,7 +172,6 @@ class InverseDynamicsController(Worker[ControllerNodeParameters]):
             self._commands.watch()
 
     def _report(self) -> None:
-        """Publish the diagnostics."""
         follower = self.follower
         stage = "waiting for joint_states" if self._seen is None else follower.stage.value
         counts = follower.samples, follower.irregular, follower.limited
@@ -204,7 +201,6 @@ def _measure(state: JointState) -> Measurement:
 
 
 def _print(tracking: TrackingMetrics | None) -> None:
-    """Print the tracking errors of a motion."""
     if tracking is not None:
         print(tracking_table(tracking), flush=True)
 

@@ -111,7 +111,6 @@ class Worker(Generic[P]):
 def _declare(
     node: Node, cls: type[P], more_defaults: Callable[[dict[str, Any]], dict[str, Any]]
 ) -> P:
-    """Declare every field of a section on the node and return the values."""
     # rclpy has no public call for the values that were given; Jazzy and Kilted have this.
     given: dict[str, Any] = {name: one.value for name, one in node._parameter_overrides.items()}
     changeable = getattr(cls, "CHANGEABLE", ())

@@ -230,8 +230,8 @@ class SimulatorTopics:
         self._clock = PublishedClock(node) if given.publish_clock else None
         history = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
-        names = ("joint_states", "orientation", "euler_zyz", "applied_torques")
-        *self._shown, self._torques = (own[name].publisher(node, depth) for name in names)
+        shown = ("joint_states", "orientation", "euler_zyz", "applied_torques")
+        *self._shown, self._torques = (own[name].publisher(node, depth) for name in shown)
         self._read: list[Publisher[Any]] = []
         self._states: list[tuple[Publisher[Any], Message]] = []
         self._counted_ns = 0
@@ -240,7 +240,13 @@ class SimulatorTopics:
         if given.publish_description:
             own["robot_description"].publisher(node).publish(String(data=urdf(scene)))
         self.diagnostics = own["diagnostics"].publisher(node)
-        self._awaited = self._find_publishers(given.wait_for_subscribers)
+        made = {publisher.topic_name: publisher for publisher in node.publishers}
+        names = [node.resolve_topic_name(name) for name in given.wait_for_subscribers if name]
+        unknown = [name for name in names if name not in made]
+        allowed = f"must be topics that the node publishes: {', '.join(sorted(made))}"
+        problem = "wait_for_subscribers", unknown, not unknown, allowed
+        refuse_unless(node.get_fully_qualified_name(), problem)
+        self._awaited = [made[name] for name in names]
         self._samples, self._idles = state_messages(), state_messages(IDLE_FRAME_ID)
         self._valid: Numbers = (0.0, 0.0, 0.0, 1.0), _AT_REST * 2, ZERO
         moments = scene.moment is not None and scene.moment.topic
@@ -338,12 +344,3 @@ class SimulatorTopics:
     def _messages(self, of: Sequence[Message]) -> list[tuple[Publisher[Any], Message]]:
         """Messages of a state whose topics have subscribers."""
         return [pair for pair in zip(self._shown, of, strict=True) if pair[0] in self._read]
-
-    def _find_publishers(self, names: tuple[str, ...]) -> list[Publisher[Any]]:
-        own = {publisher.topic_name: publisher for publisher in self._node.publishers}
-        found = [self._node.resolve_topic_name(name) for name in names if name]
-        unknown = [name for name in found if name not in own]
-        allowed = f"must be topics that the node publishes: {', '.join(sorted(own))}"
-        problem = "wait_for_subscribers", unknown, not unknown, allowed
-        refuse_unless(self._node.get_fully_qualified_name(), problem)
-        return [own[name] for name in found]

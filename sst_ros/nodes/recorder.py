@@ -39,10 +39,6 @@ _DECLARED = {
 }
 
 
-class RecordingIncomplete(SstError):
-    """Topics that belong to the recording have no message in it, or not all."""
-
-
 @dataclass
 class RecordedTopic:
     """A topic that is recorded; the connection is where its messages go in the bag.
@@ -90,10 +86,7 @@ class Recorder(Worker[RecorderParameters]):
         every(self.node, _TAKE_PERIOD_S, self._take)
 
     def close(self) -> None:
-        """Take what has arrived and close the bag.
-
-        RecordingIncomplete names the topics without messages, and those that lost some.
-        """
+        """Take what has arrived and close the bag; name topics without messages, or some lost."""
         self._take()
         if self._failure is not None:
             raise self._failure
@@ -105,12 +98,9 @@ class Recorder(Worker[RecorderParameters]):
         faults = [f"no message of {_join(self._missing())}"] if self._missing() else []
         faults += [f"lost messages: {_join(lost)}"] if lost else []
         if faults:
-            raise RecordingIncomplete(
-                f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})"
-            )
+            raise SstError(f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})")
 
     def _missing(self) -> set[str]:
-        """Topics that belong to the recording and have no message yet."""
         heard = {topic for topic, recorded in self._recorded.items() if recorded.messages}
         return (self._required | self._foreign) - heard
 

@@ -96,7 +96,6 @@ class Simulator(Worker[SimulatorParameters]):
             raise SstError(self._loop.fault)
 
     def _live(self) -> None:
-        """Run in a thread of its own."""
         self._schedule()  # at once: the run may begin before the first report
         try:
             self._loop.run()

@@ -89,7 +89,6 @@ class TorquePlayer(Worker[PlayerParameters]):
 
 
 def _load(given: PlayerParameters) -> tuple[TorqueFunction, float]:
-    """Return the profile and its length [s]."""
     if given.csv != "-":
         table = TorqueTable.read(given.csv)
         return table, float(table.times[-1])

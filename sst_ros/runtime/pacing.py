@@ -49,17 +49,8 @@ class SteadyTime:
 class Pacer:
     """Deadlines anchor + k period / speed. After an overrun the whole periods in it are dropped.
 
-    Lateness up to `tolerance_ns` is made up for: the step of a followed clock.
-
-    Attributes:
-        speed: real-time factor; 0 for deadlines that have always come.
-        interval_ns: time between deadlines [ns]; 0 without any.
-        together: ticks that one sleep of 2 ms may end in, 1 at least; 1 on a clock that is
-            followed: the next deadline is not known by it.
-        missed, overruns: ticks dropped, and times that some were.
-        jumps: times that the clock went back.
-        late_ns: lateness of the start of the last tick [ns].
-
+    Lateness up to `tolerance_ns` is made up for: the step of a followed clock. With the speed 0,
+    the real-time factor, deadlines have always come.
     """
 
     def __init__(
@@ -68,7 +59,9 @@ class Pacer:
         self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
         self._anchor = self._count = self._seen = 0
         self._set(speed)
-        self.missed = self.overruns = self.jumps = self.late_ns = 0
+        self.missed = self.overruns = 0  # ticks dropped, and times that some were
+        self.jumps = 0  # of the clock, back
+        self.late_ns = 0  # of the start of the last tick
 
     def start(self) -> None:
         """Begin now; the first deadline is one period away."""
@@ -82,7 +75,8 @@ class Pacer:
 
     def _set(self, speed: float) -> None:
         self.speed, self._interval = speed, self._period_ns / speed if speed else 0.0
-        self.interval_ns = round(self._interval)
+        self.interval_ns = round(self._interval)  # between deadlines; 0 without any
+        # Ticks that one sleep may end in; a clock that is followed does not tell the next deadline.
         several = speed > 0.0 and self._tolerance_ns == 0
         self.together = max(1, int(_TOGETHER_NS // self._interval)) if several else 1
 

@@ -55,14 +55,7 @@ _NOT_DONE = Reply(False, "not done: the run has ended or failed")
 
 
 class RunLoop(TickLoop):
-    """State machine of one node's run, whose ticks are those of a `TickLoop`.
-
-    Attributes:
-        phase: present phase.
-        fault: reason why the run stopped, until a reset.
-        failed: the fault ends the node, because nothing is left to wait for.
-
-    """
+    """State machine of one node's run, whose ticks are those of a `TickLoop`."""
 
     def __init__(
         self,
@@ -73,7 +66,8 @@ class RunLoop(TickLoop):
         pacer: Pacer,
         output: RunOutput,
     ) -> None:
-        self.phase, self.fault, self.failed = Phase.WAITING, "", False
+        self.phase, self.fault = Phase.WAITING, ""  # why the run stopped, until a reset
+        self.failed = False  # the fault ends the node: nothing is left to wait for
         self._build, self._original = build, build(scene)
         super().__init__(self._original, run, torque_input, pacer, output)
         self._requests: deque[tuple[Callable[[], Reply | None], Future[Reply]]] = deque()

@@ -31,20 +31,12 @@ RunOutput: TypeAlias = Any
 
 
 class Counters:
-    """Counters of a run.
-
-    Attributes:
-        ticks, published: steps done and samples published.
-        resets, states_set: number of resets and of states set.
-        step_max_s: longest mean time of the steps of a call [s].
-        ticks_at_once: steps that one call may take: one as long as none has been measured.
-
-    """
+    """Counters of a run: steps, samples published, resets, states set; times of steps."""
 
     def __init__(self) -> None:
         self.ticks = self.published = self.resets = self.states_set = 0
-        self._step_total_s = self.step_max_s = 0.0
-        self.ticks_at_once = 1
+        self._step_total_s = self.step_max_s = 0.0  # the mean of the steps of one call
+        self.ticks_at_once = 1  # that one call may take: one as long as none has been measured
         self._late_total = self._late_square = self._late_max = 0.0
         self._wall_s = 0.0
         self._resumed: float | None = None
@@ -150,17 +142,7 @@ class NoAnswer(SstError):
 
 
 class TickLoop:
-    """Ticks and samples of one simulation.
-
-    Attributes:
-        simulation: what is run; its `state` may be read by any thread.
-        begun: the first sample has been published.
-        counters: counters of the run.
-        held: torques since the start, for the estimate of the hold error.
-        step_since: time.perf_counter at which the step in progress began; 0 between steps.
-        requested, stopped: set by others to interrupt a wait, or to end.
-
-    """
+    """Ticks and samples of one simulation."""
 
     def __init__(
         self,
@@ -170,10 +152,12 @@ class TickLoop:
         pacer: Pacer,
         output: RunOutput,
     ) -> None:
-        self.simulation, self.begun, self.counters = simulation, False, Counters()
-        self.held = HeldTorques()
+        self.simulation = simulation  # its `state` may be read by any thread
+        self.begun = False  # the first sample has been published
+        self.counters, self.held = Counters(), HeldTorques()
+        # Set by others to interrupt a wait, or to end.
         self.requested, self.stopped = threading.Event(), threading.Event()
-        self.step_since = 0.0
+        self.step_since = 0.0  # perf_counter at which the step in progress began, 0 between steps
         self._run, self._input, self._pacer, self._output = run, torque_input, pacer, output
         self._lockstep, self._last_tick = run.lockstep, run.last_tick
         self._period_ns, self._ticks_per_sample = run.period_ns, run.ticks_per_sample

@@ -34,17 +34,7 @@ class MessageRefused(Exception):
 
 
 class TorqueInput:
-    """Torque commands of a run. Owned by the thread of the run; others read the counters.
-
-    Attributes:
-        received, dropped, clamped, timeouts: counters.
-        reasons: number of dropped messages by reason.
-        last_refusal: reason of the last dropped message.
-        begun: a command has come since the start.
-        stale: the last command is older than command_timeout and not used.
-        moment: external moment in {B} [N m].
-
-    """
+    """Torque commands of a run. Owned by the thread of the run; others read the counters."""
 
     def __init__(
         self,
@@ -59,7 +49,7 @@ class TorqueInput:
         self._damping = actuators.idle_damping if actuators else 0.0
         self._commands, self._stamped, self._moments = commands, stamped, moments
         self.received = self.dropped = self.clamped = self.timeouts = 0
-        self.reasons: dict[str, int] = {}
+        self.reasons: dict[str, int] = {}  # of dropped messages, with counts
         self._forget()
 
     def clear(self) -> None:
@@ -69,8 +59,9 @@ class TorqueInput:
         self._forget()
 
     def _forget(self) -> None:
-        self._held = self.moment = ZERO
-        self.begun = self.stale = False
+        self._held = self.moment = ZERO  # torques; external moment in {B} [N m]
+        self.begun = False  # a command has come since the start
+        self.stale = False  # the last one is older than command_timeout and not used
         self.last_refusal = ""
         self._idle_ns = [0, 0]
         self.refresh()

@@ -141,7 +141,6 @@ class TrajectoryGoal:
         self._times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in points]
 
     def _resolve_all(self, name: str, given: Iterable[Any], own: dict[str, float]) -> Tolerances:
-        """Resolve a sequence of JointTolerance messages."""
         found = {(quantity, joint): own[quantity] for quantity in own for joint in ACTUATORS}
         for index, tolerance in enumerate(given):
             place = f"{name}[{index}]"
