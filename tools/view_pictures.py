@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sst_ros.description.tree import BASE, LEGS, STAR, end_point, name_actuated, name_intermediate
+from sst_ros.description.tree import ACTUATED, BASE, INTERMEDIATE, LEGS, STAR, end_point
 from sst_ros.errors import SstError
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, load
@@ -94,8 +94,8 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
     bar = 1.04 * (base + 1.5 * thick) * np.array([np.cos(_ALONG), 0.0, np.sin(_ALONG)])
     places = {BASE: ("{B}", np.zeros(3), 0.42), STAR: ("{E}", 1.05 * end, 0.24)}
     for k in LEGS:
-        places[name_actuated(k)] = (f"{{1{k}}}", bar, 0.15)
-        places[name_intermediate(k)] = (f"{{2{k}}}", 1.07 * star * np.array([1.0, 0.0, 0.0]), 0.15)
+        places[ACTUATED[k - 1]] = (f"{{1{k}}}", bar, 0.15)
+        places[INTERMEDIATE[k - 1]] = (f"{{2{k}}}", 1.07 * star * np.array([1.0, 0.0, 0.0]), 0.15)
     for link, (name, position, length) in places.items():
         node = f"/manipulator/{link}/axes"
         server.scene.add_frame(

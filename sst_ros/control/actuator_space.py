@@ -75,15 +75,6 @@ class ActuatorSpaceMap:
         """sin(mu) and beta [rad] of the legs, six numbers, and det J2 of an orientation."""
         return self._posture(*q)
 
-    def of_actuators(
-        self, near: Quaternion, gamma: Vector3, gamma_dot: Vector3, gamma_ddot: Vector3
-    ) -> Reference:
-        """Return the reference of a state of the actuators, of the assembly closest to `near`."""
-        q = self.orientation(near, gamma)
-        return Reference(
-            q, *self.star_motion(q, gamma_dot, gamma_ddot), gamma, gamma_dot, gamma_ddot
-        )
-
     def star_motion(
         self, q: Quaternion, gamma_dot: Vector3, gamma_ddot: Vector3
     ) -> tuple[Vector3, Vector3]:

@@ -208,8 +208,8 @@ class ControlLaw(NamedTuple):
 
     settings: ControllerSettings
     torque: Callable[[Any, Any, Any], Triple]  # of the model, by quaternion, W and W_dot [N m]
-    accelerate: Callable[[Any, Any, Any], tuple[Triple, Triple]]  # W and W_dot of the model, by
-    # quaternion, gamma_dot and gamma_ddot
+    # W and W_dot of the model, by quaternion, gamma_dot and gamma_ddot
+    accelerate: Callable[[Any, Any, Any], tuple[Triple, Triple]]
     kp: Triple  # gains of accelerations [1/s^2]
     kd: Triple  # [1/s]
     inertia: Triple  # M_kk at the start of the motion [kg m^2]

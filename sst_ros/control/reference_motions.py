@@ -13,7 +13,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -209,8 +209,9 @@ def move_actuators(
     def inside(time: float) -> Reference:
         gamma, gamma_dot, gamma_ddot = path(time)
         index = max(bisect_right(times, time) - 1, 0)
-        near = space.follow(known[index], gammas[index], gamma, sigma[index])
-        return space.of_actuators(near, gamma, gamma_dot, gamma_ddot)
+        q = space.follow(known[index], gammas[index], gamma, sigma[index])
+        star = space.star_motion(q, gamma_dot, gamma_ddot)
+        return Reference(q, *star, gamma, gamma_dot, gamma_ddot)
 
     return ReferenceMotion(inside, pieces)
 
@@ -328,7 +329,9 @@ def through_points(
     for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
         ends[np.isnan(ends)] = 0.0
     begun = follow_assembly(geometry, start, here, gamma[0])
-    return move_actuators(geometry, _follow(at, gamma, rates, seconds), tuple(at.tolist()), begun)
+    return move_actuators(
+        geometry, _quintic_path(at, gamma, rates, seconds), tuple(at.tolist()), begun
+    )
 
 
 def through_samples(
@@ -341,7 +344,7 @@ def through_samples(
     """
     times, gamma = times - times[0], np.unwrap(positions, axis=0)
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
-    path = _follow(times, gamma, velocities, np.full_like(gamma, np.nan))
+    path = _quintic_path(times, gamma, velocities, np.full_like(gamma, np.nan))
     return move_actuators(geometry, path, pieces, start)
 
 
@@ -378,12 +381,9 @@ def _faults(at: Array, rates: Array) -> Iterator[Problem]:
             yield Problem(f"velocities[{end}]", rates[end].tolist(), allowed)
 
 
-def _follow(times: Array, *nodes: Array) -> ActuatorPath:
-    """Return `quintic` of the actuators as a path."""
+def _quintic_path(times: Array, *nodes: Array) -> ActuatorPath:
     curve = quintic(times, *nodes)
-    return lambda time: cast(
-        "tuple[Vector3, Vector3, Vector3]", (*map(tuple, curve(time).tolist()),)
-    )
+    return lambda time: triple(map(triple, curve(time).tolist()))
 
 
 _UNIT = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))

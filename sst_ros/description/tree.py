@@ -27,6 +27,10 @@ BASE, STAR = BASE_FRAME, "star"
 LEGS = (1, 2, 3)
 STARS = (STAR, "star_from_2", "star_from_3")
 """{E} as seen from legs 1, 2 and 3."""
+ACTUATED = ("actuated_1", "actuated_2", "actuated_3")
+"""Links with the frames {1k} = [r, w x r, w] of the legs."""
+INTERMEDIATE = ("intermediate_1", "intermediate_2", "intermediate_3")
+"""Links with the frames {2k} = [r, t x r, t] of the legs."""
 
 Colour: TypeAlias = tuple[float, float, float]
 GLOBE: Colour = (0.93, 0.94, 0.96)
@@ -63,17 +67,19 @@ class Joint:
 
 def tree(geometry: Geometry) -> tuple[Joint, ...]:
     """All nine joints, parents before children; signs are those of Eqs. 50 to 52."""
-    return tuple(joint for k in range(3) for joint in _leg(geometry, k))
-
-
-def name_actuated(leg: int) -> str:
-    """Name of the actuated link of a leg, 1 to 3; its frame is {1k} = [r, w x r, w]."""
-    return f"actuated_{leg}"
-
-
-def name_intermediate(leg: int) -> str:
-    """Name of the intermediate link of a leg, 1 to 3; its frame is {2k} = [r, t x r, t]."""
-    return f"intermediate_{leg}"
+    z, found = np.array([0.0, 0.0, 1.0]), []
+    legs = zip(LEGS, geometry.v, geometry.w, geometry.e, ACTUATED, INTERMEDIATE, STARS, strict=True)
+    for leg, v, w, e, actuated, intermediate, star in legs:
+        at_rest = np.stack([v, np.cross(w, v), w], axis=1)  # 0kR at gamma = 0
+        # At beta = 0 the arc's end s lies at r: in {E} the vectors of {2k} are z, e x z and e.
+        folded = np.stack([z, np.cross(e, z), e], axis=1).T
+        back = (-float(e[0]), -float(e[1]), -float(e[2]))
+        found += [
+            Joint(f"gamma_{leg}", BASE, actuated, at_rest, (0.0, 0.0, 1.0)),
+            Joint(f"mu_{leg}", actuated, intermediate, np.eye(3), (-1.0, 0.0, 0.0)),
+            Joint(f"beta_{leg}", intermediate, star, folded, back),
+        ]
+    return tuple(found)
 
 
 def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str, Array]:
@@ -82,20 +88,6 @@ def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str,
     for joint in joints:
         found[joint.child] = found[joint.parent] @ joint.rotation(angles[joint.name])
     return found
-
-
-def _leg(geometry: Geometry, k: int) -> tuple[Joint, Joint, Joint]:
-    v, w, e, leg = geometry.v[k], geometry.w[k], geometry.e[k], LEGS[k]
-    base = np.stack([v, np.cross(w, v), w], axis=1)  # 0kR at gamma = 0
-    # At beta = 0 the arc's end s lies at r: in {E} the vectors of {2k} are z, e x z and e.
-    z = np.array([0.0, 0.0, 1.0])
-    star = np.stack([z, np.cross(e, z), e], axis=1).T
-    back = (-float(e[0]), -float(e[1]), -float(e[2]))
-    return (
-        Joint(f"gamma_{leg}", BASE, name_actuated(leg), base, (0.0, 0.0, 1.0)),
-        Joint(f"mu_{leg}", name_actuated(leg), name_intermediate(leg), np.eye(3), (-1.0, 0.0, 0.0)),
-        Joint(f"beta_{leg}", name_intermediate(leg), STARS[k], star, back),
-    )
 
 
 @dataclass(frozen=True)
@@ -175,14 +167,14 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
         centre = np.array(scene.payload.centre)
         rod = Rod(star * z, centre, 0.8 * thick, STEEL)
         found[STAR] += [rod, Ball(centre, 2.8 * thick, STEEL)]
-    for leg, colour in zip(LEGS, LEG_COLOURS, strict=True):
+    for actuated, intermediate, colour in zip(ACTUATED, INTERMEDIATE, LEG_COLOURS, strict=True):
         # A quarter arc from the motor at w to the carriage at r, just above the base.
         middle = base + 1.5 * thick
-        found[name_actuated(leg)] = [
+        found[actuated] = [
             Arc(x, -y, np.pi / 2, middle, thick, colour),
             Rod(z * (base - thick), z * (middle + 2.0 * thick), 2.4 * thick, colour),
         ]
-        found[name_intermediate(leg)] = [
+        found[intermediate] = [
             Rod(x * (base - thick), x * star, 0.9 * thick, STEEL),
             Box(star * x, 3.0 * thick * np.array([1.0, 1.3, 1.3]), colour),
         ]

@@ -134,8 +134,8 @@ def bodies(scene: Scene) -> list[Body]:
         found.append(Body(PAYLOAD, tree.STAR, scene.payload.mass, centre, tensor))
     for k, leg in enumerate(tree.LEGS):
         for name, link, radius in (
-            (tree.name_actuated(leg), scene.actuated_links[k], base.radius),
-            (tree.name_intermediate(leg), scene.intermediate_links[k], star.radius),
+            (tree.ACTUATED[k], scene.actuated_links[k], base.radius),
+            (tree.INTERMEDIATE[k], scene.intermediate_links[k], star.radius),
         ):
             if link.mass or link.inertia is not None:
                 found.append(_body(name, link.mass, link.centre, link.tensor, radius))
@@ -143,7 +143,7 @@ def bodies(scene: Scene) -> list[Body]:
             # A thin disc behind its gear: only its inertia about w matters.
             behind = motor.gear_ratio**2 * motor.rotor_inertia
             tensor = np.diag([behind / 2.0, behind / 2.0, behind])
-            found.append(_massless(f"rotor_{leg}", tree.name_actuated(leg), tensor, base.radius))
+            found.append(_massless(f"rotor_{leg}", tree.ACTUATED[k], tensor, base.radius))
     return found
 
 

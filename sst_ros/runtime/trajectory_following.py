@@ -18,14 +18,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.control.controller import Controller, Measurement
 from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference import Reference, ReferenceMotion, slow_down
 from sst_ros.control.reference_motions import reference_motion, through_points
 from sst_ros.control.tracking import TrackingMetrics, track_of
-from sst_ros.errors import InputError, Problem, SingularConfiguration, refuse_unless
+from sst_ros.errors import InputError, Problem, refuse_unless
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO, axpy
@@ -361,11 +360,7 @@ class TrajectoryFollower:
         meant = None if named is None else rotation_matrix(named)
         assembly = kinematics.admissible(self._geometry, seen.gamma, meant)
         x, y, z, w = quaternion_of(assembly.rotation).tolist()
-        space = ActuatorSpaceMap(self._geometry)
-        try:
-            return space.of_actuators((x, y, z, w), seen.gamma, ZERO, ZERO)
-        except ArithmeticError:
-            raise SingularConfiguration("the manipulator is singular, det J2", 0.0) from None
+        return Reference((x, y, z, w), ZERO, ZERO, seen.gamma, ZERO, ZERO)
 
     def _refuse_elsewhere(self, measured: Measurement) -> None:
         begin, tolerance = self._motion.at(0.0).gamma, self._settings.start_tolerance

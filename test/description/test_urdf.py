@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from sst_ros.__main__ import main
 from sst_ros.description.tree import (
+    ACTUATED,
+    INTERMEDIATE,
     LEGS,
     STAR,
     STARS,
@@ -24,8 +26,6 @@ from sst_ros.description.tree import (
     Ball,
     Box,
     end_point,
-    name_actuated,
-    name_intermediate,
     shapes,
 )
 from sst_ros.description.urdf import PLUGIN, roll_pitch_yaw, urdf, urdf_with_ros2_control
@@ -40,7 +40,7 @@ ACTUATORS = list(JOINTS[:3])
 CONTROLLERS = Path(__file__).parents[2] / "config" / "controllers.yaml"
 EXACT = 2e-14  # a product of nine rotations, each rounded
 GEARED = Actuators(rotor_inertia=1e-4, gear_ratio=10.0)
-LINKS = {STAR, *map(name_actuated, LEGS), *map(name_intermediate, LEGS)}
+LINKS = {STAR, *ACTUATED, *INTERMEDIATE}
 
 
 class Read:
@@ -83,10 +83,10 @@ def test_poses_of_all_links(isotropic):
         at = sample.posture
         angles = angles_of(sample.geometry, sample.gamma, sample.rotation)
         expected = dict.fromkeys(STARS, sample.rotation)
-        for k, leg in enumerate(LEGS):
+        for k in range(3):
             r, t, w = at.r[k], at.t[k], at.w[k]
-            expected[name_actuated(leg)] = np.stack([r, np.cross(w, r), w], axis=1)
-            expected[name_intermediate(leg)] = np.stack([r, np.cross(t, r), t], axis=1)
+            expected[ACTUATED[k]] = np.stack([r, np.cross(w, r), w], axis=1)
+            expected[INTERMEDIATE[k]] = np.stack([r, np.cross(t, r), t], axis=1)
         for link, rotation in expected.items():
             assert np.abs(read.rotation(angles, link) - rotation).max() < EXACT
 
