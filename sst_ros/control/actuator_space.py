@@ -37,10 +37,8 @@ from sst_ros.mechanism.generic_math import (
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.state import Quaternion, Vector3
 
-ROUNDING = 4e-16
-"""Residual abs(r_k . t_k) at which Newton's method ends: rounding."""
-CLOSED = 1e-14
-"""Largest loop-closure residual abs(r_k . t_k) of an orientation that is returned."""
+ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
+CLOSED = 1e-14  # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
 _STEPS = 20
 _STAR = (*"xyzw", "wx", "wy", "wz", "ax", "ay", "az")
 _MOVING = (*_STAR[:4], "d1", "d2", "d3", "dd1", "dd2", "dd3")

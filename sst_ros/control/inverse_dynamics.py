@@ -18,8 +18,7 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, State, Vector3
 
-SINGULAR = 1e-10
-"""sin(mu_k) and det J2 below which rounding leaves a torque less than six digits."""
+SINGULAR = 1e-10  # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
 
 
 class InverseDynamics:

@@ -60,8 +60,7 @@ from sst_ros.state import Vector3, clamp
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 SPACES = ("gamma", "so3")
 INSTANTS = ("start", "middle")
-_ROUND = 1.5 * 2.0**52
-"""Added and subtracted, it rounds to whole numbers, halves to even."""
+_ROUND = 1.5 * 2.0**52  # added and subtracted, it rounds to whole numbers, halves to even
 
 
 def _joint_gain(name: str, unit: str, instead: str) -> Any:

@@ -32,16 +32,12 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import Scene
 
-SAMPLES = 16
-"""Parts of a piece of the motion; even, for Simpson's rule."""
-SINGULAR_J2 = 1e-6
-"""det J2 within which a motion counts as singular."""
-SLOWEST, FASTEST = 1e-4, 1e8
-"""Factors of speed between which the ends of what is feasible are looked for."""
+SAMPLES = 16  # parts of a piece of the motion; even, for Simpson's rule
+SINGULAR_J2 = 1e-6  # det J2 within which a motion counts as singular
+SLOWEST, FASTEST = 1e-4, 1e8  # factors of speed between which ends are looked for
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 """Of the peaks of an `ActuatorDemand`."""
-_GRID, _BEYOND = 360, 27
-"""Factors that are tried, and how many infeasible ones (three doublings) end the search."""
+_GRID, _BEYOND = 360, 27  # factors to try; infeasible ones, three doublings, that end it
 _ROUNDING = 1e-13
 
 

@@ -13,22 +13,14 @@ from sst_ros.state import Quaternion, Vector3
 
 @dataclass(frozen=True)
 class Reference:
-    """Desired state and acceleration at one instant; all parts describe the same motion.
+    """Desired state and acceleration at one instant; all parts describe the same motion."""
 
-    Attributes:
-        quaternion: of {E} in {B}, (x, y, z, w), of length 1 up to rounding.
-        body_rate: W in {E} [rad/s].
-        body_acceleration: W_dot in {E} [rad/s^2].
-        gamma, gamma_dot, gamma_ddot: actuators [rad], [rad/s], [rad/s^2].
-
-    """
-
-    quaternion: Quaternion
-    body_rate: Vector3
-    body_acceleration: Vector3
-    gamma: Vector3
-    gamma_dot: Vector3
-    gamma_ddot: Vector3
+    quaternion: Quaternion  # of {E} in {B}, (x, y, z, w), of length 1 up to rounding
+    body_rate: Vector3  # W in {E} [rad/s]
+    body_acceleration: Vector3  # W_dot in {E} [rad/s^2]
+    gamma: Vector3  # of the actuators [rad]
+    gamma_dot: Vector3  # [rad/s]
+    gamma_ddot: Vector3  # [rad/s^2]
 
 
 class ReferenceMotion:

@@ -35,22 +35,17 @@ from sst_ros.scene.loads import Spiral, Sweep, ToAngles
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3
 
-PIECES = 8
-"""Pieces of a minimum-jerk motion, and of a quarter of a turn."""
-SAMPLES_A_PIECE = 8
-"""Of a recording, whose samples lie much denser than the motion turns."""
-STEP = 0.03
-"""Distance in gamma [rad] between orientations that are kept."""
-LONGEST = 100.0
-"""Longest path in gamma [rad] within a piece of a motion."""
-NEAR = 0.1
-"""Largest distance of a first point at time 0 from the start [rad]."""
+PIECES = 8  # pieces of a minimum-jerk motion, and of a quarter of a turn
+SAMPLES_A_PIECE = 8  # of a recording, whose samples lie much denser than the motion turns
+STEP = 0.03  # distance in gamma [rad] between orientations that are kept
+LONGEST = 100.0  # longest path in gamma [rad] within a piece of a motion
+NEAR = 0.1  # largest distance of a first point at time 0 from the start [rad]
 _SAMPLES = 16
 
+# Share of the path to the turn from the start, and to W and its derivative by that share.
 StarPath: TypeAlias = Callable[[float], tuple[Quaternion, Vector3, Vector3]]
-"""Share of the path to the turn from the start, a quaternion, and to W and W_dot per share."""
+# Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2].
 ActuatorPath: TypeAlias = Callable[[float], tuple[Vector3, Vector3, Vector3]]
-"""Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2]."""
 OpenPoints: TypeAlias = Sequence[Sequence[float] | None]
 
 

@@ -11,13 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.mechanism.geometry import Array
 
-BAND = 0.02
-"""Settling band: share of the largest range of a joint."""
+BAND = 0.02  # settling band: share of the largest range of a joint
 
 ROWS = 10
 
-_KEPT = 4096
-"""Rows of the history of a record that is added in parts: above it every other row goes."""
+_KEPT = 4096  # rows of the history of a record in parts: above it every other row goes
 
 _PARTS = ("gamma", "gamma_dot", "error", "error_rate", "feedforward", "feedback", "torque")
 TRACK = np.dtype([("time", float), *((name, float, 3) for name in _PARTS)])

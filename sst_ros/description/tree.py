@@ -25,8 +25,7 @@ from sst_ros.state import BASE_FRAME
 
 BASE, STAR = BASE_FRAME, "star"
 LEGS = (1, 2, 3)
-STARS = (STAR, "star_from_2", "star_from_3")
-"""{E} as seen from legs 1, 2 and 3."""
+STARS = (STAR, "star_from_2", "star_from_3")  # {E} as seen from legs 1, 2 and 3
 ACTUATED = ("actuated_1", "actuated_2", "actuated_3")
 """Links with the frames {1k} = [r, w x r, w] of the legs."""
 INTERMEDIATE = ("intermediate_1", "intermediate_2", "intermediate_3")
@@ -40,8 +39,7 @@ STEEL: Colour = (0.60, 0.63, 0.67)
 LEG_COLOURS: tuple[Colour, ...] = ((0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45))
 """Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
 
-STEP = np.radians(6.0)
-"""Arcs are drawn as chords of this length or less: 0.14 % of the radius off."""
+STEP = np.radians(6.0)  # arcs are drawn as chords of this length or less: 0.14 % of the radius off
 
 
 @dataclass(frozen=True)

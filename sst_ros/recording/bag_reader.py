@@ -32,8 +32,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, Problem
 
-_RECORD_HEAD = 9
-"""Bytes of opcode and length before the content of an MCAP record."""
+_RECORD_HEAD = 9  # bytes of opcode and length before the content of an MCAP record
 _DATA_END_SIZE = _RECORD_HEAD + 4
 _PIECE = 1 << 20
 

@@ -20,8 +20,7 @@ from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.recording.bag_reader import McapFile, message_types, refusal
 
 VERSION: Final = 9
-FLUSH_PERIOD_S = 1.0
-"""A process that is killed loses the messages of this time at most."""
+FLUSH_PERIOD_S = 1.0  # a process that is killed loses the messages of this time at most
 _CHUNK_BYTES = 512 * 1024
 """Bounds what the writer holds when a flush comes late. Without a bound a recorder that was held
 up for some seconds kept 1 to 4 MB more from then on; below 512 KiB nothing more is gained, and the
