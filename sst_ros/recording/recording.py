@@ -50,24 +50,14 @@ class Status(NamedTuple):
 
 @dataclass(frozen=True)
 class Signals:
-    """All that a recording holds of a run, as tables.
+    """All that a recording holds of a run, as tables."""
 
-    Attributes:
-        bag: the recording: its path, topics, damage.
-        scene: what was simulated; None where it was not recorded.
-        start_ns: stamp of the start of the run [ns].
-        topic_series: rows of each topic, by its key; none of one that was not recorded.
-        idle_states: number of joint states that are no samples of the run.
-        statuses: diagnostics, in order of reception.
-
-    """
-
-    bag: Bag
-    scene: Scene | None
-    start_ns: int
-    topic_series: dict[str, Series]
-    idle_states: int
-    statuses: tuple[Status, ...]
+    bag: Bag  #: the recording: its path, topics, damage
+    scene: Scene | None  #: what was simulated; None where it was not recorded
+    start_ns: int  #: stamp of the start of the run [ns]
+    topic_series: dict[str, Series]  #: rows of each topic, none if not recorded, by its key
+    idle_states: int  #: number of joint states that are no samples of the run
+    statuses: tuple[Status, ...]  #: diagnostics, in order of reception
 
     @cached_property
     def tables(self) -> dict[str, Series]:

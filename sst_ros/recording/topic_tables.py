@@ -68,20 +68,12 @@ class InvalidMessage(ValueError):
 
 @dataclass(frozen=True)
 class Series:
-    """Rows of one table: of one topic, or of all topics at the stamps of samples.
+    """Rows of one table: of one topic, or of all topics at the stamps of samples."""
 
-    Attributes:
-        columns: what the numbers are.
-        stamp_ns: stamps of the messages [ns], shape (n,); 0 where they have none.
-        received_ns: reception by the recorder, by its clock [ns], shape (n,); 0 where it failed.
-        values: shape (n, number of columns); nan where a message was lost.
-
-    """
-
-    columns: tuple[Column, ...]
-    stamp_ns: Integers
-    received_ns: Integers
-    values: Array
+    columns: tuple[Column, ...]  #: what the numbers are
+    stamp_ns: Integers  #: stamps of the messages [ns], shape (n,); 0 where they have none
+    received_ns: Integers  #: by the recorder's clock [ns], shape (n,); 0 where it failed
+    values: Array  #: shape (n, number of columns); nan where a message was lost
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
