@@ -20,6 +20,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import newton
 
+from sst_ros.mechanism.virtual_work import Mechanism
 from sst_ros.scene.scene import Scene
 
 HOME = math.pi / 4
@@ -28,9 +29,9 @@ HOME = math.pi / 4
 
 def inertia(scene: Scene, x: Any) -> Any:
     """M1(x) [kg m^2], twice the kinetic energy of a leg's share over x_dot^2."""
-    star, link = scene.star.inertia, scene.intermediate_inertias[0]
+    star, link = scene.star.inertia, scene.intermediate_links[0].tensor
     d, c = 2.0 - np.cos(2.0 * x), np.cos(x)
-    axial = scene.actuated_inertias[0][2][2] + link[1][1]
+    axial = Mechanism.of(scene).actuated[0][2][2] + link[1][1]
     return star.zz / d**2 + axial + 2.0 * link[0][0] * c**2 / d**2
 
 

@@ -85,13 +85,14 @@ class Task:
         self.w, self.t = geometry.w, geometry.e @ rotation.T
         self.r = np.cos(self.gamma)[:, None] * geometry.v + np.sin(self.gamma)[:, None] * across
         self.frames = {"s": rotation}
-        self.tensors = {"s": self.scene.star_inertia}
+        mechanism = virtual_work.Mechanism.of(self.scene)
+        self.tensors = {"s": mechanism.star}
         for k in range(3):
             r, w, t = self.r[k], self.w[k], self.t[k]
             self.frames[f"a{k}"] = np.stack([r, np.cross(w, r), w], 1)
             self.frames[f"i{k}"] = np.stack([r, np.cross(t, r), t], 1)
-            self.tensors[f"a{k}"] = self.scene.actuated_inertias[k]
-            self.tensors[f"i{k}"] = self.scene.intermediate_inertias[k]
+            self.tensors[f"a{k}"] = mechanism.actuated[k]
+            self.tensors[f"i{k}"] = mechanism.intermediate[k]
 
     def tensor(self, body: str) -> Array:
         """Inertia about O at the start in {B}."""

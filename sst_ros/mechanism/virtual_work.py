@@ -35,9 +35,14 @@ class Mechanism:
 
     @classmethod
     def of(cls, scene: Scene) -> Mechanism:
-        """Collect what the equations need from a scene."""
-        inertias = scene.star_inertia, scene.actuated_inertias, scene.intermediate_inertias
-        return cls(Geometry.of(scene), *inertias)
+        """Collect what the equations need: payload and rotors are part of the bodies."""
+        star, payload, motor = scene.star.inertia.matrix, scene.payload, scene.actuators
+        actuated = np.stack([link.tensor for link in scene.actuated_links])
+        if motor is not None:
+            actuated[:, 2, 2] += motor.gear_ratio**2 * motor.rotor_inertia
+        star = star if payload is None else star + payload.about_o
+        intermediate = np.stack([link.tensor for link in scene.intermediate_links])
+        return cls(Geometry.of(scene), star, actuated, intermediate)
 
 
 @dataclass(frozen=True)

@@ -121,25 +121,6 @@ class Scene(Section):
         """Whether the torques of the actuators lag behind what is commanded."""
         return self.actuators is not None and self.actuators.time_constant is not None
 
-    @property
-    def star_inertia(self) -> Matrix:
-        """Inertia of the star and its payload about O in {E}, shape (3, 3) [kg m^2]."""
-        own = self.star.inertia.matrix
-        return own if self.payload is None else own + self.payload.about_o
-
-    @property
-    def actuated_inertias(self) -> Matrix:
-        """Inertias of actuated links and rotors in {1k}, shape (3, 3, 3) [kg m^2]."""
-        inertias = np.stack([link.tensor for link in self.actuated_links])
-        if self.actuators is not None:
-            inertias[:, 2, 2] += self.actuators.gear_ratio**2 * self.actuators.rotor_inertia
-        return inertias
-
-    @property
-    def intermediate_inertias(self) -> Matrix:
-        """Inertias of the intermediate links in {2k}, shape (3, 3, 3) [kg m^2]."""
-        return np.stack([link.tensor for link in self.intermediate_links])
-
     def check(self) -> Iterator[Problem]:
         """Refuse numbers of another unit, and what contradicts itself across sections."""
         for place, value, spec in _numbers(self):

@@ -97,11 +97,12 @@ def test_inertias_of_every_scene(name):
     read = Read(scene)
     found = dict(zip(read.model.names, read.model.inertias, strict=True))
     about_o = {joint: inertia.matrix()[3:, 3:] for joint, inertia in found.items()}
-    expected = {"beta_1": scene.star_inertia}
+    bodies = virtual_work.Mechanism.of(scene)
+    expected = {"beta_1": bodies.star}
     for k, leg in enumerate(LEGS):
-        expected[f"gamma_{leg}"] = scene.actuated_inertias[k]
-        expected[f"mu_{leg}"] = scene.intermediate_inertias[k]
-    scale = np.abs(scene.star_inertia).max()
+        expected[f"gamma_{leg}"] = bodies.actuated[k]
+        expected[f"mu_{leg}"] = bodies.intermediate[k]
+    scale = np.abs(bodies.star).max()
     for joint, tensor in expected.items():
         assert np.abs(about_o[joint] - tensor).max() < 1e-15 * scale
     for joint in ("beta_2", "beta_3"):
