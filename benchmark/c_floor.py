@@ -53,13 +53,12 @@ double slopes(long count, double *y) {{
 }}
 
 double march(double t, double h, long count, double *y, double *error) {{
-    double r[{twice}];
+    double r[{size}];
     for (long i = 0; i < count; i++) {{
-        step(t + i * h, h, {state}, r);
+        attempt(t + i * h, h, y, y, 0, 0, r, error);
         double s = 1.0 / sqrt(r[0]*r[0] + r[1]*r[1] + r[2]*r[2] + r[3]*r[3]);
         for (int j = 0; j < 4; j++) y[j] = r[j] * s;
         for (int j = 4; j < {size}; j++) y[j] = r[j];
-        for (int j = 0; j < {size}; j++) error[j] = r[{size} + j];
     }}
     return y[0];
 }}
@@ -94,7 +93,7 @@ def write_step(program: Program, tableau: Tableau) -> str:
     size = len(program.outputs)
     state = ", ".join(f"y[{j}]" for j in range(size))
     texts = [_function(program.source("rhs")), _function(explicit_step(tableau, size, 0))]
-    loops = LOOPS.format(size=size, twice=2 * size, state=state)
+    loops = LOOPS.format(size=size, state=state)
     return "\n".join([HEAD, *texts, loops])
 
 
@@ -109,20 +108,22 @@ def compile_step(text: str, folder: Path, name: str, *flags: str) -> ctypes.CDLL
 
 
 def _function(text: str) -> str:
-    """A flat Python function as a C function that writes its tuple to `out`."""
+    """A flat Python function as a C function, which writes a tuple that it returns to `out`."""
+    head, *body = text.splitlines()
+    name, *inputs = re.findall(r"\w+", head.removeprefix("def "))
+    arrays = {*inputs[2:]} if "new_y" in inputs else {"out"}
+    inputs += arrays - {*inputs}
+    given = ", ".join(f"double {'*restrict ' * (one in arrays)}{one}" for one in inputs)
     lines = []
-    for line in text.splitlines():
-        if match := re.fullmatch(r"def (\w+)\((.*)\):", line):
-            inputs = ", ".join(f"double {name}" for name in match[2].split(", "))
-            lines.append(f"{INLINE} void {match[1]}({inputs}, double *restrict out) {{")
-        elif match := re.fullmatch(r"    return \((.*),\)", line):
-            results = _split(match[1])
-            lines += [f"    out[{i}] = {result};" for i, result in enumerate(results)]
-            lines.append("}")
+    for line in body:
+        if match := re.fullmatch(r"    return \((.*),\)", line):
+            results = enumerate(_split(match[1]))
+            lines += [f"    out[{i}] = {result};" for i, result in results]
         else:
             lines += _assignment(line.strip())
     declared = {name for line in lines for name in re.findall(r"^    (\w+) = ", line)}
-    return "\n".join([lines[0], f"    double {', '.join(sorted(declared))};", *lines[1:]]) + "\n"
+    names = f"    double {', '.join(sorted(declared))};"
+    return "\n".join([f"{INLINE} void {name}({given}) {{", names, *lines, "}"]) + "\n"
 
 
 def _assignment(line: str) -> list[str]:

@@ -285,7 +285,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
     ]
     texts: list[str] = []
     if isinstance(method, Tableau):
-        texts.append(step_loops.attempt_explicitly(method, size, len(d), *p))
+        texts.append(step_loops.explicit_step(method, size, len(d), *p))
     else:
         constants |= method.constants
         slope = [f"slope[{i}]" for i in range(size)]

@@ -265,10 +265,10 @@ def substitute(a, pivot, b):
 
 
 def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
-    """Source of `step(t, h, y0, .., d0, ..)` of an explicit Runge-Kutta method, for scalars.
+    """Source of `attempt` of an explicit Runge-Kutta method: a step of h from t and y.
 
     It calls `rhs(t, y0, .., d0, ..)` of the state y and of the drive d, which is constant over the
-    step, and returns the new state and the local error estimate of each number of the state, zero
+    step, and fills in the new state and the local error estimate of each number of the state, zero
     where the method has none.
 
     Args:
@@ -279,34 +279,26 @@ def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
 
     Of RK4, three of its lines a stage and the last ones:
 
-        def step(t, h, y0, y1, ..., d0, d1, d2, p):
+        def attempt(t, h, y, near, d, p, new_y, error):
+            y0 = y[0]
+            d0 = d[0]
             k0_0, k0_1, ... = rhs(t, y0, y1, ..., d0, d1, d2, p)
             s0 = y0 + h * (0.5 * k0_0)
             s1 = y1 + h * (0.5 * k0_1)
             k1_0, k1_1, ... = rhs(t + 0.5 * h, s0, s1, ..., d0, d1, d2, p)
             n0 = y0 + h * (0.16666666666666666 * k0_0 + 0.3333333333333333 * k1_0 + ...)
             e0 = 0.0
-            return (n0, n1, ..., e0, e1, ...,)
+            new_y[0] = n0
+            error[0] = e0
 
     """
-    y, d = _names("y", size), [*_names("d", drive), *more]
-    lines = [f"def step({', '.join(['t', 'h', *y, *d])}):", *_stages(tableau, size, d)]
-    results = ", ".join([*_names("n", size), *_names("e", size)])
-    lines.append(f"    return ({results},)")
-    return "\n".join(lines) + "\n"
-
-
-def attempt_explicitly(tableau: Tableau, size: int, drive: int, *more: str) -> str:
-    """Source of the same step on arrays, as `step_loops` has them: attempt(t, h, y, ..)."""
-    places = [*_names("new_y", size, "[{}]"), *_names("error", size, "[{}]")]
-    results = [*_names("n", size), *_names("e", size)]
-    d = [*_names("d", drive), *more]
     lines = [
         "def attempt(t, h, y, near, d, p, new_y, error):",
         *(f"    y{i} = y[{i}]" for i in range(size)),
         *(f"    d{i} = d[{i}]" for i in range(drive)),
-        *_stages(tableau, size, d),
-        *(f"    {place} = {result}" for place, result in zip(places, results, strict=True)),
+        *_stages(tableau, size, [*_names("d", drive), *more]),
+        *(f"    new_y[{i}] = n{i}" for i in range(size)),
+        *(f"    error[{i}] = e{i}" for i in range(size)),
     ]
     return "\n".join(lines) + "\n"
 
@@ -346,5 +338,5 @@ def _combination(weights: Sequence[float], j: int) -> str:
     return combination(weights, lambda i: f"k{i}_{j}")
 
 
-def _names(letter: str, count: int, place: str = "{}") -> list[str]:
-    return [letter + place.format(i) for i in range(count)]
+def _names(letter: str, count: int) -> list[str]:
+    return [f"{letter}{i}" for i in range(count)]

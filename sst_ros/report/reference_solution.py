@@ -243,11 +243,12 @@ class ExtendedSolver:
         result = np.full((count + 1, size), np.nan, dtype=np.longdouble)
         result[0] = problem.start
         y, h = [number(x) for x in problem.start], number(problem.interval) / steps
+        new_y, error = list(y), list(y)
         with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
             for k in range(count * steps):
-                y = self._code.step(k * h, h, *y, *problem.drive)[:size]
-                length = self._code.sqrt(sum(x * x for x in y[:4]))
-                y = [*(x / length for x in y[:4]), *y[4:]]
+                self._code.attempt(k * h, h, y, y, problem.drive, (), new_y, error)
+                length = self._code.sqrt(sum(x * x for x in new_y[:4]))
+                y = [*(x / length for x in new_y[:4]), *new_y[4:]]
                 if (k + 1) % steps == 0:  # as text, in which both kinds have all their digits
                     result[(k + 1) // steps] = [np.longdouble(str(x)) for x in y]
         return result
