@@ -65,17 +65,11 @@ _CLOSE = 0.95
 def fit_weighted(
     columns: Array, torque: Array, noise: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Fit torque = columns estimate.
+    """Fit torque = columns estimate, with b independent columns, shape (m, 3, b).
 
-    Args:
-        columns: regressor of b independent columns, shape (m, 3, b).
-        torque: measured less known torques [N m], shape (m, 3).
-        noise: standard deviations of the torques [N m], shape (3,); by default estimated.
-
-    Returns:
-        The estimates, shape (b,); R of the weighted regressor, R^T R = covariance^-1, shape (b, b);
-        and the noise.
-
+    Torques are measured less known ones [N m], shape (m, 3), and the noise their standard
+    deviations, shape (3,), by default estimated. Returns the estimates, shape (b,), R of the
+    weighted regressor, R^T R = covariance^-1, shape (b, b), and the noise.
     """
     floor = EXACT * float(np.sqrt(np.mean(torque**2))) + 1e-300
     if noise is None:
@@ -123,18 +117,10 @@ def find_consistent_values(
 ) -> tuple[Array, float]:
     """Values of all parameters that fit the base parameters, those of bodies that can exist.
 
-    Args:
-        names: of the parameters, length p.
-        given: their values in the scene, shape (p,).
-        transform: the combinations that were estimated, shape (b, p).
-        estimate: of the combinations, shape (b,).
-        root: R of its covariance (R^T R)^-1, shape (b, b).
-        reach: distance from O within which centres of mass lie [m].
-
-    Returns:
-        The values, shape (p,), and chi^2 of the base parameters there: how much worse the torques
-        are fitted than without the constraints.
-
+    Of p parameters with values given in the scene, b combinations (transform, shape (b, p)) were
+    estimated, with the covariance (R^T R)^-1 of the root R. Centres of mass lie within the reach of
+    O [m]. Returns the values, shape (p,), and chi^2 of the base parameters there: how much worse
+    the torques are fitted than without the constraints.
     """
     cones, sizes = list(cones_of(tuple(names), reach)), scales(names, given)
     rows = np.vstack([root @ transform, np.diag(1.0 / sizes)])
@@ -184,9 +170,7 @@ def _newton_step(
 ) -> tuple[Array, float, float]:
     """Newton's step for |rows values - right|^2 / 2 - barrier sum log det.
 
-    Returns:
-        The step, how far to go along it, and its decrement, squared and over the barrier.
-
+    Returns it, how far to go along it, and its decrement, squared and over the barrier.
     """
     blocks, targets, whitened = [rows], [right - rows @ values], []
     for cone in cones:

@@ -114,9 +114,7 @@ class Batch:
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios, already checked, that shares this one's compiled code.
 
-        Raises:
-            InputError: numbers differ that do not differ in this batch.
-
+        Numbers that do not differ in this batch must not differ in that.
         """
         other = copy.copy(self)
         other._scenarios, other.columns = scenarios, self.model.columns(scenarios)

@@ -74,10 +74,8 @@ class ParametricModel:
     def columns(self, scenarios: Scenarios) -> ParameterColumns:
         """Return the numbers of scenarios.
 
-        Raises:
-            InputError: actuators cannot give the torques of the profile, or a number differs that
-                does not in the scenarios that this model was made from.
-
+        Refused are actuators that cannot give the torques of the profile, and numbers that differ
+        but do not in the scenarios that this model was made from.
         """
         geometries, which = Geometry.of_scenarios(scenarios)
         tree = self._constants_of(scenarios, geometries, which)

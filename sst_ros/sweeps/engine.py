@@ -73,9 +73,12 @@ def run_chunk(study: SweepStudy, steps: int, folder: Path | None, index: int) ->
     counts.pop("reached the end", None)
     if folder is None:
         return ChunkOutcome(index, counts, (table, trajectory))
-    if trajectory is not None:
-        write(trajectory, folder, name_part(index, "trajectory"), ready.about)
-    write(table, folder, name_part(index), ready.about)
+    try:
+        if trajectory is not None:
+            write(trajectory, folder, name_part(index, "trajectory"), ready.about)
+        write(table, folder, name_part(index), ready.about)
+    except OSError as error:
+        raise OSError(f"{folder}: {error}") from error
     return ChunkOutcome(index, counts, None)
 
 
@@ -87,7 +90,7 @@ def run_local(compute: Compute, chunks: Sequence[int], done: Done, workers: int)
             for future in as_completed(futures):
                 done(future.result())
         except OSError as error:
-            raise SweepFailed(f"results cannot be written: {error}") from error
+            raise SweepFailed(str(error)) from error
         finally:
             pool.shutdown(cancel_futures=True)
 

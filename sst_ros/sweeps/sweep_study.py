@@ -253,12 +253,10 @@ class SweepStudy(Section):
 
     def document(self) -> dict[str, Any]:
         """Return the study as nested dicts and lists; a table as digests of its columns."""
-        values = {name: getattr(self, name) for name in specs(SweepStudy)}
+        values = self.__getstate__()
         if self.table is not None:
-            digests = {name: make_digest(column.tobytes()) for name, column in self.table.items()}
-            values["table"] = digests
-        document: dict[str, Any] = plain(values)
-        return document
+            values["table"] = {name: make_digest(x.tobytes()) for name, x in self.table.items()}
+        return dict(plain(values))
 
     @cached_property
     def digest(self) -> str:
