@@ -61,17 +61,14 @@ class ActuatorSpaceMap:
         ]
         self._actuators = compile_program(trace(self._of_star, _STAR))
         self._star = compile_program(trace(self.star_accelerations, _MOVING))
-        self._posture = compile_program(trace(self._of_posture, _STAR[:4]))
+        # sin(mu) and beta [rad] of the legs, six numbers, and det J2, of a quaternion.
+        self.posture = compile_program(trace(self._of_posture, _STAR[:4]))
         self._newton = compile_program(trace(self.newton_step, _POSE))
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad]."""
         g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(*q, *rate, *acceleration)
         return Reference(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
-
-    def posture(self, q: Quaternion) -> tuple[float, ...]:
-        """sin(mu) and beta [rad] of the legs, six numbers, and det J2 of an orientation."""
-        return self._posture(*q)
 
     def star_motion(
         self, q: Quaternion, gamma_dot: Vector3, gamma_ddot: Vector3
@@ -118,7 +115,7 @@ class ActuatorSpaceMap:
         step = math.dist(gamma, here)
         with contextlib.suppress(ArithmeticError):
             if sigma is None:
-                sigma = 2.0 / 3.0 * abs(self.posture(known)[-1])
+                sigma = 2.0 / 3.0 * abs(self.posture(*known)[-1])
             if step <= continuation.SAFE * sigma * sigma:
                 found = self.orientation(known, gamma)
                 # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle / 2).

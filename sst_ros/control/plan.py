@@ -201,7 +201,7 @@ def _distances(
 
     def measure(at: Reference) -> tuple[float, ...]:
         """Gamma, sin(mu), beta and det J2, ten numbers; sin(mu) < 0 beyond a serial singularity."""
-        posture = list(space.posture(at.quaternion))
+        posture = list(space.posture(*at.quaternion))
         turned = space.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
         for leg in range(3):
             # On the other branch of the leg r_k has the opposite direction: gamma differs by pi.
@@ -275,8 +275,8 @@ class TimeScaling:
 def time_scaling(plan: MotionPlan) -> TimeScaling:
     """Find the highest feasible factor of speed.
 
-    The factors that torques allow are found on a grid first, then to rounding; a
-    feasible range narrower than the grid, between others that are not, may be overlooked.
+    The factors that torques allow are found on a grid first, then to rounding; a feasible range
+    narrower than the grid, between others that are not, may be overlooked.
     """
     known, torque_limit = limits(plan.scene.actuators), plan.scene.torque_limit
     caps = {"torque": math.inf}
@@ -285,9 +285,11 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
         if name in known and largest:
             caps[name] = (known[name] / largest) ** power
     binding = min(caps, key=lambda name: caps[name])
-    cap = caps[binding]
+    highest = cap = caps[binding]
+    if math.isinf(cap):
+        binding = ""
     if torque_limit is None:
-        return TimeScaling(cap, 0.0, binding if math.isfinite(cap) else "")
+        return TimeScaling(cap, 0.0, binding)
     excess = _excess(plan, torque_limit)
     find_end = partial(brentq, excess, xtol=1e-300, rtol=4.0 * np.finfo(float).eps)
     grid = np.geomspace(SLOWEST * min(cap, 1.0), min(cap, FASTEST), _GRID).tolist()
@@ -299,11 +301,8 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     if not any(fits):
         return TimeScaling(None, 0.0, "torque")
     last = int(np.flatnonzero(fits)[-1])
-    highest = grid[last]
     if last < _GRID - 1:
         highest, binding = find_end(grid[last], grid[last + 1]), "torque"
-    elif math.isinf(cap):
-        highest, binding = math.inf, ""
     slow = np.flatnonzero(np.logical_not(fits[:last]))
     if len(slow):
         return TimeScaling(highest, find_end(grid[slow[-1]], grid[slow[-1] + 1]), binding)
