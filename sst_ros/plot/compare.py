@@ -62,11 +62,8 @@ def _difference(runs: Drawn) -> Figure:
 def _sphere(runs: Drawn) -> Figure:
     scene = runs[0][0].scene
     assert scene is not None
-    figure, axes, view = workspace.ground(scene)
-    for run, label, style in runs:
-        axes.plot(*view.flat(pictures.directions(run)), label=label, **style)
-    axes.legend(loc="upper left", fontsize=8, frameon=False)
-    return figure
+    paths = [(label, pictures.directions(run), look) for run, label, look in runs]
+    return workspace.draw_paths(scene, paths)
 
 
 JOINTS, ERROR, TICKS, TURN = "joint_states", "tracking_error", "applied_torques", "orientation"

@@ -216,12 +216,8 @@ def directions(run: Signals) -> Array:
 
 def _sphere(run: Signals, scene: Scene) -> Figure:
     """Draw the path of E over how far the best turn of the star keeps from every limit."""
-    figure, axes, view = workspace.ground(scene)
-    x, y = view.flat(directions(run))
-    axes.plot(x, y, color=BLUE, linewidth=1.8, label="path of E")
-    style.mark_ends(axes, x, y)
-    axes.legend(loc="upper left", fontsize=8, frameon=False)
-    return figure
+    looks = {"color": BLUE, "linewidth": 1.8}
+    return workspace.draw_paths(scene, [("path of E", directions(run), looks)])
 
 
 def _power(run: Signals) -> Array:

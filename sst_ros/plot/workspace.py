@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The workspace on the sphere: maps, a row of three for each manipulator; ground for a path of E.
+"""The workspace on the sphere: maps, a row of three for each manipulator, and paths of E.
 
 The sphere is seen from outside along the middle of the base triangle, in the equal-area
 projection of Lambert, so that equal patches are equal solid angles.
@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.workspace import OrientationMap, triangle_directions
-from sst_ros.plot.style import BLUE, GREY, INK, Looks, sides, styled
+from sst_ros.mechanism.workspace import OrientationMap
+from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
 from sst_ros.scene.scene import Scene
 
 WORST_COND = 10.0  # from this cond J on the colour stays the same
@@ -41,14 +41,18 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
     names = titles or ["E on the base triangle"] * len(charts)
     for row, chart, title in zip(rows, charts, names, strict=True):
-        divisions = round((math.sqrt(8 * len(chart.s) + 1) - 3) / 2)
-        _row(row, chart, triangle_directions(chart.geometry, divisions)[1], title)
+        _row(row, chart, title)
     return figure
 
 
-def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str) -> None:
-    view = View(chart.geometry)
-    poses = workspace.parallel_singularities(chart)
+def triangles(chart: OrientationMap) -> NDArray[np.intp]:
+    """Triangles of the directions of a map, shape (n, 3)."""
+    divisions = round((math.sqrt(8 * len(chart.s) + 1) - 3) / 2)
+    return workspace.triangle_directions(chart.geometry, divisions)[1]
+
+
+def _row(figure: Any, chart: OrientationMap, title: str) -> None:
+    poses, faces = workspace.parallel_singularities(chart), triangles(chart)
     a, b, c = (chart.s[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     reach = np.average((chart.turn > 0.0)[faces].mean(axis=1), weights=area)
@@ -64,7 +68,7 @@ def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str
         (axes, "Best condition of J over that turn", chart.best_cond_j),
         (right, "Distance to the nearest limit, best turn", margin),
     ):
-        _panel(panel, view, chart, faces, values, condition=panel is axes)
+        _panel(panel, chart, faces, values, condition=panel is axes)
         panel.set_title(name, fontsize=10.5, color=INK, loc="center")
     ends = workspace.serial_singularities(chart.geometry)
     for found, marker, size, colour, label in (
@@ -72,23 +76,17 @@ def _row(figure: Any, chart: OrientationMap, faces: NDArray[np.intp], title: str
         (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
     ):
         if len(found):
-            x, y = view.flat(found.rotation[:, :, 2])
+            x, y = project(chart.geometry, found.rotation[:, :, 2])
             axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
             axes.plot([], [], "o", markersize=4, color=colour, label=label)
             axes.legend(loc="upper right", fontsize=8, frameon=False)
 
 
 def _panel(
-    axes: Axes,
-    view: View,
-    chart: OrientationMap,
-    faces: NDArray[np.intp],
-    values: Array,
-    *,
-    condition: bool,
+    axes: Axes, chart: OrientationMap, faces: NDArray[np.intp], values: Array, *, condition: bool
 ) -> None:
     """Draw values (n,): angles [deg], or cond J: logarithmic, from 1, and the least is the best."""
-    x, y = view.flat(chart.s)
+    x, y = project(chart.geometry, chart.s)
     mesh = Triangulation(x, y, faces)
     axes.tripcolor(mesh, np.zeros(len(x)), cmap="Greys", vmin=-0.5, vmax=5)
     known = np.isfinite(values)
@@ -126,7 +124,7 @@ def _panel(
         box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
         beside: Looks = {"textcoords": "offset points", "fontsize": 9, "ha": "center", "bbox": box}
         axes.annotate(text, place, (0, 8), color=INK, **beside)
-    draw_triangle(axes, view)
+    draw_triangle(axes, chart.geometry)
 
 
 def _contours(axes: Axes, mesh: Triangulation, values: Array, condition: bool) -> list[Any]:
@@ -140,19 +138,18 @@ def _contours(axes: Axes, mesh: Triangulation, values: Array, condition: bool) -
     return [lines, *axes.clabel(lines, fontsize=7.5, fmt="%g" if condition else "%g°")]
 
 
-def draw_triangle(axes: Axes, view: View) -> None:
+def draw_triangle(axes: Axes, geometry: Geometry) -> None:
     """Draw the base triangle with its corners and the sense of gamma along its arcs."""
-    geometry = view.geometry
-    reach = max(float(np.hypot(*view.flat(v))) for v in geometry.v)
+    reach = float(np.hypot(*project(geometry, geometry.v)).max())
     arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.5}
-    for k, side in enumerate(sides(geometry, 61)):
-        x, y = view.flat(side)
+    for k, side in enumerate(sides(geometry, 61), 1):
+        x, y = project(geometry, side)
         axes.plot(x, y, color=INK, lw=1.8, solid_capstyle="round")
         # gamma_k grows from P_k to P_k+1.
         axes.annotate("", (x[32], y[32]), (x[28], y[28]), arrowprops=arrow)
         corner, middle = np.array([x[0], y[0]]), np.array([x[30], y[30]])
         axes.plot(*corner, "o", markersize=5, color=INK)
-        for point, name in ((middle, f"$\\gamma_{k + 1}$"), (corner, f"$P_{k + 1}$")):
+        for point, name in ((middle, f"$\\gamma_{k}$"), (corner, f"$P_{k}$")):
             x, y = point * (1.0 + 0.1 / np.hypot(*point))
             axes.text(x, y, name, fontsize=12, color=INK, ha="center", va="center")
     axes.set_aspect("equal")
@@ -161,53 +158,52 @@ def draw_triangle(axes: Axes, view: View) -> None:
     axes.set_axis_off()
 
 
-class View:
-    """Equal-area projection about the middle of the base triangle, P_1 upward."""
-
-    def __init__(self, geometry: Geometry) -> None:
-        self.geometry = geometry
-        middle = geometry.v.sum(axis=0)
-        self.out = middle / np.linalg.norm(middle)
-        up = geometry.v[0] - self.out * (self.out @ geometry.v[0])
-        self.up = up / np.linalg.norm(up)
-        self.right = np.cross(self.up, self.out)
-
-    def flat(self, s: Array) -> tuple[Array, Array]:
-        """Project unit vectors (..., 3)."""
-        scale = np.sqrt(2.0 / (1.0 + s @ self.out))
-        return scale * (s @ self.right), scale * (s @ self.up)
+def project(geometry: Geometry, s: Array) -> tuple[Array, Array]:
+    """Project unit vectors (..., 3) about the middle of the base triangle, P_1 upward."""
+    middle = geometry.v.sum(axis=0)
+    out = middle / np.linalg.norm(middle)
+    up = geometry.v[0] - out * (out @ geometry.v[0])
+    up = up / np.linalg.norm(up)
+    scale = np.sqrt(2.0 / (1.0 + s @ out))
+    return scale * (s @ np.cross(up, out)), scale * (s @ up)
 
 
 LEVELS = (5, 10, 20, 30)
-_DIVISIONS, _TURNS = 40, 72
 
 
-def ground(scene: Scene) -> tuple[Figure, Axes, View]:
-    """Draw the base triangle, where E cannot be, and lines of equal distance to the limits."""
+@lru_cache(maxsize=4)
+def _map(scene: Scene) -> OrientationMap:
+    return workspace.workspace(Geometry.of(scene), divisions=40, turns=72)
+
+
+def draw_paths(scene: Scene, paths: Sequence[tuple[str, Array, Looks]]) -> Figure:
+    """Draw paths of E, directions (n, 3) each, over the base triangle, and where E cannot be.
+
+    Lines show how far the best turn of the star keeps from every limit; one path has its ends.
+    """
     geometry = Geometry.of(scene)
-    view = View(geometry)
     figure = Figure(figsize=(6.4, 5.6))
     axes = figure.subplots()
-    s, faces, margin = _margins(scene)
-    mesh = Triangulation(*view.flat(s), faces)
+    chart = _map(scene)
+    margin, faces = np.degrees(chart.best_margin), triangles(chart)
+    mesh = Triangulation(*project(geometry, chart.s), faces)
     beyond = np.isnan(margin)
     if beyond.any():
         out = Triangulation(mesh.x, mesh.y, faces[beyond[faces].any(axis=1)])
-        axes.tripcolor(out, np.zeros(len(s)), cmap="Greys", vmin=-0.5, vmax=2.0)
+        axes.tripcolor(out, np.zeros(len(margin)), cmap="Greys", vmin=-0.5, vmax=2.0)
         axes.plot([], [], "s", color="#cccccc", label="E cannot be there")
     inside = Triangulation(mesh.x, mesh.y, faces, mask=beyond[faces].any(axis=1))
     levels = [level for level in LEVELS if np.nanmin(margin) < level < np.nanmax(margin)]
     if levels:
-        looks: Looks = {"levels": levels, "colors": GREY, "linewidths": 0.7, "alpha": 0.7}
-        drawn = axes.tricontour(inside, np.nan_to_num(margin), **looks)
+        lines: Looks = {"levels": levels, "colors": GREY, "linewidths": 0.7, "alpha": 0.7}
+        drawn = axes.tricontour(inside, np.nan_to_num(margin), **lines)
         axes.clabel(drawn, fontsize=7, fmt="%g°")
         axes.plot([], [], color=GREY, linewidth=0.7, label="distance to the nearest limit")
-    draw_triangle(axes, view)
-    return figure, axes, view
-
-
-@lru_cache(maxsize=4)
-def _margins(scene: Scene) -> tuple[Array, NDArray[np.intp], Array]:
-    s, faces = workspace.triangle_directions(Geometry.of(scene), _DIVISIONS)
-    chart = workspace.over_orientations(Geometry.of(scene), s, turns=_TURNS)
-    return s, faces, np.degrees(chart.best_margin)
+    draw_triangle(axes, geometry)
+    for name, s, looks in paths:
+        x, y = project(geometry, s)
+        axes.plot(x, y, label=name, **looks)
+        if len(paths) == 1:
+            mark_ends(axes, x, y)
+    axes.legend(loc="upper left", fontsize=8, frameon=False)
+    return figure
