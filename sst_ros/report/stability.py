@@ -255,10 +255,7 @@ def _start(scene: Scene, rotation: Array, rate: Array) -> Scene:
 
 ROWS: dict[str, tuple[str, Change]] = {
     "as-it-is": ("nothing", lambda scene, _: scene),
-    "torque": (
-        "ten times the torque",
-        _scale(10.0, r"torque\.amplitude.*", "torques of its own"),
-    ),
+    "torque": ("ten times the torque", _scale(10.0, r"torque\.amplitude.*", "torques of its own")),
     "rates": ("ten times the rates at the start", _faster),
     "stiffness": (
         "a hundred times the stiffness",

@@ -173,16 +173,7 @@ class _Panel:
         self._head.content = str(_PANEL.head(self._scene, phase, colour, time))
         if state is None:
             return
-        rows = (
-            ("γ", "deg", np.degrees(state.gamma)),
-            ("γ̇", "rad/s", np.array(state.gamma_dot)),
-            ("τ", "N m", np.array(state.torque)),
-            ("μ", "deg", np.degrees(state.mu)),
-            ("β", "deg", np.degrees(state.beta)),
-        )
-        # No minus before a zero.
-        shown = [(name, unit, (values + 0.0).tolist()) for name, unit, values in rows]
-        self._joints.content = str(_PANEL.joints(_COLOURS, shown))
+        self._joints.content = str(_PANEL.joints(_COLOURS, state))
         shown = _PANEL.status(_LEVELS[status.level], status.message, status.values)
         self._status.content = str(shown)
 
