@@ -94,10 +94,10 @@ def step_many(
 
     That is one in which a step is rejected, a limit may be met, or more is done than is allowed.
     One row of `lengths` and `drives` is for all periods. Where starts[k] has numbers and not NaN,
-    period k begins there. y, z, joints (nine angles, nine rates) and `run` become those at the end
-    of the last period that was done, and reached[k] the solutions at the end of period k. `run` has
-    the longest next step [s], attempts and steps so far, and the period that comes next; then what
-    is allowed: longest step [s], attempts until the method is looked at, and steps.
+    period k begins there. y, z, joints (nine angles, nine rates) and `run` become those at the
+    begin of the period that is returned, and reached[k] the solutions at the end of period k. `run`
+    has the longest next step [s], attempts and steps so far, and the period that comes next; then
+    what is allowed: longest step [s], attempts until the method is looked at, and steps.
     """
     now_y, now_z, new_y, new_z = vector(SIZE), vector(SIZE), vector(SIZE), vector(SIZE)
     error, now_joints, new_joints = vector(SIZE), vector(18), vector(18)
@@ -105,13 +105,12 @@ def step_many(
         h, d = lengths[k % len(lengths)], drives[k % len(drives)]
         longest, attempts, steps = run[0], run[1], run[2]
         if len(starts) > 0 and starts[k][0] == starts[k][0]:
-            copy(starts[k], now_y)
-            copy(starts[k], now_z)
-            joints_of(now_y, p, now_joints)
-        else:
-            copy(y, now_y)
-            copy(z, now_z)
-            copy(joints, now_joints)
+            copy(starts[k], y)
+            copy(starts[k], z)
+            joints_of(y, p, joints)
+        copy(y, now_y)
+        copy(z, now_z)
+        copy(joints, now_joints)
         t, last = 0.0, False
         while not last:
             length = min(longest, run[4], h - t)

@@ -41,7 +41,7 @@ DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 TRACKING_DRAWN = ("tracking", "tracking_error", "control_torques")
 """Pictures of `plot` that the reports have, too."""
 
-SUMMARY, PAGE, HTML = "summary.json", "page.png", "page.html"
+PAGE, HTML = "page.png", "page.html"
 
 ERROR_LIMIT_RAD = 1e-9  # of the integration, where the tolerance of the run was not recorded
 ANSWERED_PERCENT = 90.0  # share of samples that a controller at the sample rate answers
@@ -67,7 +67,7 @@ def evaluate_run(run: Recording) -> RunEvaluation:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
     numbers = {
-        **summarise(run, integration, ideal, reference.check_with_paper(run)),
+        **summarise(run, integration, ideal),
         **measured.numbers(),
         "energy_residual_max_J": largest(np.abs(energy)),
         "unknown": [*measured.missing, *filter(None, [missing])],
@@ -108,7 +108,7 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
         )
         (out / HTML).write_text(page, encoding="utf-8")
         document = json.dumps(result, indent=2, allow_nan=False) + "\n"
-        (out / SUMMARY).write_text(document, encoding="utf-8")
+        (out / "summary.json").write_text(document, encoding="utf-8")
     return result
 
 
@@ -148,14 +148,9 @@ def summary_table(summary: dict[str, Any]) -> str:
     return render("run_table.txt", s=summary, made=provenance(summary["report"]))
 
 
-def summarise(
-    run: Recording,
-    integration: Comparison,
-    ideal: Comparison | None,
-    formulation: tuple[float | None, int],
-) -> dict[str, Any]:
+def summarise(run: Recording, integration: Comparison, ideal: Comparison | None) -> dict[str, Any]:
     """Collect all figures of the report but those of timing and energy."""
-    tracked = tracking.of(run)
+    tracked, formulation = tracking.of(run), reference.check_with_paper(run)
     found = tracked and tracked.metrics
     ideals: dict[str, Any] = {}
     if ideal:
@@ -344,8 +339,8 @@ def _panels(run: Recording, found: RunEvaluation) -> Iterator[Panel]:
     late = measured.late_us / 1e3
     yield _curve("Delay of samples", "delay, less the shortest [ms]", seconds, late)
     title, effort = "Effort of joint_states against applied torque", run.effort_difference
-    same = _missing(effort) or ("" if np.nanmax(effort) else "no difference")
-    yield _curve(title, "largest difference [N m]", seconds, effort)._replace(missing=same)
+    panel = _curve(title, "largest difference [N m]", seconds, effort)
+    yield panel._replace(missing="no difference") if largest(effort) == 0.0 else panel
     used = (1e-6 * reported.ticks * reported.step_mean_us).to_numpy()
     # Reports come once a second: between them, and from the start, the steps cost the same.
     at_samples = np.interp(seconds, [0.0, *reported.time_s], [0.0, *used])
