@@ -299,9 +299,7 @@ class Program:
 class Slots:
     """Where the numbers of some programs are in the vector p that their compiled code takes.
 
-    Attributes:
-        values: the vector, for the scene that the programs were traced for.
-
+    `values` is the vector for the scene that the programs were traced for.
     """
 
     def __init__(self) -> None:

@@ -96,13 +96,7 @@ def initial_states(
 
 @lru_cache(maxsize=64)
 def start_of(scene: Scene) -> tuple[float, ...]:
-    """Return the initial state of a scene in which a run can begin.
-
-    Raises:
-        InputError: the initial gamma lies outside the stroke.
-        AssemblyError, SingularConfiguration: as `initial_state`.
-
-    """
+    """Return `initial_state` of a scene; InputError where gamma lies outside the stroke."""
     gamma, geometry = np.array(scene.initial.gamma), Geometry.of(scene)
     inside = scene.stroke.at_end != "stop" or bool(np.all((gamma >= 0) & (gamma <= geometry.arc)))
     ends = ", ".join(f"{arc:.6f}" for arc in geometry.arc)
@@ -120,11 +114,7 @@ def accelerate_by_paper(
     """Return W_dot in {E} [rad/s^2] and gamma_dot [rad/s], each shape (3,), by Eqs. 1 to 92.
 
     The state is quaternion (x, y, z, w) and W in {E} [rad/s]; torques and the external moment on
-    the star in {B} are in N m.
-
-    Raises:
-        SingularConfiguration: the posture is singular.
-
+    the star in {B} are in N m. In a singular posture SingularConfiguration is raised.
     """
     numbers = np.asarray(state, dtype=float)
     rotation = rotation_matrix(numbers[:4])
@@ -141,11 +131,7 @@ class VirtualWorkDerivative:
     """Derivative of a scene's state by Eqs. 1 to 92.
 
     It may have bodies, payload, rotors, torque limits and an external moment, as the paper has them
-    or in its inertias and n_ext.
-
-    Raises:
-        InputError: the scene has another term; names each.
-
+    or in its inertias and n_ext; InputError names each other term.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -164,11 +150,8 @@ class VirtualWorkDerivative:
     def __call__(self, _: float, *inputs: float) -> tuple[float, ...]:
         """Differentiate quaternion, body rate [rad/s] and work [J] by time.
 
-        Torques [N m] follow, and a moment on the star in {B} [N m] if it comes from a topic.
-
-        Raises:
-            ArithmeticError: the posture is singular.
-
+        Torques [N m] follow, and a moment on the star in {B} [N m] if it comes from a topic. In a
+        singular posture ArithmeticError is raised.
         """
         x, y, z, w, *rate = inputs[:7]
         torque = np.array(inputs[8:11])

@@ -128,18 +128,12 @@ recent = lru_cache(maxsize=32)(Dynamics)
 class ODE:
     """Derivative of a scene's state, as programs with the inputs t, state, drive.
 
-    Args:
-        dynamics: the scene.
-        torque: torques over time that replace those of the drive.
-        limit: of the actuators, which clamps `torque` [N m].
-        phases: the drive keeps three numbers for the torques: the phases [rad] of `torque`.
-        work: append to the state the work [J] that actuators and moments have put in, less what
-            friction has taken out.
+    `torque` over time, clamped to `limit` [N m], replaces the torques of the drive; with `phases`
+    the drive keeps three numbers for them, the phases [rad]. `work` appends to the state the work
+    [J] that actuators and moments have put in, less what friction has taken out.
 
-    Attributes:
-        state: names of the state's numbers: quaternion, body rate, lagged torques, work.
-        drive: names of what acts from outside and is constant over a step.
-
+    `state` has the names of the state's numbers: quaternion, body rate, lagged torques, work;
+    `drive` of what acts from outside and is constant over a step.
     """
 
     def __init__(
@@ -228,9 +222,7 @@ class ODE:
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
 
-        Raises:
-            ArithmeticError, ValueError: it is not finite.
-
+        Where it is not finite, ArithmeticError or ValueError is raised.
         """
         size = len(self.state)
         flat = np.array(self.linearised(t, *y, *d)[2 * size :])

@@ -40,20 +40,14 @@ _SQRT2 = 2.0**0.5
 class BranchEnds(SingularConfiguration):
     """The branch meets a parallel singularity before the motion ends.
 
-    Attributes:
-        measure: sigma, the least singular value of J2, at the last assembly.
-        row: index of the point of `gamma` that was not reached.
-        gamma: actuator angles of the last assembly [rad], shape (3,).
-        rotation: R of the last assembly, shape (3, 3).
-        det_j2: determinant of J2 there.
-
+    `measure` is sigma, the least singular value of J2, at the last assembly.
     """
 
     def __init__(self, measure: float, row: int, gamma: Array, rotation: Array, j2: Array) -> None:
-        self.row = row
-        self.gamma = gamma
-        self.rotation = rotation
-        self.det_j2 = float(np.linalg.det(j2))
+        self.row = row  #: index of the point of the motion that was not reached
+        self.gamma = gamma  #: actuator angles of the last assembly [rad], shape (3,)
+        self.rotation = rotation  #: R of the last assembly, shape (3, 3)
+        self.det_j2 = float(np.linalg.det(j2))  #: determinant of J2 there
         angles = np.array2string(gamma, precision=9)
         super().__init__(
             f"parallel singularity before point {row}: the branch ends at gamma = {angles} rad,"
@@ -77,10 +71,8 @@ class Branch:
 def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = None) -> Branch:
     """Follow a branch along the straight segments between the points gamma [rad], shape (n, 3).
 
-    Args:
-        geometry: base triangle and star.
-        gamma: the motion; sample a curved one finely enough that the chords stand for it.
-        rotation: R of the assembly at gamma[0]; None takes the admissible one.
+    Sample a curved motion finely enough that the chords stand for it. `rotation` is R of the
+    assembly at gamma[0], by default of the admissible one.
 
     Raises:
         AssemblyError: rotation is None and there is no unique admissible assembly, rotation is
@@ -112,9 +104,7 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
 def advance(geometry: Geometry, rotation: ArrayLike, start: ArrayLike, end: ArrayLike) -> Array:
     """Return R, shape (3, 3), at gamma = end [rad] of the branch that has `rotation` at start.
 
-    Raises:
-        BranchEnds: a parallel singularity lies on the path.
-
+    Where a parallel singularity lies on the path, BranchEnds is raised.
     """
     first, last = np.array(start, dtype=float), np.array(end, dtype=float)
     return _segment(geometry, first, last, np.array(rotation, dtype=float), 1)

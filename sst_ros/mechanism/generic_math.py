@@ -49,11 +49,8 @@ def atan2(y: Any, x: Any) -> Any:
             return number.apply("atan2", y, x)
     if np.iscomplexobj(y) or np.iscomplexobj(x):
         angle = np.arctan2(np.real(y), np.real(x))
-        turned_x, turned_y = (
-            x * np.cos(angle) + y * np.sin(angle),
-            y * np.cos(angle) - x * np.sin(angle),
-        )
-        return angle + np.arctan(turned_y / turned_x)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        return angle + np.arctan((y * cosine - x * sine) / (x * cosine + y * sine))
     return _other("atan2", y, x)
 
 
@@ -157,8 +154,7 @@ def solve_symmetric(matrix: Symmetric, right: Triple) -> Triple:
 def rotate_back(rows: Rows, vector: Triple) -> Triple:
     """R^T times a vector of {B}."""
     x, y, z = vector
-    first, second, third = (x * rows[0][i] + y * rows[1][i] + z * rows[2][i] for i in range(3))
-    return (first, second, third)
+    return triple(x * rows[0][i] + y * rows[1][i] + z * rows[2][i] for i in range(3))
 
 
 def dot3(a: Triple, b: Triple) -> Scalar:

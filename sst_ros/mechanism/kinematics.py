@@ -138,13 +138,9 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
 
 
 def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = None) -> Assembly:
-    """Return the one assembly in which the manipulator can be built at gamma, section 4.1.
+    """Return the one assembly in which the manipulator can be built at gamma [rad], section 4.1.
 
-    Args:
-        geometry: base triangle and star.
-        gamma: actuator angles [rad], shape (3,).
-        near: rotation that selects one where several are admissible: the only one
-            within NEAR of it.
+    Where several are admissible, the rotation `near` selects the only one within NEAR of it.
 
     Raises:
         NoAdmissibleAssembly: no assembly has E on the base triangle and 0 < beta_k <= beta_max.

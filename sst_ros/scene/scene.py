@@ -162,12 +162,7 @@ def _numbers(scene: Scene) -> Iterator[tuple[Place, Any, Spec]]:
 
 
 def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
-    """Return a scene as it is, by its name or path, or built from its document as a dict.
-
-    Raises:
-        InputError: there is no such scene, or its document is refused.
-
-    """
+    """Return a scene as it is, built from its document as a dict, or as `load` does."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, Mapping):
@@ -181,9 +176,7 @@ def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
 def with_initial(scene: Scene, initial: Any) -> Scene:
     """Return the scene with another initial state: (gamma, gamma_dot), a mapping or `Initial`.
 
-    Raises:
-        InputError: it is none of these, or its numbers are refused.
-
+    InputError is raised where it is none of these, or its numbers are refused.
     """
     if initial is None:
         return scene
@@ -211,12 +204,7 @@ def load(name_or_path: str | Path) -> Scene:
 
 
 def text_of(name_or_path: str | Path) -> tuple[str, str]:
-    """Return the YAML text of a scene, found as by `load`, and the path that it is from.
-
-    Raises:
-        InputError: there is no such file, or it is no text.
-
-    """
+    """Return the YAML text of a scene, found as by `load`, and the path that it is from."""
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         path = share_directory() / "config" / "scenes" / f"{name_or_path}.yaml"
@@ -234,12 +222,7 @@ def names() -> list[str]:
 
 
 def share_directory() -> Path:
-    """Folder that holds config/ and launch/: the source tree, or share/sst_ros of a prefix.
-
-    Raises:
-        InputError: sst_ros was installed without its data files.
-
-    """
+    """Folder that holds config/ and launch/: the source tree, or share/sst_ros of a prefix."""
     for parent in Path(__file__).resolve().parents:
         for candidate in (parent, parent / "share" / "sst_ros"):
             if (candidate / "config" / "scenes").is_dir():
@@ -282,12 +265,7 @@ class Scenarios:
             raise InputError(scene.name, problems)
 
     def scene(self, row: int) -> Scene:
-        """Build the scene of a row.
-
-        Raises:
-            InputError: the numbers of this row make no scene; names each and what is allowed.
-
-        """
+        """Build the scene of a row; InputError names the numbers that make none."""
         values = {place: self.rows[key][row].tolist() for place, (key, _) in self._fields.items()}
         try:
             return build(Scene, rebuild(self.document, values), "", of_row=True)

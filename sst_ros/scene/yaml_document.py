@@ -71,12 +71,7 @@ class Switch(str):
 
 
 def read(cls: type[S], source: str, origin: str) -> S:
-    """Build `cls` from YAML text.
-
-    Raises:
-        InputError: the text is no YAML or breaks the schema; lists every fault with its line.
-
-    """
+    """Build `cls` from YAML text; InputError lists every fault with its line."""
     lines: dict[str, int] = {}
     problems: list[Problem] = []
     try:
@@ -172,11 +167,8 @@ def plain(value: Any) -> Any:
 def replace_values(document: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested dicts and lists with other values by key; a single one fills a list.
 
-    A section that the document does not have is made; None takes a value or a section away.
-
-    Raises:
-        KeyError: a key does not fit the document; its argument is the key.
-
+    A section that the document does not have is made; None takes a value or a section away. The
+    argument of KeyError is a key that does not fit the document.
     """
     changed: dict[str, Any] = plain(document)
     for key, value in values.items():
@@ -229,11 +221,7 @@ def build(cls: type[S], values: Any, origin: str, *, path: str = "", of_row: boo
 
     Messages are headed by `origin`, and `path` is the section's key in a larger document. A
     document that says what has no effect is refused, as a friction whose coefficients are zero;
-    with `of_row` that is left out.
-
-    Raises:
-        InputError: lists every fault.
-
+    with `of_row` that is left out. InputError lists every fault.
     """
     builder = _Builder(of_row, [])
     result = builder.section(cls, plain(values), path)
@@ -326,11 +314,7 @@ def find_fields(
     """Yield the place of each field that a key names, its value, and what it allows.
 
     With `components` an index may also pick a component of a vector. `place` is that of the tree in
-    a larger one.
-
-    Raises:
-        ValueError: there is no such field, or it is not in this scene.
-
+    a larger one. ValueError says why there is no such field, or not in this scene.
     """
     word, _, rest = key.partition(".")
     try:
