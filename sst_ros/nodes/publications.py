@@ -18,6 +18,7 @@ import contextlib
 import math
 import struct
 import time
+from array import array
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -161,37 +162,42 @@ class TorqueLog:
     def __init__(self, period_ns: int, *, moments: bool = False) -> None:
         self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
         self._period_ns, self._moments = period_ns, moments
-        self._rows: list[tuple[float, ...]] = []
+        self._rows = array("d")
         # Each point begins with no positions, velocities and accelerations and the length of a row;
         # the first beginning is part of what stands before the points.
         self._begin = 0, 0, 0, len(self._names)
         parts = ("row", "<f8", (len(self._names),)), ("time", "<i4", (2,)), ("begin", "<u4", (4,))
         self._point = np.dtype([*parts])
+        self._lay_out(0)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._rows) // len(self._names)
 
     def clear(self) -> None:
         """Forget the rows."""
-        self._rows.clear()
+        self._rows = array("d")
 
-    def append(self, torque: Sequence[float], moment: Sequence[float], ticks: int = 1) -> None:
+    def append(self, torque: Vector3, moment: Sequence[float], ticks: int = 1) -> None:
         """Log the torque [N m] and the moment [N m] of some ticks."""
-        row = (*torque, *moment) if self._moments else tuple(torque)
-        self._rows.extend([row] * ticks)
+        self._rows.extend(((*torque, *moment) if self._moments else torque) * ticks)
 
     def take(self, stamp_ns: int) -> bytes:
         """Return the message of the ticks logged since stamp_ns and clear the log."""
-        points = np.empty(len(self._rows), self._point)
-        points["row"] = np.reshape(self._rows, points["row"].shape)
-        ends = self._period_ns * np.arange(1, len(points) + 1)
-        points["time"] = np.stack(np.divmod(ends, NANOSECONDS), axis=1)
-        points["begin"] = self._begin
-        self._rows.clear()
-        named = BASE_FRAME, len(self._names), *self._names, len(points)
-        head = _layout(*named, *self._begin) if len(points) else _layout(*named, align=1)
+        if len(self) != len(self._points):  # most messages have as many as the one before
+            self._lay_out(len(self))
+        self._points["row"] = np.array(self._rows).reshape(self._points["row"].shape)
+        self.clear()
         behind = 4 * len(self._begin)
-        return _ENCAPSULATION + stamp(stamp_ns) + head + points.tobytes()[:-behind]
+        return _ENCAPSULATION + stamp(stamp_ns) + self._head + self._points.tobytes()[:-behind]
+
+    def _lay_out(self, count: int) -> None:
+        """Make what stands before the points and behind each row."""
+        named = BASE_FRAME, len(self._names), *self._names, count
+        self._head = _layout(*named, *self._begin) if count else _layout(*named, align=1)
+        self._points = np.empty(count, self._point)
+        ends = self._period_ns * np.arange(1, count + 1)
+        self._points["time"] = np.stack(np.divmod(ends, NANOSECONDS), axis=1)
+        self._points["begin"] = self._begin
 
 
 def follows_clock(node: Node) -> bool:
