@@ -155,7 +155,7 @@ def run_in_loop(
         constant=lambda _: False,
         now_ns=lambda: NANOSECONDS,
         sample=sample,
-        **dict.fromkeys(("refresh", "start", "ticks"), nothing),
+        **dict.fromkeys(("refresh", "ticks"), nothing),
         moment=ZERO,
         unread=False,
     )

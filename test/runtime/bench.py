@@ -69,9 +69,6 @@ class Output:
     def missing_subscribers(self):
         return self.missing
 
-    def start(self):
-        pass
-
     def ticks(self, torque, moment, count):
         self.acted.extend([torque] * count)
 
