@@ -125,7 +125,7 @@ def design(
 
 
 class _Trial:
-    """Motions of a scene as Fourier series of free numbers, and what they tell of parameters.
+    """Motions of a scene as Fourier series of free numbers, and what they determine of parameters.
 
     Attributes:
         centre: angles at both ends [rad], shape (3,).

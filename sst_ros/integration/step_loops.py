@@ -96,7 +96,7 @@ def step_many(
     One row of `lengths` and `drives` is for all periods. Where starts[k] has numbers and not NaN,
     period k begins there. y, z, joints (nine angles, nine rates) and `run` become those at the
     begin of the period that is returned, and reached[k] the solutions at the end of period k. `run`
-    has the longest next step [s], attempts and steps so far, and the period that comes next; then
+    has the longest next step [s], attempts and steps until now, and the next period; then
     what is allowed: longest step [s], attempts until the method is looked at, and steps.
     """
     now_y, now_z, new_y, new_z = vector(SIZE), vector(SIZE), vector(SIZE), vector(SIZE)

@@ -2,7 +2,7 @@
 """One style for all figures: colours, lines, sizes, and how a figure is saved.
 
 A function that draws takes data and returns a `Figure`; `styled` gives it the style. Of a long
-curve matplotlib leaves out what no picture could show (`path.simplify`).
+curve matplotlib leaves out what no picture could show (its setting "path.simplify").
 """
 
 from __future__ import annotations

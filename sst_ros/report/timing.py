@@ -71,8 +71,8 @@ class Timing(NamedTuple):
         }
         found: dict[str, Any] = {}
         for name, values in delays.items():
-            told = values.describe([0.99, 0.999]).dropna()
-            found |= {f"{name}_{word}_us": told.get(key) for key, word in STATISTICS.items()}
+            described = values.describe([0.99, 0.999]).dropna()
+            found |= {f"{name}_{word}_us": described.get(key) for key, word in STATISTICS.items()}
         return found | {"commands_followed": len(self.commands), **self.answers}
 
 
@@ -103,8 +103,8 @@ def measure(recording: Recording) -> Timing:
     elif commands.empty:
         missing.append("no recorded command is found among the applied torques")
     late, first = received_ns - time, int(received_ns[0])
-    told = [values for _, values in recording.reports]
-    reported = pandas.DataFrame(told, columns=REPORTED).replace("", None).astype(float)
+    reports = [values for _, values in recording.reports]
+    reported = pandas.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
     at = [when_ns - first for when_ns, _ in recording.reports]
     since = (received_ns - first).astype(float)
     reported.insert(0, "time_s", np.interp(at, since, recording.seconds))

@@ -76,7 +76,7 @@ class Pacer:
     def _set(self, speed: float) -> None:
         self.speed, self._interval = speed, self._period_ns / speed if speed else 0.0
         self.interval_ns = round(self._interval)  # between deadlines; 0 without any
-        # Ticks that one sleep may end in; a clock that is followed does not tell the next deadline.
+        # Ticks that one sleep may end in; a clock that is followed does not give the next deadline.
         several = speed > 0.0 and self._tolerance_ns == 0
         self.together = max(1, int(_TOGETHER_NS // self._interval)) if several else 1
 

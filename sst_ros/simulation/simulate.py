@@ -31,7 +31,7 @@ from sst_ros.simulation.torque_profile import (
     TorqueTable,
     profile_of,
 )
-from sst_ros.simulation.trajectory import Trajectory, judge
+from sst_ros.simulation.trajectory import Trajectory, check_error
 from sst_ros.state import NANOSECONDS, Array
 
 METHODS = (*INTEGRATORS, GAUSS)
@@ -201,7 +201,7 @@ def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:
     if motion.status < 0:
         numbers = describe_conditioning(Geometry.of(task.scene), motion.state())
         message = f"{message} ({numbers})"
-    status, message = judge(point.error, task.tolerance, motion.status, message)
+    status, message = check_error(point.error, task.tolerance, motion.status, message)
     rows = np.array(motion.rows).reshape(-1, 29)
     changes = [f"{to} from {at:g} s ({why})" for at, to, why in point.changes]
     energy = motion.propagator.dynamics.total_energy

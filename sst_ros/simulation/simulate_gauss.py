@@ -22,7 +22,7 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.simulation.stepped_motion import Task
 from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
-from sst_ros.simulation.trajectory import Trajectory, judge
+from sst_ros.simulation.trajectory import Trajectory, check_error
 from sst_ros.state import clamp
 
 GAUSS = "gauss"
@@ -127,7 +127,7 @@ class CollocatedMotion:
         task, status, message = self._task, 0, "reached the end"
         if self._met:
             status, message = 1, f"stopped at t = {self._end:.12f} s: {self._met.reason}"
-        status, message = judge(self._error, task.tolerance, status, message)
+        status, message = check_error(self._error, task.tolerance, status, message)
         most = task.scene.torque_limit or math.inf
         return Trajectory(
             task.scene,

@@ -62,7 +62,7 @@ _UNMET = 2
 """Status of a motion that reached its end with an error estimate above the tolerance."""
 
 
-def judge(error: float, tolerance: float, status: int, message: str) -> tuple[int, str]:
+def check_error(error: float, tolerance: float, status: int, message: str) -> tuple[int, str]:
     """Return status and message of a motion with an error estimate at its end [rad]."""
     if not error > tolerance:
         return status, message

@@ -215,7 +215,7 @@ class _Run:
         return again
 
     def _take(self, index: int, future: Any) -> bool:
-        """Take what has come of a chunk; return False if it has to be computed again."""
+        """Take the outcome of a chunk; return False if it has to be computed again."""
         if future.status == "finished":
             found = future.result(timeout=GATHER)
             if isinstance(found, ChunkOutcome):
@@ -236,7 +236,7 @@ class _Run:
         return True
 
     def _refuse(self, worker: str, unfit: str) -> None:
-        """Give a worker no more chunks where it is unfit, and tell once."""
+        """Give a worker no more chunks where it is unfit, and say so once."""
         if unfit and worker not in self._unfit:
             self._unfit[worker] = unfit
             text = f"sweep: worker {worker} gets no more chunks: {unfit}"
