@@ -40,7 +40,7 @@ from sst_ros.dynamics.expression import (
 )
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE, Dynamics
+from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, scales
@@ -236,7 +236,7 @@ class Sensitivities:
         rows[t <= 0.0] = y
         for end in np.unique(np.append(inside, t[-1])).tolist():
             here = (t > begin) & (t <= end)
-            acting = torque.acting(begin, end, Dynamics.of(self.scene))
+            acting = torque.acting(begin, end)
             try:
                 run = solve_ivp(
                     rates, (begin, end), y, "DOP853", np.union1d(t[here], end),

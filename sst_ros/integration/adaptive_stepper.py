@@ -117,8 +117,7 @@ class AdaptiveStepper:
         method: name of a method in `methods.METHODS`, or auto.
         tolerance: largest local error estimate of a step: of the quaternion, and of the rate
             relative to its length.
-        derivative: see `CompiledMethod`; for explicit methods only.
-        law: a torque function, whose derivatives take the place of those of the ODE.
+        law: torques in plain Python, whose derivatives take the place of those of the ODE.
         ranges: see `CompiledMethod`.
         joints: nine angles and nine rates of a state's first seven numbers, for the ends of steps.
         budget: counts evaluations, and ends a period that takes too many.
@@ -137,7 +136,6 @@ class AdaptiveStepper:
         budget: EvaluationBudget,
         max_step: float,
         ranges: JointRanges = (),
-        derivative: Function | None = None,
         law: AppliedTorque | None = None,
     ) -> None:
         self.tolerance, self.budget = tolerance, budget
@@ -145,8 +143,8 @@ class AdaptiveStepper:
         self._methods, self._compiled = methods_of(method), compiled
         self._chooses = len(self._methods) > 1
         self._most_attempts = _CHOOSE_EVERY - 1 if self._chooses else math.inf
-        self._derivative = derivative if law is None else law.derivative
-        self._linearise = None if law is None or not law.is_traced else law.linearise
+        self._derivative = law.derivative if law else None
+        self._linearise = law.linearise if law and law.is_traced else None
         self._ranges, self._joints = ranges, joints
         self._machines: dict[str, CompiledMethod] = {}
 
@@ -157,8 +155,6 @@ class AdaptiveStepper:
 
     def load(self) -> None:
         """Have the code of all methods that a run may turn to loaded, or made."""
-        if self._derivative is not None:
-            return  # plain Python, and an explicit method to the end
         for method in self._methods:
             self._machine(method).load()
         if self._chooses:
@@ -166,7 +162,7 @@ class AdaptiveStepper:
 
     def compile(self) -> None:
         """Take compiled steps from now on, which have the same bits; those of a function stay."""
-        if self._derivative is None and not self._compiled:
+        if self._law is None and not self._compiled:
             self._compiled = True
             self._machines.clear()
 
@@ -222,8 +218,6 @@ class AdaptiveStepper:
         the method is looked at, or `ranges` may be left. One call takes at most the evaluations of
         one period's budget.
         """
-        if self._derivative is not None:
-            return 0, at
         machine = self._machine(at.method)
         most = self._most(at, machine, 1)
         done, end = machine.step_many(h, count, self.tolerance, most, at, d)
@@ -261,7 +255,7 @@ class AdaptiveStepper:
         """
         at = at._replace(attempts=at.attempts + 1)
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(at.method, Rosenbrock)
-        if not self._chooses or (self._derivative is not None and self._linearise is None):
+        if not self._chooses or (self._law is not None and not self._law.is_traced):
             return at
         if at.attempts < _CHOOSE_EVERY and not early:
             return at

@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from sst_ros.dynamics.expression import compile_program
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, Function
+from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_with_work
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamp
 
@@ -23,65 +24,42 @@ _STATE_STEP = 1e-7
 """For its derivatives by the state, relative to numbers above 1: half of the digits remain."""
 
 
-class StateFeedback:
-    """Torques that are a function of time and state, evaluated in each stage of a step.
-
-    Args:
-        function: f(t, state) -> torques [N m]. In `state.torque` are the lagged torques of the
-            actuators; without lag zero, for torques of this instant are what it returns.
-        dynamics: of the scene.
-
-    """
-
-    def __init__(
-        self, function: Callable[[float, State], Sequence[float]], dynamics: Dynamics
-    ) -> None:
-        self._function, self._dynamics = function, dynamics
-        self._lag = len(dynamics.state) > 7
-
-    def __call__(self, t: float, y: Sequence[float]) -> Vector3:
-        """Torques [N m] at a time [s] and the numbers of a state.
-
-        Raises:
-            ArithmeticError: the state is not finite, as in a trial step that is too long.
-
-        """
-        if not math.isfinite(sum(y)):
-            raise ArithmeticError("the state of a trial step is not finite")
-        lagged = (y[7], y[8], y[9]) if self._lag else (0.0, 0.0, 0.0)
-        state = State.of(round(t * NANOSECONDS), y, self._dynamics.joints(*y[:7]), lagged)
-        first, second, third = self._function(t, state)
-        return first, second, third
+Torque = Vector3 | SineTorque | TorqueFunction
+"""A function is called with the time [s], and with the `State` if its `feedback` is true."""
 
 
-Torque = Vector3 | SineTorque | TorqueFunction | StateFeedback
-
-
-def torque_at(torque: Torque, time: float, y: Sequence[float] = ()) -> Vector3:
-    """Torques [N m] at a time [s] and a state y, which only feedback looks at."""
-    if isinstance(torque, StateFeedback):
-        return torque(time, y)
+def torque_at(torque: Any, *given: Any) -> Any:
+    """Torques [N m] of numbers, a sine or a function, given the time [s] and what it asks for."""
     if isinstance(torque, SineTorque):
-        return torque.at(time)
-    return torque(time) if callable(torque) else torque
+        return torque.at(*given)
+    return torque(*given) if callable(torque) else torque
 
 
 class AppliedTorque:
     """Derivative of the state under a torque function, and the clamp of the actuators.
 
     Args:
-        ode: equations whose torques are part of the drive.
+        dynamics: its equations with work have the torques in their drive.
         limit: largest torque of an actuator [N m], or None.
-        rhs: derivative of the state in place of that of `ode`, with its inputs; `is_traced` says
-            that there is none.
+        derivative: of the state in place of that of these equations, with their inputs;
+            `is_traced` says that there is none.
 
     """
 
-    def __init__(self, ode: ODE, limit: float | None, rhs: Function | None = None) -> None:
-        self._ode, self.limit, self._rhs = ode, limit, rhs
-        self.is_traced = rhs is None
-        self._torque: TorqueFunction | StateFeedback | None = None
+    def __init__(
+        self, dynamics: Dynamics, limit: float | None, derivative: Function | None
+    ) -> None:
+        self._dynamics, self._ode, self.limit = dynamics, ode_with_work(dynamics), limit
+        self.is_traced = derivative is None
+        if derivative is not None:
+            self.rhs = derivative
+        self._torque: Torque = (0.0, 0.0, 0.0)
         self._start = 0.0
+
+    @cached_property
+    def rhs(self) -> Function:
+        """The derivative under torques that are numbers; machine code may take its place."""
+        return compile_program(self._ode.program)
 
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: numbers within the limit of the actuators; functions as they are.
@@ -102,37 +80,44 @@ class AppliedTorque:
         return None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
 
     def begin(self, torque: Torque, start: float) -> Vector3:
-        """Take the sine or function of a period that begins at `start` [s].
+        """Take what acts in a period that begins at `start` [s].
 
         Returns:
-            Three numbers of the drive: phases of the sine [rad], zero for a function.
+            Three numbers of the drive: phases of a sine [rad], else zero.
 
         """
         if isinstance(torque, SineTorque):
             rows = zip(torque.frequency, torque.phase, strict=True)
             first, second, third = (math.fmod(f * start + p, math.tau) for f, p in rows)
             return first, second, third
-        assert callable(torque)
         self._torque, self._start = torque, start
         return (0.0, 0.0, 0.0)
 
-    def evaluate_by(self, rhs: Function) -> None:
-        """Take another form of the same derivative from now on, in machine code."""
-        self._rhs = rhs
-
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
-        """Torques that act at a time [s] and a state y, within the limit [N m]."""
-        found: Any = tuple(map(float, torque_at(torque, time, y)))
-        return clamp(found, self.limit)
+        """Torques that act at a time [s] and a state y, within the limit [N m].
+
+        In the state that a function is given are the lagged torques of the actuators; without lag
+        zero, for torques of this instant are what it returns.
+
+        Raises:
+            ArithmeticError: the state is not finite, as in a trial step that is too long.
+
+        """
+        given: tuple[Any, ...] = (time,)
+        if _has_feedback(torque):
+            if not math.isfinite(sum(y)):
+                raise ArithmeticError("the state of a trial step is not finite")
+            lagged = (y[7], y[8], y[9]) if len(self._dynamics.state) > 7 else (0.0, 0.0, 0.0)
+            joints = self._dynamics.joints(*y[:7])
+            given = time, State.of(round(time * NANOSECONDS), y, joints, lagged)
+        first, second, third = map(float, torque_at(torque, *given))
+        return clamp((first, second, third), self.limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""
-        if self._rhs is None:
-            self._rhs = compile_program(self._ode.program)
-        assert self._torque is not None
         size = len(self._ode.state)
         torque = self.at(self._torque, self._start + t, inputs[:size])
-        return self._rhs(t, *inputs[:size], *torque, *inputs[size + 3 :])
+        return self.rhs(t, *inputs[:size], *torque, *inputs[size + 3 :])
 
     def jump(self, begin: float, end: float, y: Sequence[float]) -> tuple[float, float] | None:
         """Locate a jump of a function's torques: the last time before it and the first one after.
@@ -143,7 +128,6 @@ class AppliedTorque:
         Between two times of the derivative [s], at the same state y.
         """
         torque = self._torque
-        assert torque is not None
 
         def acting(time: float) -> Vector3:
             return self.at(torque, self._start + time, y)
@@ -184,7 +168,7 @@ class AppliedTorque:
         near, far = (np.array(self.at(torque, time + k * _TIME_STEP, y)) for k in (1, 2))
         rate = (4.0 * near - far - 3.0 * np.array(now)) / (2.0 * _TIME_STEP)
         by_time[:] = (np.array(found[size : 2 * size]) + by_torque @ rate).tolist()
-        if isinstance(torque, StateFeedback):
+        if _has_feedback(torque):
             turns = np.zeros((3, size))
             for i in range(size - 1):  # the last number is the work, which no torque sees
                 step = _STATE_STEP * max(1.0, abs(y[i]))
@@ -193,3 +177,7 @@ class AppliedTorque:
             by_state = by_state + by_torque @ turns
         for i, row in enumerate(by_state.tolist()):
             matrix[i][:] = row
+
+
+def _has_feedback(torque: Torque) -> bool:
+    return bool(getattr(torque, "feedback", False))

@@ -100,14 +100,9 @@ def first_event(
     return min(found, key=lambda pair: pair[0]) if found else None
 
 
-def load_root_finder() -> None:
-    """Import now what the first event needs: it takes 0.4 s, too long for a step in real time."""
-    import scipy.optimize  # noqa: F401
-
-
 def _root(signal: Signal, begin: float, end: float) -> float:
     if signal(begin) == 0.0 or signal(begin) * signal(end) > 0.0:
         return begin
-    from scipy.optimize import brentq  # see above: many runs have no event
+    from scipy.optimize import brentq  # takes 0.4 s, and many runs have no event
 
     return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))

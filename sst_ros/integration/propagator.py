@@ -25,7 +25,6 @@ from sst_ros.integration.events import (
     first_event,
     free_range,
     just_beyond,
-    load_root_finder,
     may_occur,
 )
 from sst_ros.integration.point import Point
@@ -83,12 +82,12 @@ class Propagator:
         contacts = tuple(contact_events_of(scene, geometry))
         self._events = (*ends, *contacts)
         self._ranges = ranges_of([*ends, *free_range(contacts)])
-        self.torque = AppliedTorque(self.ode, scene.torque_limit, derivative)
+        self.torque = AppliedTorque(self.dynamics, scene.torque_limit, derivative)
         self._new_stepper = partial(
             AdaptiveStepper, method=integrator, tolerance=tolerance, compiled=compiled,
             ranges=self._ranges, joints=self.dynamics.joints, budget=budget, max_step=max_step,
         )  # fmt: skip
-        self._constant = self._new_stepper(self.ode, derivative=derivative)
+        self._constant = self._new_stepper(self.ode)
         self._others: dict[SineTorque | None, AdaptiveStepper] = {}
 
     def begin(self, y: list[float]) -> Point:
@@ -123,28 +122,15 @@ class Propagator:
             if done:
                 return end, done
         with np.errstate(all="ignore"):
-            for step in self._steps(stepper, at, start, h, drive):
+            for step in self.steps(at, start, h, torque, moment):
                 at = step.end
         return at, 1
-
-    def steps(
-        self, at: Point, start: float, h: float, torque: Torque, moment: tuple[float, ...]
-    ) -> Iterator[Step]:
-        """Yield the steps of a period: of their own lengths, up to events.
-
-        Raises:
-            LimitReached, CannotStep, ArithmeticError, ValueError: as `advance`, after the last
-                valid step.
-
-        """
-        stepper, drive = self._begin_period(torque, start, moment)
-        return self._steps(stepper, at, start, h, drive)
 
     def _begin_period(
         self, torque: Torque, start: float, moment: tuple[float, ...]
     ) -> tuple[AdaptiveStepper, tuple[float, ...]]:
-        """Return the stepper of constant torques, of functions, or of a sine, and the drive."""
-        if type(torque) is tuple:
+        """Return the stepper of constant torques, of plain Python, or of a sine, and the drive."""
+        if type(torque) is tuple and self.torque.is_traced:
             return self._constant, (*torque, *moment) if moment else torque
         sine = torque if isinstance(torque, SineTorque) else None
         if sine not in self._others:
@@ -155,15 +141,17 @@ class Propagator:
             self._others[sine] = new
         return self._others[sine], (*self.torque.begin(torque, start), *moment)
 
-    def _steps(
-        self,
-        stepper: AdaptiveStepper,
-        at: Point,
-        start: float,
-        h: float,
-        drive: tuple[float, ...],
+    def steps(
+        self, at: Point, start: float, h: float, torque: Torque, moment: tuple[float, ...]
     ) -> Iterator[Step]:
-        """Step through a period; steps end where contact with a stop begins or ends."""
+        """Yield the steps of a period: of their own lengths, each up to the first event in it.
+
+        Raises:
+            LimitReached, CannotStep, ArithmeticError, ValueError: as `advance`, after the last
+                valid step.
+
+        """
+        stepper, drive = self._begin_period(torque, start, moment)
         self.budget.begin()
         x = 0.0
         while x < h:
@@ -190,14 +178,16 @@ class Propagator:
 
     def load(self) -> None:
         """Have the code loaded that periods under constant torques may need."""
-        load_root_finder()
-        self._constant.load()
+        import scipy.optimize  # noqa: F401  # takes 0.4 s, too long for a step in real time
+
+        if self.torque.is_traced:
+            self._constant.load()
 
     def compile(self) -> None:
         """Take compiled steps from now on; the bits are the same."""
         self._new_stepper.keywords["compiled"] = True
         if None in self._others and self.torque.is_traced:
-            self.torque.evaluate_by(compile_derivative(self.ode))
+            self.torque.rhs = compile_derivative(self.ode)
         for stepper in (self._constant, *self._others.values()):
             stepper.compile()
 

@@ -157,7 +157,7 @@ class SteppedMotion:
         kinks = np.union1d(task.breaks, task.torque.kinks(task.scene.torque_limit, end))
         inside = kinks[(kinks > begin) & (kinks < end)].tolist()
         for start, stop in pairwise([begin, *inside, end]):
-            acting = task.torque.acting(start, stop, self.propagator.dynamics)
+            acting = task.torque.acting(start, stop)
             yield start, stop - start, stop, acting
 
     def _pass(self, step: Step) -> None:

@@ -16,9 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import InputError, Problem
-from sst_ros.integration.applied_torque import StateFeedback, Torque
+from sst_ros.errors import InputError, Problem, refuse_unless
+from sst_ros.integration.applied_torque import Torque
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import State, Vector3, finite_vector
 
@@ -29,6 +28,11 @@ FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
 
 _MOST_CROSSINGS = 1e5
 """Radians of a sine beyond which its clamping is not computed in advance."""
+
+
+def ascend(times: Array) -> bool:
+    """Return whether times are finite and ascending, shape (n,)."""
+    return times.ndim == 1 and bool(np.isfinite(times).all() and (np.diff(times) > 0.0).all())
 
 
 class TorqueProfile(ABC):
@@ -47,13 +51,9 @@ class TorqueProfile(ABC):
         """
         return np.empty(0)
 
-    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+    def acting(self, begin: float, end: float) -> Torque:
         """Return what acts on [begin, end], in which no kink lies, as a `Propagator` takes it."""
         return self
-
-    def record(self) -> dict[str, Any]:
-        """Numbers from which `profile_from` builds the same profile."""
-        return {"kind": "function"}
 
     def __call__(self, t: float) -> Vector3:
         """Torques [N m] at a time [s]."""
@@ -71,13 +71,9 @@ class ConstantTorque(TorqueProfile):
         """See `TorqueProfile`."""
         return np.tile(self.torque, (len(t), 1))
 
-    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+    def acting(self, begin: float, end: float) -> Torque:
         """See `TorqueProfile`."""
         return self.torque
-
-    def record(self) -> dict[str, Any]:
-        """See `TorqueProfile`."""
-        return {"kind": "constant", "torque": self.torque}
 
 
 @dataclass(frozen=True)
@@ -107,13 +103,9 @@ class SineProfile(TorqueProfile):
         times = np.unique(np.concatenate(found))
         return np.asarray(times[(times > 0.0) & (times < end)])
 
-    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+    def acting(self, begin: float, end: float) -> Torque:
         """See `TorqueProfile`."""
         return self.sine
-
-    def record(self) -> dict[str, Any]:
-        """See `TorqueProfile`."""
-        return {"kind": "sine", **vars(self.sine)}
 
 
 class PolynomialTorque(TorqueProfile):
@@ -130,14 +122,15 @@ class PolynomialTorque(TorqueProfile):
 
     def __init__(self, coefficients: ArrayLike, breakpoints: ArrayLike) -> None:
         self.c, self.x = np.array(coefficients, dtype=float), np.array(breakpoints, dtype=float)
-        if self.x.ndim != 1 or len(self.x) < 2 or np.any(np.diff(self.x) <= 0.0):
-            allowed = "must be two or more ascending times [s]"
-            raise InputError("torque", [Problem("breakpoints", breakpoints, allowed)])
-        if self.c.ndim != 3 or self.c.shape[1:] != (len(self.x) - 1, 3):
-            allowed = f"must have the shape (order + 1, {len(self.x) - 1}, 3)"
-            raise InputError("torque", [Problem("coefficients", self.c.shape, allowed)])
-        if not (np.all(np.isfinite(self.c)) and np.all(np.isfinite(self.x))):
-            raise InputError("torque", [Problem("coefficients", "not finite", "must be finite")])
+        good, pieces = self.x.size > 1 and ascend(self.x), max(self.x.size - 1, 1)
+        size, shape = self.c.shape, f"must have the shape (order + 1, {pieces}, 3)"
+        finite = bool(np.all(np.isfinite(self.c)))
+        refuse_unless(
+            "torque",
+            ("breakpoints", breakpoints, good, "must be two or more ascending times [s]"),
+            ("coefficients", size, size[1:] == (pieces, 3), shape),
+            ("coefficients", "not finite", finite, "must be finite"),
+        )
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -154,7 +147,7 @@ class PolynomialTorque(TorqueProfile):
         roots = [leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds]
         return np.unique([x for x in np.concatenate([self.x, *roots]) if np.isfinite(x)])
 
-    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+    def acting(self, begin: float, end: float) -> Torque:
         """See `TorqueProfile`."""
         piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
         if not 0 <= piece < self.c.shape[1]:
@@ -169,11 +162,8 @@ class PolynomialTorque(TorqueProfile):
 
         return torque
 
-    def record(self) -> dict[str, Any]:
-        """See `TorqueProfile`."""
-        return {"kind": "polynomial", "c": self.c.tolist(), "x": self.x.tolist()}
 
-
+@dataclass(frozen=True)
 class FunctionTorque(TorqueProfile):
     """A function f(t) of the time [s], or f(t, state) of it and the `State` -> three torques [N m].
 
@@ -182,23 +172,18 @@ class FunctionTorque(TorqueProfile):
 
     """
 
-    def __init__(self, function: TorqueFunction | FeedbackFunction, *, feedback: bool) -> None:
-        self._function: Callable[..., Sequence[float]] = function
-        self.feedback = feedback
+    function: Callable[..., Sequence[float]]
+    feedback: bool
 
     def __call__(self, t: float, *state: State) -> Vector3:
         """Torques [N m] at a time [s], and a state where it is an argument."""
-        return three(self._function(t, *state), f"torque({t:g})")
+        return three(self.function(t, *state), f"torque({t:g})")
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`; nan for a function of the state."""
         if self.feedback:
             return np.full((len(t), 3), np.nan)
         return np.array([self(float(time)) for time in t]).reshape(-1, 3)
-
-    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
-        """See `TorqueProfile`."""
-        return StateFeedback(self, dynamics) if self.feedback else self
 
 
 class LostTorque(TorqueProfile):
@@ -237,16 +222,15 @@ class TorqueTable(TorqueProfile):
     def __init__(self, times: ArrayLike, torques: ArrayLike) -> None:
         self.times = np.array(times, dtype=float)
         self.torques = np.array(torques, dtype=float)
-        problems = []
-        if self.times.ndim != 1 or not len(self.times) or np.any(np.diff(self.times) <= 0.0):
-            problems.append(Problem("times", times, "must be ascending times [s], shape (n,)"))
-        elif self.torques.shape != (len(self.times), 3):
-            allowed = f"must have the shape ({len(self.times)}, 3) [N m]"
-            problems.append(Problem("torques", self.torques.shape, allowed))
-        if not (np.all(np.isfinite(self.times)) and np.all(np.isfinite(self.torques))):
-            problems.append(Problem("times, torques", "not finite", "must be finite numbers"))
-        if problems:
-            raise InputError("torque table", problems)
+        good = self.times.size > 0 and ascend(self.times)
+        found, shape = self.torques.shape, (self.times.size, 3)
+        finite = bool(np.all(np.isfinite(self.torques)))
+        refuse_unless(
+            "torque table",
+            ("times", times, good, "must be finite, ascending times [s], shape (n,)"),
+            ("torques", found, found == shape, f"must have the shape {shape} [N m]"),
+            ("torques", "not finite", finite, "must be finite numbers [N m]"),
+        )
 
     @classmethod
     def read(cls, path: str | Path) -> TorqueTable:
@@ -294,13 +278,9 @@ class TorqueTable(TorqueProfile):
         """See `TorqueProfile`."""
         return self.times
 
-    def acting(self, begin: float, end: float, dynamics: Dynamics) -> Torque:
+    def acting(self, begin: float, end: float) -> Torque:
         """See `TorqueProfile`."""
         return self(0.5 * (begin + end))
-
-    def record(self) -> dict[str, Any]:
-        """See `TorqueProfile`."""
-        return {"kind": "table", "times": self.times.tolist(), "torques": self.torques.tolist()}
 
 
 def profile_of(torque: Any) -> TorqueProfile:
@@ -321,18 +301,34 @@ def profile_of(torque: Any) -> TorqueProfile:
     return ConstantTorque(three(torque, "torque"))
 
 
-def profile_from(record: dict[str, Any] | None) -> TorqueProfile | None:
-    """Build the profile that `TorqueProfile.record` has described."""
-    if record is None:
-        return None
-    kind, given = record["kind"], {name: x for name, x in record.items() if name != "kind"}
+_KINDS = {
+    "constant": ConstantTorque,
+    "sine": SineProfile,
+    "table": TorqueTable,
+    "polynomial": PolynomialTorque,
+}
+
+
+def record_of(profile: TorqueProfile) -> dict[str, Any]:
+    """Return kind and numbers of a profile, from which `profile_from` builds it again."""
+    for kind, profiles in _KINDS.items():
+        if isinstance(profile, profiles):
+            given = vars(profile.sine if isinstance(profile, SineProfile) else profile)
+            return {"kind": kind, **{name: np.asarray(x).tolist() for name, x in given.items()}}
+    return {"kind": "function"}
+
+
+def profile_from(record: dict[str, Any]) -> TorqueProfile:
+    """Build the profile that `record_of` has described."""
+    given = dict(record)
+    kind = given.pop("kind")
     if kind == "function":
         return LostTorque()
-    if kind == "constant":
-        return ConstantTorque(three(given["torque"], "torque"))
-    if kind == "sine":
-        return SineProfile(SineTorque(**given))
-    return TorqueTable(**given) if kind == "table" else PolynomialTorque(given["c"], given["x"])
+    if kind == "table":
+        return TorqueTable(**given)
+    if kind == "polynomial":
+        return PolynomialTorque(*given.values())
+    return profile_of(given["torque"] if kind == "constant" else SineTorque(**given))
 
 
 def _arguments(function: Callable[..., Any]) -> int:

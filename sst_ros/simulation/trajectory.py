@@ -30,12 +30,12 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.torque_profile import (
-    ConstantTorque,
     LostTorque,
     TorqueProfile,
+    ascend,
     profile_from,
     profile_of,
-    three,
+    record_of,
 )
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
 
@@ -130,7 +130,7 @@ class Trajectory:
         if joints is not None:
             self._joints = _own(joints)
         n, problems = len(self.t), []
-        if self.t.ndim != 1 or not np.isfinite(self.t).all() or np.any(np.diff(self.t) <= 0.0):
+        if not ascend(self.t):
             problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
         for name, size in (("quaternion", 4), ("body_rate", 3), ("torque", 3), ("_joints", 18)):
             array = vars(self).get(name)
@@ -277,7 +277,7 @@ class Trajectory:
         about = self._figures() | {
             "format": _FORMAT,
             "scene": dump(self.scene),
-            "torque": None if self.law is None else self.law.record(),
+            "torque": self.law and record_of(self.law),
         }
         units = {name: {"unit": unit} for name, unit in UNITS.items()}
         try:
@@ -313,7 +313,7 @@ class Trajectory:
             columns["t"],
             *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
             joints=np.hstack([arrays[name] for name in _JOINTS]),
-            law=profile_from(about["torque"]),
+            law=about["torque"] and profile_from(about["torque"]),
             **{name: about[name] for name in _FIGURES if name in about},
         )
 
@@ -392,7 +392,7 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
     for k in np.unique(before[times > t[before]]):
         rows = np.flatnonzero((before == k) & (times > t[k]))
         asked, places = np.unique(times[rows], return_inverse=True)
-        law = trajectory.law or ConstantTorque(three(trajectory.torque[k + 1], "torque"))
+        law = trajectory.law or profile_of(trajectory.torque[k + 1])
         span = float(t[k]), float(asked[-1])
         task = Task(trajectory.scene, law, span, asked, DOP853.name, _ACCURACY)
         motion = SteppedMotion(task, samples[k, :size], limits=False).run()
