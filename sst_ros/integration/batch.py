@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
+from sst_ros.dynamics.parametric_model import ParameterColumns, ParametricModel
 from sst_ros.dynamics.traced_dynamics import TORQUE
 from sst_ros.errors import refuse_unless
 from sst_ros.extras import require
@@ -25,7 +26,6 @@ from sst_ros.host import compiled_module
 from sst_ros.host.output import slices
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
-from sst_ros.integration.parametric_model import ParameterColumns, ParametricModel
 from sst_ros.mechanism import frames
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scenarios, Scene

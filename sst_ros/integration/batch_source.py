@@ -15,9 +15,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sst_ros.dynamics.expression import Program
+from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, indent, loop
 from sst_ros.integration.events import GRAZING
 from sst_ros.integration.methods import Tableau
-from sst_ros.integration.simd_source import Layout, evaluate_lanes, indent, loop
 from sst_ros.integration.step_loops import combination
 
 SIMD_WIDTH = 32

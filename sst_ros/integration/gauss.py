@@ -23,9 +23,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from sst_ros.dynamics.expression import Program, Slots
-from sst_ros.dynamics.traced_dynamics import ODE
-from sst_ros.host import compiled_module
-from sst_ros.integration.simd_source import (
+from sst_ros.dynamics.simd_source import (
     Layout,
     evaluate_lanes,
     flat_sin,
@@ -34,6 +32,8 @@ from sst_ros.integration.simd_source import (
     put,
     split,
 )
+from sst_ros.dynamics.traced_dynamics import ODE
+from sst_ros.host import compiled_module
 from sst_ros.mechanism.geometry import Array
 
 Code: TypeAlias = Callable[[Any, Any], float]

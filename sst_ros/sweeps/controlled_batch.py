@@ -25,11 +25,11 @@ from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
+from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, indent, loop
 from sst_ros.errors import InputError, Problem
 from sst_ros.host import compiled_module
 from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.integration.batch_source import SIMD_WIDTH, load_lanes, over_blocks, replace_valid
-from sst_ros.integration.simd_source import Layout, evaluate_lanes, indent, loop
 from sst_ros.mechanism.generic_math import axpy, dot3, positive
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
