@@ -63,9 +63,9 @@ WHOLE_MOTION_BUDGET = 10_000_000
 
 
 class EvaluationBudget:
-    """Evaluations of the right-hand side that a period may take; `spent` counts those of a run.
+    """Evaluations of the right-hand side that a period, or a whole run, may take.
 
-    With `whole_run` they are those of a run, whatever its periods.
+    `spent` counts those of a run.
     """
 
     def __init__(self, per_period: int, *, whole_run: bool = False) -> None:

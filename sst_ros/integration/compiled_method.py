@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.expression import Slots
-from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, ode_with_work
+from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, Function, ode_with_work
 from sst_ros.host import compiled_module
 from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import step_loops
@@ -35,7 +35,6 @@ from sst_ros.integration.point import Point
 from sst_ros.scene.scene import Scene
 
 Vector = Sequence[float]
-Function = Callable[..., tuple[float, ...]]
 Linearisation = Callable[[float, Vector, Vector, Any, Any, Any, Any], None]
 """(t, y, d, numbers, slope, by_time, matrix) -> None: fills the derivative, df/dt and df/dy, which
 are zero before."""
@@ -68,18 +67,6 @@ class Most(NamedTuple):
     h: float = math.inf  # a step [s]
     attempts: float = math.inf  # since the method was chosen
     steps: float = math.inf  # since the start of the run
-
-
-class _MethodSource(NamedTuple):
-    """Functions of a module, one text each, in the order of their calls; constants; numbers.
-
-    `base` has what the modules of all methods have in common.
-    """
-
-    base: compiled_module.SharedFunctions
-    texts: list[str]
-    constants: dict[str, Any]
-    numbers: list[float]
 
 
 class CompiledMethod:
@@ -116,17 +103,15 @@ class CompiledMethod:
         self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
         if derivative is not None and (compiled or (implicit and linearise is None)):
             raise ValueError("a derivative of its own needs plain Python and, if implicit, its own")
-        source = _source(system, method, by_structure=compiled)
-        self._module: ModuleType = compiled_module.load(
-            source.texts, source.constants, numba=compiled, base=source.base
-        )
+        texts, constants, base, numbers = _source(system, method, by_structure=compiled)
+        self._module: ModuleType = compiled_module.load(texts, constants, numba=compiled, base=base)
         if derivative is not None:
             self._module.__dict__["rhs"] = derivative
         if linearise is not None and implicit:
             self._module.__dict__["linearise"] = linearise
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
         self._listed: Callable[[Any], list[float]] = np.ndarray.tolist if compiled else list
-        self._numbers = self._vector(source.numbers)
+        self._numbers = self._vector(numbers)
         self._extra = (self._numbers,) if compiled else ()
         # At each wake in real time the processor's caches are cold: to make an array takes 8 us, a
         # tenth of a step's call.
@@ -241,21 +226,26 @@ def has_step_code(
     system: ODE, method: Method, functions: Sequence[str] = ("step_pair", "step_many")
 ) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
-    source = _source(system, method, by_structure=True)
-    return compiled_module.has_code(source.texts, source.constants, functions, base=source.base)
+    texts, constants, base, _ = _source(system, method, by_structure=True)
+    return compiled_module.has_code(texts, constants, functions, base=base)
 
 
 def compile_derivative(system: ODE) -> Function:
     """Return the derivative of a system in machine code, with the digits of plain Python."""
-    source = _source(system, DORMAND_PRINCE, by_structure=True)
-    base, numbers = source.base, np.array(source.numbers)
+    _, _, base, numbers = _source(system, DORMAND_PRINCE, by_structure=True)
     rhs: Function = compiled_module.load(list(base.texts), base.constants, numba=True).rhs
-    return lambda *inputs: rhs(*inputs, numbers)
+    place = np.array(numbers)
+    return lambda *inputs: rhs(*inputs, place)
 
 
 @lru_cache(maxsize=64)
-def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource:
-    """Return what the steps of a system by a method consist of.
+def _source(
+    system: ODE, method: Method, *, by_structure: bool
+) -> tuple[list[str], dict[str, Any], compiled_module.SharedFunctions, list[float]]:
+    """Return what the steps of a system by a method are made of.
+
+    That is one text a function, in the order of their calls; constants; what the modules of all
+    methods have in common; numbers.
 
     By structure the text has no number of the scene: they are in a vector p, an argument of all
     functions. Otherwise they are in the text, and p is empty.
@@ -302,7 +292,7 @@ def _source(system: ODE, method: Method, *, by_structure: bool) -> _MethodSource
         ]
     texts += [inspect.getsource(function) for function in _LOOPS]
     base = compiled_module.SharedFunctions(tuple(shared), common)
-    return _MethodSource(base, texts, constants, slots.values if slots else [])
+    return texts, constants, base, slots.values if slots else []
 
 
 def _assign(places: list[str], call: str) -> str:

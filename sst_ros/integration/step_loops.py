@@ -291,51 +291,37 @@ def explicit_step(tableau: Tableau, size: int, drive: int, *more: str) -> str:
             error[0] = e0
 
     """
-    lines = [
-        "def attempt(t, h, y, near, d, p, new_y, error):",
-        *(f"    y{i} = y[{i}]" for i in range(size)),
-        *(f"    d{i} = d[{i}]" for i in range(drive)),
-        *_stages(tableau, size, [*_names("d", drive), *more]),
-        *(f"    new_y[{i}] = n{i}" for i in range(size)),
-        *(f"    error[{i}] = e{i}" for i in range(size)),
-    ]
-    return "\n".join(lines) + "\n"
+    y, d = [f"y{j}" for j in range(size)], [f"d{i}" for i in range(drive)]
 
+    def weigh(weights: Sequence[float], j: int) -> str:
+        return combination(weights, lambda stage: f"k{stage}_{j}")
 
-def _stages(tableau: Tableau, size: int, d: list[str]) -> list[str]:
-    """Lines of a step from y0, .. to the new state n0, .. and its error estimate e0, .."""
-    y, lines = _names("y", size), []
+    lines = [f"{name} = y[{j}]" for j, name in enumerate(y)]
+    lines += [f"{name} = d[{i}]" for i, name in enumerate(d)]
     for stage, row in enumerate(tableau.a):
-        for j in range(size) if stage else ():
-            lines.append(f"    s{j} = y{j} + h * ({_combination(row, j)})")
-        inputs = _names("s", size) if stage else y
+        lines += [f"s{j} = y{j} + h * ({weigh(row, j)})" for j in range(size) if stage]
+        at = [f"s{j}" for j in range(size)] if stage else y
         time = f"t + {tableau.c[stage]!r} * h" if tableau.c[stage] else "t"
-        outputs = ", ".join(f"k{stage}_{j}" for j in range(size))
-        lines.append(f"    {outputs} = rhs({', '.join([time, *inputs, *d])})")
+        slopes = ", ".join(f"k{stage}_{j}" for j in range(size))
+        lines.append(f"{slopes} = rhs({', '.join([time, *at, *d, *more])})")
     for j in range(size):
-        lines.append(f"    n{j} = y{j} + h * ({_combination(tableau.b, j)})")
+        lines.append(f"n{j} = y{j} + h * ({weigh(tableau.b, j)})")
         if not tableau.error:
-            lines.append(f"    e{j} = 0.0")
+            lines.append(f"e{j} = 0.0")
         elif not tableau.damping:
-            lines.append(f"    e{j} = h * ({_combination(tableau.error, j)})")
+            lines.append(f"e{j} = h * ({weigh(tableau.error, j)})")
         else:
             # Hairer's estimate for DOP853, each number of the state for itself.
-            lines.append(f"    fine = {_combination(tableau.error, j)}")
-            lines.append(f"    coarse = {_combination(tableau.damping, j)}")
-            lines.append("    both = fine * fine + 0.01 * (coarse * coarse)")
-            lines.append(f"    e{j} = h * fine * abs(fine) / sqrt(both) if both > 0.0 else 0.0")
-    return lines
+            lines.append(f"fine = {weigh(tableau.error, j)}")
+            lines.append(f"coarse = {weigh(tableau.damping, j)}")
+            lines.append("both = fine * fine + 0.01 * (coarse * coarse)")
+            lines.append(f"e{j} = h * fine * abs(fine) / sqrt(both) if both > 0.0 else 0.0")
+    lines += [f"new_y[{j}] = n{j}" for j in range(size)]
+    lines += [f"error[{j}] = e{j}" for j in range(size)]
+    return "\n    ".join(["def attempt(t, h, y, near, d, p, new_y, error):", *lines]) + "\n"
 
 
 def combination(weights: Sequence[float], word: Callable[[int], str]) -> str:
     """Sum of weights times words, without the zeros; "" where there is nothing else."""
     terms = [f"{w!r} * {word(i)}" for i, w in enumerate(weights) if w]
     return " + ".join(terms).replace("+ -", "- ")
-
-
-def _combination(weights: Sequence[float], j: int) -> str:
-    return combination(weights, lambda i: f"k{i}_{j}")
-
-
-def _names(letter: str, count: int) -> list[str]:
-    return [f"{letter}{i}" for i in range(count)]

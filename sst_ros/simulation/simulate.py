@@ -29,6 +29,7 @@ from sst_ros.simulation.torque_profile import (
     TorqueFunction,
     TorqueProfile,
     TorqueTable,
+    ascend,
     profile_of,
 )
 from sst_ros.simulation.trajectory import Trajectory, check_error
@@ -141,7 +142,7 @@ def prepare(
     length = given.duration if duration is None else duration
     if length is None:
         _refuse("duration", None, "must be given: the scene has none")
-    span_ns = _nanoseconds("duration", length)
+    span_ns, jumps = _nanoseconds("duration", length), _array(breaks)
     longest = math.inf if max_step is None else max_step
     if method not in METHODS:
         _refuse("method", method, "must be one of " + ", ".join(METHODS))
@@ -149,7 +150,7 @@ def prepare(
         _refuse("tolerance", tolerance, "must be a number > 0 [rad]")
     if not _is_positive(longest):
         _refuse("max_step", max_step, "must be a number > 0 [s]")
-    if (jumps := _ascending(breaks)) is None:
+    if not ascend(jumps):
         _refuse("breaks", breaks, "must be ascending times [s]")
     period, end = _check_period(control_period, profile, span_ns), span_ns / NANOSECONDS
     inside = jumps[(jumps > 0.0) & (jumps < end)]
@@ -226,12 +227,20 @@ def _is_positive(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0.0
 
 
+def _array(values: Any) -> Array:
+    """Return numbers as an array with a dimension at least; nan where they are none."""
+    try:
+        return np.atleast_1d(np.array(values, dtype=float))
+    except (TypeError, ValueError):
+        return np.array([math.nan])
+
+
 def _nanoseconds(name: str, value: Any) -> int:
     try:
         seconds = float(value)
     except (TypeError, ValueError):
         seconds = math.nan
-    if not (math.isfinite(seconds) and 1e-9 <= seconds <= 9e9):
+    if not 1e-9 <= seconds <= 9e9:
         _refuse(name, value, "must be a number from 1e-9 to 9e9 [s]")
     return round(seconds * NANOSECONDS)
 
@@ -248,24 +257,14 @@ def _check_period(period: float | None, profile: TorqueProfile, span: int) -> in
     return found
 
 
-def _ascending(values: ArrayLike) -> Array | None:
-    """Return finite, ascending numbers as an array; None where they are none."""
-    try:
-        numbers: Array = np.atleast_1d(np.array(values, dtype=float))
-    except (TypeError, ValueError):
-        return None
-    fits = numbers.ndim == 1 and np.all(np.isfinite(numbers)) and np.all(np.diff(numbers) > 0)
-    return numbers if fits else None
-
-
 def _times(t_eval: ArrayLike | None, span_ns: int) -> Array | None:
     """Return the times of the samples [s], rounded to nanoseconds."""
     if t_eval is None:
         return None
-    times = _ascending(t_eval)
-    if times is not None and len(times):
-        rounded = np.rint(times * NANOSECONDS)
-        if rounded[0] >= 0 and rounded[-1] <= span_ns and np.all(np.diff(rounded) > 0):
-            return np.asarray(rounded / NANOSECONDS)
-    allowed = f"must be ascending times from 0 to {span_ns / NANOSECONDS:g} s, a nanosecond apart"
-    _refuse("t_eval", t_eval, allowed)
+    rounded = np.rint(_array(t_eval) * NANOSECONDS)
+    if not (rounded.size and ascend(rounded) and rounded[0] >= 0.0 and rounded[-1] <= span_ns):
+        end = span_ns / NANOSECONDS
+        _refuse(
+            "t_eval", t_eval, f"must be ascending times from 0 to {end:g} s, a nanosecond apart"
+        )
+    return np.asarray(rounded / NANOSECONDS)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import Diverged, InputError, Problem
+from sst_ros.errors import Diverged, InputError, Problem, refuse_unless
 from sst_ros.extras import MissingDependency, require
 from sst_ros.host.table_file import SUFFIXES, load_table, write_table
 from sst_ros.integration.methods import DOP853
@@ -267,13 +267,13 @@ class Trajectory:
             MissingDependency: pyarrow (.parquet) or pandas (.csv) is not installed.
 
         """
-        path = Path(path)
-        if path.suffix not in SUFFIXES:
-            allowed = f"must end in {' or '.join(SUFFIXES)}"
-            raise InputError("save", [Problem("path", str(path), allowed)])
-        if path.exists() and not overwrite:
-            allowed = "exists; overwrite=True replaces it"
-            raise InputError("save", [Problem("path", str(path), allowed)])
+        path, ends = Path(path), f"must end in {' or '.join(SUFFIXES)}"
+        free = overwrite or not path.exists()
+        refuse_unless(
+            "save",
+            ("path", str(path), path.suffix in SUFFIXES, ends),
+            ("path", str(path), free, "exists; overwrite=True replaces it"),
+        )
         about = self._figures() | {
             "format": _FORMAT,
             "scene": dump(self.scene),
