@@ -50,7 +50,7 @@ def better_method(
     return method, ""
 
 
-class CannotStep(ArithmeticError):
+class CannotStep(Exception):
     """No step is small enough to resolve the motion."""
 
 
@@ -237,7 +237,7 @@ class AdaptiveStepper:
     def _most(self, at: Point, machine: CompiledMethod, periods: int) -> Most:
         """Bound what a call takes by the budget of periods and the next look at the method."""
         steps = max(periods * self.budget.per_period // (3 * machine.cost), 1)
-        return Most(self._max_step, self._most_attempts, at.steps + steps)
+        return self._max_step, self._most_attempts, at.steps + steps
 
     def part(self, step: Step, x: float) -> Point:
         """Return the point x [s] after the begin of an accepted step, by a shorter one."""

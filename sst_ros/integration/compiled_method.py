@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +39,9 @@ Linearisation = Callable[[float, Vector, Vector, Any, Any, Any, Any], None]
 """(t, y, d, numbers, slope, by_time, matrix) -> None: fills the derivative, df/dt and df/dy, which
 are zero before."""
 JointRanges = Sequence[tuple[int, float, float]]
+Most = tuple[float, float, float]
+"""What one call may take: longest step [s], attempts since the method was chosen, and steps since
+the start of the run; then another method may be chosen, or a bound is met."""
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
@@ -59,14 +62,6 @@ def methods_of(integrator: str) -> tuple[Method, ...]:
     """Methods that an integrator may use, the one it begins with first: of auto three."""
     named = METHODS.get(integrator)
     return (named,) if named else (DORMAND_PRINCE, DOP853, RODAS5P)
-
-
-class Most(NamedTuple):
-    """What the periods of one call may take, for another method or bound to come in between."""
-
-    h: float = math.inf  # a step [s]
-    attempts: float = math.inf  # since the method was chosen
-    steps: float = math.inf  # since the start of the run
 
 
 class CompiledMethod:
@@ -130,7 +125,7 @@ class CompiledMethod:
         size, drive = len(self.system.state), (0.0,) * len(self.system.drive)
         y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
         self.step_pair(0.0, 1e-3, y, y, drive)
-        self.step_many(1e-3, 1, 1.0, Most(), Point(y, y, (0.0,) * 18, self.method), drive)
+        self.step_many(1e-3, 1, 1.0, (math.inf,) * 3, Point(y, y, (0.0,) * 18, self.method), drive)
 
     def step_pair(
         self, t: float, h: float, y: Vector, z: Vector, d: Vector

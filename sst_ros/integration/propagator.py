@@ -14,7 +14,6 @@ from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import (
     AdaptiveStepper,
-    CannotStep,
     EvaluationBudget,
     Step,
 )
@@ -32,6 +31,9 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Vector3
+
+Moment = tuple[float, ...]
+"""External moment on the star in {B} [N m] where the scene takes it from a topic, else empty."""
 
 
 class LimitReached(Exception):
@@ -95,19 +97,12 @@ class Propagator:
         return self._constant.begin(y)
 
     def advance(
-        self,
-        at: Point,
-        start: float,
-        h: float,
-        count: int,
-        torque: Torque,
-        moment: tuple[float, ...],
+        self, at: Point, start: float, h: float, count: int, torque: Torque, moment: Moment
     ) -> tuple[Point, int]:
         """Advance by `count` periods of h [s] from `start` [s], or by fewer, but by one at least.
 
-        The torque is one of `AppliedTorque.acting`.
-
-        Periods that take one step each are one call; another period is done by itself.
+        Periods in which nothing happens but steps are one call; another is done by itself. The
+        torque is one of `AppliedTorque.acting`.
 
         Returns:
             Where the last period ended that was done, and how many were.
@@ -127,7 +122,7 @@ class Propagator:
         return at, 1
 
     def _begin_period(
-        self, torque: Torque, start: float, moment: tuple[float, ...]
+        self, torque: Torque, start: float, moment: Moment
     ) -> tuple[AdaptiveStepper, tuple[float, ...]]:
         """Return the stepper of constant torques, of plain Python, or of a sine, and the drive."""
         if type(torque) is tuple and self.torque.is_traced:
@@ -142,7 +137,7 @@ class Propagator:
         return self._others[sine], (*self.torque.begin(torque, start), *moment)
 
     def steps(
-        self, at: Point, start: float, h: float, torque: Torque, moment: tuple[float, ...]
+        self, at: Point, start: float, h: float, torque: Torque, moment: Moment
     ) -> Iterator[Step]:
         """Yield the steps of a period: of their own lengths, each up to the first event in it.
 
@@ -161,8 +156,6 @@ class Propagator:
                 if not step_loops.all_far(self._ranges, *ends, step.h):  # type: ignore[no-untyped-call]
                     try:
                         step, event = self._until_first(stepper, step)
-                    except CannotStep:
-                        raise
                     except (ArithmeticError, ValueError):  # it has leapt over a singularity
                         x, at = step.t, step.begin._replace(h=0.5 * step.h)
                         break

@@ -193,7 +193,7 @@ def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:
     for _ in range(_ATTEMPTS):
         attempt = replace(task, tolerance=local)
         motion = SteppedMotion(attempt, start_of(task.scene), spent=spent, progress=progress).run()
-        spent += motion.evaluations
+        spent += motion.budget.spent
         excess = motion.at.error / task.tolerance
         if task.period is not None or motion.status < 0 or not excess > 1.0:
             break

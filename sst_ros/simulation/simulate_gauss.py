@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 import threading
 from bisect import bisect_left
-from collections.abc import Sequence
 from functools import lru_cache, partial
 
 import numpy as np
@@ -102,18 +101,20 @@ class CollocatedMotion:
         with self._lock:  # all of them use the same arrays
             return np.array([self._inside(k, x) for k, x in pairs]).reshape(len(times), -1)
 
-    def _inside(self, k: int, x: float) -> Sequence[float]:
+    def _inside(self, k: int, x: float) -> list[float]:
         """State x [s] after step k began; that of the run itself where it begins, or all end."""
+        begin: list[float] = self._states[k].tolist()
         if x == 0.0:
-            return list[float](self._states[k].tolist())
-        self._single.begin(float(self._grid[k]), x, self._states[k].tolist(), self._drive)
+            return begin
+        self._single.begin(float(self._grid[k]), x, begin, self._drive)
         self._single.run()
-        return list[float](self._single.states[-1].tolist())
+        end: list[float] = self._single.states[-1].tolist()
+        return end
 
     def _find_limit(self) -> Limit | None:
         """Return the first limit that is met, if there is one; the motion ends there."""
 
-        def joints(k: int, x: float) -> Sequence[float]:
+        def joints(k: int, x: float) -> tuple[float, ...]:
             return self._dynamics.joints(*self._inside(k, x)[:7])
 
         if self._limits and self._motion.least.min() <= _NEAR:

@@ -81,6 +81,7 @@ class SteppedMotion:
         start, at, time: first and last valid point, and time of the last [s].
         status, message: 0 at the end, 1 at a limit, -1 where no step resolves the motion; why.
         propagator: what made the steps.
+        budget: `budget.spent` counts evaluations of the derivative.
 
     """
 
@@ -94,9 +95,9 @@ class SteppedMotion:
         progress: bool = False,
     ) -> None:
         self._task, self._spent = task, spent
-        self._budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
+        self.budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
         self.propagator = Propagator(
-            task.scene, task.method, task.tolerance, compiled=False, budget=self._budget,
+            task.scene, task.method, task.tolerance, compiled=False, budget=self.budget,
             limits=limits, max_step=task.max_step,
         )  # fmt: skip
         self.start = self.at = self.propagator.begin(list(y))
@@ -108,11 +109,6 @@ class SteppedMotion:
         self._segment = task.span
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
         self._compile_after = _WORTH_LOADING if numba_version() else math.inf
-
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the derivative."""
-        return self._budget.spent
 
     def run(self) -> SteppedMotion:
         """Go to the end or a limit: through segments of a smooth torque, by steps, to events."""
@@ -162,7 +158,7 @@ class SteppedMotion:
 
     def _pass(self, step: Step) -> None:
         """Take samples in an accepted step."""
-        if self._spent + self._budget.spent > self._compile_after:
+        if self._spent + self.budget.spent > self._compile_after:
             self._compile(step.machine)
         self._last, self._last_begin = step, self._segment[0] + step.t
         end = self._segment[1] if step.last else self._last_begin + step.h
@@ -186,7 +182,7 @@ class SteppedMotion:
         there = callable(self._torque) or has_step_code(
             machine.system, machine.method, ("step_pair", "step_fixed")
         )
-        if there or self._spent + self._budget.spent > _WORTH_COMPILING:
+        if there or self._spent + self.budget.spent > _WORTH_COMPILING:
             self.propagator.compile()
             self._compile_after = math.inf
         else:
@@ -209,7 +205,7 @@ class SteppedMotion:
         polynomial = KroghInterpolator(np.repeat(times, 2), data)
         worst = _WORST * step.h
         found, exact = polynomial(worst).tolist(), step.state(worst)
-        self._budget.charge(4 * step.machine.cost + len(times))
+        self.budget.charge(4 * step.machine.cost + len(times))
         return polynomial if state_distance(found, exact) <= self._task.tolerance else None
 
     def _take_if_wanted(self, time: float, y: Sequence[float]) -> None:
@@ -222,7 +218,7 @@ class SteppedMotion:
             return
         if y is None:
             x = time - self._last_begin
-            self._budget.charge(self._last.machine.cost)
+            self.budget.charge(self._last.machine.cost)
             y = self._last.state(x) if x > 0.0 else self._last.begin.y
         at = self.propagator.begin(list(y))
         acting = self.propagator.acting(self._torque, time, at)

@@ -7,7 +7,6 @@ import contextlib
 import csv
 import inspect
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,14 +34,14 @@ def ascend(times: Array) -> bool:
     return times.ndim == 1 and bool(np.isfinite(times).all() and (np.diff(times) > 0.0).all())
 
 
-class TorqueProfile(ABC):
+class TorqueProfile:
     """Torques that act over a motion; most are known as a function of time alone."""
 
     feedback = False
 
-    @abstractmethod
     def values(self, t: Array) -> Array:
-        """Torques [N m] at times [s], shape (n,) -> (n, 3)."""
+        """Torques [N m] at times [s], shape (n,) -> (n, 3); nan if not known from t."""
+        return np.full((len(t), 3), np.nan)
 
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """Return the times [s] at which torques, or their derivatives, jump or pass a limit [N m].
@@ -180,18 +179,14 @@ class FunctionTorque(TorqueProfile):
         return three(self.function(t, *state), f"torque({t:g})")
 
     def values(self, t: Array) -> Array:
-        """See `TorqueProfile`; nan for a function of the state."""
+        """See `TorqueProfile`."""
         if self.feedback:
-            return np.full((len(t), 3), np.nan)
+            return super().values(t)
         return np.array([self(float(time)) for time in t]).reshape(-1, 3)
 
 
 class LostTorque(TorqueProfile):
     """Torques of a function that a file does not have: known at the samples alone."""
-
-    def values(self, t: Array) -> Array:
-        """See `TorqueProfile`; they are nowhere known."""
-        return np.full((len(t), 3), np.nan)
 
 
 def three(value: Any, name: str) -> Vector3:
