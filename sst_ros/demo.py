@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import select
 import shutil
 import signal
 import subprocess
@@ -92,8 +93,9 @@ def _record(bag: Path, **run: object) -> Iterator[None]:
     """Record a run of the simulator, which ends by itself after what the block does."""
     with _node("recorder", output=str(bag), timeout=_READY_S) as recorder:
         with _node("simulator", **run) as simulator:
-            # One line when it receives all topics, none where it gives up.
-            if not (recorder.stdout and recorder.stdout.readline()):
+            # One line when it receives all topics, none where it gives up, or is stuck.
+            said, most_s = recorder.stdout, 2.0 * _READY_S
+            if not (said and select.select([said], [], [], most_s)[0] and said.readline()):
                 text = f"the recorder received nothing from a simulator within {_READY_S:g} s"
                 raise SstError(text)
             yield

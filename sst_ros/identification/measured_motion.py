@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, refuse_unless
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.torque_profile import (
@@ -99,22 +99,27 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
     held = bool(given.get("held", False))
     allowed = f"must be one of {', '.join(KEYS)}"
     problems = [Problem(key, given[key], allowed) for key in given if key not in KEYS]
-    n = np.size(given.get("t", ()))
-    shapes = {"t": (n,), "gamma": (n, 3), "torque": (n, 3), "gamma_dot": (n, 3), "quaternion": (4,)}
     arrays: dict[str, Array] = {}
-    for key, shape in shapes.items():
+    for key in ("t", "gamma", "torque", "gamma_dot", "quaternion"):
         if given.get(key) is not None:
-            also = (n - 1, 3) if held and key == "torque" else shape
-            arrays |= _read_array(key, given[key], (shape, also), problems)
+            arrays |= _read_array(key, given[key], problems)
         elif key in ("t", "gamma", "torque"):
             problems.append(Problem(key, None, "must be given"))
-    if np.any(np.diff(arrays.get("t", np.empty(0))) <= 0.0):
-        problems.append(Problem("t", given["t"], "must be rising times [s], shape (n,)"))
-    elif n < FEWEST:
-        problems.append(Problem("t", n, f"must be {FEWEST} samples or more"))
     if problems:
         raise InputError("identify", problems)
-    t, torque = arrays["t"], arrays["torque"]
+    t, n = arrays["t"], arrays["t"].size
+    rising = t.ndim == 1 and bool(np.all(np.diff(t) > 0.0))
+    refuse_unless("identify", ("t", t, rising, "must be rising times [s], shape (n,)"))
+    if n < FEWEST:
+        problems.append(Problem("t", n, f"must be {FEWEST} samples or more"))
+    for key in [*arrays][1:]:
+        shape = (4,) if key == "quaternion" else (n, 3)
+        also = (n - 1, 3) if held and key == "torque" else shape
+        if arrays[key].shape not in (shape, also):
+            problems.append(Problem(key, arrays[key].shape, f"must have the shape {shape}"))
+    if problems:
+        raise InputError("identify", problems)
+    torque = arrays["torque"]
     if held and len(torque) == n:
         torque = torque[:-1]
     if delay:
@@ -125,17 +130,12 @@ def read_motion(data: Measured, scene: Scene | None = None, delay: float = 0.0) 
     return MeasuredMotion(t, arrays["gamma"], rates, torque, start, saturated)
 
 
-def _read_array(
-    key: str, value: Any, shapes: Sequence[tuple[int, ...]], problems: list[Problem]
-) -> dict[str, Array]:
-    """Return finite numbers of one of some shapes by their key, or note a problem."""
+def _read_array(key: str, value: Any, problems: list[Problem]) -> dict[str, Array]:
+    """Return finite numbers by their key, or note a problem."""
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         problems.append(Problem(key, value, "must be numbers"))
-        return {}
-    if array.shape not in shapes:
-        problems.append(Problem(key, array.shape, f"must have the shape {shapes[0]}"))
         return {}
     for bad in np.argwhere(~np.isfinite(array))[:1].tolist():
         problems.append(Problem(f"{key}{bad}", "not finite", "must be finite numbers"))

@@ -55,7 +55,8 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
     """
     names, stamp = list(message.joint_names), nanoseconds(message.header.stamp)
     times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points]
-    late = not any(begin.gamma_dot) or not times or times[0] > 0.0
+    first, moving = times[0] if times else math.inf, any(begin.gamma_dot)
+    late = "must be > 0 s while the reference is moving"
     one_each = f"must be {', '.join(ACTUATORS)}, each once"
     refuse_unless(
         "joint_trajectory",
@@ -65,7 +66,7 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
             (f"points[{i}].effort", [*at.effort], not at.effort, "must be left out: it is computed")
             for i, at in enumerate(message.points)
         ),
-        ("points[0].time_from_start", 0.0, late, "must be > 0 s while the reference is moving"),
+        ("points[0].time_from_start", first, first > 0.0 or not moving, late),
     )
     places = [names.index(name) for name in ACTUATORS]
 

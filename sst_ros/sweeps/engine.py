@@ -44,6 +44,10 @@ MOST_DEATHS = 5
 POLL = 0.05
 """Time between two looks at the chunks of a cluster [s]."""
 
+AHEAD = 4
+"""Chunks sent to the scheduler for each thread: enough to keep it busy between two looks, few
+enough to cancel, and for a worker to hold, with the study in each."""
+
 
 class SweepFailed(SstError):
     """Chunks of a study could not be computed or written; the others are complete."""
@@ -162,51 +166,59 @@ class _Run:
         # Before Python 3.11 asyncio's TimeoutError, which is Dask's, was another one.
         self.waits = TimeoutError, distributed.TimeoutError, distributed.CancelledError
         self._client, self._compute, self._check, self._done = client, compute, check, done
-        self.running: dict[Any, int] = {}  # chunks by their futures
+        self.running: dict[Any, tuple[int, set[str]]] = {}  # chunk and chosen workers, or none
         self._unfit: dict[str, str] = {}  # why a worker gets no chunks
         self._deaths = Counter[int]()
         self.given_up: dict[int, str] = {}
 
     def work(self, waiting: list[int]) -> None:
-        """Compute chunks; those that wait are sent to all workers, or to the fit ones alone."""
+        """Compute chunks; they are sent to all workers, or where some are unfit to the others."""
         for worker, answer in self._client.run(eval, self._check, on_error="return").items():
             self._refuse(worker, answer if isinstance(answer, str) else repr(answer))
-        sent_to, idle = set[str](), time.monotonic()
+        idle = time.monotonic()
         while waiting or self.running:
-            fit = self._find_workers() - self._unfit.keys()
-            if fit:
+            threads = self._find_threads()
+            if threads:
                 idle = time.monotonic()
             elif time.monotonic() - idle > NO_WORKER:
                 refused = "; ".join(f"{worker}: {text}" for worker, text in self._unfit.items())
                 why = f"{NO_WORKER:g} s ({refused or 'none is there'})"
                 raise SweepFailed(f"no worker takes chunks for {why}")
-            if self._unfit and fit != sent_to:  # Dask would wait for a chosen worker that is gone
-                waiting += self.running.values()
-                self._client.cancel(list(self.running), force=True)
-                self.running.clear()
-            if waiting and fit:
+            for future, (index, chosen) in [*self.running.items()]:
+                # Dask would wait for chosen workers that are all gone.
+                if chosen and chosen.isdisjoint(threads) and future.status == "pending":
+                    self._client.cancel([future], force=True)
+                    del self.running[future]
+                    waiting.append(index)
+            room = AHEAD * sum(threads.values()) - len(self.running)
+            if waiting and room > 0:
+                sent, waiting = waiting[:room], waiting[room:]
+                chosen = {*threads} if self._unfit else set()
                 futures = self._client.map(
-                    _run_on_worker, waiting, compute=self._compute, check=self._check, pure=False,
-                    workers=list(fit) if self._unfit else None, key=f"chunk-{time.monotonic_ns()}",
+                    _run_on_worker, sent, compute=self._compute, check=self._check, pure=False,
+                    workers=list(chosen) or None, key=f"chunk-{time.monotonic_ns()}",
                 )  # fmt: skip
-                self.running |= zip(futures, waiting, strict=True)
-                waiting, sent_to = [], fit
+                self.running |= {
+                    one: (index, chosen) for one, index in zip(futures, sent, strict=True)
+                }
             time.sleep(POLL)
             waiting += self._collect()
 
-    def _find_workers(self) -> set[str]:
+    def _find_threads(self) -> dict[str, int]:
+        """Threads of each worker that is not unfit."""
         end = time.monotonic() + NO_SCHEDULER
         while self._client.status != "running":
             if self._client.status == "closed" or time.monotonic() > end:
                 raise SweepFailed(NO_ANSWER)
             time.sleep(0.1)
-        return set(self._client.scheduler_info(n_workers=-1)["workers"])
+        workers = self._client.scheduler_info(n_workers=-1)["workers"].items()
+        return {name: about["nthreads"] for name, about in workers if name not in self._unfit}
 
     def _collect(self) -> list[int]:
         """Take what has ended; return the chunks to be computed again."""
         again = []
         for future in [one for one in self.running if one.status != "pending"]:
-            index, taken = self.running.pop(future), False
+            (index, _), taken = self.running.pop(future), False
             with contextlib.suppress(*self.waits):  # the worker that held the outcome is gone
                 taken = self._take(index, future)
             future.release()

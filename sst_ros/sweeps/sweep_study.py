@@ -233,8 +233,8 @@ class SweepStudy(Section):
         elif self.sampling == "latin_hypercube" and rows > LARGEST_HYPERCUBE:
             allowed = f"must be <= {LARGEST_HYPERCUBE} with latin_hypercube; use sobol"
         if allowed:
-            value = sorted(lengths) if key == "table" else self.n
-            raise InputError("sweep", [Problem(key, value, allowed)])
+            given = {"table": sorted(lengths), "n": self.n or (rows if rows > 1 else None)}
+            raise InputError("sweep", [Problem(key, given[key], allowed)])
         return rows
 
     @cached_property

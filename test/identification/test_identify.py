@@ -138,6 +138,8 @@ def samples():
     ("change", "message"),
     [
         ({"gamma": None}, "gamma = None: must be given"),
+        ({"t": None}, "t = None: must be given$"),
+        ({"t": [[0.0], [1.0, 2.0]]}, "must be numbers$"),
         ({"t": np.zeros(400)}, "must be rising times"),
         ({"torque": np.zeros((400, 2))}, r"torque = \(400, 2\): must have the shape \(400, 3\)"),
         ({"speed": 1.0}, "speed = 1.0: must be one of t, gamma"),

@@ -40,6 +40,7 @@ def patched(self, index):
 PreparedSweep.chunk = patched
 """
 POISONED = BEFORE_A_CHUNK.format("index == 3 and os.kill(os.getpid(), signal.SIGKILL)")
+NOTED = BEFORE_A_CHUNK.format("open('noted', 'a').write(f'{index}\\n'); time.sleep(0.3)")
 SLOW = BEFORE_A_CHUNK.format("time.sleep(0.1)")
 
 
@@ -192,9 +193,16 @@ def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
     processes, expected, tmp_path, capsys, patch, reason
 ):
     processes.add_worker(patch)
-    processes.add_worker()
-    with processes.client(2) as client:
+    processes.add_worker(NOTED)
+
+    def join():
+        until(lambda: len(list((tmp_path / "out").glob("part-*"))) >= 3)
+        processes.add_worker(NOTED)
+
+    with processes.client(2) as client, meanwhile(join):
         same(run_study(STUDY, tmp_path / "out", client=client), expected)
+    # What the workers that fit have begun is not begun again when another is refused, or joins.
+    assert sorted(map(int, (tmp_path / "noted").read_text().split())) == list(range(12))
     said = capsys.readouterr().err
     assert "gets no more chunks: " in said
     assert reason in said
