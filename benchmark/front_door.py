@@ -18,9 +18,9 @@ from statistics import median
 
 from benchmark.measure import divide, time_in_turn
 from sst_ros import load_scene, prepare, simulate
+from sst_ros.scene.torque_profile import profile_of
 from sst_ros.simulation.simulate_gauss import CollocatedMotion
 from sst_ros.simulation.stepped_motion import Task
-from sst_ros.simulation.torque_profile import profile_of
 
 ROUNDS, STARTS = 50, 9
 LIST, NUMPY = ("-m", "sst_ros", "scene", "list"), ("-c", "import numpy")

@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from sst_ros.scene.bodies import arc_inertia as arc_inertia
     from sst_ros.scene.loads import SineTorque as SineTorque
     from sst_ros.scene.scene import Scene as Scene
+    from sst_ros.scene.torque_profile import PolynomialTorque as PolynomialTorque
+    from sst_ros.scene.torque_profile import TorqueTable as TorqueTable
     from sst_ros.simulation.simulate import prepare as prepare
     from sst_ros.simulation.simulate import simulate as simulate
     from sst_ros.simulation.simulation import Simulation as Simulation
-    from sst_ros.simulation.torque_profile import PolynomialTorque as PolynomialTorque
-    from sst_ros.simulation.torque_profile import TorqueTable as TorqueTable
     from sst_ros.simulation.trajectory import Trajectory as Trajectory
     from sst_ros.state import State as State
     from sst_ros.sweeps.sweep import sweep as sweep
@@ -61,7 +61,7 @@ _MODULES = {
     "Identification": "identification.parameters",
     "InputError": "errors",
     "InverseDynamics": "control.inverse_dynamics",
-    "PolynomialTorque": "simulation.torque_profile",
+    "PolynomialTorque": "scene.torque_profile",
     "Recording": "recording.recording",
     "ReferenceMotion": "control.reference",
     "RunStopped": "errors",
@@ -71,7 +71,7 @@ _MODULES = {
     "SingularConfiguration": "errors",
     "SstError": "errors",
     "State": "state",
-    "TorqueTable": "simulation.torque_profile",
+    "TorqueTable": "scene.torque_profile",
     "Trajectory": "simulation.trajectory",
     "arc_inertia": "scene.bodies",
     "direct_kinematics": "mechanism.kinematics:direct",

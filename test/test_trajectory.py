@@ -11,8 +11,8 @@ import pytest
 from sst_ros.errors import InputError
 from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import load
+from sst_ros.scene.torque_profile import PolynomialTorque, TorqueTable
 from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.torque_profile import PolynomialTorque, TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 
 EXAMPLE2 = load("example2_heavy")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sst_ros.errors import InputError, Problem, refuse_unless
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque_profile import (
+from sst_ros.scene.torque_profile import (
     ConstantTorque,
     PolynomialTorque,
     SineProfile,

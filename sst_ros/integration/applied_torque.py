@@ -14,7 +14,8 @@ import numpy as np
 from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_with_work
 from sst_ros.scene.loads import SineTorque
-from sst_ros.state import NANOSECONDS, State, TorqueFunction, Vector3, clamp
+from sst_ros.scene.torque_profile import Torque, torque_at
+from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 
 _SEARCHED = 8
 """Parts of a step in which a jump is looked for."""
@@ -22,17 +23,6 @@ _TIME_STEP = 1e-7
 """For the derivative of a torque by time [s]: an error of 1e-9 where it changes within 1 ms."""
 _STATE_STEP = 1e-7
 """For its derivatives by the state, relative to numbers above 1: half of the digits remain."""
-
-
-Torque = Vector3 | SineTorque | TorqueFunction
-"""A function is called with the time [s], and with the `State` if its `feedback` is true."""
-
-
-def torque_at(torque: Any, *given: Any) -> Any:
-    """Torques [N m] of numbers, a sine or a function, given the time [s] and what it asks for."""
-    if isinstance(torque, SineTorque):
-        return torque.at(*given)
-    return torque(*given) if callable(torque) else torque
 
 
 class AppliedTorque:

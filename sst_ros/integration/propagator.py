@@ -17,7 +17,7 @@ from sst_ros.integration.adaptive_stepper import (
     EvaluationBudget,
     Step,
 )
-from sst_ros.integration.applied_torque import AppliedTorque, Torque
+from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.compiled_method import compile_derivative
 from sst_ros.integration.events import (
     contact_events_of,
@@ -30,6 +30,7 @@ from sst_ros.integration.point import Point
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.torque_profile import Torque
 from sst_ros.state import Vector3
 
 Moment = tuple[float, ...]

@@ -16,7 +16,7 @@ from sst_ros.nodes import topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
-from sst_ros.simulation.torque_profile import TorqueTable
+from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
 
 

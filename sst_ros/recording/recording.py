@@ -28,7 +28,7 @@ from sst_ros.recording.bag_reader import Bag, refusal
 from sst_ros.recording.topic_tables import Column, Integers, Series, TopicTable, places
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque_profile import TorqueTable
+from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS
 

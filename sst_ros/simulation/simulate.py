@@ -20,10 +20,7 @@ from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Initial, SineTorque
 from sst_ros.scene.scene import Scene, scene_of, with_initial
-from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
-from sst_ros.simulation.simulation import AUTO, INTEGRATORS, describe_conditioning
-from sst_ros.simulation.stepped_motion import SteppedMotion, Task
-from sst_ros.simulation.torque_profile import (
+from sst_ros.scene.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
     TorqueFunction,
@@ -32,6 +29,9 @@ from sst_ros.simulation.torque_profile import (
     ascend,
     profile_of,
 )
+from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
+from sst_ros.simulation.simulation import AUTO, INTEGRATORS, describe_conditioning
+from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.trajectory import Trajectory, check_error
 from sst_ros.state import NANOSECONDS, Array
 

@@ -19,8 +19,8 @@ from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.point import estimate_error, orientation_distance, state_distance
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
+from sst_ros.scene.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.stepped_motion import Task
-from sst_ros.simulation.torque_profile import ConstantTorque, SineProfile
 from sst_ros.simulation.trajectory import Trajectory, check_error
 from sst_ros.state import clamp
 

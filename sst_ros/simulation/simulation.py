@@ -21,7 +21,6 @@ from sst_ros.integration.adaptive_stepper import (
     CannotStep,
     EvaluationBudget,
 )
-from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.propagator import LimitReached, Propagator
@@ -30,6 +29,7 @@ from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene, scene_of
+from sst_ros.scene.torque_profile import Torque
 from sst_ros.state import NANOSECONDS, State, Vector3, finite_vector
 
 AUTO = "auto"

@@ -18,13 +18,12 @@ from sst_ros.integration.adaptive_stepper import (
     EvaluationBudget,
     Step,
 )
-from sst_ros.integration.applied_torque import Torque
 from sst_ros.integration.compiled_method import CompiledMethod, has_step_code
 from sst_ros.integration.point import state_distance
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.torque_profile import TorqueProfile
+from sst_ros.scene.torque_profile import Torque, TorqueProfile
 from sst_ros.state import NANOSECONDS, State, Vector3
 
 _WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000

@@ -27,9 +27,7 @@ from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import frames, kinematics
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import dump, read
-from sst_ros.simulation.stepped_motion import SteppedMotion, Task
-from sst_ros.simulation.torque_profile import (
+from sst_ros.scene.torque_profile import (
     LostTorque,
     TorqueProfile,
     ascend,
@@ -37,6 +35,8 @@ from sst_ros.simulation.torque_profile import (
     profile_of,
     record_of,
 )
+from sst_ros.scene.yaml_document import dump, read
+from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
 
 if TYPE_CHECKING:

@@ -39,8 +39,8 @@ from sst_ros.scene.loads import (
     Workspace,
 )
 from sst_ros.scene.scene import load, text_of
+from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.simulation.torque_profile import TorqueTable
 
 HOME = (math.pi / 4,) * 3
 EXAMPLE1 = replace(load("example1"), initial=Initial(gamma=HOME))

@@ -12,7 +12,7 @@ from models import FAST
 
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import load
-from sst_ros.simulation.torque_profile import TorqueTable
+from sst_ros.scene.torque_profile import TorqueTable
 
 HEADER = "time,tau_1,tau_2,tau_3\n"
 

@@ -15,7 +15,7 @@ from sst_ros.errors import InputError
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import value_of
 from sst_ros.identification.simulation_fit import Sensitivities, differentiate_damping
-from sst_ros.simulation.torque_profile import SineProfile
+from sst_ros.scene.torque_profile import SineProfile
 from tools.reading_figure import PANELS, determined
 
 

@@ -16,13 +16,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem, refuse_unless
-from sst_ros.integration.applied_torque import Torque
 from sst_ros.scene.loads import SineTorque
 from sst_ros.state import State, Vector3, finite_vector
 
 Array = NDArray[np.float64]
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
+
+Torque = Vector3 | SineTorque | TorqueFunction
+"""A function is called with the time [s], and with the `State` if its `feedback` is true."""
+
+
+def torque_at(torque: Any, *given: Any) -> Any:
+    """Torques [N m] of numbers, a sine or a function, given the time [s] and what it asks for."""
+    if isinstance(torque, SineTorque):
+        return torque.at(*given)
+    return torque(*given) if callable(torque) else torque
 
 
 _MOST_CROSSINGS = 1e5
