@@ -183,9 +183,10 @@ def test_a_limit_ends_the_motion_and_keeps_what_is_valid(duration, method, lette
 
 
 def test_another_start():
-    for initial in (([0.5, 0.6, 0.7], np.zeros(3)), {"gamma": [0.5, 0.6, 0.7]}):
+    gamma = [0.5, 0.6, 0.7]
+    for initial in ((gamma, np.zeros(3)), {"gamma": gamma}, {"gamma": gamma, "orientation": None}):
         found = simulate(EXAMPLE2, duration=0.01, initial=initial)
-        np.testing.assert_allclose(found.gamma[0], [0.5, 0.6, 0.7], atol=1e-14)
+        np.testing.assert_allclose(found.gamma[0], gamma, atol=1e-14)
 
 
 @pytest.mark.parametrize(

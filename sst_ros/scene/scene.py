@@ -188,7 +188,9 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
             raise InputError("initial", [Problem("initial", initial, allowed)]) from None
         initial = {"gamma": gamma, "gamma_dot": gamma_dot}
     if isinstance(initial, Mapping):
-        initial = build(Initial, initial, "initial")
+        # As in `Initial`, None is no orientation.
+        given = {key: x for key, x in initial.items() if key != "orientation" or x is not None}
+        initial = build(Initial, given, "initial")
     return replace(scene, initial=initial)
 
 
