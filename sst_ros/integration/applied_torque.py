@@ -100,8 +100,10 @@ class AppliedTorque:
             lagged = (y[7], y[8], y[9]) if len(self._dynamics.state) > 7 else (0.0, 0.0, 0.0)
             joints = self._dynamics.joints(*y[:7])
             given = time, State.of(round(time * NANOSECONDS), y, joints, lagged)
-        first, second, third = map(float, torque_at(torque, *given))
-        return clamp((first, second, third), self.limit)
+        found: Any = tuple(map(float, torque_at(torque, *given)))
+        if len(found) != 3:  # a ValueError would count as a motion that diverges
+            raise TypeError(f"a torque function must return three torques [N m], not {len(found)}")
+        return clamp(found, self.limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""
