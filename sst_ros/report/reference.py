@@ -47,7 +47,7 @@ over it: torques, and a moment on the star in {B} where the scene takes one [N m
 
 LONGEST_TICK_NS = 1_000_000  # longer ticks are divided [ns]
 TICK_TOLERANCE = 1e-13  # largest local error estimate of a step
-TICK_BUDGET = 3600  # evaluations that a tick may take: a hundred steps
+TICK_BUDGET = 3600  # evaluations that a tick may take on average: a hundred steps
 COMPILED_FROM = 10_000  # from this number of ticks on compilation costs less than it saves
 PLAIN_TICKS = 60_000  # so many are compared in plain Python, a minute's work
 CHUNK = 25_000  # so many ticks at a time, which bounds the memory

@@ -267,4 +267,4 @@ def _times(t_eval: ArrayLike | None, span_ns: int) -> Array | None:
         _refuse(
             "t_eval", t_eval, f"must be ascending times from 0 to {end:g} s, a nanosecond apart"
         )
-    return np.asarray(rounded / NANOSECONDS)
+    return np.asarray(np.abs(rounded) / NANOSECONDS)  # -0.0 is 0.0
