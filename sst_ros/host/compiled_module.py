@@ -31,6 +31,9 @@ def square(n):
 
 def rows(m, n):
     return [[0.0] * n for _ in range(m)]
+
+def copy(values, place):
+    place[:] = values
 """
 
 _NUMBA = """\
@@ -54,12 +57,17 @@ def square(n):
 @jit_inner
 def rows(m, n):
     return np.zeros((m, n))
+
+@jit_inner
+def copy(values, place):  # a slice would take seconds to compile
+    for i in range(len(values)):
+        place[i] = values[i]
 """
 
 # Compiled functions alone call these. What Python would need to call them - which without it is a
 # segmentation fault - takes a fifth of the time to compile.
 _INNER = (
-    "angles_and_rates joints_of normalise all_far copy step_factor next_length "
+    "angles_and_rates joints_of normalise all_far step_factor next_length "
     "evaluate linearise factorise substitute"
 )
 

@@ -50,7 +50,6 @@ _SHARED = (
     step_loops.size_of,
     step_loops.normalise,
     step_loops.all_far,
-    step_loops.copy,
     step_loops.step_factor,
     step_loops.next_length,
 )

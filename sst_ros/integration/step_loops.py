@@ -141,11 +141,6 @@ def step_many(
     return end
 
 
-def copy(values, place):
-    """Put values into a place of the same length."""
-    place[:] = values
-
-
 def next_length(longest: float, h: float, error: float, error_order: int, cut: bool) -> float:
     """Longest step after an accepted one of h with a local error, relative to the tolerance.
 
