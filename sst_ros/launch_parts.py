@@ -27,7 +27,7 @@ from launch.launch_description import LaunchDescription
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from sst_ros.description.urdf import urdf, urdf_with_ros2_control
+from sst_ros.description.robot import urdf, urdf_with_ros2_control
 from sst_ros.host import child_process
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics

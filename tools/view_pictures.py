@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sst_ros.description.tree import ACTUATED, BASE, INTERMEDIATE, LEGS, STAR, end_point
+from sst_ros.description.robot import ACTUATED, BASE, INTERMEDIATE, LEGS, STAR
 from sst_ros.errors import SstError
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, load
@@ -90,7 +90,7 @@ def _build(server: PageServer, scene: Scene) -> None:
 
 def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
     thick, base, star = 0.02 * scene.base.radius, scene.base.radius, scene.star.radius
-    end = end_point(scene, np.eye(3))
+    end = np.array([0.0, 0.0, star])
     bar = 1.04 * (base + 1.5 * thick) * np.array([np.cos(_ALONG), 0.0, np.sin(_ALONG)])
     places = {BASE: ("{B}", np.zeros(3), 0.42), STAR: ("{E}", 1.05 * end, 0.24)}
     for k in LEGS:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from sst_ros.description.urdf import urdf, urdf_with_ros2_control
+from sst_ros.description.robot import urdf, urdf_with_ros2_control
 from sst_ros.scene.scene import Scene, load, names
 from sst_ros.scene.schema import json_schema
 

@@ -27,7 +27,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
-from sst_ros.description.urdf import urdf
+from sst_ros.description.robot import urdf
 from sst_ros.errors import SstError, refuse_unless
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics

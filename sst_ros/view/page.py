@@ -16,7 +16,7 @@ import jinja2
 import numpy as np
 from viser import GuiButtonHandle, GuiSliderHandle, GuiUplotHandle, Icon, ViserServer, uplot
 
-from sst_ros.description.tree import LEG_COLOURS
+from sst_ros.description.robot import LEG_COLOURS
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.view.scene_drawing import SceneDrawing

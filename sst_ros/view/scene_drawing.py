@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from viser import ArrowsHandle, ViserServer
 
-from sst_ros.description import tree
+from sst_ros.description import robot
 from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
@@ -32,9 +32,9 @@ class SceneDrawing:
 
     def __init__(self, server: ViserServer, scene: Scene) -> None:
         self._server, self._scene, self._geometry = server, scene, Geometry.of(scene)
-        self._joints = tree.tree(self._geometry)
+        self._joints = robot.joints_of(self._geometry)
         self._frames = {}
-        for link, drawn in tree.shapes(scene).items():
+        for link, drawn in robot.shapes(scene).items():
             self._frames[link] = server.scene.add_frame(f"{_ROOT}/{link}", show_axes=False)
             for index, shape in enumerate(drawn):
                 add_shape(server, f"{_ROOT}/{link}/{index}", shape)
@@ -51,10 +51,10 @@ class SceneDrawing:
             thickness=0.016 * size,
         )
         outward = scene.star.radius * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.28]])
-        self._add_arrow(f"{tree.STAR}/s", outward, tree.STAR_COLOUR, (0.010, 0.028, 0.075))
+        self._add_arrow(f"{robot.STAR}/s", outward, robot.STAR_COLOUR, (0.010, 0.028, 0.075))
         self._torques = [
             self._add_arrow(f"torque_{k}", np.zeros((2, 3)), colour, (0.014, 0.040, 0.090))
-            for k, colour in enumerate(tree.LEG_COLOURS, 1)
+            for k, colour in enumerate(robot.LEG_COLOURS, 1)
         ]
         for arrow in self._torques:
             arrow.visible = False
@@ -74,17 +74,17 @@ class SceneDrawing:
             self._last = -np.inf
         if time is not None and time - self._last >= _POINT_PERIOD_S:
             self._last = time
-            star = tree.rotations(self._joints[:3], angles)[tree.STAR]
-            self._points.append((time, tree.end_point(self._scene, star)))
+            star = robot.rotations(self._joints[:3], angles)[robot.STAR]
+            self._points.append((time, self._scene.star.radius * star[:, 2]))
             while self._points[0][0] < time - _PATH_S:
                 self._points.popleft()
 
     def show(self, angles: Mapping[str, float], torque: Sequence[float]) -> None:
         """Move everything to joint angles [rad], and show torques [N m], shape (3,)."""
-        found = tree.rotations(self._joints, angles)
+        found = robot.rotations(self._joints, angles)
         for link, frame in self._frames.items():
             frame.wxyz = wxyz(found[link])
-        end = tree.end_point(self._scene, found[tree.STAR])
+        end = self._scene.star.radius * found[robot.STAR][:, 2]
         points = np.array([*(point for _, point in self._points), end])[-PATH_POINTS:]
         points = np.concatenate([np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points])
         points *= _LIFT
@@ -127,26 +127,28 @@ class SceneDrawing:
         outwards = v - v.mean(axis=0)
         outwards /= np.linalg.norm(outwards, axis=1)[:, None]
         points = self._scene.base.radius * (v + 0.13 * outwards)
-        places = [(f"{tree.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at) for k, at in enumerate(points, 1)]
-        places.append((f"{tree.STAR}/E", "E", self._scene.star.radius * np.array([0.0, 0.0, 1.36])))
+        places = [(f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at) for k, at in enumerate(points, 1)]
+        places.append(
+            (f"{robot.STAR}/E", "E", self._scene.star.radius * np.array([0.0, 0.0, 1.36]))
+        )
         for name, text, at in places:
             self._server.scene.add_label(
                 f"{_ROOT}/{name}", text, position=at, anchor="center-center", font_screen_scale=2.0
             )
 
 
-def add_shape(server: ViserServer, name: str, shape: tree.Shape) -> None:
+def add_shape(server: ViserServer, name: str, shape: robot.Shape) -> None:
     """Add a shape to viser's scene under a name."""
     scene = server.scene
-    if isinstance(shape, tree.Ball):
+    if isinstance(shape, robot.Ball):
         scene.add_icosphere(
             name, shape.radius, shape.colour, position=shape.centre,
             subdivisions=3 if shape.radius < 0.1 else 20,  # of an edge of the icosahedron
             opacity=shape.opacity if shape.opacity < 1.0 else None,
         )  # fmt: skip
-    elif isinstance(shape, tree.Box):
+    elif isinstance(shape, robot.Box):
         scene.add_box(name, shape.colour, shape.size, position=shape.centre)
-    elif isinstance(shape, tree.Arc):
+    elif isinstance(shape, robot.Arc):
         turns = 2.0 * np.pi * np.arange(_SIDES + 1) / _SIDES
         outline = np.stack([np.cos(turns), np.sin(turns)], axis=1) * shape.thickness
         mesh = trimesh.creation.revolve(
@@ -155,7 +157,7 @@ def add_shape(server: ViserServer, name: str, shape: tree.Shape) -> None:
         frame = np.stack([shape.begin, np.cross(shape.axis, shape.begin), shape.axis], axis=1)
         scene.add_mesh_simple(name, mesh.vertices @ frame.T, mesh.faces, color=shape.colour)
         for index, end in enumerate(shape.points()[[0, -1]]):
-            add_shape(server, f"{name}/{index}", tree.Ball(end, shape.thickness, shape.colour))
+            add_shape(server, f"{name}/{index}", robot.Ball(end, shape.thickness, shape.colour))
     else:
         along = shape.end - shape.begin
         middle, length = (shape.begin + shape.end) / 2.0, float(np.linalg.norm(along))

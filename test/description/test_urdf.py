@@ -16,19 +16,21 @@ from models import assembly_of, seeded_samples
 from scipy.spatial.transform import Rotation
 
 from sst_ros.__main__ import main
-from sst_ros.description.tree import (
+from sst_ros.description.robot import (
     ACTUATED,
     INTERMEDIATE,
     LEGS,
+    PLUGIN,
     STAR,
     STARS,
     Arc,
     Ball,
     Box,
-    end_point,
+    roll_pitch_yaw,
     shapes,
+    urdf,
+    urdf_with_ros2_control,
 )
-from sst_ros.description.urdf import PLUGIN, roll_pitch_yaw, urdf, urdf_with_ros2_control
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import rates, virtual_work
 from sst_ros.mechanism.frames import quaternion_of
@@ -274,7 +276,7 @@ def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name)
     geometry = Geometry.of(scene)
     arcs = [shape.points() for shape in shapes(scene)[STAR] if isinstance(shape, Arc)]
     for points, e in zip(arcs, geometry.e, strict=True):
-        assert points[0] == pytest.approx(end_point(scene, np.eye(3)))
+        assert points[0] == pytest.approx([0.0, 0.0, scene.star.radius])
         assert points @ e == pytest.approx(0.0, abs=1e-15)
 
 

@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import Scene, load_scene
-from sst_ros.description.urdf import urdf
+from sst_ros.description.robot import urdf
 from sst_ros.runtime.torque_input import MOST_WAITING
 from sst_ros.scene.yaml_document import dump, read
 

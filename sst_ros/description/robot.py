@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The manipulator as links, joints and shapes, for the view, and as URDF, for ROS and engines.
+
+    base_link -gamma_k- actuated_k -mu_k- intermediate_k -beta_1- star
+                                                         -beta_2- star_from_2
+                                                         -beta_3- star_from_3
+
+All joints turn about axes through O, so every frame has its origin there and a pose is a rotation.
+The star is attached to leg 1. Legs 2 and 3 end in a frame without a body: {E} as that leg sees it.
+The loops are closed where the three are one. Links are drawn as arcs, rods, balls and boxes in
+their own frames; thicknesses are for the eye, arcs and radii are the scene's, no shape is meant for
+collisions. URDF has no loops, no springs, no elastic stops and no Stribeck friction: a simulation
+of the file must add them.
+
+A scene gives inertias about O, and a mass only where something weighs; URDF wants a mass. Where the
+scene has none, it is the one that would have this tensor on the sphere of its link,
+trace / (2 radius^2), with its centre at O: the motion is then the same for any mass.
+
+The actuators can be hardware of ros2_control, which drives them over topics by the plug-in
+JointStateTopicSystem of the package joint_state_topic_hardware_interface. It sends the effort of
+the joints of its tag only: passive joints, which have no command, must not be in it.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from sst_ros.dynamics.model import limits_of, ranges_of
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.scene import LARGEST, Scene
+from sst_ros.state import BASE_FRAME, Vector3
+
+BASE, STAR, PAYLOAD = BASE_FRAME, "star", "payload"
+LEGS = (1, 2, 3)
+STARS = (STAR, "star_from_2", "star_from_3")  # {E} as seen from legs 1, 2 and 3
+ACTUATED = ("actuated_1", "actuated_2", "actuated_3")
+"""Links with the frames {1k} = [r, w x r, w] of the legs."""
+INTERMEDIATE = ("intermediate_1", "intermediate_2", "intermediate_3")
+"""Links with the frames {2k} = [r, t x r, t] of the legs."""
+
+Colour: TypeAlias = tuple[float, float, float]
+GLOBE: Colour = (0.93, 0.94, 0.96)
+TRIANGLE: Colour = (0.35, 0.38, 0.42)
+STAR_COLOUR: Colour = (0.90, 0.62, 0.00)
+STEEL: Colour = (0.60, 0.63, 0.67)
+LEG_COLOURS: tuple[Colour, ...] = ((0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45))
+"""Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
+
+STEP = np.radians(6.0)  # arcs are drawn as chords of this length or less: 0.14 % of the radius off
+
+PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
+EVERY_CYCLE = "-1"
+"""Threshold of the change of a command below which the plug-in sends none: the simulator drops a
+command that is not repeated within command_timeout."""
+
+_NOTE = """ Made by sst_ros from the scene {name}. Joints have the names and angles of joint_states.
+     star_from_2 and star_from_3 are the star's frame as legs 2 and 3 see it: in closed loops they
+     and star are one. """
+
+_ASSUMED = """ The scene has no masses for {bodies}. Theirs are trace / (2 radius^2), with
+     the centre at O, about which all turns: they change no motion. The tensors are the scene's. """
+
+
+class Joint(NamedTuple):
+    """A joint between two links, named as in joint_states.
+
+    child = parent * origin * rotation about the axis by the angle, with the origin, shape (3, 3), a
+    rotation in the frame of the parent, and the axis a unit vector in the joint's frame.
+    """
+
+    name: str
+    parent: str
+    child: str
+    origin: Array
+    axis: Vector3
+
+
+def joints_of(geometry: Geometry) -> list[Joint]:
+    """All nine joints, parents before children; signs are those of Eqs. 50 to 52."""
+    z, found = np.array([0.0, 0.0, 1.0]), []
+    legs = zip(LEGS, geometry.v, geometry.w, geometry.e, ACTUATED, INTERMEDIATE, STARS, strict=True)
+    for leg, v, w, e, actuated, intermediate, star in legs:
+        at_rest = np.stack([v, np.cross(w, v), w], axis=1)  # 0kR at gamma = 0
+        # At beta = 0 the arc's end s lies at r: in {E} the vectors of {2k} are z, e x z and e.
+        folded = np.stack([z, np.cross(e, z), e], axis=1).T
+        back = (-float(e[0]), -float(e[1]), -float(e[2]))
+        found += [
+            Joint(f"gamma_{leg}", BASE, actuated, at_rest, (0.0, 0.0, 1.0)),
+            Joint(f"mu_{leg}", actuated, intermediate, np.eye(3), (-1.0, 0.0, 0.0)),
+            Joint(f"beta_{leg}", intermediate, star, folded, back),
+        ]
+    return found
+
+
+def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str, Array]:
+    """Rotation of every link in {B}, each shape (3, 3), by the angles of the joints [rad]."""
+    found: dict[str, Array] = {BASE: np.eye(3)}
+    for joint in joints:
+        angle, across = angles[joint.name], np.cross(np.eye(3), np.array(joint.axis))
+        turn = np.eye(3) + np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
+        found[joint.child] = found[joint.parent] @ (joint.origin @ turn)
+    return found
+
+
+class Arc(NamedTuple):
+    """A round bar along a circular arc about O, `thickness` its radius [m].
+
+    From the unit vector `begin` it turns by an angle [rad] about `axis`, a unit vector
+    perpendicular to it; `radius` is that of the arc [m].
+    """
+
+    begin: Array
+    axis: Array
+    angle: float
+    radius: float
+    thickness: float
+    colour: Colour
+
+    def points(self) -> Array:
+        """Points along the arc, STEP apart or less, shape (n, 3) [m]."""
+        count = max(2, int(np.ceil(self.angle / STEP)) + 1)
+        angles = np.linspace(0.0, self.angle, count)[:, None]
+        across = np.cross(self.axis, self.begin)
+        return np.asarray(self.radius * (np.cos(angles) * self.begin + np.sin(angles) * across))
+
+
+class Rod(NamedTuple):
+    """A straight round bar between two points, shape (3,) [m]; `thickness` is its radius [m]."""
+
+    begin: Array
+    end: Array
+    thickness: float
+    colour: Colour
+
+
+class Ball(NamedTuple):
+    """A ball; centre, shape (3,) [m]."""
+
+    centre: Array
+    radius: float
+    colour: Colour
+    opacity: float = 1.0
+
+
+class Box(NamedTuple):
+    """A box with sides along the axes of its link; size and centre, shape (3,) [m]."""
+
+    centre: Array
+    size: Array
+    colour: Colour
+
+
+Shape: TypeAlias = "Arc | Rod | Ball | Box"
+
+
+def shapes(scene: Scene) -> dict[str, list[Shape]]:
+    """Return the shapes of every link that has some, by the link's name."""
+    geometry = Geometry.of(scene)
+    base, star = scene.base.radius, scene.star.radius
+    thick, (x, y, z) = 0.02 * base, np.eye(3)
+    sides = zip(geometry.v, geometry.w, geometry.arc.tolist(), strict=True)
+    found: dict[str, list[Shape]] = {
+        BASE: [
+            Ball(np.zeros(3), base - thick, GLOBE, 0.92),
+            *(Arc(v, w, angle, base, 0.7 * thick, TRIANGLE) for v, w, angle in sides),
+            *(Ball(base * v, 1.6 * thick, TRIANGLE) for v in geometry.v),
+        ],
+        # In {E} the carriage k is at s turned about e by +beta.
+        STAR: [
+            *(Arc(z, e, geometry.beta_max, star, thick, STAR_COLOUR) for e in geometry.e),
+            Ball(star * z, 2.2 * thick, STAR_COLOUR),
+        ],
+    }
+    if scene.payload is not None:
+        centre = np.array(scene.payload.centre)
+        rod = Rod(star * z, centre, 0.8 * thick, STEEL)
+        found[STAR] += [rod, Ball(centre, 2.8 * thick, STEEL)]
+    for actuated, intermediate, colour in zip(ACTUATED, INTERMEDIATE, LEG_COLOURS, strict=True):
+        # A quarter arc from the motor at w to the carriage at r, just above the base.
+        middle = base + 1.5 * thick
+        found[actuated] = [
+            Arc(x, -y, np.pi / 2, middle, thick, colour),
+            Rod(z * (base - thick), z * (middle + 2.0 * thick), 2.4 * thick, colour),
+        ]
+        found[intermediate] = [
+            Rod(x * (base - thick), x * star, 0.9 * thick, STEEL),
+            Box(star * x, 3.0 * thick * np.array([1.0, 1.3, 1.3]), colour),
+        ]
+    return found
+
+
+def urdf(scene: Scene) -> str:
+    """Write a scene as a URDF document."""
+    return _text(_robot(scene))
+
+
+def urdf_with_ros2_control(
+    scene: Scene,
+    commands: str = "/sst_simulator/commands_stamped",
+    states: str = "/joint_states",
+) -> str:
+    """Write a scene as URDF with the ros2_control tag of its actuators.
+
+    The simulator takes commands by name on the one topic, and has its joint states on the other.
+    Until the first of them arrive, the hardware has the initial state of the scene: without it
+    joint_trajectory_controller, activated before, holds nan, and no command starts the run.
+    """
+    root = _robot(scene)
+    tag = ET.SubElement(root, "ros2_control", name="sst_ros", type="system")
+    hardware = ET.SubElement(tag, "hardware")
+    ET.SubElement(hardware, "plugin").text = PLUGIN
+    for name, value in (
+        ("joint_commands_topic", commands),
+        ("joint_states_topic", states),
+        ("trigger_joint_command_threshold", EVERY_CYCLE),
+    ):
+        ET.SubElement(hardware, "param", name=name).text = value
+    starts = zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)
+    for name, gamma, gamma_dot in starts:
+        joint = ET.SubElement(tag, "joint", name=name)
+        ET.SubElement(joint, "command_interface", name="effort")
+        for state, start in (("position", gamma), ("velocity", gamma_dot), ("effort", 0.0)):
+            interface = ET.SubElement(joint, "state_interface", name=state)
+            ET.SubElement(interface, "param", name="initial_value").text = repr(start)
+    return _text(root)
+
+
+def _text(root: ET.Element) -> str:
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _robot(scene: Scene) -> ET.Element:
+    geometry = Geometry.of(scene)
+    joints, drawn = joints_of(geometry), shapes(scene)
+    bodies = {body.name: body for body in _bodies(scene)}
+    # An XML name has no spaces.
+    name = "".join(letter if letter.isalnum() else "_" for letter in scene.name)
+    root = ET.Element("robot", name=name)
+    root.append(ET.Comment(_NOTE.format(name=name)))
+    if assumed := ", ".join(body.name for body in bodies.values() if body.assumed):
+        root.append(ET.Comment(_ASSUMED.format(bodies=assumed)))
+    for name in dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies)):
+        link = ET.SubElement(root, "link", name=name)
+        if (body := bodies.get(name)) is not None:
+            inertial = ET.SubElement(link, "inertial")
+            ET.SubElement(inertial, "origin", xyz=_exact(*body.centre))
+            ET.SubElement(inertial, "mass", value=_exact(body.mass))
+            entries = map(_exact, body.tensor[np.triu_indices(3)])
+            inertia = dict(zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), entries, strict=True))
+            ET.SubElement(inertial, "inertia", inertia)
+        for shape in drawn.get(name, ()):
+            _add_shape(link, shape)
+    ranges = {joint: (low, high) for joint, low, high in ranges_of([*limits_of(scene, geometry)])}
+    for joint in joints:
+        ends = ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf))
+        limited = bool(np.all(np.isfinite(ends)))
+        kind = "revolute" if limited else "continuous"
+        element = _add_joint(root, joint.name, kind, joint.parent, joint.child)
+        ET.SubElement(element, "origin", xyz="0 0 0", rpy=_exact(*roll_pitch_yaw(joint.origin)))
+        ET.SubElement(element, "axis", xyz=_exact(*joint.axis))
+        motor = scene.actuators if joint.name.startswith("gamma") else None
+        bounds = {"lower": _exact(ends[0]), "upper": _exact(ends[1])} if limited else {}
+        for key, limit in (("effort", "torque_limit"), ("velocity", "velocity_limit")):
+            bounds[key] = _exact(getattr(motor, limit, None) or LARGEST)
+        ET.SubElement(element, "limit", bounds)
+        if friction := getattr(scene.friction, joint.name.split("_")[0], None):
+            damping, coulomb = _exact(friction.viscous), _exact(friction.coulomb)
+            ET.SubElement(element, "dynamics", damping=damping, friction=coulomb)
+    for body in bodies.values():
+        if body.name != body.link:
+            _add_joint(root, f"{body.name}_fixed", "fixed", body.link, body.name)
+    return root
+
+
+class _Body(NamedTuple):
+    """A rigid body that is fixed to a link of the tree, and has its name where it is the link."""
+
+    name: str
+    link: str  # whose frame all vectors are in
+    mass: float  # [kg]
+    centre: Array  # of mass [m], shape (3,)
+    tensor: Array  # about the centre of mass [kg m^2], shape (3, 3)
+    assumed: bool = False  # the scene has no mass for it
+
+
+def _bodies(scene: Scene) -> Iterator[_Body]:
+    """All bodies that have mass or inertia."""
+    star, base, payload, motor = scene.star, scene.base, scene.payload, scene.actuators
+
+    def body(
+        name: str, radius: float, about_o: Array, mass: float = 0.0, at: Vector3 = (0.0, 0.0, 0.0)
+    ) -> _Body:
+        c, assumed = np.array(at), float(np.trace(about_o)) / (2.0 * radius**2)
+        own = about_o - mass * (c @ c * np.eye(3) - np.outer(c, c))
+        return _Body(name, name, mass or assumed, c, own, mass == 0.0)
+
+    yield body(STAR, star.radius, star.tensor, star.mass, star.centre)
+    if payload is not None:
+        tensor = np.zeros((3, 3)) if payload.inertia is None else payload.inertia.matrix
+        yield _Body(PAYLOAD, STAR, payload.mass, np.array(payload.centre), tensor)
+    for k, leg in enumerate(LEGS):
+        for name, link, radius in (
+            (ACTUATED[k], scene.actuated_links[k], base.radius),
+            (INTERMEDIATE[k], scene.intermediate_links[k], star.radius),
+        ):
+            if link.mass or link.inertia is not None:
+                yield body(name, radius, link.tensor, link.mass, link.centre)
+        if motor is not None and motor.rotor_inertia:
+            # A thin disc behind its gear: only its inertia about w matters.
+            behind = motor.gear_ratio**2 * motor.rotor_inertia
+            disc = np.diag([behind / 2.0, behind / 2.0, behind])
+            yield body(f"rotor_{leg}", base.radius, disc)._replace(link=ACTUATED[k])
+
+
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """Angles (r, p, y) [rad] of R = Rz(y) Ry(p) Rx(r), shape (3,), exact at p = pi/2 too."""
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    sine, cosine = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    roll = np.arctan2(
+        sine * rotation[0, 2] - cosine * rotation[1, 2],
+        cosine * rotation[1, 1] - sine * rotation[0, 1],
+    )
+    return np.array([roll, pitch, yaw])
+
+
+def _add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
+    joint = ET.SubElement(root, "joint", name=name, type=kind)
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+    return joint
+
+
+def _add_shape(link: ET.Element, shape: Shape) -> None:
+    rgba = (*shape.colour, getattr(shape, "opacity", 1.0))
+    name = "_".join(f"{round(255 * part):02x}" for part in rgba)
+    for kind, size, at, turn in _solids(shape):
+        visual = ET.SubElement(link, "visual")
+        ET.SubElement(visual, "origin", xyz=_short(*at), rpy=_short(*turn))
+        ET.SubElement(ET.SubElement(visual, "geometry"), kind, size)
+        material = ET.SubElement(visual, "material", name=f"rgba_{name}")
+        ET.SubElement(material, "color", rgba=_short(*rgba))
+
+
+def _solids(shape: Shape) -> Iterator[tuple[str, dict[str, str], Array, Array]]:
+    """Yield kind, size, centre, and roll, pitch, yaw of what a shape is in URDF."""
+    if isinstance(shape, Ball):
+        yield "sphere", {"radius": _short(shape.radius)}, shape.centre, np.zeros(3)
+    elif isinstance(shape, Box):
+        yield "box", {"size": _short(*shape.size)}, shape.centre, np.zeros(3)
+    else:
+        ends = shape.points() if isinstance(shape, Arc) else (shape.begin, shape.end)
+        for begin, end in pairwise(ends):
+            x, y, z = end - begin
+            # The cylinder's axis is z; it ends a little late, so that no gap shows at the bends.
+            turn = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
+            length = float(np.linalg.norm(end - begin)) + 0.1 * shape.thickness
+            size = {"radius": _short(shape.thickness), "length": _short(length)}
+            yield "cylinder", size, (begin + end) / 2.0, turn
+
+
+def _exact(*values: float) -> str:
+    return " ".join(repr(float(x) + 0.0) for x in values)
+
+
+def _short(*values: float) -> str:
+    return " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)
