@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sst_ros import Controller, ControllerSettings, Geometry, load_scene, reference_motion, simulate
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import rotation_matrix
 
 scene = load_scene("spiral")
 geometry, reference = Geometry.of(scene), reference_motion(scene)

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sst_ros import Geometry, load_scene, simulate
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import rotation_matrix
 from sst_ros.mechanism.workspace import measures
 
 scene = load_scene("example2_heavy")

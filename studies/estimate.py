@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from sst_ros import Simulation, SineTorque, load_scene, simulate
 from sst_ros.errors import AssemblyError, SstError
 from sst_ros.integration.methods import METHODS
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.plot.style import BLUE, VERMILION, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish
 from sst_ros.scene.scene import Scene

@@ -20,7 +20,7 @@ from typing import Any
 
 from sst_ros.errors import RunStopped
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3

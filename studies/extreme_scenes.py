@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism import kinematics, workspace
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3

@@ -25,8 +25,7 @@ from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.methods import METHODS
-from sst_ros.mechanism.frames import angle_between
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, angle_between
 from sst_ros.plot.style import GREY, INK, MARKERS, styled
 from sst_ros.report.results import data_frame, markdown, provenance, publish
 from sst_ros.simulation.simulate_gauss import GAUSS, NODES

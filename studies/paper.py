@@ -19,8 +19,7 @@ from sst_ros import demo
 from sst_ros.extras import MissingDependency, require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, angle_between, quaternion_of, rotation_matrix
 from sst_ros.plot.motion import ASSUMPTION, NUMBERS, Solution, angle, caption, position_of_e
 from sst_ros.plot.motion import path as path_of_e
 from sst_ros.plot.pictures import PICTURES, save

@@ -15,7 +15,7 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from sst_ros.errors import RunStopped
-from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.mechanism.geometry import rotation_matrix, zyz_angles
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import message_types
 from sst_ros.recording.bag_writer import BagWriter

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism import kinematics, virtual_work, workspace
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.bodies import Base, Inertia, Link, Star
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene, load

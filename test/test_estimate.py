@@ -9,7 +9,7 @@ import pytest
 from sst_ros import TorqueTable, load_scene, simulate
 from sst_ros.integration.compiled_method import JACOBIAN_COST
 from sst_ros.integration.methods import METHODS
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.torque_profile import PolynomialTorque
 

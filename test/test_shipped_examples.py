@@ -15,7 +15,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics import kernel
 from sst_ros.errors import StrokeExceeded
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.frames import angle_between, rotation_matrix
+from sst_ros.mechanism.geometry import angle_between, rotation_matrix
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 

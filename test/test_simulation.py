@@ -24,7 +24,7 @@ from sst_ros.errors import (
     WorkspaceLeft,
 )
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.scene.scene import Actuators, Initial, Moment, Workspace, load
 from sst_ros.simulation.simulation import Simulation
 

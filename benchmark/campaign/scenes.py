@@ -12,7 +12,7 @@ import yaml
 
 from benchmark.campaign.ledger import Ledger
 from sst_ros import Simulation
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene.scene import Scene, text_of
 from sst_ros.scene.yaml_document import read
 

@@ -25,7 +25,7 @@ from benchmark.measure import time_in_turn
 from benchmark.peers.task import DURATION, Task
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, RK4
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import rotation_matrix
 
 _STEPS = 400
 _MOST = 80

@@ -10,7 +10,7 @@ import numpy as np
 from benchmark.peers.study import Engine, Failed, Series, Setting
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.frames import rotation_matrix
+from sst_ros.mechanism.geometry import rotation_matrix
 
 ENGINE, PACKAGE = "SciPy on the paper's form", "scipy"
 

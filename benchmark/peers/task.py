@@ -20,9 +20,8 @@ from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.generic_math import rotation_rows
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 

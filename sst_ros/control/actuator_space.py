@@ -22,7 +22,6 @@ from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_for_arrays, compile_program, trace
 from sst_ros.mechanism import continuation
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import (
     ZERO,
     cos,
@@ -34,7 +33,7 @@ from sst_ros.mechanism.generic_math import (
     sin,
     sqrt,
 )
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.state import Quaternion, Vector3
 
 ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding

@@ -22,9 +22,8 @@ from sst_ros.control.law import (
 from sst_ros.control.reference import ReferenceMotion
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.frames import rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO, triple
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.scene import Scene
 from sst_ros.state import State, Vector3
 

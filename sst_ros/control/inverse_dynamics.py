@@ -12,9 +12,8 @@ from sst_ros.control.reference import Reference
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, State, Vector3
 

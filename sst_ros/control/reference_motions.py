@@ -28,9 +28,8 @@ from sst_ros.control.reference import Reference, ReferenceMotion, equal_pieces
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import ZERO, axpy, multiply, quaternion_product, triple
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.loads import Spiral, Sweep, ToAngles
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3

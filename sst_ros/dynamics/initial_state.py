@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import quaternion_rate
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
 
 SINGULAR = 1.5e-5

@@ -33,8 +33,7 @@ from sst_ros.dynamics.expression import compile_for_arrays, mark_present, with_j
 from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
 from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene

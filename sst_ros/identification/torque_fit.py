@@ -50,8 +50,7 @@ from sst_ros.identification.consistency import find_consistent_values, fit_weigh
 from sst_ros.identification.measured_motion import Measured, MeasuredMotion, read_motion
 from sst_ros.identification.parameters import BaseParameters, Identification, Regressor
 from sst_ros.mechanism import continuation
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
 
 STILL = 1e-6

@@ -26,8 +26,7 @@ from sst_ros.host import compiled_module
 from sst_ros.host.output import slices
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
-from sst_ros.mechanism import frames
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, rotation_matrix, zyz_angles
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import TURN
 from sst_ros.state import DIMENSIONS, UNITS, arrays_of, columns_of
@@ -361,7 +360,7 @@ class BatchResult:
     @cached_property
     def euler_zyz(self) -> Array:
         """ZYZ angles (theta, phi, psi) of {E} in {B} [rad], shape (..., N, 3)."""
-        return np.asarray(frames.zyz_angles(frames.rotation_matrix(self.quaternion)))
+        return np.asarray(zyz_angles(rotation_matrix(self.quaternion)))
 
     @cached_property
     def torque(self) -> Array:

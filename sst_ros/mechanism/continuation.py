@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import AssemblyError, SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import cross
-from sst_ros.mechanism.geometry import Array, Geometry, frozen
+from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen
 from sst_ros.mechanism.kinematics import ROUNDING, rotate
 
 SAFE = 0.18

@@ -26,8 +26,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
-from sst_ros.mechanism.frames import angle_between, columns, cross, dot, quaternion_of
-from sst_ros.mechanism.geometry import Array, Geometry, frozen
+from sst_ros.mechanism.geometry import (
+    Array,
+    Geometry,
+    angle_between,
+    columns,
+    cross,
+    dot,
+    frozen,
+    quaternion_of,
+)
 from sst_ros.state import Assembly
 
 Index = NDArray[np.intp]

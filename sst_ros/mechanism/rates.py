@@ -33,8 +33,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.frames import cross, rotation_matrix
-from sst_ros.mechanism.geometry import Array, Geometry, frozen
+from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
 from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture
 
 

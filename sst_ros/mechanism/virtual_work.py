@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import cross
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, cross
 from sst_ros.scene.scene import Scene
 
 SINGULAR = 1e-12

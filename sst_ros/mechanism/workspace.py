@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import refuse_unless
 from sst_ros.host.output import slices
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import columns, cross
-from sst_ros.mechanism.geometry import Array, Geometry, frozen
+from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
 
 _BLOCK, _BISECTIONS = 20_000, 55
 

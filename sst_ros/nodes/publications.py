@@ -133,7 +133,7 @@ def state_messages(frame_id: str = "") -> tuple[Message, Message, Message]:
 
 
 def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
-    """ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w), as `frames.zyz_angles`.
+    """ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w), as `geometry.zyz_angles`.
 
     z / w is tan((theta + psi) / 2), -x / y is tan((theta - psi) / 2).
     """

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.plot import pictures, workspace
 from sst_ros.plot.pictures import DEGREES, Picture, draw_legs, tick_torques
 from sst_ros.plot.style import LINES, hide_zeros, legend, stack, styled

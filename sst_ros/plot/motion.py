@@ -15,8 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
 from sst_ros.plot import style
 from sst_ros.plot.style import BLUE, GREY, LINES, Looks
 from sst_ros.scene.scene import Scene

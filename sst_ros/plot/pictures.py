@@ -14,8 +14,7 @@ from scipy.interpolate import CubicHermiteSpline
 from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import write_into
-from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot import motion, style, workspace
 from sst_ros.plot.style import BLUE, GREY, VERMILION, leg_names, lines, stack

@@ -29,8 +29,7 @@ from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.frames import angle_between
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, angle_between
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places

@@ -31,8 +31,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.step_loops import explicit_step
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import angle_between, rotation_matrix
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, angle_between, rotation_matrix
 from sst_ros.report.reference import initial, joint_columns
 from sst_ros.report.results import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene

@@ -28,8 +28,7 @@ from sst_ros.errors import InputError, Problem, SstError, suggestion
 from sst_ros.host.output import slices
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
-from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
 from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, legend, note, styled
 from sst_ros.report import scene_summary as advised
 from sst_ros.report.results import WHOLE_RUN_S, data_frame, provenance, publish, records, render

@@ -13,13 +13,12 @@ import numpy as np
 from sst_ros.control.tracking import Track, TrackingMetrics, track_of
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import continuation
-from sst_ros.mechanism.frames import angle_between, quaternion_of, rotation_matrix
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, places
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import NANOSECONDS, Array
 
 KEYS = (REFERENCE.key, TRACKING_ERROR.key)
 

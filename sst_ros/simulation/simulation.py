@@ -25,8 +25,7 @@ from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.torque_profile import Torque

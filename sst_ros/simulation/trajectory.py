@@ -24,8 +24,8 @@ from sst_ros.errors import Diverged, InputError, Problem, refuse_unless
 from sst_ros.extras import MissingDependency, require
 from sst_ros.host.table_file import SUFFIXES, load_table, write_table
 from sst_ros.integration.methods import DOP853
-from sst_ros.mechanism import frames, kinematics
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.geometry import Geometry, rotation_matrix, unwrap_zyz, zyz_angles
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import (
     LostTorque,
@@ -181,7 +181,7 @@ class Trajectory:
     @cached_property
     def euler_zyz(self) -> Array:
         """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], shape (n, 3)."""
-        return frames.unwrap_zyz(frames.zyz_angles(frames.rotation_matrix(self.quaternion)))
+        return unwrap_zyz(zyz_angles(rotation_matrix(self.quaternion)))
 
     @cached_property
     def energy(self) -> Array:
@@ -199,7 +199,7 @@ class Trajectory:
     @cached_property
     def closure_error(self) -> float:
         """Largest abs(r_k . t_k) of all samples: how far the loops are from closed; 0 if exact."""
-        rotation, geometry = frames.rotation_matrix(self.quaternion), Geometry.of(self.scene)
+        rotation, geometry = rotation_matrix(self.quaternion), Geometry.of(self.scene)
         return float(np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0))
 
     @property

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.integration.batch import Batch, BatchResult
-from sst_ros.mechanism.frames import angle_between
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.scene.scene import Scenarios
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints, columns_of
 from sst_ros.sweeps.controlled_batch import ControlledBatch

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from viser import ArrowsHandle, ViserServer
 
 from sst_ros.description import robot
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
 from sst_ros.scene.scene import Scene
 
 PATH_POINTS = 400

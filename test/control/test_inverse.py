@@ -20,8 +20,8 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.frames import quaternion_of
 from sst_ros.mechanism.generic_math import symmetric_rows
+from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation

@@ -24,9 +24,8 @@ from sst_ros.control.reference_motions import (
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
 from sst_ros.mechanism.generic_math import quaternion_product
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.loads import (
     DesiredMotion,
     Recorded,

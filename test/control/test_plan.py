@@ -22,8 +22,7 @@ from sst_ros.control.plan import check_motion, examine_motion, maximum, time_sca
 from sst_ros.control.reference_motions import geodesic_motion, reference_motion
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.loads import (
     Actuators,
     DesiredMotion,

@@ -33,8 +33,7 @@ from sst_ros.description.robot import (
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import rates, virtual_work
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Actuators, load, names
 

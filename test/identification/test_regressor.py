@@ -13,8 +13,7 @@ from sst_ros.errors import InputError, MotionRefused
 from sst_ros.identification import parameters
 from sst_ros.identification.excitation import design
 from sst_ros.identification.parameters import Regressor, find_base_parameters, find_independent
-from sst_ros.mechanism.frames import quaternion_of
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from models import FAST
 from scipy.spatial.transform import Rotation
 
-from sst_ros.mechanism.frames import (
+from sst_ros.mechanism.geometry import (
     angle_between,
     quaternion_of,
     rotation_matrix,

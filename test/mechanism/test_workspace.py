@@ -11,7 +11,7 @@ from models import assembly_of
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work, workspace
-from sst_ros.mechanism.frames import zyz_angles
+from sst_ros.mechanism.geometry import zyz_angles
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from loaded_scenes import loaded
 from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics import kernel
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.recording import recording
 from sst_ros.report import reference
 from sst_ros.report.run import summarise

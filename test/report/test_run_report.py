@@ -12,7 +12,7 @@ from matplotlib import image
 
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.recording import recording
 from sst_ros.report import reference, timing, tracking
 from sst_ros.report.reference import TickPropagator

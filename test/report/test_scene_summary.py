@@ -17,7 +17,7 @@ from models import seeded_samples
 from sst_ros import __main__ as cli
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.methods import METHODS
-from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.report import work_precision
 from sst_ros.report.accuracy import accuracy_page, document
 from sst_ros.report.scene_summary import (

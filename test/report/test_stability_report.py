@@ -12,8 +12,7 @@ from matplotlib import image
 from sst_ros import __main__ as cli
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
-from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.report import stability
 from sst_ros.report.stability import ROWS, draw_stability, examine_stability, stability_page
 from sst_ros.scene.scene import Scene, load

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros import load_scene
-from sst_ros.mechanism.frames import rotation_matrix, zyz_angles
+from sst_ros.mechanism.geometry import rotation_matrix, zyz_angles
 from sst_ros.nodes import publications
 from sst_ros.nodes.publications import NotFinite, SimulatorTopics, TorqueLog, finite, state_messages
 from sst_ros.runtime.settings import SimulatorParameters

@@ -9,8 +9,7 @@ from ros.conftest import NODE, foreign_types
 
 from sst_ros import load_scene
 from sst_ros.mechanism import kinematics, rates
-from sst_ros.mechanism.frames import quaternion_of, rotation_matrix
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.nodes.simulation_interfaces import FEATURES
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]

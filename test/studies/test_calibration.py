@@ -6,7 +6,7 @@ import pickle
 import pytest
 
 from sst_ros.errors import InputError, Problem, RunStopped, SingularConfiguration
-from sst_ros.mechanism.frames import angle_between
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.report.results import data_frame
 from studies.estimate import CLASSES, measure
 from studies.orders import MOTIONS, ORDER, measure_steps, measure_tolerance, order_table, truth

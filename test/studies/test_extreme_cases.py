@@ -16,7 +16,7 @@ from models import inertia_of
 
 from sst_ros.dynamics import kernel
 from sst_ros.errors import AssemblyError, RunStopped, SingularConfiguration, SstError
-from sst_ros.mechanism.frames import quaternion_of
+from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.scene.scene import Initial, load
 from sst_ros.simulation.simulation import Simulation
 from studies import extreme

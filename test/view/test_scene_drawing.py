@@ -9,8 +9,7 @@ pytest.importorskip("viser", reason="needs viser: pip install .[view]")
 import trimesh
 
 from sst_ros.description.robot import BASE, STAR, Arc, Ball, Box, Rod, shapes
-from sst_ros.mechanism.frames import rotation_matrix
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.view.scene_drawing import SceneDrawing, add_shape
