@@ -39,7 +39,7 @@ EXTRAS = {
     "cluster": ["dask[distributed]>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "view": ["viser>=1.1,<2"],
 }
-EXTRAS["all"] = ["argcomplete", "mpmath", "xarray", *chain.from_iterable(EXTRAS.values())]
+EXTRAS["all"] = ["argcomplete", "xarray", *chain.from_iterable(EXTRAS.values())]
 EXTRAS |= {
     "jazzy": wheels("jazzy"),
     # For developers.

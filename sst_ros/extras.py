@@ -13,7 +13,6 @@ EXTRAS = {
     "lz4": "record",
     "matplotlib": "plot",
     "mcap": "record",
-    "mpmath": "all",
     "numba": "fast",
     "pinocchio": "engines",
     "pandas": "record",

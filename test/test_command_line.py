@@ -33,7 +33,7 @@ def status(words):
 sys.exit(max(map(status, {commands!r})))
 """
 OPTIONAL = (
-    "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "numba", "mpmath",
+    "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "numba",
 )  # fmt: skip
 
 TOP = [name for name in COMMANDS if " " not in name]

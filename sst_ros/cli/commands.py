@@ -180,7 +180,6 @@ COMMANDS: dict[str, Subcommand | str] = {
             "scenes", "names, or paths of .yaml files; default: all", nargs="*", metavar="SCENE"
         ),
         *_out("folder of the results", "accuracy_out"),
-        _flag("--mpmath", "reference in 30 digits, slow"),
     ),
     "report stability": Subcommand(
         "stable steps along the motion of a scene; runs at its limits and with other numbers",

@@ -11,7 +11,6 @@ from sst_ros.control.law import MODES
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
-from sst_ros.report.reference_solution import EXTENDED, MPMATH
 from sst_ros.scene.scene import load, names
 
 
@@ -27,8 +26,7 @@ def report_run(options: argparse.Namespace) -> None:
 def report_accuracy(options: argparse.Namespace) -> None:
     """Measure the error and the run time of every method."""
     out = free_out(options, "accuracy_out")
-    kind = MPMATH if options.mpmath else EXTENDED
-    function("report.accuracy:write_accuracy_report")(options.scenes or names(), out, kind=kind)
+    function("report.accuracy:write_accuracy_report")(options.scenes or names(), out)
 
 
 def report_stability(options: argparse.Namespace) -> int:

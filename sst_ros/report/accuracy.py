@@ -1,117 +1,357 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The accuracy report: work-precision studies on the terminal, in files, and as one page."""
+"""Work-precision study: error and computing time of every method and setting on a scene.
+
+Each method has settings from coarse to fine. Fixed steps use no error estimate; those of Gauss
+collocation are of a motion that was prepared. Tolerances go to `Simulation`, whose estimate of the
+global error is counted and timed with it, and for collocation to `prepare`. The report shows the
+studies on the terminal, in files, and as one page.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
-from collections.abc import Sequence
+import timeit
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from sst_ros.host.compiled_module import numba_version
-from sst_ros.plot.style import INK, MARKERS, Looks, legend, note, styled
-from sst_ros.report import work_precision as study_of
-from sst_ros.report.reference_solution import EXTENDED
+from sst_ros.errors import SstError
+from sst_ros.host.output import slices
+from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.methods import METHODS, RK4, Method
+from sst_ros.mechanism.geometry import Array
+from sst_ros.plot.style import INK, MARKERS, Looks, note, styled
+from sst_ros.report.reference import compare_with_paper
+from sst_ros.report.reference_solution import (
+    InitialValueProblem,
+    ReferenceSolution,
+    Run,
+    solve_reference,
+)
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records, render
-from sst_ros.report.scene_summary import cost_table
-from sst_ros.report.work_precision import ERROR, WorkPrecision
-from sst_ros.scene import scene
+from sst_ros.report.scene_summary import StepAdvice, cost_table, step_advice
+from sst_ros.scene import scene as scenes
+from sst_ros.scene.scene import Scene
+from sst_ros.simulation.simulate import PreparedRun, prepare, simulate
+from sst_ros.simulation.simulate_gauss import GAUSS
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
+FIXED, TOLERANCE = "fixed steps", "tolerance"
+_STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
+_TOLERANCES = tuple(10.0**-n for n in range(4, 14))
 TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
 """Orientation errors for which the fastest setting is named [rad]; TARGET is in titles."""
 
+ABOVE_REFERENCE = 100.0  # errors are reported if they are so many times the reference's own
+USELESS = 0.1  # an orientation error above this [rad] is a failure
+ROUNDING = 2e-14  # finer steps are not expected to give less than this [rad]
+LONGEST_RUN_S = 0.4  # no finer settings are tried after a run that took longer than this [s]
+LEAST_SETTINGS = 3
+"""So many settings of each method are tried even where they take longer: a busy machine slows one
+run, but must not empty the grid."""
+SLOWER = 5.0  # so much longer `Simulation` may take under clamped torques, in plain Python
+SAME_EQUATIONS = 1e-10  # kernel and the paper's equations must agree to this part
 
-def write_accuracy_report(
-    names: Sequence[str], out: Path, *, kind: str = EXTENDED
-) -> list[WorkPrecision]:
+ERROR = "largest_orientation_rad"
+ERRORS = [
+    f"{when}_{quantity}"
+    for when in ("final", "largest")
+    for quantity in ("orientation_rad", "gamma_rad", "gamma_dot_rad_per_s")
+]
+COLUMNS = (
+    *("scene", "method", "kind", "setting", "evaluations", "wall_min_s", *ERRORS),
+    *("below_floor", "failure"),
+)
+"""Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
+`evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
+for a failure, and `failure` for a success."""
+
+
+@dataclass(frozen=True)
+class WorkPrecision:
+    """Result of a work-precision study of a scene."""
+
+    scene: str
+    seconds: float  # time span [s]
+    ends: str  # why it ends before the scene's duration; empty where it does not
+    reference: ReferenceSolution
+    rows: DataFrame  # the solver grid, columns as in COLUMNS; settings from coarse to fine
+    advice: StepAdvice  # as `scene show` prints it
+    measured: float | None
+    """Error of `simulate` with that advice [rad]; None where a limit stops it."""
+    formulation: float | None
+    """Largest difference of W_dot from the paper's equations along the reference, relative to the
+    largest W_dot; None where it cannot be compared."""
+    warnings: tuple[str, ...]  # contradictions
+
+    @property
+    def floor(self) -> float:
+        """Smallest orientation error that is reported [rad]."""
+        return ABOVE_REFERENCE * self.reference.own.orientation
+
+    @property
+    def rests(self) -> bool:
+        """Whether nothing moves, so that every setting is right to rounding.
+
+        So it is with scenes that a controller drives along a reference motion.
+        """
+        states = self.reference.states[:, :7]
+        return bool(np.abs(states - states[0]).max() < ROUNDING)
+
+    def best(self, target: float) -> Series[Any] | None:
+        """Return the fastest setting with an orientation error of at most `target` [rad].
+
+        A setting counts only if at least one finer setting of its method was tried and every one
+        of them is as good: a coarse setting whose errors happen to cancel is no recommendation.
+        """
+        good: list[Any] = []
+        if self.rests:
+            return None
+        for _, group in self.rows.groupby(["method", "kind"], sort=False):
+            bad = np.flatnonzero(~(group[ERROR].astype(float).to_numpy() <= target))
+            good += group.index[bad[-1] + 1 if len(bad) else 0 : -1].tolist()
+        found = self.rows.loc[good].sort_values("wall_min_s", kind="stable")
+        return None if found.empty else found.iloc[0]
+
+    @cached_property
+    def fastest(self) -> dict[float, Series[Any]]:
+        """The fastest setting for each of TARGETS that has one and is not below the floor."""
+        found = {target: self.best(target) for target in TARGETS if target >= self.floor}
+        return {target: row for target, row in found.items() if row is not None}
+
+
+def study_scene(
+    scene: Scene, *, shown: bool = False, longest_s: float = LONGEST_RUN_S
+) -> WorkPrecision:
+    """Solve a scene with every method and setting and compare with the reference.
+
+    Progress is `shown` on the terminal; no finer settings are tried after a run that took longer
+    than `longest_s`. Raises what the problem and its reference do.
+    """
+    problem = InitialValueProblem(scene)
+    grid, truth = list_settings(problem), solve_reference(problem)
+    rows: list[dict[str, Any]] = []
+    best: dict[str, tuple[float, Array]] = {}  # by method: least error, and the last state
+    for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
+        for row, end in _refine(grid[part.start], problem, truth, longest_s):
+            rows.append({"scene": scene.name, **row})
+            found = row.get("final_orientation_rad", math.inf), end
+            best[row["method"]] = min(best.get(row["method"], found), found, key=lambda x: x[0])
+    zero = np.zeros((len(problem.times), 3))
+    torques = zero if scene.torque is None else scene.torque.values(problem.times)
+    along = zip(truth.states.astype(float), torques.tolist(), strict=True)
+    difference, _ = compare_with_paper(scene, along)
+    motion, measured = simulate(scene, duration=problem.seconds, t_eval=problem.times), None
+    if len(motion) > problem.count:  # else a limit stops it before
+        states = np.hstack([motion.quaternion, motion.body_rate])
+        measured = problem.errors(states, truth.states)[1].orientation
+    return WorkPrecision(
+        scene=scene.name,
+        seconds=problem.seconds,
+        ends=problem.ends,
+        reference=truth,
+        rows=data_frame(rows, COLUMNS),
+        advice=step_advice(scene),
+        measured=measured,
+        formulation=difference,
+        warnings=tuple(_warnings(problem, truth, best, difference)),
+    )
+
+
+def _warnings(
+    problem: InitialValueProblem,
+    truth: ReferenceSolution,
+    best: dict[str, tuple[float, Array]],
+    difference: float | None,
+) -> Iterator[str]:
+    if difference is not None and difference > SAME_EQUATIONS:
+        yield f"the kernel differs from the paper's equations by {difference:.1e}"
+    if problem.clamped:
+        yield "the torques are clamped to the actuators' limit: no fixed steps are tried"
+    for (one, (error, end)), (two, (other, other_end)) in itertools.combinations(best.items(), 2):
+        apart = problem.errors(end[None], other_end[None].astype(np.longdouble))[0].orientation
+        least = min(error, other)
+        if math.inf > least > 100.0 * max(apart, 10.0 * truth.own.orientation, 1e-13):
+            yield (
+                f"{one} and {two} agree to {apart:.1e} rad, but are {least:.1e} "
+                "rad off the reference: they do not solve what the reference solves"
+            )
+            return
+
+
+class SolverSetting(NamedTuple):
+    """One point of the grid."""
+
+    method: str
+    kind: str  # FIXED or TOLERANCE
+    setting: float  # step [s] or tolerance
+    solve: Callable[[], Run]  # raises SstError, ArithmeticError or ValueError
+    timed: Callable[[], object]  # does the same work with the least overhead
+
+
+def list_settings(problem: InitialValueProblem) -> list[Iterator[SolverSetting]]:
+    """Return the settings by method and kind, each from coarse to fine."""
+    found: list[Iterator[SolverSetting]] = []
+    for method in METHODS.values():
+        if not problem.clamped:  # fixed steps know no limit of torque
+            found.append(_list_steps(problem, method))
+        if method is not RK4:  # its steps in a run are fixed
+            found.append(_list_tolerances(problem, method.name))
+    if not problem.kinked:
+        found += [_list_collocation(problem, kind) for kind in (FIXED, TOLERANCE)]
+    return found
+
+
+def _list_steps(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
+    machine = CompiledMethod(problem.system, method, compiled=True)
+    for steps in _STEPS_PER_INTERVAL:
+        h, start = problem.interval / steps, list(problem.start)
+        timed = partial(machine.step_fixed, 0.0, h, steps * problem.count, start, problem.drive)
+        yield SolverSetting(
+            method.name, FIXED, h, partial(problem.run_steps, machine, steps), timed
+        )
+
+
+def _list_tolerances(problem: InitialValueProblem, method: str) -> Iterator[SolverSetting]:
+    for tolerance in _TOLERANCES:
+        run = partial(problem.run_simulation, problem.simulation(method, tolerance))
+        yield SolverSetting(method, TOLERANCE, tolerance, run, run)
+
+
+def _list_collocation(problem: InitialValueProblem, kind: str) -> Iterator[SolverSetting]:
+    """Yield settings of Gauss collocation, with the steps that each tolerance chooses.
+
+    A run of fixed steps is one of a motion that has been prepared. One for a tolerance searches
+    for its steps, which solves the motion several times.
+    """
+
+    def solve(make: Callable[[], PreparedRun]) -> Run:
+        motion = make().run()
+        dense = motion.at(problem.times)
+        return np.hstack([dense.quaternion, dense.body_rate]), motion.evaluations
+
+    longest = math.inf
+    for tolerance in (1e-2, 1e-3, *_TOLERANCES):
+        make = partial(
+            prepare, problem.scene, None, problem.seconds, method=GAUSS, tolerance=tolerance
+        )
+        if kind == TOLERANCE:
+            yield SolverSetting(GAUSS, kind, tolerance, partial(solve, make), make)
+            continue
+        with contextlib.suppress(SstError):
+            ready = make()
+            step = ready.run().step
+            if step < longest:
+                longest = step
+                yield SolverSetting(GAUSS, kind, step, partial(solve, make), ready.run)
+
+
+def _refine(
+    settings: Iterator[SolverSetting],
+    problem: InitialValueProblem,
+    truth: ReferenceSolution,
+    longest_s: float,
+) -> Iterator[tuple[dict[str, Any], Array]]:
+    """Go from coarse to fine until a run takes long or two errors lie below the floor."""
+    below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
+    for number, setting in enumerate(settings, start=1):
+        row, end = _measure(setting, problem, truth)
+        yield row | {"below_floor": row[ERROR] < floor if ERROR in row else None}, end
+        below += row.get(ERROR, math.inf) < max(floor, ROUNDING)
+        slower = SLOWER if problem.clamped and setting.kind == TOLERANCE else 1.0
+        if (row["wall_min_s"] > longest_s * slower and number >= LEAST_SETTINGS) or below > 1:
+            return
+
+
+def _measure(
+    setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
+) -> tuple[dict[str, Any], Array]:
+    """Run one setting: its row of the grid, and its last state, nan for a failure."""
+    row: dict[str, Any] = dict(zip(("method", "kind", "setting"), setting[:3], strict=True))
+    row |= {"evaluations": None, "wall_min_s": 0.0, "failure": ""}
+    states: Array = np.full((1, 7), np.nan)
+    with np.errstate(all="ignore"):
+        try:
+            states, row["evaluations"] = setting.solve()
+            wall = timeit.timeit(setting.timed, number=1)
+            if wall < LONGEST_RUN_S:
+                turns = min(14, max(2, int(0.15 / wall)))
+                wall = min(wall, *timeit.repeat(setting.timed, number=1, repeat=turns))
+            row["wall_min_s"] = wall
+            if not np.isfinite(states[:, :7]).all():
+                raise ArithmeticError("not finite")
+            final, largest = problem.errors(states, truth.states)
+            if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
+                raise ArithmeticError(f"off by {largest.orientation:.1g} rad")
+            row |= dict(zip(ERRORS, (*final, *largest), strict=True))
+        except (SstError, ArithmeticError, ValueError) as error:
+            row["failure"] = str(error).splitlines()[0] if str(error) else "not finite"
+    return row, states[-1]
+
+
+def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision]:
     """Study scenes one after another; print each, and write all finished results into `out`.
 
-    Files: accuracy.csv, .json, .md, .png, and accuracy_SCENE.png.
+    Files: accuracy.csv, .json, .md, and accuracy_SCENE.png.
 
     Raises:
         SstError: a scene is refused or cannot start, or `out` cannot be written.
 
     """
     studies: list[WorkPrecision] = []
-    terms: list[dict[str, Any]] = []
-    for each in [scene.load(name) for name in names]:
-        study = study_of.work_precision(each, kind=kind, shown=True)
+    documents, terms = list[dict[str, Any]](), list[dict[str, Any]]()
+    for each in [scenes.load(name) for name in names]:
+        study = study_scene(each, shown=True)
         studies.append(study)
         terms += cost_table(each)
         print(accuracy_text(study), flush=True)
-        figures = {} if study.rests else {f"accuracy_{each.name}": draw_accuracy(study)}
-        if len(studies) == len(names):
-            figures["accuracy"] = draw_fastest(list_fastest(studies), provenance())
-        whole = {"studies": [document(one) for one in studies], "terms": terms}
-        given = {"csv": join_grids(studies), "page": accuracy_page(studies, terms)}
-        publish(out, "accuracy", document=whole, figures=figures, **given)
+        about = ("scene", "seconds", "ends", "measured", "formulation", "warnings")
+        documents.append(
+            {
+                **{name: getattr(study, name) for name in about},
+                "reference": study.reference.how,
+                "reference_own_error": study.reference.own._asdict(),
+                "advice": study.advice._asdict(),
+                "fastest": name_fastest(study),
+                "rows": records(study.rows),
+            }
+        )
+        publish(
+            out,
+            "accuracy",
+            csv=data_frame(row for one in documents for row in one["rows"]),
+            document={"studies": documents, "terms": terms},
+            page=accuracy_page(studies, terms),
+            figures={} if study.rests else {f"accuracy_{each.name}": draw_accuracy(study)},
+        )
     return studies
 
 
-def join_grids(studies: Sequence[WorkPrecision]) -> DataFrame:
-    """Return the grids of all studies as one table."""
-    return data_frame(row for study in studies for row in records(study.rows))
-
-
-def document(study: WorkPrecision) -> dict[str, Any]:
-    """Return a study as JSON has it."""
-    return {
-        "scene": study.scene,
-        "seconds": study.seconds,
-        "ends": study.ends,
-        "compiled": numba_version() is not None,
-        "reference": study.reference.how,
-        "reference_own_error": study.reference.own._asdict(),
-        "formulation_difference_relative": study.formulation,
-        "advice": study.advice._asdict(),
-        "advice_measured_error_rad": study.measured and study.measured[0],
-        "fastest": fastest(study),
-        "warnings": list(study.warnings),
-        "rows": records(study.rows),
-    }
-
-
-def list_fastest(studies: Sequence[WorkPrecision]) -> DataFrame:
-    """Return method and time, as a share of the motion's, of the fastest setting by target."""
-    rows = [
-        {"scene": study.scene, "target": target, "method": best.method}
-        | {"share": best.wall_min_s / study.seconds}
-        for study in studies
-        for target, best in _choose(study).items()
-    ]
-    return data_frame(rows, ("scene", "target", "method", "share"))
-
-
-def _choose(study: WorkPrecision) -> dict[float, Series[Any]]:
-    """Return the fastest setting for each of TARGETS that has one and is not below the floor."""
-    found = {target: study.best(target) for target in TARGETS if target >= study.floor}
-    return {target: row for target, row in found.items() if row is not None}
-
-
-def fastest(study: WorkPrecision) -> str:
+def name_fastest(study: WorkPrecision) -> str:
     """Return the fastest setting for TARGET as a sentence."""
     best = study.best(TARGET)
     if study.rests:
         return "It rests: it has no torques of its own, a controller drives it along its motion."
     if best is not None:
-        return f"{TARGET:.0e} rad over {study.seconds:g} s: {setting(best)}, {_time(best)}."
+        return f"{TARGET:.0e} rad over {study.seconds:g} s: {_setting(best)}, {_time(best)}."
     least = study.rows[ERROR].astype(float).min()
     reached = f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
     return f"No setting that was tried reaches {TARGET:.0e} rad with every finer one; {reached}."
 
 
-def setting(row: Series[Any]) -> str:
+def _setting(row: Series[Any]) -> str:
     """Return method and setting in words."""
-    if row.kind == study_of.TOLERANCE:
+    if row.kind == TOLERANCE:
         return f"{row.method}, tolerance {row.setting:.0e}"
     return f"{row.method}, {1e3 * row.setting:.4g} ms steps"
 
@@ -122,39 +362,36 @@ def _time(row: Series[Any]) -> str:
 
 
 HEADS = {
-    "wall_min_s": "min [s]",
-    "wall_median_s": "median [s]",
+    "setting": "setting",
+    "evaluations": "evaluations",
+    "wall_min_s": "time [s]",
     "final_orientation_rad": "end [rad]",
     ERROR: "largest [rad]",
     "largest_gamma_rad": "gamma [rad]",
     "largest_gamma_dot_rad_per_s": "rate [rad/s]",
-    "energy_residual_J": "energy [J]",
-    "closure_residual": "closure",
 }
 """Columns of the grid that the terminal shows, and their heads there."""
 
 
 def accuracy_text(study: WorkPrecision) -> str:
     """Format a study for the terminal."""
-    shown = study.rows.assign(setting=[setting(row) for _, row in study.rows.iterrows()])
-    shown = shown[["setting", "evaluations", *HEADS]].rename(columns=HEADS)
+    shown = study.rows.assign(setting=[_setting(row) for _, row in study.rows.iterrows()])
+    shown = shown[list(HEADS)].rename(columns=HEADS)
     below = [row is True for row in study.rows.below_floor]
     shown[""] = ["*" if row else "" for row in below]
     shown["failure"] = [f"FAILED: {why[:60]}" if why else "" for why in study.rows.failure]
     grid = shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
-    return render(
-        "accuracy.txt", study=study, grid=grid, below=sum(below),
-        fastest=fastest(study), provenance=provenance(),
-    )  # fmt: skip
+    given = {"fastest": name_fastest(study), "provenance": provenance()}
+    return render("accuracy.txt", study=study, grid=grid, below=sum(below), **given)
 
 
 def accuracy_page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
     """Write studies, and the rows of `cost_table` of their scenes, as one Markdown page."""
     rows = []
     for each in studies:
+        words = {target: f"{_setting(x)}: {_time(x)}" for target, x in each.fastest.items()}
+        cells = {f"{target:.0e} rad": words.get(target) for target in TARGETS}
         run = "at rest" if each.rests else f"{each.seconds:g} s"
-        cells: dict[str, Any] = {f"{target:.0e} rad": None for target in TARGETS}
-        cells |= {f"{t:.0e} rad": f"{setting(x)}: {_time(x)}" for t, x in _choose(each).items()}
         rows.append({"scene": each.scene, "run": run, **cells})
     costs = data_frame({**row, "ns": f"{row['ns']:.0f}"} for row in terms)
     return render(
@@ -162,67 +399,31 @@ def accuracy_page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, An
         studies=studies,
         summary=markdown(data_frame(rows)),
         terms=markdown(costs) if terms else "",
-        fastest=fastest,
+        fastest=name_fastest,
         provenance=provenance(),
     )
 
 
 @styled
 def draw_accuracy(study: WorkPrecision) -> Figure:
-    """Draw the largest errors of orientation and actuator rates over wall time, side by side.
+    """Draw the largest error of the orientation over wall time.
 
     The fastest setting for each of TARGETS is marked.
     """
     rows, floor = study.rows, study.floor
-    figure = Figure(figsize=(11.0, 6.4))
-    body: Any = figure.subfigures()
-    panels = body.subplots(1, 2, sharex=True)
-    rate = study_of.ABOVE_REFERENCE * study.reference.own.gamma_dot
-    for axes, quantity, least, label in (
-        (panels[0], ERROR, floor, "largest error of the orientation [rad]"),
-        (panels[1], "largest_gamma_dot_rad_per_s", rate, "largest error of γ̇ [rad/s]"),
-    ):
-        _draw_grid(axes, rows, quantity, least)
-        axes.set(xlabel=f"wall time for {study.seconds:g} s of motion [ms]", ylabel=label)
-    best = _choose(study)
-    for target, row in best.items():
-        panels[0].axhline(target, color=INK, linewidth=0.9, linestyle=":")
-        panels[0].plot(1e3 * row.wall_min_s, max(row[ERROR], floor), "o", color=INK, **_RING)
-    used = {name: look for name, look in MARKERS.items() if name in set(rows.method)}
-    handles = [_entry(name, mark, colour, linewidth=1.5) for name, (colour, mark) in used.items()]
-    handles.append(_entry("fixed steps (full)", "o"))
-    handles.append(_entry("tolerance (hollow)", "o", markerfacecolor="white", linestyle="--"))
-    if (rows.failure != "").any():
-        handles.append(_entry("failed", "x", linestyle="none"))
-    if best:
-        name = f"fastest for {', '.join(f'{target:.0e}' for target in best)} rad"
-        handles.append(_entry(name, "o", **_RING, linestyle=":"))
-    body.legend(handles=handles, fontsize=8, frameon=False, loc="outside lower center", ncol=9)
-    figure.suptitle(f"{study.scene}: error against wall time\n{fastest(study)}", fontsize=12)
-    note(figure, f"Reference: {study.reference.how}. {provenance()}", 185)
-    return figure
-
-
-_RING: Looks = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4, "zorder": 5}
-
-
-def _entry(label: str, marker: str, color: str = INK, **looks: Any) -> Line2D:
-    """Return an entry of a legend."""
-    return Line2D([], [], label=label, marker=marker, color=color, **looks)
-
-
-def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None:
-    axes.set(xscale="log", yscale="log")
-    drawn = rows[(rows[quantity] >= floor) & (rows[quantity] > 0.0) & (rows.wall_min_s > 0.0)]
+    figure = Figure(figsize=(10.5, 6.2))
+    axes = figure.subplots()
+    axes.set(xscale="log", yscale="log", ylabel="largest error of the orientation [rad]")
+    axes.set_xlabel(f"wall time for {study.seconds:g} s of motion [ms]")
+    drawn = rows[(rows[ERROR] >= floor) & (rows[ERROR] > 0.0)]
     for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
         colour, marker = MARKERS[name]
-        face, line = (colour, "-") if kind == study_of.FIXED else ("white", "--")
-        looks: Looks = {"marker": marker, "linestyle": line, "markerfacecolor": face, "zorder": 3}
-        x, y = 1e3 * group.wall_min_s, group[quantity]
-        axes.plot(x, y, color=colour, markersize=6.5, linewidth=1.5, **looks)
-    errors: Any = drawn[quantity]
-    high = 10.0 ** math.ceil(math.log10(errors.max() if len(errors) else 1.0) + 0.01)
-    low = 10.0 ** math.floor(math.log10(errors.min() if len(errors) else high * 1e-3) - 0.7)
+        hollow: Looks = {} if kind == FIXED else {"markerfacecolor": "white", "linestyle": "--"}
+        looks: Looks = {"color": colour, "marker": marker, "markersize": 6.5, **hollow}
+        axes.plot(1e3 * group.wall_min_s, group[ERROR], label=f"{name}, {kind}", **looks)
+    errors = drawn[ERROR].astype(float) if len(drawn) else np.array([1e-3, 1.0])
+    high = 10.0 ** math.ceil(math.log10(errors.max()) + 0.01)
+    low = 10.0 ** math.floor(math.log10(errors.min()) - 0.7)
     top = high * (high / low) ** 0.1
     across: Looks = {"transform": axes.get_yaxis_transform(), "va": "center"}
     failed = rows[rows.failure != ""]
@@ -230,44 +431,23 @@ def _draw_grid(axes: Axes, rows: DataFrame, quantity: str, floor: float) -> None
         axes.axhspan(high, top, color="#f4e3d7", linewidth=0)
         middle = math.sqrt(high * top)
         axes.text(0.99, middle, f"failed: {len(failed)}", ha="right", fontsize=8.5, **across)
-        for name, wall in zip(failed.method, 1e3 * failed.wall_min_s, strict=True):
-            colour, marker = MARKERS[name]
-            x = wall if wall > 0.0 else np.nan
-            axes.plot(x, middle, marker, color=colour, markerfacecolor="none", zorder=3)
-            axes.plot(x, middle, "x", color=INK, markersize=5, zorder=4)
+        for name, group in failed[failed.wall_min_s > 0.0].groupby("method"):
+            walls = 1e3 * group.wall_min_s
+            axes.plot(walls, walls * 0.0 + middle, "x", color=MARKERS[name][0], zorder=4)
     if floor > low:
         axes.axhspan(low, floor, color="#999999", alpha=0.25, linewidth=0)
         text = "100 × the reference's own error: none plotted"
         axes.text(0.02, math.sqrt(low * floor), text, fontsize=7.5, **across)
+    ring: Looks = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4}
+    for target, row in study.fastest.items():
+        axes.axhline(target, color=INK, linewidth=0.9, linestyle=":")
+        place = 1e3 * row.wall_min_s, max(row[ERROR], floor)
+        label = "fastest for a dotted line" if target == min(study.fastest) else None
+        axes.plot(*place, "o", color=INK, zorder=5, label=label, **ring)
     axes.set_ylim(low, top)
     axes.yaxis.set_major_locator(LogLocator(numticks=12))
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-@styled
-def draw_fastest(rows: DataFrame, said: str) -> Figure:
-    """Draw rows of `list_fastest`, a line of markers for each scene, and a footnote."""
-    names = list(dict.fromkeys(rows.scene))
-    figure = Figure(figsize=(9.0, 1.7 + 0.36 * len(names)))
-    axes = figure.subplots()
-    sizes = {t: 5.5 + 3.0 * k for k, t in enumerate(sorted(set(rows.target), reverse=True))}
-    hollow: Looks = {"markerfacecolor": "none", "linestyle": "none"}
-    for row in rows.itertuples():
-        colour, marker = MARKERS[row.method]
-        place = 100.0 * row.share, names.index(row.scene)
-        looks: Looks = {"color": colour, "markersize": sizes[row.target], "markeredgewidth": 1.5}
-        axes.plot(*place, marker, **looks, **hollow)
-    axes.axvline(100.0, color=INK, linewidth=0.8, linestyle=":")
-    axes.set(xscale="log", xlabel="wall time of the integration per time of the motion [%]")
-    axes.set_yticks(range(len(names)), names)
-    axes.set_ylim(len(names) - 0.4, -0.6)
-    figure.suptitle(
-        "Fastest setting for an error of the orientation", fontsize=11, x=0.02, ha="left"
-    )
-    used = {name: look for name, look in MARKERS.items() if name in set(rows.method)}
-    handles = [_entry(name, mark, colour, **hollow) for name, (colour, mark) in used.items()]
-    for target, size in sizes.items():
-        handles.append(_entry(f"{target:.0e} rad", "o", markersize=size, **hollow))
-    legend(axes, handles=handles, ncol=5)
-    note(figure, said, 150)
+    figure.legend(fontsize=8, frameon=False, loc="outside right center")
+    figure.suptitle(f"{study.scene}: error against wall time\n{name_fastest(study)}", fontsize=12)
+    note(figure, f"Reference: {study.reference.how}. {provenance()}", 145)
     return figure

@@ -18,8 +18,7 @@ from sst_ros import __main__ as cli
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import quaternion_of
-from sst_ros.report import work_precision
-from sst_ros.report.accuracy import accuracy_page, document
+from sst_ros.report import accuracy
 from sst_ros.report.scene_summary import (
     TERMS,
     WIDTH,
@@ -161,11 +160,11 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
     advice = step_advice(scene)
     assert (advice.method, advice.step) == (motion.method, motion.step)
     assert f"  {advice.text}" in summary(scene).replace("\n  ", " ").replace("advice ", "  ")
-    monkeypatch.setattr(work_precision, "solver_grid", lambda *_: [])
-    study = work_precision.work_precision(scene)
-    assert study.advice == advice and study.measured[0] < 1e-8
-    assert document(study)["advice"]["text"] == advice.text
-    assert f"Advice: {advice.text}. Measured: {study.measured[0]:.1e} rad" in accuracy_page([study])
+    monkeypatch.setattr(accuracy, "list_settings", lambda _: [])
+    study = accuracy.study_scene(scene)
+    assert study.advice == advice and study.measured < 1e-8
+    said = f"Advice: {advice.text}. Measured: {study.measured:.1e} rad"
+    assert said in accuracy.accuracy_page([study])
 
 
 def test_a_stiff_scene_is_advised_the_implicit_method_and_the_rate_is_named():
