@@ -25,8 +25,7 @@ least-squares problem, so that data without noise are fitted to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -38,7 +37,7 @@ EXACT = 1e-12
 """Noise over RMS torque that is assumed at least: data of a simulation have no other."""
 
 INTERIOR = 1e-3
-"""Share of its trace that J of a flat body is lifted by at the start, into the interior."""
+"""Share of its size by which a parameter is lifted at the start, into the interior."""
 
 BARRIERS = tuple(10.0**-k for k in range(0, 11))
 """Weights of the barrier; at the last, chi^2 is off by 1e-10 for each boundary that is active."""
@@ -63,24 +62,25 @@ _CLOSE = 0.95
 
 
 def fit_weighted(
-    columns: Array, torque: Array, noise: Array | None = None
+    columns: Array, torque: Array, noise: Sequence[float] | None = None
 ) -> tuple[Array, Array, Array]:
     """Fit torque = columns estimate, with b independent columns, shape (m, 3, b).
 
     Torques are measured less known ones [N m], shape (m, 3), and the noise their standard
-    deviations, shape (3,), by default estimated. Returns the estimates, shape (b,), R of the
-    weighted regressor, R^T R = covariance^-1, shape (b, b), and the noise.
+    deviations, three, by default estimated. Returns the estimates, shape (b,), R of the weighted
+    regressor, R^T R = covariance^-1, shape (b, b), and the noise, shape (3,).
     """
+    if noise is not None:
+        given = np.array(noise)
+        return (*_solve(columns, torque, given)[:2], given)
     floor = EXACT * float(np.sqrt(np.mean(torque**2))) + 1e-300
-    if noise is None:
-        noise = np.ones(3)
-        for _ in range(2):
-            estimate, _, leverage = _solve(columns, torque, noise)
-            free = np.maximum(len(torque) - leverage, 1.0)
-            squares = np.sum((torque - columns @ estimate) ** 2, axis=0)
-            noise = np.maximum(np.sqrt(squares / free), floor)
-    estimate, root, _ = _solve(columns, torque, noise)
-    return estimate, root, noise
+    found = np.ones(3)
+    for _ in range(2):
+        estimate, _, leverage = _solve(columns, torque, found)
+        squares = np.sum((torque - columns @ estimate) ** 2, axis=0)
+        free = np.maximum(len(torque) - leverage, 1.0)
+        found = np.maximum(np.sqrt(squares / free), floor)
+    return (*_solve(columns, torque, found)[:2], found)
 
 
 def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, Array]:
@@ -94,17 +94,6 @@ def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, A
     estimate = estimate + solve_triangular(r, q.T @ (right - matrix / lengths @ estimate))
     leverage = np.sum((q**2).reshape(-1, 3, len(r)), axis=(0, 2))
     return estimate / lengths, r * lengths, leverage
-
-
-class Cone(NamedTuple):
-    """A matrix that must be positive semidefinite: values at `places` times basis (., n, n)."""
-
-    places: list[int]
-    basis: Array
-
-    def matrix(self, values: Array) -> Array:
-        """Return the matrix for all parameters."""
-        return np.asarray(np.tensordot(values[self.places], self.basis, 1))
 
 
 def find_consistent_values(
@@ -122,24 +111,75 @@ def find_consistent_values(
     O [m]. Returns the values, shape (p,), and chi^2 of the base parameters there: how much worse
     the torques are fitted than without the constraints.
     """
-    cones, sizes = list(cones_of(tuple(names), reach)), scales(names, given)
+    sizes, (constant, basis) = scales(names, given), make_cones(names, reach)
     rows = np.vstack([root @ transform, np.diag(1.0 / sizes)])
     right = np.concatenate([root @ estimate, given / sizes])
-    values = _lift_into_interior(cones, given)
+    identity = np.tile(np.eye(4), (len(constant), 1, 1)).ravel()
+
+    def cost(values: Array, barrier: float) -> float:
+        """|rows values - right|^2 / 2 - barrier sum log det; infinite outside the cones."""
+        try:
+            factors = np.linalg.cholesky(constant + np.tensordot(values, basis, 1))
+        except np.linalg.LinAlgError:
+            return np.inf
+        off = rows @ values - right
+        logs = np.log(np.diagonal(factors, axis1=1, axis2=2))
+        return float(0.5 * off @ off - 2.0 * barrier * logs.sum())
+
+    # Into the interior: flat bodies and what is zero lie on the boundary.
+    lifted = [".moment." not in name and name[-2:] not in ("xy", "xz", "yz") for name in names]
+    values = given + INTERIOR * sizes * lifted
     for barrier in BARRIERS:
         for _ in range(_NEWTON_STEPS):
-            step, size, decrement = _newton_step(cones, rows, right, values, barrier)
-            if decrement < CENTRED:
+            inverse = np.linalg.inv(np.linalg.cholesky(constant + np.tensordot(values, basis, 1)))
+            # Of the matrices by the parameters, in units of themselves.
+            slopes = inverse @ basis @ inverse.transpose(0, 2, 1)
+            matrix = np.vstack([rows, np.sqrt(barrier) * slopes.reshape(len(values), -1).T])
+            target = np.concatenate([right - rows @ values, np.sqrt(barrier) * identity])
+            lengths = np.linalg.norm(matrix, axis=0)
+            q, r = np.linalg.qr(matrix / lengths)
+            part = q.T @ target
+            step = solve_triangular(r, part) / lengths
+            least = float(np.linalg.eigvalsh(np.tensordot(step, slopes, 1)).min(initial=0.0))
+            size = 1.0 if least > -_CLOSE else -_CLOSE / least
+            if part @ part < CENTRED * barrier:
                 values = values + size * step
                 break
-            before = _cost(cones, rows, right, values, barrier)
-            while _cost(cones, rows, right, values + size * step, barrier) > before:
+            before = cost(values, barrier)
+            # Below the last size is rounding: the step cannot get better.
+            while cost(values + size * step, barrier) > before and size > 1e-12:
                 size *= 0.5
-                if size < 1e-12:  # rounding: the step cannot get better
-                    break
             values = values + size * step
     off = root @ (transform @ values - estimate)
     return values, float(off @ off)
+
+
+def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
+    """Return k matrices that must be positive semidefinite, linear in p parameters.
+
+    That is their constant part, shape (k, 4, 4), which fills the diagonal of smaller ones, and what
+    each parameter adds for a unit, shape (p, k, 4, 4).
+    """
+    cones: list[dict[str, Array]] = []
+    # [[m r 1, h], [h^T, m r]] of m and h.
+    centre = [reach * np.eye(4), *_PSEUDO[1:4]]
+    for body in dict.fromkeys(name.partition(".")[0] for name in names):
+        parts = [f"{body}.{part}" for part in STANDARD]
+        if set(parts) <= set(names):
+            cones += dict(zip(parts, _PSEUDO, strict=True)), dict(zip(parts, centre, strict=False))
+        elif set(parts[4:]) <= set(names):
+            cones.append(dict(zip(parts[4:], _PSEUDO[4:], strict=True)))
+    cones += [
+        {name: np.diag([1.0, 0.0, 0.0, 0.0])}
+        for name in names
+        if name.startswith(("friction", "springs", "actuators"))
+    ]
+    basis = np.zeros((len(names), len(cones), 4, 4))
+    for k, cone in enumerate(cones):
+        for name, matrix in cone.items():
+            basis[names.index(name), k] = matrix
+    empty = np.asarray(~basis.any(axis=(0, 3)))
+    return empty[:, :, None] * np.eye(4), basis
 
 
 def scales(names: Sequence[str], given: Array) -> Array:
@@ -153,74 +193,3 @@ def scales(names: Sequence[str], given: Array) -> Array:
         of_body = {"mass": mass, "moment": np.sqrt(mass * trace), "inertia": trace}
         sizes.append(of_body.get(part.partition(".")[0], abs(values[name])) or 1.0)
     return np.array(sizes, dtype=float)
-
-
-def _cost(cones: list[Cone], rows: Array, right: Array, values: Array, barrier: float) -> float:
-    """Cost of a barrier problem; infinite outside the cones."""
-    try:
-        logs = [np.log(np.diag(np.linalg.cholesky(cone.matrix(values)))) for cone in cones]
-    except np.linalg.LinAlgError:
-        return np.inf
-    off = rows @ values - right
-    return float(0.5 * off @ off - 2.0 * barrier * sum(float(one.sum()) for one in logs))
-
-
-def _newton_step(
-    cones: list[Cone], rows: Array, right: Array, values: Array, barrier: float
-) -> tuple[Array, float, float]:
-    """Newton's step for |rows values - right|^2 / 2 - barrier sum log det.
-
-    Returns it, how far to go along it, and its decrement, squared and over the barrier.
-    """
-    blocks, targets, whitened = [rows], [right - rows @ values], []
-    for cone in cones:
-        inverse = np.linalg.inv(np.linalg.cholesky(cone.matrix(values)))
-        slopes = inverse @ cone.basis @ inverse.T  # of the matrix, in units of itself
-        block = np.zeros((slopes[0].size, len(values)))
-        block[:, cone.places] = slopes.reshape(len(slopes), -1).T
-        blocks.append(np.sqrt(barrier) * block)
-        targets.append(np.sqrt(barrier) * np.eye(len(inverse)).ravel())
-        whitened.append((cone.places, slopes))
-    matrix = np.vstack(blocks)
-    lengths = np.linalg.norm(matrix, axis=0)
-    q, r = np.linalg.qr(matrix / lengths)
-    part = q.T @ np.concatenate(targets)
-    step = np.asarray(solve_triangular(r, part) / lengths)
-    changes = (np.tensordot(step[places], slopes, 1) for places, slopes in whitened)
-    least = min((float(np.linalg.eigvalsh(change)[0]) for change in changes), default=0.0)
-    return step, 1.0 if least > -_CLOSE else -_CLOSE / least, float(part @ part) / barrier
-
-
-def cones_of(names: tuple[str, ...], reach: float) -> Iterator[Cone]:
-    """Yield what must be positive semidefinite."""
-    index = {name: i for i, name in enumerate(names)}
-    # [[m r 1, h], [h^T, m r]] of m and h.
-    centre = np.stack([reach * np.eye(4), *_PSEUDO[1:4]])
-    for body in dict.fromkeys(name.partition(".")[0] for name in names):
-        inertia = [index[key] for part in STANDARD[4:] if (key := f"{body}.{part}") in index]
-        if len(inertia) < len(STANDARD[4:]):
-            continue
-        if f"{body}.mass" in index:
-            moment = [index[f"{body}.{part}"] for part in STANDARD[:4]]
-            yield Cone(moment + inertia, _PSEUDO)
-            yield Cone(moment, centre)
-        else:
-            yield Cone(inertia, _PSEUDO[4:, :3, :3])
-    for name, place in index.items():
-        if name.startswith(("friction", "springs", "actuators")):
-            yield Cone([place], np.ones((1, 1, 1)))
-
-
-def _lift_into_interior(cones: list[Cone], given: Array) -> Array:
-    """Values near those given at which every matrix is positive definite."""
-    values = given.copy()
-    for cone in cones:
-        n = cone.basis.shape[1]
-        if n == 1:
-            values[cone.places] = np.maximum(values[cone.places], INTERIOR)
-        elif len(cone.places) > n:
-            j = cone.matrix(values)
-            lifted = j + INTERIOR * (float(np.trace(j[:3, :3])) or 1.0) * np.eye(n)
-            back = np.linalg.pinv(cone.basis.reshape(len(cone.places), -1).T)
-            values[cone.places] = back @ lifted.ravel()
-    return np.asarray(values)

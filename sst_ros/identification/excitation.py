@@ -69,11 +69,10 @@ class ExcitingMotion:
 
     def table(self) -> str:
         """Return the base parameters with their standard deviations, as text."""
-        lines = [f"condition number {self.condition:.3g} (columns of length one)"]
-        lines += ["", f"{'std. dev. at 1 N m':>19}  base parameter"]
+        condition = f"condition number {self.condition:.3g} (columns of length one)"
         rows = zip(self.deviation, self.base.labels, strict=True)
-        lines += [f"{deviation:19.3g}  {label}" for deviation, label in rows]
-        return "\n".join(lines) + "\n"
+        lines = [f"{deviation:19.3g}  {label}" for deviation, label in rows]
+        return "\n".join([condition, "", f"{'std. dev. at 1 N m':>19}  base parameter", *lines, ""])
 
 
 def design(
@@ -146,25 +145,21 @@ class _Trial:
         self._scene, self._values = scene, parameters.values(scene, names)
         self._space = ActuatorSpaceMap(Geometry.of(scene))
         self._start = np.array(initial_state(scene, self._space.geometry)[:4])
-        self.centre, n = np.array(scene.initial.gamma), np.arange(1, harmonics + 1)
+        self.centre = np.array(scene.initial.gamma)
+        self.times = np.arange(1, POINTS * harmonics + 1) * duration / (POINTS * harmonics)
+        n = np.arange(1, harmonics + 1)
         rest = np.zeros((3, 2 * harmonics))  # gamma, gamma_dot, gamma_ddot at the beginning
         rest[0, harmonics:], rest[1, :harmonics], rest[2, harmonics:] = 1.0, n, n * n
-        self._basis = null_space(rest)
-        self.size = 3 * self._basis.shape[1]
-        count = POINTS * harmonics
-        self.times = np.arange(1, count + 1) * duration / count
-        self._w = 2.0 * np.pi * n / duration
-        self._s, self._c = (f(np.outer(self.times, self._w)) for f in (np.sin, np.cos))
+        basis, w = null_space(rest), 2.0 * np.pi * n / duration
+        self.size = 3 * basis.shape[1]
+        s, c = (f(np.outer(self.times, w)) for f in (np.sin, np.cos))
+        derivatives = ([s, c], [c * w, -s * w], [-s * w * w, -c * w * w])
+        self._maps = [np.hstack(parts) @ basis for parts in derivatives]
 
     def series(self, free: Array) -> tuple[Array, Array, Array]:
         """Angles [rad] and two derivatives at the samples, each shape (n, 3)."""
-        sine, cosine = np.split(self._basis @ free.reshape(-1, 3), 2)
-        s, c, w = self._s, self._c, self._w
-        return (
-            self.centre + s @ sine + c @ cosine,
-            (c * w) @ sine - (s * w) @ cosine,
-            -(s * w * w) @ sine - (c * w * w) @ cosine,
-        )
+        gamma, rate, acceleration = (part @ free.reshape(-1, 3) for part in self._maps)
+        return self.centre + gamma, rate, acceleration
 
     def cost(self, free: Array) -> float:
         """Return what the optimisation minimises."""
@@ -177,35 +172,31 @@ class _Trial:
     def evaluate(self, free: Array) -> tuple[Array, Array]:
         """Return the regressor of b base parameters, shape (3 n, b), and excesses over limits."""
         gamma, rate, acceleration = self.series(free)
-        space, actuators, excess = self._space, self._scene.actuators, []
+        space, chosen = self._space, self.base.chosen
         with np.errstate(all="ignore"):
-            quaternion = self._follow(gamma)
+            # From the centre along straight lines, all samples at once.
+            quaternion = np.tile(self._start, (len(gamma), 1))
+            for part in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
+                here = self.centre + part * (gamma - self.centre)
+                quaternion = space.orientations(quaternion, here, 5 if part == 1.0 else 2)
             star = np.stack(space.star_rates(*quaternion.T, *rate.T, *acceleration.T), axis=1)
             known, columns = self._regressor(quaternion, star[:, :3], star[:, 3:])
             torque = known + columns @ self._values
             posture = np.stack(space.postures(*quaternion.T), axis=1)
         sines, beta, det_j2 = posture[:, :3], posture[:, 3:6], posture[:, 6:]
         # How far numbers lie beyond SHARE of their range, over the range.
-        for values, high in ((gamma, space.geometry.arc), (beta, space.geometry.beta_max)):
-            excess.append(np.abs(values / high - 0.5) - 0.5 * SHARE)
+        ranges = (gamma, space.geometry.arc), (beta, space.geometry.beta_max)
+        excess = [np.abs(values / high - 0.5) - 0.5 * SHARE for values, high in ranges]
         excess.append(LEAST_SINE - np.hstack([sines, np.abs(det_j2)]))
         reached = {"torque": torque, "velocity": rate, "acceleration": acceleration}
         for name, values in reached.items():
-            if (limit := getattr(actuators, f"{name}_limit", None)) is not None:
+            if (limit := getattr(self._scene.actuators, f"{name}_limit", None)) is not None:
                 excess.append(np.abs(values) / limit - SHARE)
-        beyond = np.concatenate([part.ravel() for part in excess])
-        columns = columns[..., self.base.chosen].reshape(-1, len(self.base.chosen))
+        beyond = np.hstack(excess)
+        columns = columns[..., chosen].reshape(-1, len(chosen))
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(beyond))):
             return np.ones_like(columns), np.array([1e3])
         return columns, np.maximum(beyond, 0.0)
-
-    def _follow(self, gamma: Array) -> Array:
-        """Quaternion at each sample, followed from the centre along straight lines, all at once."""
-        found = np.tile(self._start, (len(gamma), 1))
-        for part in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
-            here = self.centre + part * (gamma - self.centre)
-            found = self._space.orientations(found, here, 5 if part == 1.0 else 2)
-        return found
 
 
 def _condition(columns: Array) -> float:
@@ -219,12 +210,6 @@ def _write_scene(scene: Scene, times: Array, angles: tuple[Array, Array, Array])
     names = ("time", "gamma", "gamma_dot", "gamma_ddot")
     points = [dict(zip(names, row, strict=True)) for row in zip(times, *angles, strict=True)]
     points[-1] |= dict.fromkeys(names[2:], (0.0, 0.0, 0.0))
-    return scene.with_values(
-        {
-            "initial.gamma_dot": 0.0,
-            "torque": None,
-            "motion": {"waypoints": points},
-            "duration": times[-1],
-            "provenance.motion": "designed to identify parameters: Fourier series",
-        }
-    )
+    origin = "designed to identify parameters: Fourier series"
+    changes = {"initial.gamma_dot": 0.0, "torque": None, "motion": {"waypoints": points}}
+    return scene.with_values(changes | {"duration": times[-1], "provenance.motion": origin})

@@ -1,28 +1,156 @@
 # SPDX-License-Identifier: Apache-2.0
-"""identify(): constants of a scene from a recorded or simulated motion."""
+"""identify(): constants of a scene from a recorded or simulated motion, here from its torques.
+
+Torques are fitted by weighted least squares on the inverse dynamics; `simulation_fit` fits angles.
+
+With measured rates the motion is a Hermite spline, exact to rounding where the data are. Without,
+or with a cut-off, angles pass a Butterworth filter of order 4 forwards and backwards (no phase) and
+a quintic spline, whose derivatives are the rates and accelerations.
+
+Torques that are held ask for the mean of the equation over each interval (weak form with a box as
+test function). Two Gauss points take it: there the second derivative of a cubic Hermite spline is
+of third order, and the errors of the pair cancel, so that the mean is of fourth order in the period
+although the acceleration jumps at each sample.
+
+Noise of variance s^2 in the angles is in the acceleration with a spectrum that rises as f^4. In the
+regressor it shrinks estimates by its share of the power of the acceleration (errors in variables),
+most those that the motion excites weakly. A lower cut-off of the angles would change the motion
+itself. So the regressor is made of angles filtered little, and then torques and columns alike are
+projected on the m sines of lowest frequency,
+
+    sqrt(2 / (n + 1)) sum over i of x_i sin(pi i k / (n + 1)), k = 1 to m.
+
+This is linear: what holds for samples holds for the components, without any distortion (parallel
+filtering and decimation: Gautier, Proc. IEEE ICRA 1997, 1922-1927). The sines are orthonormal:
+white noise of the torques stays white, of the same deviation. They vanish at both ends (modulating
+functions: Shinbrot, Trans. ASME 79 (1957) 547-552): integrated by parts, the acceleration leaves
+no noise of the rates there, as cosines, or sums of samples, would.
+
+Below the frequency f, the noise of the acceleration has the variance s^2 (2 pi f)^4 (2 f / 5 f_s),
+with f_s the rate of samples: a band three times the bandwidth of the motion has 400 times less
+of it than the filter of the angles leaves at ten times. In 1.2 s of the scene `reach` with encoders
+of 65,536 counts the bias is then 0.3 standard deviations at most, and without the projection 6.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
-from sst_ros.errors import InputError, Problem
-from sst_ros.identification.measured_motion import Measured, open_data
-from sst_ros.identification.parameters import Identification
-from sst_ros.identification.simulation_fit import fit_simulation
-from sst_ros.identification.torque_fit import fit_torques
-from sst_ros.scene.scene import Scene, scene_of
+import numpy as np
+from scipy.fft import dst
+from scipy.interpolate import CubicHermiteSpline, make_interp_spline
+from scipy.linalg import solve_triangular
+from scipy.signal import butter, sosfiltfilt
 
-INVERSE_DYNAMICS, SIMULATION = "inverse_dynamics", "simulation"
-Given = Scene | Mapping[str, Any] | str | Path | None
+from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.errors import AssemblyError, InputError, Problem, refuse_unless
+from sst_ros.identification import parameters
+from sst_ros.identification.consistency import find_consistent_values, fit_weighted, scales
+from sst_ros.identification.measured_motion import Measured, MeasuredMotion, open_data, read_motion
+from sst_ros.identification.parameters import BaseParameters, Identification, Regressor
+from sst_ros.identification.simulation_fit import fit_simulation
+from sst_ros.mechanism import continuation
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
+from sst_ros.scene.scene import Scene, scene_of
+from sst_ros.state import finite_vector
+
+STILL = 1e-6
+"""Range of gamma [rad] below which a motion is none."""
+
+SIGNIFICANT = 25.0
+"""chi^2 above which the nearest bodies that can exist do not explain the estimates (5 sigma)."""
+
+BAND = 3.0
+"""Highest frequency of the sines over the bandwidth of the motion: products of rates double the
+frequencies of torques. From 2 to 5, 95 % intervals cover 0.90 to 0.99 in 200 long recordings; the
+bias of short ones grows."""
+
+MARGIN = 10.0
+"""Default cut-off over the frequency below which the motion has all but 1e-4 of its power."""
+
+STEP = 0.03
+"""Length of gamma [rad] between poses that continuation follows; Newton's method takes the rest."""
+
+_EDGE = 8
+"""Samples at both ends at which an interpolating quintic spline has not its full order."""
+
+
+@dataclass(frozen=True)
+class TorqueFit(Identification):
+    """Constants identified by torques; its estimates are those of the base parameters.
+
+    Attributes:
+        base: the combinations of parameters that the motion determines; `estimate` is without the
+            constraint that bodies can exist.
+        noise: standard deviations of the torques [N m], shape (3,).
+        condition: condition number of the weighted regressor with columns of length one.
+        excess: chi^2 of `values` against the estimates.
+        vague: combinations whose standard deviation exceeds their size.
+        samples: of the torques that were fitted.
+        band: frequency below which they were [Hz]; None where angles were not filtered.
+        regressor: of the torques.
+
+    """
+
+    base: BaseParameters
+    noise: Array
+    condition: float
+    excess: float
+    vague: tuple[str, ...]
+    samples: int
+    band: float | None
+    regressor: Regressor
+
+    @property
+    def consistent(self) -> bool:
+        """Whether bodies that can exist explain the estimates within their uncertainty."""
+        return self.excess < SIGNIFICANT
+
+    def predict(self, data: Measured, cutoff: float | None = None) -> tuple[Array, Array]:
+        """Torques of another motion by the base parameters, and the measured ones.
+
+        Returns:
+            Predicted and measured torques [N m], each shape (m, 3): at the samples, or means over
+            the intervals where torques are held; without those at the ends that a filter needs.
+
+        Raises:
+            InputError: the data are not sound.
+
+        """
+        equations = form_equations(read_motion(data), self.regressor, cutoff)
+        known, columns, torque, _ = equations
+        return known + columns[..., self.base.chosen] @ self.estimate, torque
+
+    def _notes(self) -> Iterator[str]:
+        noise = ", ".join(f"{value:.3g}" for value in self.noise)
+        band = "" if self.band is None else f", frequencies up to {self.band:.3g} Hz"
+        yield f"{self.samples} samples{band}; noise of the torques {noise} N m (std. dev.)"
+        yield f"condition number {self.condition:.3g} (columns of length one)"
+        pairs = np.abs(np.triu(self.correlation, 1))
+        if pairs.size > 1:
+            i, j = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
+            first, second = self.names[self.base.chosen[i]], self.names[self.base.chosen[j]]
+            yield f"largest correlation {self.correlation[i, j]:+.3f}: {first}, {second}"
+        if not self.consistent:
+            yield (
+                f"no bodies that can exist have these estimates (chi^2 {self.excess:.3g}): the "
+                "scene has the nearest; a load may be missing, or a torque may be wrong"
+            )
+        yield from (f"not determined by this motion: {label}" for label in self.undetermined)
+        yield from (f"uncertain by more than its size: {label}" for label in self.vague)
+        if self.undetermined or self.vague:
+            yield "another motion would help: `sst-ros identify design` makes one"
 
 
 def identify(
     data: Measured,
-    scene: Given = None,
+    scene: Scene | Mapping[str, Any] | str | Path | None = None,
     parameters: Iterable[str] | None = None,
-    method: str = INVERSE_DYNAMICS,
+    method: str = "inverse_dynamics",
     *,
     cutoff: float | None = None,
     delay: float = 0.0,
@@ -63,16 +191,190 @@ def identify(
             allowed.
 
     """
-    if method not in (INVERSE_DYNAMICS, SIMULATION):
-        allowed = f"must be {INVERSE_DYNAMICS} or {SIMULATION}"
-        raise InputError("identify", [Problem("method", method, allowed)])
+    known = method in ("inverse_dynamics", "simulation")
+    refuse_unless("identify", ("method", method, known, "must be inverse_dynamics or simulation"))
     data = open_data(data)
-    known = scene if scene is not None else getattr(data, "scene", None)
-    if known is None:
-        raise InputError("identify", [Problem("scene", None, "must be given with arrays")])
-    if method == INVERSE_DYNAMICS:
-        return fit_torques(data, scene_of(known), parameters, cutoff, delay, noise)
-    if cutoff is not None or delay or noise is not None:
-        problem = Problem("method", method, "takes no cutoff, delay or noise")
-        raise InputError("identify", [problem])
-    return fit_simulation(data, scene_of(known), parameters)
+    given: Any = scene if scene is not None else getattr(data, "scene", None)
+    refuse_unless("identify", ("scene", None, given is not None, "must be given with arrays"))
+    given = scene_of(given)
+    if method == "inverse_dynamics":
+        return fit_torques(data, given, parameters, cutoff, delay, noise)
+    plain = cutoff is None and not delay and noise is None
+    refuse_unless("identify", ("method", method, plain, "takes no cutoff, delay or noise"))
+    return fit_simulation(data, given, parameters)
+
+
+def fit_torques(
+    data: Measured,
+    scene: Scene,
+    requested: Iterable[str] | None,
+    cutoff: float | None,
+    delay: float,
+    noise: Iterable[float] | None,
+) -> TorqueFit:
+    """Identify by torques; arguments as for `identify`."""
+    names = parameters.select_names(scene, requested)
+    measured = read_motion(data, delay)
+    reached = float(np.ptp(measured.gamma, axis=0).max())
+    allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
+    weights = finite_vector(noise)
+    three = noise is None or (weights is not None and min(weights) > 0.0)
+    refuse_unless(
+        "identify",
+        ("gamma", reached, reached >= STILL or scene.gravity is not None, allowed),
+        ("noise", noise, three, "must be three finite standard deviations > 0 [N m]"),
+    )
+    regressor = Regressor(scene, names)
+    known, columns, torque, band = form_equations(measured, regressor, cutoff)
+    limit = np.inf if scene.torque_limit is None else scene.torque_limit * (1.0 - 1e-9)
+    sound = np.abs(torque).max(axis=1) < limit
+    warning = (
+        f"{int((~sound).sum())} of {len(sound)} samples left out: a torque was at the limit of "
+        "the actuators, and what was recorded may not be what acted"
+    )
+    torque, columns = (torque - known)[sound], columns[sound]
+    samples = len(torque)
+    allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
+    refuse_unless("identify", ("t", samples, samples > len(names), allowed))
+    if band is not None:
+        period = float(np.median(np.diff(measured.t)))
+        sines = max(int(np.ceil(2.0 * band * period * samples)), len(names))
+        torque, columns = (
+            np.asarray(dst(one, type=1, norm="ortho", axis=0)[:sines]) for one in (torque, columns)
+        )
+    base = parameters.find_independent(columns, names)
+    allowed = "must determine something: no torque depends on these parameters here"
+    refuse_unless("identify", ("parameters", list(names), bool(base.chosen), allowed))
+    estimate, root, deviations = fit_weighted(columns[..., base.chosen], torque, weights)
+    inverse = solve_triangular(root, np.eye(len(root)))
+    given = parameters.values(scene, names)
+    reach = max(scene.base.radius, scene.star.radius)
+    values, excess = find_consistent_values(names, given, base.transform, estimate, root, reach)
+    whole = parameters.find_base_parameters(regressor)
+    lost = [chosen not in base.chosen for chosen in whole.chosen]
+    vague = np.linalg.norm(inverse, axis=1) > scales(names, given)[base.chosen]
+    return TorqueFit(
+        scene=parameters.with_parameters(
+            scene, names, values, f"identified from {samples} samples"
+        ),
+        given=scene,
+        names=names,
+        values=values,
+        labels=base.labels,
+        before=np.asarray(base.transform @ given),
+        estimate=estimate,
+        covariance=inverse @ inverse.T,
+        undetermined=tuple(compress(whole.labels, lost)),
+        warnings=() if sound.all() else (warning,),
+        base=base,
+        noise=deviations,
+        condition=float(np.linalg.cond(root / np.linalg.norm(root, axis=0))),
+        excess=excess,
+        vague=tuple(compress(base.labels, vague)),
+        samples=samples,
+        band=band,
+        regressor=regressor,
+    )
+
+
+def form_equations(
+    measured: MeasuredMotion, regressor: Regressor, cutoff: float | None
+) -> tuple[Array, Array, Array, float | None]:
+    """Evaluate the equation of motion at the samples, or its means where torques are held.
+
+    Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at MARGIN times
+    the bandwidth of the motion.
+
+    Returns known and measured torques [N m], each shape (m, 3), between them the regressor of p
+    parameters, shape (m, 3, p); and the frequency [Hz] up to which they are sound where angles were
+    filtered, else None. Angles that no assembly has, and uneven samples where they are filtered,
+    are refused.
+    """
+    t, gamma, rate, band, unsettled = measured.t, measured.gamma, measured.gamma_dot, None, 0
+    spline: Any
+    if cutoff is not None or rate is None:
+        bandwidth = find_bandwidth(float(np.median(np.diff(t))), gamma)
+        band = min(BAND * bandwidth, cutoff or np.inf)
+        smooth, unsettled = filter_angles(t, gamma, cutoff)
+        spline = make_interp_spline(t, smooth, k=5)
+        path = spline, spline.derivative(), spline.derivative(2)
+    elif measured.held:
+        spline = CubicHermiteSpline(t, gamma, rate)
+        path = spline, spline.derivative(), spline.derivative(2)
+    else:
+        spline, unsettled = make_interp_spline(t, rate, k=5), min(_EDGE, len(t) // 4)
+        path = make_interp_spline(t, gamma, k=5), spline, spline.derivative()
+    times = t[:, None]
+    if measured.held:  # two Gauss points in each interval
+        middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t) / np.sqrt(3.0)
+        times = np.stack([middle - half, middle + half], axis=1)
+    rows = slice(unsettled, len(times) - unsettled)
+    angles, rates, accelerations = (one(times[rows].ravel()) for one in path)
+    coordinates = ActuatorSpaceMap(Geometry.of(regressor.scene))
+    quaternion = _follow_orientations(coordinates, angles, measured)
+    star = np.stack(coordinates.star_rates(*quaternion.T, *rates.T, *accelerations.T), axis=1)
+    found = regressor(quaternion, star[:, :3], star[:, 3:])
+    known, columns = (
+        part.reshape(-1, times.shape[1], *part.shape[1:]).mean(axis=1) for part in found
+    )
+    return known, columns, measured.torque[rows], band
+
+
+def _follow_orientations(
+    coordinates: ActuatorSpaceMap, gamma: Array, measured: MeasuredMotion
+) -> Array:
+    """Quaternions (n, 4) at gamma (n, 3) in the assembly mode of the first sample."""
+    begin, first = measured.quaternion, measured.gamma[:1]
+    start = None if begin is None else rotation_matrix(begin)
+    length = np.cumsum(np.linalg.norm(np.diff(gamma, axis=0, prepend=first), axis=1))
+    known = np.unique(np.searchsorted(length, np.arange(0.0, length[-1] + STEP, STEP)))
+    points = np.vstack([first, gamma[known[known < len(gamma)]]])
+    try:
+        coarse = continuation.follow(coordinates.geometry, points, start).rotation
+    except (AssemblyError, continuation.BranchEnds) as error:
+        allowed = f"must be angles of this manipulator ({error})"
+        raise InputError("identify", [Problem("gamma", first[0].tolist(), allowed)]) from None
+    nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
+    return coordinates.orientations(quaternion_of(coarse)[nearest], gamma)
+
+
+def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, int]:
+    """Angles after a zero-phase filter, and the samples at both ends that it has not settled for.
+
+    Samples must be evenly spaced, and the cut-off be below half their rate.
+    """
+    spacing = np.diff(t)
+    period = float(np.median(spacing))
+    even = np.abs(spacing - period).max() <= 1e-3 * period
+    if cutoff is None:
+        cutoff = min(MARGIN * find_bandwidth(period, gamma), 0.4 / period)
+    settled = int(np.ceil(1.0 / (cutoff * period))) if cutoff > 0.0 else 0
+    least = 4 * settled + 10
+    refuse_unless(
+        "identify",
+        ("t", spacing, even, "must be evenly spaced (to 0.1 %) for angles to be filtered"),
+        (
+            "cutoff",
+            cutoff,
+            0.0 < cutoff < 0.5 / period,
+            f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz",
+        ),
+        (
+            "t",
+            float(t[-1] - t[0]),
+            len(t) >= least,
+            f"must last {least * period:g} s or more at {cutoff:g} Hz",
+        ),
+    )
+    sections = butter(4, cutoff, fs=1.0 / period, output="sos")
+    smooth = sosfiltfilt(sections, gamma, axis=0, padlen=min(3 * settled, len(t) - 1))
+    return np.asarray(smooth), settled
+
+
+def find_bandwidth(period: float, gamma: Array) -> float:
+    """Frequency [Hz] below which the angles have all but 1e-4 of the power of their changes."""
+    spread = (gamma - gamma.mean(axis=0)) * np.hanning(len(gamma))[:, None]
+    power = np.sum(np.abs(np.fft.rfft(spread, axis=0)) ** 2, axis=1)
+    share = np.cumsum(power) / max(float(power.sum()), 1e-300)
+    frequencies = np.fft.rfftfreq(len(gamma), period)
+    return float(frequencies[max(int(np.searchsorted(share, 1.0 - 1e-4)), 1)])

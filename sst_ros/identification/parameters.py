@@ -23,8 +23,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,13 +36,7 @@ from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
 from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import (
-    build,
-    build_unchecked,
-    find_fields,
-    plain,
-    replace_values,
-)
+from sst_ros.scene.yaml_document import build, build_unchecked, find_fields, plain, replace_values
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 
@@ -88,9 +81,9 @@ def values(scene: Scene, names: Sequence[str]) -> Array:
     """Values of parameters in a scene, zero for what it does not have, shape (len(names),)."""
 
     def value(name: str) -> float:
-        body, _, axis = name.partition(".moment.")
-        mass = (value_of(scene, f"{body}.mass") or 0.0) if axis else 1.0
-        return mass * (value_of(scene, _of_centre(name)) or 0.0)
+        body, moment, _ = name.partition(".moment.")
+        factor = value_of(scene, f"{body}.mass") if moment else 1.0
+        return (factor or 0.0) * (value_of(scene, _of_centre(name)) or 0.0)
 
     return np.array([value(name) for name in names])
 
@@ -201,18 +194,16 @@ class Identification(ABC):
 
     def table(self) -> str:
         """Return estimates, standard deviations, and what the motion leaves open, as text."""
-        return "\n".join([*self._rows(), "", *self._notes(), *self.warnings]) + "\n"
+        lines = [f"{'given':>12} {'estimate':>12} {'std. dev.':>10} {'relative':>10}  parameter"]
+        rows = zip(self.before, self.estimate, self.deviation, self.labels, strict=True)
+        for given, value, deviation, label in rows:
+            share = f"{deviation / abs(value):.2%}" if deviation < abs(value) else "-"
+            lines.append(f"{given:12.5g} {value:12.5g} {deviation:10.2g} {share:>10}  {label}")
+        return "\n".join([*lines, "", *self._notes(), *self.warnings]) + "\n"
 
     @abstractmethod
     def _notes(self) -> Iterator[str]:
         """Yield lines below the estimates."""
-
-    def _rows(self) -> Iterator[str]:
-        yield f"{'given':>12} {'estimate':>12} {'std. dev.':>10} {'relative':>10}  parameter"
-        rows = zip(self.before, self.estimate, self.deviation, self.labels, strict=True)
-        for given, value, deviation, label in rows:
-            share = f"{deviation / abs(value):10.2%}" if deviation < abs(value) else f"{'-':>10}"
-            yield f"{given:12.5g} {value:12.5g} {deviation:10.2g} {share}  {label}"
 
 
 DEPENDENT = 1e-8
@@ -228,8 +219,24 @@ class Regressor:
 
     def __init__(self, scene: Scene, names: Sequence[str]) -> None:
         self.scene, self.names = scene, tuple(names)
-        self._geometry = Geometry.of(scene)
-        self._traced = [n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"]
+        traced = [n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"]
+        geometry, document = Geometry.of(scene), plain(scene)
+        # Torques depend on mass times centre alone: bodies of mass 1 have it as their centre.
+        for body in (document["star"], *(link for kind in LINKS for link in document[kind])):
+            body["centre"] = [body["mass"] * part for part in body["centre"]]
+            body["mass"] = 1.0
+
+        def torques(*inputs: Any) -> tuple[Any, ...]:
+            varied = zip(map(_of_centre, traced), map(mark_present, inputs[10:]), strict=True)
+            opened = build_unchecked(Scene, replace_values(document, dict(varied)))
+            model = kernel.model_of(opened, geometry)
+            return kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])[0]
+
+        symbols = tuple(f"p{i}" for i in range(len(traced)))
+        inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
+        self._torques = compile_for_arrays(with_jacobian(torques, inputs, symbols))
+        self._traced = [self.names.index(name) for name in traced]
+        self._springs = np.array([name.startswith("springs") for name in self.names])
 
     def __call__(self, quaternion: Array, rate: Array, acceleration: Array) -> tuple[Array, Array]:
         """Return the known torques [N m], shape (n, 3), and Y, shape (n, 3, len(names)).
@@ -238,70 +245,31 @@ class Regressor:
         """
         count = len(quaternion)
         # A stiffness of zero leaves no rest angle: springs are evaluated at 1 N m/rad.
-        at = [float(name.startswith("springs")) for name in self._traced]
-        found = self._function(*quaternion.T, *rate.T, *acceleration.T, *at)
+        at = self._springs[self._traced].astype(float)
+        found = self._torques(*quaternion.T, *rate.T, *acceleration.T, *at)
         rows = np.stack([np.broadcast_to(row, (count,)) for row in found]).reshape(-1, 3, count)
         columns = np.zeros((count, 3, len(self.names)))
-        columns[:, :, [self.names.index(name) for name in self._traced]] = rows[1:].T
+        columns[:, :, self._traced] = rows[1:].T
         for i, name in enumerate(self.names):
             if name.startswith("offset"):
                 columns[:, int(name[7]), i] = 1.0
-        springs = [name.startswith("springs") for name in self.names]
-        return rows[0].T - columns[:, :, springs].sum(axis=2), columns
-
-    @cached_property
-    def _function(self) -> Any:
-        """Three torques, then their derivatives by each parameter of the dynamics."""
-        document = plain(self.scene)
-        # Torques depend on mass times centre alone: bodies of mass 1 have it as their centre.
-        for body in (
-            document["star"],
-            *document["actuated_links"],
-            *document["intermediate_links"],
-        ):
-            body["centre"] = [body["mass"] * part for part in body["centre"]]
-            body["mass"] = 1.0
-
-        def torques(*inputs: Any) -> tuple[Any, ...]:
-            varied = zip(map(_of_centre, self._traced), map(mark_present, inputs[10:]), strict=True)
-            opened = build_unchecked(Scene, replace_values(document, dict(varied)))
-            model = kernel.model_of(opened, self._geometry)
-            return kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])[0]
-
-        symbols = tuple(f"p{i}" for i in range(len(self._traced)))
-        inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
-        return compile_for_arrays(with_jacobian(torques, inputs, symbols))
+        return rows[0].T - columns[:, :, self._springs].sum(axis=2), columns
 
 
-@dataclass(frozen=True)
-class BaseParameters:
+class BaseParameters(NamedTuple):
     """Combinations of parameters: beta = transform parameters.
 
     Attributes:
-        names: of the parameters, length p.
-        chosen: indices of those whose columns are independent, length b.
+        labels: each combination as text, length b; the chosen parameter comes first.
+        chosen: indices of the parameters whose columns are independent, length b.
         transform: shape (b, p); row i has 1 at the chosen parameter i, and the coefficients of
             those whose columns depend on it.
 
     """
 
-    names: tuple[str, ...]
+    labels: tuple[str, ...]
     chosen: list[int]
     transform: Array
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Each combination as text; the chosen parameter comes first."""
-        found = []
-        for row, chosen in zip(self.transform, self.chosen, strict=True):
-            text = self.names[chosen]
-            for i in np.flatnonzero(row).tolist():
-                factor = abs(row[i])
-                shown = f"{factor:.4g} " if abs(factor - 1.0) > ROUNDED else ""
-                if i != chosen:
-                    text += f" {'-' if row[i] < 0.0 else '+'} {shown}{self.names[i]}"
-            found.append(text)
-        return tuple(found)
 
 
 def find_base_parameters(regressor: Regressor, seed: int = 0) -> BaseParameters:
@@ -334,4 +302,10 @@ def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
     solved[np.abs(solved) < ROUNDED] = 0.0
     transform = np.zeros((len(chosen), len(names)))
     transform[:, there] = solved * lengths[there] / lengths[there[chosen]][:, None]
-    return BaseParameters(tuple(names), there[chosen].tolist(), transform)
+    indices: list[int] = there[chosen].tolist()
+    labels = [names[i] for i in indices]
+    for (row, i), factor in np.ndenumerate(transform):
+        if factor and i != indices[row]:
+            shown = "" if abs(abs(factor) - 1.0) <= ROUNDED else f"{abs(factor):.4g} "
+            labels[row] += f" {'-' if factor < 0.0 else '+'} {shown}{names[i]}"
+    return BaseParameters(tuple(labels), indices, transform)

@@ -20,7 +20,6 @@ figure, may fix fewer combinations than there are parameters.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -177,7 +176,6 @@ class Sensitivities:
                 allowed = "must be the key of a number that the scene has"
             if allowed:
                 raise InputError("identify", [Problem("parameters", name, allowed)])
-        self._inner = [i for i, name in enumerate(self.names) if not name.startswith("initial")]
         self._state = (*QUATERNION, *RATE, *(LAG if scene.lags else ()))
 
     def compare(self, values: Array, read: Readings) -> tuple[Array, Array]:
@@ -189,14 +187,12 @@ class Sensitivities:
         count = len(read.t)
         times = read.t if read.t[-1] > 0.0 else np.append(read.t, 1e-9)
         states, slopes = (part[:count] for part in self.run(values, times))
-        found = compile_observables(self.scene)(*states[:, :4].T)
+        found = self._observables(*states[:, :4].T)
         rows = np.stack([np.broadcast_to(row, count) for row in found]).reshape(5, -1, count)
-        value, *by_pose = rows[:, list(read.columns)]
-        off = value.T - read.values
-        angle = np.array(read.columns) < 6
-        off[:, angle] = np.angle(np.exp(1j * off[:, angle]))
+        off = rows[0].T - read.values
+        off[:, :6] = np.angle(np.exp(1j * off[:, :6]))
         deviation = np.ones_like(off) if read.deviation is None else read.deviation
-        changes = np.einsum("qcn,nqp->ncp", np.stack(by_pose), slopes[:, :4])
+        changes = np.einsum("qcn,nqp->ncp", rows[1:], slopes[:, :4])
         there = np.isfinite(read.values)
         return (off / deviation)[there], (changes / deviation[:, :, None])[there]
 
@@ -207,25 +203,23 @@ class Sensitivities:
         shape (n, m), and their derivatives, (n, m, p); raises InputError where there is no motion.
         """
         # Inertias between iterations of a fit need not be those of bodies that can exist.
-        outer = [i for i, name in enumerate(self.names) if name.startswith(("initial", "stroke"))]
-        scene = self.scene.with_values({self.names[i]: float(values[i]) for i in outer})
-        inner = values[self._inner].copy()
-        chain = np.ones(len(values))
+        outer = zip(self.names, values.tolist(), strict=True)
+        scene = self.scene.with_values(
+            {name: value for name, value in outer if name.startswith(("initial", "stroke"))}
+        )
+        given, chain = values.tolist(), np.ones(len(values))
         if RESTITUTION in self.names:
-            chain[self.names.index(RESTITUTION)] = differentiate_damping(scene)
-            inner[self._inner.index(self.names.index(RESTITUTION))] = damping_of(scene.stroke)
+            place = self.names.index(RESTITUTION)
+            chain[place], given[place] = differentiate_damping(scene), damping_of(scene.stroke)
         state, slopes = self._start(scene)
-        size, count = len(self._state), len(values)
-        y = np.concatenate([state, slopes.ravel()])
-        derivatives, torque, given = self._derivatives, self._torque, inner.tolist()
+        size, y = len(state), np.concatenate([state, slopes.ravel()])
+        derivatives, torque = self._derivatives, self._torque
 
         def rates(time: float, y: Array, acting: Callable[[float], Any]) -> Array:
-            found = derivatives(*y[:size].tolist(), *acting(time), *given)
-            derivative = np.array(found).reshape(-1, size)
-            into = np.zeros((size, count))
-            into[:, self._inner] = derivative[1 + size :].T
-            flow = derivative[1 : 1 + size].T @ y[size:].reshape(size, count)
-            return np.concatenate([derivative[0], (flow + into * chain).ravel()])
+            found = np.array(derivatives(*y[:size].tolist(), *acting(time), *given))
+            rate, by_state, by_parameter = np.split(found.reshape(-1, size), [1, 1 + size])
+            flow = by_state.T @ y[size:].reshape(size, -1) + by_parameter.T * chain
+            return np.concatenate([rate[0], flow.ravel()])
 
         tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
         least = np.append(np.ones(size), np.tile(1.0 / (np.abs(values) + (values == 0.0)), size))
@@ -247,24 +241,42 @@ class Sensitivities:
                 problem = Problem("parameters", values.tolist(), "leave no motion to the last time")
                 raise InputError("identify", [problem])
             rows[here], y, begin = run.y.T[: int(here.sum())], run.y[:, -1], end
-        return rows[:, :size], rows[:, size:].reshape(len(t), size, count)
+        return rows[:, :size], rows[:, size:].reshape(len(t), size, -1)
 
     @cached_property
     def _derivatives(self) -> Callable[..., tuple[float, ...]]:
         """y', then its derivatives by each component of y and by each parameter."""
-        size, names = len(self._state), [self.names[i] for i in self._inner]
+        size = len(self._state)
 
         def derivative(*inputs: Any) -> tuple[Any, ...]:
-            symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
+            symbols = dict(zip(self.names, map(mark_present, inputs[size + 3 :]), strict=True))
             if RESTITUTION in symbols:  # its number is that of the damping
                 symbols |= {"stroke.damping": symbols[RESTITUTION], RESTITUTION: None}
             opened = build_unchecked(Scene, replace_values(plain(self.scene), symbols))
             model = kernel.model_of(opened, self._geometry)
             return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
 
-        varied = tuple(f"p{i}" for i in range(len(names)))
+        varied = tuple(f"p{i}" for i in range(len(self.names)))
         inputs, by = (*self._state, *TORQUE, *varied), (*self._state, *varied)
         return compile_program(with_jacobian(derivative, inputs, by))
+
+    @cached_property
+    def _observables(self) -> Callable[..., tuple[Any, ...]]:
+        """Nine `OBSERVABLES` of a quaternion, then their derivatives by it."""
+        model, radius = kernel.model_of(self.scene, self._geometry), self.scene.star.radius
+
+        def function(*q: Any) -> tuple[Any, ...]:
+            rows = rotation_rows((q[0], q[1], q[2], q[3]))
+            first, second, third = rows
+            return (
+                *(kernel.joint_angle(kernel.leg_motion(leg, rows, ZERO), 0) for leg in model.legs),
+                atan2(second[2], first[2]),
+                atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
+                atan2(third[1], -third[0]),
+                *(radius * row[2] for row in rows),
+            )
+
+        return compile_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:
         """Return the initial state, and its derivatives by the parameters, shape (m, p)."""
@@ -278,38 +290,17 @@ class Sensitivities:
             return np.array(to_star(*q, *gamma_dot, 0.0, 0.0, 0.0)[:3])
 
         for column, name in enumerate(self.names):
-            if not name.startswith("initial"):
-                continue
-            index = re.search(r"\[(\d)\]", name)
-            unit = np.ones(3) if index is None else np.eye(3)[int(index[1])]
-            turn = body_rate(quaternion, unit)
-            if name.startswith("initial.gamma_dot"):
-                slopes[4:7, column] = turn
-                continue
-            along: Any = np.array(quaternion_rate(tuple(quaternion), tuple(turn)))
-            slopes[:4, column] = along
-            # Complex step: exact to rounding, as the map is rational.
-            slopes[4:7, column] = body_rate(quaternion + 1e-30j * along, rate).imag / 1e-30
+            if name.startswith("initial"):
+                unit = np.eye(3)[int(name[-2])] if name.endswith("]") else np.ones(3)
+                turn = body_rate(quaternion, unit)
+                if name.startswith("initial.gamma_dot"):
+                    slopes[4:7, column] = turn
+                    continue
+                along: Any = np.array(quaternion_rate(tuple(quaternion), tuple(turn)))
+                slopes[:4, column] = along
+                # Complex step: exact to rounding, as the map is rational.
+                slopes[4:7, column] = body_rate(quaternion + 1e-30j * along, rate).imag / 1e-30
         return state, slopes
-
-
-@lru_cache(maxsize=8)
-def compile_observables(scene: Scene) -> Callable[..., tuple[Any, ...]]:
-    """Return a function of the quaternion: nine `OBSERVABLES`, then their derivatives by it."""
-    model, radius = kernel.model_of(scene), scene.star.radius
-
-    def function(*q: Any) -> tuple[Any, ...]:
-        rows = rotation_rows((q[0], q[1], q[2], q[3]))
-        first, second, third = rows
-        return (
-            *(kernel.joint_angle(kernel.leg_motion(leg, rows, ZERO), 0) for leg in model.legs),
-            atan2(second[2], first[2]),
-            atan2(sqrt(first[2] * first[2] + second[2] * second[2]), third[2]),
-            atan2(third[1], -third[0]),
-            *(radius * row[2] for row in rows),
-        )
-
-    return compile_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))
 
 
 def differentiate_damping(scene: Scene) -> float:
@@ -337,10 +328,10 @@ def _make_possible_scene(
     Returns it, the values in it, and a warning where they are others.
     """
     note = "identified by simulation"
+    fitted = [name for name in names if ".inertia." in name]
     try:
         return parameters.with_parameters(scene, names, numbers, note), numbers, ()
     except InputError:
-        fitted = [name for name in names if ".inertia." in name]
         if not fitted:
             raise
     values = dict(zip(names, numbers, strict=True))

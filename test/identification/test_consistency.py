@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import minimize
 
 from sst_ros.identification.consistency import (
-    cones_of,
     find_consistent_values,
     fit_weighted,
+    make_cones,
     scales,
 )
 from sst_ros.identification.parameters import STANDARD
@@ -39,6 +39,11 @@ def fitted(target, noise):
     return fit_weighted(columns, columns @ target, np.full(3, noise))
 
 
+def pseudo_inertia(values, reach):
+    constant, basis = make_cones(NAMES, reach)
+    return (constant + np.tensordot(values, basis, 1))[0]
+
+
 def consistent(names, given, fit, reach):
     """The nearest values of bodies that can exist, and their chi^2."""
     whole = np.eye(len(names))
@@ -48,7 +53,7 @@ def consistent(names, given, fit, reach):
 def test_the_pseudo_inertia_is_the_sum_over_mass_of_p_p_t():
     masses, places = draw_points(np.random.default_rng(1), 4)
     expected = sum(m * np.outer([*p, 1.0], [*p, 1.0]) for m, p in zip(masses, places, strict=True))
-    found = next(cones_of(NAMES, 1.0)).matrix(of_points(np.random.default_rng(1), 4))
+    found = pseudo_inertia(of_points(np.random.default_rng(1), 4), 1.0)
     assert np.abs(found - expected).max() < 1e-14
 
 
@@ -100,4 +105,4 @@ def test_a_centre_stays_within_reach_and_friction_is_not_negative():
     values, _ = consistent(names, given, fitted(target, 1e-1), 0.3)
     assert np.linalg.norm(values[1:4]) <= 0.3 * values[0]
     assert 0.0 < values[-1] < 1e-6
-    assert np.linalg.eigvalsh(next(cones_of(NAMES, 0.3)).matrix(values))[0] > 0.0
+    assert np.linalg.eigvalsh(pseudo_inertia(values[:10], 0.3))[0] > 0.0
