@@ -186,7 +186,7 @@ class AdaptiveStepper:
                 h = min(h, stops[0] - t)
             machine = self._machine(at.method)
             self.budget.charge(3 * machine.cost)
-            y, z, size = machine.step_pair(t, h, at.y, at.z, d)
+            after, size = machine.step_pair(t, h, at, d)
             error, order = size / self.tolerance, at.method.error_order
             if size > self.tolerance:
                 stops = self._jump_in(t, h, at.y, origin)
@@ -203,7 +203,7 @@ class AdaptiveStepper:
             stopped = bool(stops) and h == stops[0] - t
             longest = step_loops.next_length(at.h, h, error, order, stopped or h == left)
             begin = at
-            at = at._replace(y=y, z=z, joints=self._joints(*y[:7]), h=longest, steps=at.steps + 1)
+            at = after._replace(h=longest, attempts=at.attempts)
             if h < left or isinstance(at.method, Rosenbrock):
                 at = self._choose_method(t + h, h, at, d, origin)
             yield Step(t, h, begin, at, d, machine, h == left)
@@ -242,8 +242,8 @@ class AdaptiveStepper:
     def part(self, step: Step, x: float) -> Point:
         """Return the point x [s] after the begin of an accepted step, by a shorter one."""
         self.budget.charge(3 * step.machine.cost)
-        y, z, _ = step.machine.step_pair(step.t, x, step.begin.y, step.begin.z, step.drive)
-        return step.end._replace(y=y, z=z, joints=self._joints(*y[:7]))
+        end, _ = step.machine.step_pair(step.t, x, step.begin, step.drive)
+        return step.end._replace(y=end.y, z=end.z, joints=end.joints)
 
     def _choose_method(
         self, t: float, h: float, at: Point, d: Vector, origin: float, rejected: int = 0

@@ -111,40 +111,36 @@ class CompiledMethod:
         # tenth of a step's call.
         size, drive = len(system.state), len(system.drive)
         self._place = [self._vector([0.0] * n) for n in (size, size, 18)]
-        self._error = self._vector([0.0] * size)
-        self._run = self._vector([0.0] * 7)
+        self._run = self._vector([0.0] * 9)
         self._length: Any = self._vector([0.0])
         self._drive: Any = np.zeros((1, drive)) if compiled else [[0.0] * drive]
         self._no_start: Any = np.empty((0, size)) if compiled else []
         self._not_kept: Any = np.empty((0, 2, size)) if compiled else []
-        self._ranges = np.array(ranges, dtype=float).reshape(-1, 3) if compiled else ranges
+        self._ranges, self._no_ranges = (
+            np.array(rows, dtype=float).reshape(-1, 3) if compiled else rows
+            for rows in (ranges, ())
+        )
 
     def load(self) -> None:
         """Have the code that a run calls loaded, or made where it is not there."""
         size, drive = len(self.system.state), (0.0,) * len(self.system.drive)
         y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
-        self.step_pair(0.0, 1e-3, y, y, drive)
         self.step_many(1e-3, 1, 1.0, (math.inf,) * 3, Point(y, y, (0.0,) * 18, self.method), drive)
 
-    def step_pair(
-        self, t: float, h: float, y: Vector, z: Vector, d: Vector
-    ) -> tuple[list[float], list[float], float]:
-        """Advance the solution y by one step of h, a second solution z by two of h / 2.
+    def step_pair(self, t: float, h: float, at: Point, d: Vector) -> tuple[Point, float]:
+        """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
 
         Returns:
-            New y, new z, and the local error estimate of y in units of the tolerance; infinite
-            where the step has no finite result.
+            Where they end, and the local error estimate in units of the tolerance; infinite where
+            the step has no finite result.
 
         """
-        new_y, new_z = self._vector(y), self._vector(z)
-        try:
-            size = self._module.step_pair(
-                t, h, self._vector(y), self._vector(z), self._vector(d), self._numbers,
-                new_y, new_z, self._error,
-            )  # fmt: skip
-        except (ArithmeticError, ValueError):
-            return list(y), list(z), float("inf")
-        return self._listed(new_y), self._listed(new_z), float(size)
+        self._length[0], self._drive[0][:] = h, d
+        periods = self._length, self._drive, self._no_start
+        at = at._replace(h=math.inf)
+        one = 0, 1, periods, at, math.inf, (math.inf,) * 3, self._not_kept
+        done, end = self._advance(*one, self._no_ranges, t)
+        return end, float(self._run[8]) if done else math.inf
 
     def slope(self, t: float, y: Vector, d: Vector) -> tuple[float, ...]:
         """Return the derivative of the state."""
@@ -185,14 +181,21 @@ class CompiledMethod:
             The first period that was not done, and where it begins.
 
         """
+        return self._advance(first, end, periods, at, tolerance, most, reached, self._ranges)
+
+    def _advance(
+        self, first: int, end: int, periods: tuple[Any, Any, Any], at: Point, tolerance: float,
+        most: Most, reached: Any, ranges: Any, t: float = 0.0,
+    ) -> tuple[int, Point]:  # fmt: skip
         y, z, joints = self._place
         run = self._run
         y[:], z[:], joints[:] = at[:3]
         run[0], run[1], run[2], run[3] = at.h, at.attempts, at.steps, first
         run[4], run[5], run[6] = most
+        run[7] = t
         try:
             done = self._module.step_many(
-                first, end, *periods, self._numbers, tolerance, y, z, self._ranges, joints,
+                first, end, *periods, self._numbers, tolerance, y, z, ranges, joints,
                 run, reached,
             )  # fmt: skip
         except (ArithmeticError, ValueError):  # plain Python, of a number without a value
@@ -216,9 +219,7 @@ class CompiledMethod:
         return self._listed(new)
 
 
-def has_step_code(
-    system: ODE, method: Method, functions: Sequence[str] = ("step_pair", "step_many")
-) -> bool:
+def has_step_code(system: ODE, method: Method, functions: Sequence[str] = ("step_many",)) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
     texts, constants, base, _ = _source(system, method, by_structure=True)
     return compiled_module.has_code(texts, constants, functions, base=base)

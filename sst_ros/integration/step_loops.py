@@ -97,7 +97,8 @@ def step_many(
     period k begins there. y, z, joints (nine angles, nine rates) and `run` become those at the
     begin of the period that is returned, and reached[k] the solutions at the end of period k. `run`
     has the longest next step [s], attempts and steps until now, and the next period; then
-    what is allowed: longest step [s], attempts until the method is looked at, and steps.
+    what is allowed: longest step [s], attempts until the method is looked at, and steps; then the
+    time at which periods begin [s], and the local error estimate of the last step.
     """
     now_y, now_z, new_y, new_z = vector(SIZE), vector(SIZE), vector(SIZE), vector(SIZE)
     error, now_joints, new_joints = vector(SIZE), vector(18), vector(18)
@@ -120,7 +121,8 @@ def step_many(
             counted = 1.0 if IMPLICIT or not last else 0.0
             if attempts + counted > run[5] or steps >= run[6]:
                 return k
-            size = step_pair(t, length, now_y, now_z, d, p, new_y, new_z, error)
+            size = step_pair(run[7] + t, length, now_y, now_z, d, p, new_y, new_z, error)
+            run[8] = size
             if not size <= tolerance:
                 return k
             joints_of(new_y, p, new_joints)

@@ -179,7 +179,7 @@ class SteppedMotion:
         Under a function only the derivative is compiled, which takes a second.
         """
         there = callable(self._torque) or has_step_code(
-            machine.system, machine.method, ("step_pair", "step_fixed")
+            machine.system, machine.method, ("step_many", "step_fixed")
         )
         if there or self._spent + self.budget.spent > _WORTH_COMPILING:
             self.propagator.compile()

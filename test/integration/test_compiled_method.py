@@ -24,6 +24,7 @@ from sst_ros.host import compiled_module
 from sst_ros.integration import gauss
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
+from sst_ros.integration.point import Point
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.scene.schema import Section
@@ -133,7 +134,8 @@ def test_the_derivative_by_time_is_exact():
 def test_a_step_without_a_finite_result_has_an_infinite_error():
     machine = CompiledMethod(system_of(EXAMPLE2), DORMAND_PRINCE, compiled=False)
     y = start_of(EXAMPLE2)
-    assert machine.step_pair(0.0, 1e-3, y, y, (1e308, 1e308, 0.0))[2] == math.inf
+    at = Point(y, y, (0.0,) * 18, DORMAND_PRINCE)
+    assert machine.step_pair(0.0, 1e-3, at, (1e308, 1e308, 0.0))[1] == math.inf
 
 
 def test_a_slope_of_its_own_needs_an_explicit_method():
@@ -251,8 +253,8 @@ def machine_of(scene, method, *, compiled):
 def march(machine, y):
     """Two pairs, then 200 steps through contact and sliding."""
     drive = (*DRIVE, *MOMENT)
-    first = machine.step_pair(0.0, 1e-3, y, y, drive)
-    second = machine.step_pair(1e-3, 2e-3, first[0], first[1], drive)
+    first = machine.step_pair(0.0, 1e-3, Point(y, y, (0.0,) * 18, machine.method), drive)
+    second = machine.step_pair(1e-3, 2e-3, first[0], drive)
     return first, second, machine.step_fixed(0.0, 1e-3, 200, y, drive)
 
 
