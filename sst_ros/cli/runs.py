@@ -100,10 +100,11 @@ def compile_code(options: argparse.Namespace) -> None:
     if (folder := cache_folder()) != configured_folder():
         raise SstError("compiled code would not be kept; see the warning above")
     simulated = load(options.scene)
-    for method in compiled_method.make_code(simulated, options.integrator):
-        print(f"{method}: compiled, in {folder}", flush=True)
+    compiled_method.make_code(simulated, options.integrator)
     if not compiled_method.code_is_there(simulated, options.integrator):
         raise SstError("another process is compiling: try again when it has ended")
+    for method in compiled_method.methods_of(options.integrator):
+        print(f"{method.name}: compiled, in {folder}")
 
 
 def map_workspace(options: argparse.Namespace) -> None:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import fcntl
 import inspect
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
+from multiprocessing import get_context
 from types import ModuleType
 from typing import Any
 
@@ -256,7 +258,8 @@ def _source(
         "SIZE": size,
         "DOUBLING": doubling,
         "IMPLICIT": isinstance(method, Rosenbrock),
-        "ERROR_ORDER": method.error_order,
+        # No int: numba would compile a function anew for each value that it is called with.
+        "ERROR_ORDER": float(method.error_order),
     }
     inputs = ", ".join(["t", *y, *d, *p])
     joints = _assign(
@@ -297,25 +300,32 @@ def _assign(places: list[str], call: str) -> str:
 
 def code_is_there(scene: Scene, integrator: str) -> bool:
     """Return whether all code of a run of the scene is there, for each method it may use."""
-    if compiled_module.numba_version() is None:
-        return False
-    system = ode_with_work(Dynamics.of(scene))
-    return all(has_step_code(system, method) for method in methods_of(integrator))
+    return compiled_module.numba_version() is not None and not _missing(scene, integrator)
 
 
-def make_code(scene: Scene, integrator: str) -> Iterator[str]:
-    """Make what is not there; yields the name of each method when its code is there.
+def make_code(scene: Scene, integrator: str) -> None:
+    """Make what is not there: of several methods the last one, the longest, in another process.
 
     Where another process makes code this does nothing: it would take the processor from it.
     """
-    system = ode_with_work(Dynamics.of(scene))
-    folder = cache_folder()
-    with (folder / "lock").open("w") as lock:
+    with (cache_folder() / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return
-        for method in methods_of(integrator):
-            if not has_step_code(system, method):
-                CompiledMethod(system, method, compiled=True).load()
-            yield method.name
+        missing = _missing(scene, integrator)
+        with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+            if len(missing) > 1:
+                beside.submit(_make, scene, missing.pop().name)
+            for method in missing:
+                _make(scene, method.name)
+
+
+def _missing(scene: Scene, integrator: str) -> list[Method]:
+    system = ode_with_work(Dynamics.of(scene))
+    return [method for method in methods_of(integrator) if not has_step_code(system, method)]
+
+
+def _make(scene: Scene, method: str) -> None:
+    system = ode_with_work(Dynamics.of(scene))
+    CompiledMethod(system, METHODS[method], compiled=True).load()

@@ -143,7 +143,7 @@ def step_many(
     return end
 
 
-def next_length(longest: float, h: float, error: float, error_order: int, cut: bool) -> float:
+def next_length(longest: float, h: float, error: float, error_order: float, cut: bool) -> float:
     """Longest step after an accepted one of h with a local error, relative to the tolerance.
 
     A step that was cut does not say that the next must be shorter than the `longest` of before.
@@ -152,7 +152,7 @@ def next_length(longest: float, h: float, error: float, error_order: int, cut: b
     return max(longest, length) if cut else length
 
 
-def step_factor(error: float, error_order: int) -> float:
+def step_factor(error: float, error_order: float) -> float:
     """Factor for the next step after one with a local error, relative to the tolerance."""
     if error == 0.0:
         return GROW
