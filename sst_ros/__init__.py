@@ -14,10 +14,10 @@ from sst_ros.version import VERSION
 
 TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
 if TYPE_CHECKING:
+    from sst_ros.control.actuator_space import ReferenceMotion as ReferenceMotion
     from sst_ros.control.controller import Controller as Controller
     from sst_ros.control.inverse_dynamics import InverseDynamics as InverseDynamics
     from sst_ros.control.law import ControllerSettings as ControllerSettings
-    from sst_ros.control.reference import ReferenceMotion as ReferenceMotion
     from sst_ros.control.reference_motions import reference_motion as reference_motion
     from sst_ros.errors import AssemblyError as AssemblyError
     from sst_ros.errors import InputError as InputError
@@ -63,7 +63,7 @@ _MODULES = {
     "InverseDynamics": "control.inverse_dynamics",
     "PolynomialTorque": "scene.torque_profile",
     "Recording": "recording.recording",
-    "ReferenceMotion": "control.reference",
+    "ReferenceMotion": "control.actuator_space",
     "RunStopped": "errors",
     "Scene": "scene.scene",
     "Simulation": "simulation.simulation",

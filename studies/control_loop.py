@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros.control.actuator_space import Reference, ReferenceMotion
 from sst_ros.control.controller import Controller, ControlStopped, Measurement
 from sst_ros.control.law import ControlChannel
-from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.control.tracking import Track, track_of
 from sst_ros.errors import RunStopped
 from sst_ros.host.compiled_module import numba_version

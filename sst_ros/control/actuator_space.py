@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the star to the actuators and back: positions, rates and accelerations, to rounding.
+"""Desired motions, and the map between the star and the actuators, to rounding.
 
 One equation serves both directions: gamma_dot_k = g_k.W and its derivative gamma_ddot_k =
 g_k.W_dot + (acceleration at W_dot = 0), which is Eq. 40 solved for gamma_ddot. The orientation at
@@ -11,23 +11,27 @@ from __future__ import annotations
 
 import contextlib
 import math
+import operator
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.control.reference import Reference
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_for_arrays, compile_program, trace
+from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.generic_math import (
     ZERO,
+    axpy,
     cos,
     cross3,
     dot3,
     multiply,
+    quaternion_product,
     rotate_back,
     rotation_rows,
     sin,
@@ -44,11 +48,88 @@ _MOVING = (*_STAR[:4], "d1", "d2", "d3", "dd1", "dd2", "dd3")
 _POSE = (*_STAR[:4], *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
 
 
+@dataclass(frozen=True)
+class Reference:
+    """Desired state and acceleration at one instant; all parts describe the same motion."""
+
+    quaternion: Quaternion  # of {E} in {B}, (x, y, z, w), of length 1 up to rounding
+    body_rate: Vector3  # W in {E} [rad/s]
+    body_acceleration: Vector3  # W_dot in {E} [rad/s^2]
+    gamma: Vector3  # of the actuators [rad]
+    gamma_dot: Vector3  # [rad/s]
+    gamma_ddot: Vector3  # [rad/s^2]
+
+
+class ReferenceMotion:
+    """A desired motion; it rests before time 0 and after `duration`.
+
+    Args:
+        inside: the reference at a time [s] from 0 to `duration`; an ArithmeticError of it is a
+            serial singularity.
+        pieces: times from 0 to `duration` [s], rising. From one to the next the motion is so smooth
+            that some ten samples resolve it.
+
+    Attributes:
+        duration: [s].
+        pieces: as given.
+
+    """
+
+    def __init__(self, inside: Callable[[float], Reference], pieces: tuple[float, ...]) -> None:
+        self._inside, self.pieces, self.duration = inside, pieces, pieces[-1]
+
+    def at(self, time: float) -> Reference:
+        """Return the reference at a time [s]; at rest before 0 and after `duration`.
+
+        Raises:
+            SingularConfiguration: the motion meets a singularity there.
+
+        """
+        inside = min(max(time, 0.0), self.duration)
+        try:
+            found = self._inside(inside)
+        except ArithmeticError:
+            said = f"serial singularity at t = {inside:.9g} s, sin(mu)"
+            raise SingularConfiguration(said, 0.0) from None
+        if time == inside:
+            return found
+        return Reference(found.quaternion, ZERO, ZERO, found.gamma, ZERO, ZERO)
+
+
+def equal_pieces(duration: float, count: int) -> tuple[float, ...]:
+    """Return the ends of `count` equal parts of a duration."""
+    return tuple((duration * (np.arange(count + 1) / count)).tolist())
+
+
+def slow_down(motion: ReferenceMotion, begin: float, duration: float) -> ReferenceMotion:
+    """Return a motion from its time `begin` [s] on, slowed down to rest over a duration > 0 [s].
+
+    Its time s has ds/dt = 1 - 3 u^2 + 2 u^3 with u = t / duration: 1 at first and 0 at the end,
+    with d^2s/dt^2 = 0 at both. It stays on the path of the given motion, which is inside all
+    limits of position, for half of `duration` more at most.
+    """
+
+    def inside(time: float) -> Reference:
+        u = time / duration
+        at = motion.at(begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
+        speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
+        return replace(
+            at,
+            body_rate=multiply(speed, at.body_rate),
+            body_acceleration=axpy(speed * speed, at.body_acceleration, change, at.body_rate),
+            gamma_dot=multiply(speed, at.gamma_dot),
+            gamma_ddot=axpy(speed * speed, at.gamma_ddot, change, at.gamma_dot),
+        )
+
+    return ReferenceMotion(inside, equal_pieces(duration, 4))
+
+
 class ActuatorSpaceMap:
     """Map between star and actuators: traced kinematics of one geometry.
 
     Each function of numbers raises an ArithmeticError in a singularity: of_star and posture in a
     serial one (sin(mu_k) = 0), orientation in a parallel one (det J2 = 0), the others in both.
+    Those of arrays give numbers that are not finite there, and a warning of NumPy.
     """
 
     def __init__(self, geometry: Geometry) -> None:
@@ -76,27 +157,6 @@ class ActuatorSpaceMap:
         x, y, z, ax, ay, az = self._star(*q, *gamma_dot, *gamma_ddot)
         return (x, y, z), (ax, ay, az)
 
-    def orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
-        """Quaternion, (x, y, z, w) of length 1, of the assembly at gamma closest to `near`.
-
-        Raises:
-            ArithmeticError: in a parallel singularity, and where no such assembly is found.
-
-        """
-        carriages = self.carriages(gamma)
-        best, least, q = near, math.inf, near
-        for _ in range(_STEPS):
-            x, y, z, w, *residuals = self._newton(*q, *carriages)
-            largest = max(map(abs, residuals))
-            if largest < least:
-                best, least = q, largest
-            if not largest > ROUNDING:
-                break
-            q = (x, y, z, w)
-        if least > CLOSED:
-            raise ArithmeticError("the loops do not close")
-        return best
-
     def follow(
         self, known: Quaternion, here: Vector3, gamma: Vector3, sigma: float | None = None
     ) -> Quaternion:
@@ -116,12 +176,28 @@ class ActuatorSpaceMap:
             if sigma is None:
                 sigma = 2.0 / 3.0 * abs(self.posture(*known)[-1])
             if step <= continuation.SAFE * sigma * sigma:
-                found = self.orientation(known, gamma)
+                found = self._find_orientation(known, gamma)
                 # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle / 2).
                 half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, known)) ** 2))
                 if half <= 0.25 * (sigma - step):
                     return found
         return follow_assembly(self.geometry, known, here, gamma)
+
+    def _find_orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
+        """Quaternion, of length 1, of the assembly at gamma that is closest to `near`."""
+        carriages = self.carriages(gamma)
+        best, least, q = near, math.inf, near
+        for _ in range(_STEPS):
+            x, y, z, w, *residuals = self._newton(*q, *carriages)
+            largest = max(map(abs, residuals))
+            if largest < least:
+                best, least = q, largest
+            if not largest > ROUNDING:
+                break
+            q = (x, y, z, w)
+        if least > CLOSED:
+            raise ArithmeticError("the loops do not close")
+        return best
 
     def carriages(self, gamma: Any) -> list[Any]:
         """Return the unit vectors r_k of the carriages at angles of any kind, nine numbers."""
@@ -141,11 +217,12 @@ class ActuatorSpaceMap:
         """See `posture`: seven arrays (n,) of a quaternion, four arrays (n,)."""
         return compile_for_arrays(trace(self._of_posture, _STAR[:4]))
 
-    def orientations(self, near: Array, gamma: Array, steps: int = _STEPS) -> Array:
-        """Quaternions (n, 4) at gamma (n, 3) by some steps of Newton's method from `near` (n, 4).
+    @cached_property
+    def _newton_of_arrays(self) -> Callable[..., tuple[Any, ...]]:
+        return compile_for_arrays(trace(self.newton_step, _POSE))
 
-        A singularity leaves numbers that are not finite, and a warning of NumPy.
-        """
+    def orientations(self, near: Array, gamma: Array, steps: int = _STEPS) -> Array:
+        """Quaternions (n, 4) at gamma (n, 3) by steps of Newton's method from `near` (n, 4)."""
         newton, carriages = self._newton_of_arrays, self.carriages(gamma.T)
         q: Any = near.T
         for _ in range(steps):
@@ -153,10 +230,6 @@ class ActuatorSpaceMap:
             if np.abs((first, second, third)).max(initial=0.0) < 1e-9:
                 break  # quadratic: the next step would be rounding
         return np.stack(q, axis=1)
-
-    @cached_property
-    def _newton_of_arrays(self) -> Callable[..., tuple[Any, ...]]:
-        return compile_for_arrays(trace(self.newton_step, _POSE))
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
         rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
@@ -188,33 +261,23 @@ class ActuatorSpaceMap:
 
     def newton_step(self, *inputs: Any) -> tuple[Any, ...]:
         """One step of Newton's method on r_k . R e_k = 0, and the residuals before it."""
-        q = inputs[:4]
-        rows = rotation_rows(q)
+        rows = rotation_rows(inputs[:4])
         arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
         local = [rotate_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
         residual = [dot3(r, e) for r, e in zip(local, arcs, strict=True)]
         # R exp(turn): the residual changes by turn . (e x r).
         slope = [cross3(e, r) for r, e in zip(local, arcs, strict=True)]
-        tx, ty, tz = (-0.5 * part for part in _solve(slope, residual))
-        x, y, z, w = q
-        moved = (
-            x + w * tx + y * tz - z * ty,
-            y + w * ty + z * tx - x * tz,
-            z + w * tz + x * ty - y * tx,
-            w - x * tx - y * ty - z * tz,
-        )
+        turn = multiply(-0.5, _solve(slope, residual))
+        moved = quaternion_product(inputs[:4], (*turn, 1.0))
         length = sqrt(sum(part * part for part in moved))
         return (*(part / length for part in moved), *residual)
 
 
-def _solve(rows: list[Any], right: Any) -> tuple[Any, ...]:
+def _solve(rows: list[Any], right: Any) -> Any:
     """Solve rows . x = right by Cramer's rule."""
     others = (cross3(rows[1], rows[2]), cross3(rows[2], rows[0]), cross3(rows[0], rows[1]))
     determinant = dot3(rows[0], others[0])
-    total = [
-        sum(number * other[i] for number, other in zip(right, others, strict=True))
-        for i in range(3)
-    ]
+    total = [sum(map(operator.mul, right, parts)) for parts in zip(*others, strict=True)]
     return tuple(part / determinant for part in total)
 
 

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
 from sst_ros.control.inverse_dynamics import InverseDynamics
 from sst_ros.control.law import (
     Command,
@@ -17,10 +16,8 @@ from sst_ros.control.law import (
     ControllerSettings,
     command_limit,
     feedback_gains,
-    feedforward_torques,
 )
-from sst_ros.control.reference import ReferenceMotion
-from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.errors import SstError, refuse_unless
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.generic_math import ZERO, triple
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
@@ -71,45 +68,46 @@ class Controller:
     ) -> None:
         self._motion, self._settings, self._period_s = motion, settings, period_s
         geometry, start = Geometry.of(model), motion.at(0.0)
-        self._inverse = InverseDynamics(model)
-        self._space, self._begin = ActuatorSpaceMap(geometry), (start.quaternion, start.gamma)
-        posture = virtual_work.posture(
-            geometry, np.array(start.gamma), rotation_matrix(start.quaternion)
-        )
-        t1, _ = virtual_work.equation_of_motion(
-            virtual_work.Mechanism.of(model), posture, (0.0, 0.0, 0.0)
-        )
+        self._inverse, self._space = InverseDynamics(model), ActuatorSpaceMap(geometry)
+        self._begin = start.quaternion, start.gamma
+        rotation = rotation_matrix(start.quaternion)
+        posture = virtual_work.posture(geometry, np.array(start.gamma), rotation)
+        mechanism = virtual_work.Mechanism.of(model)
+        t1, _ = virtual_work.equation_of_motion(mechanism, posture, (0.0, 0.0, 0.0))
         self.inertia: Vector3 = triple((-np.diag(t1)).tolist())
         column, rate = np.array(self.inertia)[:, None], settings.integral_rate
         gains = feedback_gains(column, lambda name: getattr(settings, name), settings.direct)
         kp, kd = (triple(gain[:, 0].tolist()) for gain in gains)
         # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
-        if rate >= min(kd) and rate > 0.0:
-            allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
-            raise InputError("control", [Problem("integral_rate", rate, allowed)])
+        allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
+        refuse_unless("control", ("integral_rate", rate, not rate or rate < min(kd), allowed))
         limit = float(command_limit(settings.torque_limit, model))
-        self._law = ControlLaw(
-            settings,
-            self._inverse.torque,
-            self._space.star_motion,
-            kp,
-            kd,
-            self.inertia,
-            rate,
-            limit if math.isfinite(limit) else None,
-            period_s,
-        )
+        known = limit if math.isfinite(limit) else None
+        functions, numbers = (self._inverse.torque, self._space.star_motion), (kp, kd, self.inertia)
+        self._law = ControlLaw(settings, *functions, *numbers, rate, known, period_s)
         self.reset()
 
     def reset(self) -> None:
         """Clear the integral, the orientation that was observed last, and a failure."""
-        self._known = self._begin
-        self._integral: Vector3 = ZERO
+        self._known, self._integral = self._begin, ZERO
         self._failure: ControlStopped | None = None
 
     def follow(self, motion: ReferenceMotion) -> None:
         """Track another motion, from the present reference on; gains and integral stay."""
         self._motion = motion
+
+    def desire(self, time: float) -> tuple[Reference, Vector3, Vector3]:
+        """Return the reference at a time [s], its torques [N m], and those that a period holds.
+
+        The torques are zeros where the mode does not feed them forward.
+        """
+        desired = self._motion.at(time)
+        if not self._settings.feeds:
+            return desired, ZERO, ZERO
+        now = held = self._inverse.reference_torque(desired)
+        if self._settings.feedforward_at == "middle":
+            held = self._inverse.reference_torque(self._motion.at(time + 0.5 * self._period_s))
+        return desired, now, held
 
     def command(self, time: float, measured: Measurement) -> Command:
         """Return the command at a time of the motion [s], to be held for a period.
@@ -121,29 +119,24 @@ class Controller:
         """
         if self._failure is not None:
             raise self._failure
-        gamma, gamma_dot = measured.gamma, measured.gamma_dot
-        settings, motion = self._settings, self._motion
+        allowed, observes = "must be finite numbers", self._settings.observes
         try:
-            _require_finite((*gamma, *gamma_dot), "measured")
-            desired, instant = motion.at(time), time + 0.5 * self._period_s
-            torques = feedforward_torques(settings, self._inverse, motion, desired, instant)
-            observed: Any = self._space.follow(*self._known, gamma) if settings.observes else ()
-            command = self._law.answer(desired, torques, gamma, gamma_dot, observed, self._integral)
-            _require_finite(command.total, "torque")
+            given = (*measured.gamma, *measured.gamma_dot)
+            refuse_unless("control", ("measured", given, all(map(math.isfinite, given)), allowed))
+            desired, *torques = self.desire(time)
+            observed: Any = self._space.follow(*self._known, measured.gamma) if observes else ()
+            command = self._law.answer(desired, torques, *measured, observed, self._integral)
+            total = command.total
+            refuse_unless("control", ("torque", total, all(map(math.isfinite, total)), allowed))
         except (SstError, ArithmeticError, ValueError) as error:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
         self._integral = command.integral
-        if settings.observes:
-            self._known = observed, gamma
+        if observes:
+            self._known = observed, measured.gamma
         return command
 
     def __call__(self, time: float, state: State) -> Vector3:
         """Torques [N m] for the angles and rates of a state: a function for `simulate`."""
         joints = state.joints
         return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
-
-
-def _require_finite(numbers: Sequence[float], what: str) -> None:
-    if not all(map(math.isfinite, numbers)):
-        raise InputError("control", [Problem(what, tuple(numbers), "must be finite numbers")])

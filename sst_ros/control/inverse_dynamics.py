@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sst_ros.control.reference import Reference
+from sst_ros.control.actuator_space import Reference
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import InputError, Problem, SingularConfiguration
+from sst_ros.errors import SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
@@ -35,8 +35,7 @@ class InverseDynamics:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         dynamics = Dynamics.of(scene)
-        self._has_moment_topic = dynamics.has_moment_topic
-        self._program = dynamics.inverse
+        self._has_moment_topic, self._program = dynamics.has_moment_topic, dynamics.inverse
 
     def torque(
         self,
@@ -92,31 +91,29 @@ class InverseDynamics:
         if len(pose) == 3:
             rotation = kinematics.admissible(Geometry.of(self.scene), pose).rotation
             pose = tuple(quaternion_of(rotation).tolist())
-        if len(pose) != 4:
-            allowed = "must be a State, three angles gamma or a quaternion"
-            raise InputError("gravity_torque", [Problem("at", at, allowed)])
+        allowed = "must be a State, three angles gamma or a quaternion"
+        refuse_unless("gravity_torque", ("at", at, len(pose) == 4, allowed))
         x, y, z, w = pose
         return self.torque((x, y, z, w), ZERO, ZERO)
 
-    def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> Exception:
-        """Return why there is no torque."""
-        problem = None
-        if not all(map(math.isfinite, given)):
-            problem = Problem("state", tuple(given), "must be finite numbers")
-        elif math.hypot(*quaternion) < 1e-100:
-            problem = Problem("quaternion", quaternion, "must have a length > 0")
-        if problem is not None:
-            return InputError("inverse dynamics", [problem])
+    def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> SingularConfiguration:
+        """Return why there is no torque; raises InputError where numbers are wrong."""
+        finite = all(map(math.isfinite, given))
+        short = finite and math.hypot(*quaternion) < 1e-100
+        refuse_unless(
+            "inverse dynamics",
+            ("state", tuple(given), finite, "must be finite numbers"),
+            ("quaternion", quaternion, not short, "must have a length > 0"),
+        )
         geometry = Geometry.of(self.scene)
         # t_k x w_k is r_k times sin(mu_k); J2 has the rows t_k x r_k.
         t = geometry.e @ rotation_matrix(quaternion).T
         across = np.cross(t, geometry.w)
         sines = np.linalg.norm(across, axis=1)
-        least = float(sines.min())
-        if least <= SINGULAR:
+        if (least := float(sines.min())) <= SINGULAR:
             return SingularConfiguration("serial singularity, sin(mu)", least)
         determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
-        said = "no finite torque gives this acceleration: det J2"
         if abs(determinant) <= 2.0 * SINGULAR:
-            said = "parallel singularity, det J2"
+            return SingularConfiguration("parallel singularity, det J2", determinant)
+        said = "no finite torque gives this acceleration: det J2"
         return SingularConfiguration(said, determinant)

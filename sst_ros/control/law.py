@@ -27,14 +27,13 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.reference import Reference, ReferenceMotion
+from sst_ros.control.actuator_space import Reference
 from sst_ros.errors import Problem
 from sst_ros.mechanism import generic_math
 from sst_ros.mechanism.generic_math import (
@@ -190,11 +189,7 @@ class Command:
     error: Vector3  # desired - measured gamma [rad]
     error_rate: Vector3  # desired - measured gamma_dot [rad/s]
     integral: Any  # the new sum of errors [rad s]
-
-    @property
-    def total(self) -> Vector3:
-        """The command before it is limited [N m]."""
-        return add(self.feedforward, self.feedback)
+    total: Vector3  # the command before it is limited [N m]
 
     @property
     def saturated(self) -> bool:
@@ -219,7 +214,7 @@ class ControlLaw(NamedTuple):
     def answer(
         self,
         desired: Reference,
-        torques: tuple[Triple, Triple],
+        torques: Sequence[Triple],
         gamma: Triple,
         gamma_dot: Triple,
         observed: Any,
@@ -254,7 +249,7 @@ class ControlLaw(NamedTuple):
             torque = bound(total, self.limit)
             weight = 1.0 - is_above(dot3(axpy(1.0, total, -1.0, torque), error))
         integral = integral and axpy(1.0, integral, weight * self.period, summed)
-        return Command(torque, feedforward, feedback, desired, error, rates, integral)
+        return Command(torque, feedforward, feedback, desired, error, rates, integral, total)
 
     def _correct_on_so3(
         self, desired: Reference, observed: Any, body_rate: Triple, integral: Any
@@ -262,10 +257,8 @@ class ControlLaw(NamedTuple):
         """Error on SO(3) [rad], and W_dot [rad/s^2] that makes it vanish."""
         between = relative_quaternion(observed, desired.quaternion)
         turn = rotation_rows(between)
-        rate, forward = (
-            triple(dot3(row, vector) for row in turn)
-            for vector in (desired.body_rate, desired.body_acceleration)
-        )
+        rate = triple(dot3(row, desired.body_rate) for row in turn)
+        forward = triple(dot3(row, desired.body_acceleration) for row in turn)
         moving = axpy(1.0, forward, -1.0, cross3(body_rate, rate))
         error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
         return error, add(moving, self._correct(integral, error, rates))
@@ -299,22 +292,6 @@ def command_limit(limit: Any, model: Scene) -> Array:
     """Return the limit of commands [N m]: the settings', 0 for none, or less by the actuators."""
     own = model.torque_limit or np.inf
     return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own)
-
-
-def feedforward_torques(
-    settings: ControllerSettings,
-    inverse: InverseDynamics,
-    motion: ReferenceMotion,
-    desired: Reference,
-    instant: float,
-) -> tuple[Vector3, Vector3]:
-    """Return the torques of a desired motion [N m]: now, and at the instant [s] that is held."""
-    if not settings.feeds:
-        return ZERO, ZERO
-    now = inverse.reference_torque(desired)
-    if settings.feedforward_at == "start":
-        return now, now
-    return now, inverse.reference_torque(motion.at(instant))
 
 
 def rotation_vector(quaternion: Quadruple) -> Triple:

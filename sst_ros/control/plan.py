@@ -21,9 +21,8 @@ import numpy as np
 from scipy.integrate import simpson
 from scipy.optimize import brentq, minimize_scalar
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
 from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
@@ -81,14 +80,13 @@ class LimitDistance:
         return self.sign * (self.reached.value - self.end)
 
     @property
-    def side(self) -> str:
-        """Side of the limit on which the motion must stay."""
-        return "above" if self.sign > 0.0 else "below"
-
-    @property
     def is_beyond(self) -> bool:
         """Whether the motion is refused for this limit."""
         return self.refused and self.least < 0.0
+
+    def describe(self, digits: int) -> str:
+        """Say on which side of the limit the motion must stay."""
+        return f"{'above' if self.sign > 0.0 else 'below'} {self.end:.{digits}g}"
 
 
 @dataclass(frozen=True)
@@ -122,9 +120,8 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     An external moment from a topic counts as zero; the lag of actuators is not included. Raises
     SingularConfiguration where the motion meets a singularity: no torque is defined there.
     """
-    parts = (
-        np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in pairwise(motion.pieces)
-    )
+    ends = pairwise(motion.pieces)
+    parts = (np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in ends)
     times = np.concatenate([*parts, motion.pieces[-1:]])
     desired = tuple(map(motion.at, times.tolist()))
     distances = tuple(_distances(motion, scene, times, desired))
@@ -136,12 +133,11 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
         power = (x * rate for x, rate in zip(torque, at.gamma_dot, strict=True))
         return (*torque, *power, *at.gamma_dot, *at.gamma_ddot)
 
-    peaks = [
-        max(high, low, key=lambda peak: abs(peak.value))
-        for low, high in _extremes(motion, measure, times, desired)
-    ]
-    torques = np.array(list(map(inverse.reference_torque, desired)))
+    samples = np.array(list(map(measure, desired)))
+    extremes = _extremes(motion, measure, times, samples)
+    peaks = [max(high, low, key=lambda peak: abs(peak.value)) for low, high in extremes]
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
+    torques = samples[:, :3]
     squares = simpson(torques[pieces] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
     roots = np.sqrt(squares / times[-1]).tolist()
     demands = tuple(
@@ -156,16 +152,19 @@ def _extremes(
     motion: ReferenceMotion,
     measure: Callable[[Reference], tuple[float, ...]],
     times: Array,
-    desired: Sequence[Reference],
+    samples: Array,
 ) -> Iterator[tuple[Peak, Peak]]:
     """Yield the lowest and the highest of each number that is measured at a reference."""
-    for index, values in enumerate(np.array([measure(at) for at in desired]).T):
 
-        def sample(sign: float, time: float, index: int = index) -> float:
+    def find(sign: float, index: int) -> Peak:
+        def sample(time: float) -> float:
             return sign * measure(motion.at(time))[index]
 
-        low = maximum(partial(sample, -1.0), times, -values)
-        yield Peak(-low.value, low.time), maximum(partial(sample, 1.0), times, values)
+        return maximum(sample, times, sign * samples[:, index])
+
+    for index in range(samples.shape[1]):
+        low = find(-1.0, index)
+        yield Peak(-low.value, low.time), find(1.0, index)
 
 
 def maximum(
@@ -209,7 +208,7 @@ def _distances(
                 posture[leg] = -posture[leg]
         return (*at.gamma, *posture)
 
-    extremes = list(_extremes(motion, measure, times, desired))
+    extremes = list(_extremes(motion, measure, times, np.array(list(map(measure, desired)))))
     ranges = (
         ("gamma", extremes[:3], geometry.arc.tolist(), scene.stroke.at_end != "ignore"),
         ("beta", extremes[6:9], [geometry.beta_max] * 3, scene.workspace.at_edge != "ignore"),
@@ -240,11 +239,9 @@ def _distances(
 def _faults(
     distances: Sequence[LimitDistance], demands: Sequence[ActuatorDemand], most: dict[str, float]
 ) -> Iterator[Problem]:
-    for distance in distances:
-        if distance.is_beyond:
-            allowed = f"must stay {distance.side} {distance.end:.9g} {distance.unit}"
-            said = f"{allowed} (t = {distance.reached.time:.9g} s)"
-            yield Problem(distance.key, distance.reached.value, said)
+    for one in filter(lambda one: one.is_beyond, distances):
+        said = f"must stay {one.describe(9)} {one.unit} (t = {one.reached.time:.9g} s)"
+        yield Problem(one.key, one.reached.value, said)
     for (name, limit), (leg, demand) in product(most.items(), enumerate(demands, start=1)):
         peak: Peak = getattr(demand, name)
         if abs(peak.value) > limit:
@@ -279,21 +276,18 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     narrower than the grid, between others that are not, may be overlooked.
     """
     known, torque_limit = limits(plan.scene.actuators), plan.scene.torque_limit
-    caps = {"torque": math.inf}
+    caps = {"": math.inf}
     for name, power in (("velocity", 1.0), ("acceleration", 0.5)):
         largest = max(abs(getattr(demand, name).value) for demand in plan.demands)
         if name in known and largest:
             caps[name] = (known[name] / largest) ** power
-    binding = min(caps, key=lambda name: caps[name])
-    highest = cap = caps[binding]
-    if math.isinf(cap):
-        binding = ""
+    highest, binding = min((cap, name) for name, cap in caps.items())
     if torque_limit is None:
-        return TimeScaling(cap, 0.0, binding)
+        return TimeScaling(highest, 0.0, binding)
     excess = _excess(plan, torque_limit)
     find_end = partial(brentq, excess, xtol=1e-300, rtol=4.0 * np.finfo(float).eps)
-    grid = np.geomspace(SLOWEST * min(cap, 1.0), min(cap, FASTEST), _GRID).tolist()
-    fits: list[bool] = []
+    ends = SLOWEST * min(highest, 1.0), min(highest, FASTEST)
+    grid, fits = np.geomspace(*ends, _GRID).tolist(), list[bool]()
     for factor in grid:
         fits.append(excess(factor) <= 0.0)
         if any(fits) and not any(fits[-_BEYOND:]):
@@ -337,80 +331,75 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
 
 def plan_table(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for people."""
-    said = f"{plan.motion.duration:g} s, {len(plan.times)} samples and the extremes between them"
-    heads = ["actuator 1", "actuator 2", "actuator 3"]
-    lines = [f"{plan.scene.name}: {said}", "", _row("", heads, "limit")]
+    lines = [
+        f"{plan.scene.name}: {plan.motion.duration:g} s, {len(plan.times)} samples and the extremes"
+        " between them\n"
+    ]
+
+    def add(name: str, cells: Sequence[Any], form: str = ".6g", end: str = "") -> None:
+        row = "".join(f"{format(cell, form):>14}" for cell in cells)
+        lines.append(f"{name:<28}{row}{end:>14}".rstrip())
+
+    add("", ["actuator 1", "actuator 2", "actuator 3"], "", "limit")
     known = limits(plan.scene.actuators)
     for name, unit in UNITS.items():
         peaks, limit = [getattr(demand, name) for demand in plan.demands], known.get(name)
         end = "" if limit is None else f"{limit:g}"
-        lines.append(_row(f"peak {name} [{unit}]", [f"{peak.value:.6g}" for peak in peaks], end))
-        lines.append(_row("  at t [s]", [f"{peak.time:.6g}" for peak in peaks]))
+        add(f"peak {name} [{unit}]", [peak.value for peak in peaks], end=end)
+        add("  at t [s]", [peak.time for peak in peaks])
         if limit is not None:
-            margins = [f"{1.0 - abs(peak.value) / limit:.1%}" for peak in peaks]
-            lines.append(_row("  margin", margins))
+            add("  margin", [1.0 - abs(peak.value) / limit for peak in peaks], ".1%")
         if name == "torque":
-            roots = [f"{demand.torque_rms:.6g}" for demand in plan.demands]
-            lines.append(_row("RMS torque [N m]", roots))
-    lines += ["", _row("distance to an end", ["least", "at t [s]"])]
-    for distance in plan.distances:
-        unit = f" [{distance.unit}]" if distance.unit != "1" else ""
-        name = f"{distance.key} {distance.side} {distance.end:.6g}{unit}"
-        row = _row(name, [f"{distance.least:.6g}", f"{distance.reached.time:.6g}"])
-        lines.append(row + ("" if distance.refused else "   ignored"))
+            add("RMS torque [N m]", [demand.torque_rms for demand in plan.demands])
+    lines.append("")
+    add("distance to an end", ["least", "at t [s]"], "")
+    for one in plan.distances:
+        name = f"{one.key} {one.describe(6)}" + f" [{one.unit}]" * (one.unit != "1")
+        add(name, [one.least, one.reached.time])
+        lines[-1] += "" if one.refused else "   ignored"
     return "\n".join([*lines, "", *_verdict(plan, fastest)]) + "\n"
 
 
-def _row(name: str, cells: Sequence[str], end: str = "") -> str:
-    return f"{name:<28}{''.join(f'{cell:>14}' for cell in cells)}{end:>14}".rstrip()
-
-
 def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
-    for problem in plan.problems:
-        yield f"refused: {problem}"
+    yield from (f"refused: {problem}" for problem in plan.problems)
     if plan.scene.moment is not None and plan.scene.moment.topic:
         yield "The external moment comes from a topic; it counts as zero here."
     if plan.scene.lags:
         yield "The actuators lag; commands that make up for it may exceed the torques."
     yield "feasible" if not plan.problems else "not feasible"
+    highest, lowest = fastest.highest, fastest.lowest
     if any(distance.is_beyond for distance in plan.distances):
         yield "At no speed: the path itself leaves what is allowed."
-    elif fastest.highest is None:
+    elif highest is None:
         yield "At no speed: the torque limit is too small for this path."
-    elif math.isinf(fastest.highest):
+    elif math.isinf(highest):
         yield "At any speed: the scene has no limit that it could meet."
     else:
-        duration = plan.motion.duration / fastest.highest
-        yield (
-            f"Highest speed {fastest.highest:.9g} times as planned, in {duration:.9g} s;"
-            f" then the {fastest.binding} limit is met."
-        )
-    if fastest.highest is not None and fastest.lowest > 0.0:
-        yield (
-            f"Slower than {fastest.lowest:.9g} times as planned it is not feasible either: the"
-            " torque limit is too small to rest everywhere on this path."
-        )
+        said = f"{highest:.9g} times as planned, in {plan.motion.duration / highest:.9g} s"
+        yield f"Highest speed {said}; then the {fastest.binding} limit is met."
+    if highest is not None and lowest > 0.0:
+        why = "the torque limit is too small to rest everywhere on this path."
+        yield f"Slower than {lowest:.9g} times as planned it is not feasible either: {why}"
 
 
 def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for machines: SI units, null for what does not exist."""
     highest = fastest.highest
-    return json.dumps(
-        {
-            "scene": plan.scene.name,
-            "duration": plan.motion.duration,
-            "feasible": not plan.problems,
-            "problems": [str(problem) for problem in plan.problems],
-            "limits": limits(plan.scene.actuators),
-            "actuators": [asdict(demand) for demand in plan.demands],
-            "distances": [{**asdict(one), "least": one.least} for one in plan.distances],
-            "highest_speed": None if highest is None or math.isinf(highest) else highest,
-            "any_speed": highest is not None and math.isinf(highest),
-            "lowest_speed": fastest.lowest,
-            "binding": fastest.binding,
-        },
-        indent=2,
-    )
+    any_speed = highest is not None and math.isinf(highest)
+    found = {
+        "scene": plan.scene.name,
+        "duration": plan.motion.duration,
+        "feasible": not plan.problems,
+        "problems": [str(problem) for problem in plan.problems],
+        "limits": limits(plan.scene.actuators),
+        "actuators": [asdict(demand) for demand in plan.demands],
+        "distances": [{**asdict(one), "least": one.least} for one in plan.distances],
+        "highest_speed": None if any_speed else highest,
+        "any_speed": any_speed,
+        "lowest_speed": fastest.lowest,
+        "binding": fastest.binding,
+    }
+    return json.dumps(found, indent=2)
 
 
 def write_torques(plan: MotionPlan, path: Path, period: float) -> None:

@@ -23,8 +23,13 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap, follow_assembly
-from sst_ros.control.reference import Reference, ReferenceMotion, equal_pieces
+from sst_ros.control.actuator_space import (
+    ActuatorSpaceMap,
+    Reference,
+    ReferenceMotion,
+    equal_pieces,
+    follow_assembly,
+)
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, Problem, SingularConfiguration
 from sst_ros.mechanism import continuation, kinematics

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,9 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.mechanism.geometry import Array
 
 BAND = 0.02  # settling band: share of the largest range of a joint
-
 ROWS = 10
-
 _KEPT = 4096  # rows of the history of a record in parts: above it every other row goes
 
 _PARTS = ("gamma", "gamma_dot", "error", "error_rate", "feedforward", "feedback", "torque")
@@ -22,7 +19,6 @@ TRACK = np.dtype([("time", float), *((name, float, 3) for name in _PARTS)])
 """A sample of a tracking record, 22 numbers: the time since the start of the motion or of the run
 [s], gamma and gamma_dot as desired [rad], [rad/s], desired - measured of both, the two parts of the
 controller's command [N m], and the torque that was commanded or applied [N m]."""
-
 
 Track: TypeAlias = "np.recarray[Any, Any]"
 
@@ -35,19 +31,19 @@ def track_of(rows: ArrayLike) -> Track:
 class TrackingMetrics:
     """Metrics of a tracking record, which may come part by part. Those of joints have shape (3,).
 
-    Beside the properties: the number of `samples`, the `largest` and the `last` error [rad],
-    `torque_largest` [N m], and `limited`, the samples in which a torque was limited, None where
-    that is not known.
+    Beside the properties: the number of `samples`, the `seconds` from the first to the last, the
+    `largest` and the `last` error [rad], `torque_largest` [N m], and `limited`, the samples in
+    which a torque was limited, None where that is not known.
     """
 
     def __init__(self, track: Track | None = None, limited: int | None = None) -> None:
-        self.samples, self.limited = 0, limited
+        self.samples, self.seconds, self.limited = 0, 0.0, limited
         self.largest, self.torque_largest, self.last = np.zeros((3, 3))
         self._sums = np.zeros((4, 3))  # of error^2, torque^2, feedforward x torque, feedback x it
         self._lowest, self._highest = np.full(3, np.inf), np.full(3, -np.inf)
-        self._begin = self._end = 0.0
-        self._rested: float | None = None
-        self._settled: float | None = None
+        self._begin = 0.0
+        self._rested: float | None = None  # when the motion ended
+        self._settled: float | None = None  # since when the error has been inside the band
         self._history, self._newest, self._stride = np.empty((0, 4)), np.empty(4), 1
         if track is not None:
             self.add(track)
@@ -66,35 +62,15 @@ class TrackingMetrics:
         self.torque_largest = np.maximum(self.torque_largest, np.abs(torque).max(axis=0))
         self._lowest = np.minimum(self._lowest, track.gamma.min(axis=0))
         self._highest = np.maximum(self._highest, track.gamma.max(axis=0))
-        self._settle(track, largest > self.band)
+        moving = np.any(track.gamma_dot != 0.0, axis=1)
+        self._rested = _since(self._rested, moving, time)
+        self._settled = _since(self._settled, moving | (largest > self.band), time)
         self._begin = self._begin if self.samples else float(time[0])
-        self._end, self.last = float(time[-1]), error[-1]
+        self.seconds, self.last = float(time[-1]) - self._begin, error[-1]
         while len(self._history) > _KEPT:
             self._history, self._stride = self._history[::2], 2 * self._stride
         self._history = np.vstack([self._history, rows[rows[:, 0] % self._stride == 0.0]])
         self._newest, self.samples = rows[-1], int(count[-1])
-
-    def _settle(self, track: Track, outside: NDArray[np.bool_]) -> None:
-        """Find when the motion has ended, and since when the error has been inside the band."""
-        moving = np.flatnonzero(np.any(track.gamma_dot != 0.0, axis=1))
-        rest = int(moving[-1]) + 1 if len(moving) else 0
-        if rest:
-            self._rested = self._settled = None
-        if rest == len(track):
-            return
-        if self._rested is None:
-            self._rested = float(track.time[rest])
-        wrong = np.flatnonzero(outside[rest:])
-        first = rest + (int(wrong[-1]) + 1 if len(wrong) else 0)
-        if len(wrong):
-            self._settled = None
-        if self._settled is None and first < len(track):
-            self._settled = float(track.time[first])
-
-    @property
-    def seconds(self) -> float:
-        """Time from the first sample to the last [s]."""
-        return self._end - self._begin
 
     @property
     def rms(self) -> Array:
@@ -139,29 +115,36 @@ class TrackingMetrics:
         return np.asarray(rows[np.unique(np.searchsorted(rows[:, 0], shown)), 1:])
 
 
+def _since(known: float | None, wrong: NDArray[np.bool_], time: Array) -> float | None:
+    """Return since when nothing has been wrong, behind the next part; None where its end is."""
+    if known is not None and not wrong.any():
+        return known
+    rest = int(np.max(np.flatnonzero(wrong), initial=-1)) + 1
+    return float(time[rest]) if rest < len(time) else None
+
+
 def tracking_table(found: TrackingMetrics) -> str:
     """Return the metrics as text; what is unknown is a dash."""
-    return "\n".join(_lines(found)) + "\n"
-
-
-def _lines(found: TrackingMetrics) -> Iterator[str]:
-    yield f"{'':24}{'gamma_1':>12}{'gamma_2':>12}{'gamma_3':>12}"
-    for label, row in (
-        ("error, RMS [rad]", found.rms),
-        ("error, largest [rad]", found.largest),
-        ("error at the end [rad]", found.last),
-        ("torque, RMS [N m]", found.torque_rms),
-        ("torque, largest [N m]", found.torque_largest),
-    ):
-        yield f"{label:24}" + "".join(f"{value:12.3e}" for value in row)
+    rows = {
+        "error, RMS [rad]": found.rms,
+        "error, largest [rad]": found.largest,
+        "error at the end [rad]": found.last,
+        "torque, RMS [N m]": found.torque_rms,
+        "torque, largest [N m]": found.torque_largest,
+    }
+    cells = {label: [f"{value:.3e}" for value in row] for label, row in rows.items()}
     for label, row in zip(("feedforward", "feedback"), found.shares, strict=True):
-        cells = ("-" if np.isnan(share) else f"{100.0 * share:.2f}" for share in row)
-        yield f"{label + ', share [%]':24}" + "".join(f"{cell:>12}" for cell in cells)
+        shares = ["-" if np.isnan(share) else f"{100.0 * share:.2f}" for share in row]
+        cells[f"{label}, share [%]"] = shares
+    lines = [f"{'':24}{'gamma_1':>12}{'gamma_2':>12}{'gamma_3':>12}"]
+    lines += [f"{label:24}" + "".join(f"{one:>12}" for one in row) for label, row in cells.items()]
     settled = "-" if found.settling is None else f"{found.settling:.4f}"
-    yield f"{'settling time [s]':24}{settled:>12}  (to {found.band:.2e} rad)"
     limited = "-" if found.limited is None else found.limited
-    yield f"{'samples at a limit':24}{limited:>12}  (of {found.samples})"
-    yield ""
-    yield f"{'run time [s]':>16}{'RMS to then [rad]':>20}{'largest to then [rad]':>24}"
-    for time, rms, largest in found.history:
-        yield f"{time:16.4f}{rms:20.3e}{largest:24.3e}"
+    lines += [
+        f"{'settling time [s]':24}{settled:>12}  (to {found.band:.2e} rad)",
+        f"{'samples at a limit':24}{limited:>12}  (of {found.samples})",
+        "",
+        f"{'run time [s]':>16}{'RMS to then [rad]':>20}{'largest to then [rad]':>24}",
+        *(f"{time:16.4f}{rms:20.3e}{most:24.3e}" for time, rms, most in found.history),
+    ]
+    return "\n".join(lines) + "\n"

@@ -19,10 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control import law
-from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
 from sst_ros.control.controller import Controller
-from sst_ros.control.inverse_dynamics import InverseDynamics
-from sst_ros.control.reference import Reference, ReferenceMotion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, indent, loop
@@ -154,8 +152,8 @@ class ControlledBatch:
         if study.steps and study.steps % self.samples:
             allowed = f"must be a multiple of {self.samples}, the control periods of a run"
             raise InputError("sweep", [Problem("steps", study.steps, allowed)])
-        controller = Controller(self._scene, self._motion, control, period)
-        self._inertia = np.array(controller.inertia)[:, None]
+        self._controller = Controller(self._scene, self._motion, control, period)
+        self._inertia = np.array(self._controller.inertia)[:, None]
         varied = {one.key for one in study.variations}
 
         def has(*names: str) -> bool:
@@ -304,14 +302,10 @@ class ControlledBatch:
     @cached_property
     def _references(self) -> Array:
         """References of all samples of a run, shape (samples + 1, n)."""
-        control, period = self._control, self._control.period
-        inverse, rows = InverseDynamics(self._scene), []
+        rows = []
         for k in range(self.samples + 1):
-            time = k * round(period * 1e9) / 1e9
-            at = self._motion.at(time)
-            torques = law.feedforward_torques(
-                control, inverse, self._motion, at, time + 0.5 * period
-            )
+            time = k * round(self._control.period * 1e9) / 1e9
+            at, *torques = self._controller.desire(time)
             desired = (number for name in _DESIRED for number in getattr(at, name))
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)

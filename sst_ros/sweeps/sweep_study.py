@@ -16,8 +16,8 @@ from typing import Any
 
 import yaml
 
+from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.control.law import ControlChannel, ControllerSettings
-from sst_ros.control.reference import ReferenceMotion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.loads import SineTorque

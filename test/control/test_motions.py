@@ -13,7 +13,7 @@ from numpy.polynomial import chebyshev
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.reference import slow_down
+from sst_ros.control.actuator_space import slow_down
 from sst_ros.control.reference_motions import (
     minimum_jerk,
     quintic,
