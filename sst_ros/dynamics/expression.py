@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from operator import add, mul, sub, truediv
 from typing import Any
@@ -23,7 +23,9 @@ from sst_ros.scene.schema import Place, leaves, rebuild
 
 Value = Any  # an Expression, a Number or a float
 
-FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
+FUNCTIONS: dict[str, Callable[..., float]] = {
+    name: getattr(math, name) for name in ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
+}
 _TEMPLATES = {
     "add": "{} + {}",
     "sub": "{} - {}",
@@ -37,9 +39,25 @@ _TEMPLATES = {
 }
 _ON_FLOATS: dict[str, Callable[..., float]] = {
     **{"add": add, "sub": sub, "mul": mul, "div": truediv},
-    **{name: getattr(math, name) for name in FUNCTIONS},
+    **FUNCTIONS,
     "positive": lambda x: max(x, 0.0),
 }
+_SLOPES: dict[str, Callable[..., Value]] = {
+    "add": lambda here, x, y, dx, dy: dx + dy,
+    "sub": lambda here, x, y, dx, dy: dx - dy,
+    "mul": lambda here, x, y, dx, dy: dx * y + x * dy,
+    "div": lambda here, x, y, dx, dy: (dx - here * dy) / y,
+    "atan2": lambda here, y, x, dy, dx: (dy * x - y * dx) / (y * y + x * x),
+    "neg": lambda here, x: -1.0,
+    "sqrt": lambda here, x: 0.5 / here,
+    "tanh": lambda here, x: 1.0 - here * here,
+    "exp": lambda here, x: here,
+    "sin": lambda here, x: x.apply("cos"),
+    "cos": lambda here, x: -x.apply("sin"),
+    "positive": lambda here, x: x.apply("step"),
+    "step": lambda here, x: 0.0,
+}
+"""Slopes of here = f(x, y), whose arguments have the slopes dx and dy; of f(x) without dx."""
 
 
 class Graph:
@@ -62,15 +80,17 @@ class Graph:
 
 
 class Expression:
-    """A number that is not known yet; arithmetic on it is noted in its graph."""
+    """A number that is not known yet; arithmetic on it is noted in its graph.
 
-    __slots__ = ("graph", "index")
+    One that `is_present` counts as nonzero: scenarios differ in it, so that its term is there.
+    """
+
+    __slots__ = ("graph", "index", "is_present")
     # NumPy scalars must leave the arithmetic to us.
     __array_ufunc__ = None
 
-    def __init__(self, graph: Graph, index: int) -> None:
-        self.graph = graph
-        self.index = index
+    def __init__(self, graph: Graph, index: int, *, is_present: bool = False) -> None:
+        self.graph, self.index, self.is_present = graph, index, is_present
 
     def __add__(self, other: Value) -> Value:
         if _is(other, 0.0):
@@ -128,25 +148,19 @@ class Expression:
         return mine if mine is not None else self.graph.node("neg", self)
 
     def __bool__(self) -> bool:
-        raise TypeError("a traced number has no truth value: branch on constants only")
+        if not self.is_present:
+            raise TypeError("a traced number has no truth value: branch on constants only")
+        return True
 
     def apply(self, op: str, *args: Value) -> Value:
         """Note a function of this expression, or of `args`."""
         return self.graph.node(op, *(args or (self,)))
 
 
-class VariedNumber(Expression):
-    """A number that differs between scenarios: it counts as nonzero, so its term is present."""
-
-    __slots__ = ()
-
-    def __bool__(self) -> bool:
-        return True
-
-
 def mark_present(value: Any) -> Any:
     """Return an expression as one that counts as not zero, so that no term of it is left out."""
-    return VariedNumber(value.graph, value.index) if isinstance(value, Expression) else value
+    is_traced = isinstance(value, Expression)
+    return Expression(value.graph, value.index, is_present=True) if is_traced else value
 
 
 def _folds(op: str) -> tuple[Callable[[Number, Value], Value], Callable[[Number, Value], Value]]:
@@ -236,20 +250,13 @@ class Program:
         """How often each operation is done."""
         return Counter(op for op, _ in self.steps)
 
-    def first(self, count: int) -> Program:
-        """Return the program of the first `count` outputs alone."""
-        return Program(self.inputs, self.steps, self.outputs[:count]).prune()
-
-    def prune(self) -> Program:
-        """Return the program without steps that no output needs."""
-        inputs, needed = len(self.inputs), set[int]()
-        waiting = [out for out in self.outputs if isinstance(out, int)]
-        while waiting:
-            number = waiting.pop()
-            if number >= inputs and number not in needed:
-                needed.add(number)
-                waiting += [x for x in self.steps[number - inputs][1] if isinstance(x, int)]
-        kept = sorted(needed)
+    def prune(self, outputs: Sequence[float | int]) -> Program:
+        """Return the program of some outputs alone, without the steps that none of them needs."""
+        inputs, needed = len(self.inputs), {x for x in outputs if isinstance(x, int)}
+        for number in reversed(range(inputs, inputs + len(self.steps))):
+            if number in needed:
+                needed.update(x for x in self.steps[number - inputs][1] if isinstance(x, int))
+        kept = sorted(number for number in needed if number >= inputs)
         numbers = {old: new for new, old in enumerate([*range(inputs), *kept])}
 
         def renumber(operands: Sequence[float | int]) -> tuple[float | int, ...]:
@@ -257,30 +264,29 @@ class Program:
 
         steps = (self.steps[number - inputs] for number in kept)
         renumbered = tuple((op, renumber(operands)) for op, operands in steps)
-        return Program(self.inputs, renumbered, renumber(self.outputs))
-
-    def steps_of(self, inputs: Sequence[str]) -> list[bool]:
-        """Return of each step whether it depends on one of these inputs."""
-        depends = [name in inputs for name in self.inputs]
-        for _, operands in self.steps:
-            depends.append(any(depends[x] for x in operands if isinstance(x, int)))
-        return depends[len(self.inputs) :]
+        return Program(self.inputs, renumbered, renumber(outputs))
 
     def source(self, name: str, slots: Slots | None = None) -> str:
         """Source of a flat function of all inputs that returns the tuple of outputs.
 
         With `slots` its last argument is the vector p, which it takes its numbers from.
         """
-        lines, results = self.body(slots)
+        lines, _, results = self.split((), slots)
         given = self.inputs
         if slots is not None:
             given, lines = (*given, "p"), [*slots.reads([*lines, *results]), *lines]
         lines = [f"def {name}({', '.join(given)}):", *(f"    {line}" for line in lines)]
         return "\n".join([*lines, f"    return ({', '.join(results)},)\n"])
 
-    def body(self, slots: Slots | None = None) -> tuple[list[str], list[str]]:
-        """Lines v0 = .., v1 = .., one for each step, and the outputs; numbers have their slots."""
+    def split(
+        self, late: Container[str], slots: Slots | None = None
+    ) -> tuple[list[str], list[str], list[str]]:
+        """Lines v0 = .., v1 = .., a step each, that depend on no `late` input; the others; outputs.
+
+        With `slots` numbers have the names of their slots.
+        """
         names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
+        is_late = [name in late for name in self.inputs]
 
         def word(operand: float | int) -> str:
             if isinstance(operand, int):
@@ -289,11 +295,12 @@ class Program:
                 return slots.name(operand)
             return repr(operand) if operand >= 0.0 else f"({operand!r})"
 
-        lines = [
-            f"v{i} = " + _TEMPLATES[op].format(*map(word, operands))
-            for i, (op, operands) in enumerate(self.steps)
-        ]
-        return lines, [word(output) for output in self.outputs]
+        before, after = list[str](), list[str]()
+        for i, (op, operands) in enumerate(self.steps):
+            is_late.append(any(is_late[x] for x in operands if isinstance(x, int)))
+            line = f"v{i} = " + _TEMPLATES[op].format(*map(word, operands))
+            (after if is_late[-1] else before).append(line)
+        return before, after, [word(output) for output in self.outputs]
 
 
 class Slots:
@@ -313,10 +320,10 @@ class Slots:
             self.values.append(float(number))
         return f"c{slot}"
 
-    def reads(self, lines: Sequence[str], place: str = "p[{}]") -> list[str]:
+    def reads(self, lines: Sequence[str]) -> list[str]:
         """Lines that read what other lines name."""
         used = {int(found) for line in lines for found in re.findall(r"\bc(\d+)\b", line)}
-        return [f"c{slot} = {place.format(slot)}" for slot in sorted(used)]
+        return [f"c{slot} = p[{slot}]" for slot in sorted(used)]
 
 
 def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Program:
@@ -342,9 +349,22 @@ def with_jacobian(
     directions: list[dict[str, Value]] = [{name: 1.0} for name in by]
     if along:
         directions.append({name: symbols[f"d_{name}"] for name in along})
-    results, last = list(outputs), len(graph.nodes)
-    for direction in directions:
-        results += _differentiate(graph, last, outputs, direction)
+    results, nodes = list(outputs), graph.nodes[:]
+    for direction in directions:  # forward mode: what a node makes of the slopes of its arguments
+        slopes: list[Value] = []
+        for index, (op, args) in enumerate(nodes):
+            d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
+            if op == "input":
+                slopes.append(direction.get(args[0], 0.0))
+            elif len(args) == 1 and _is(d[0], 0.0):
+                slopes.append(0.0)
+            else:
+                slope = _SLOPES[op]
+                here = Expression(graph, index)
+                slopes.append(
+                    slope(here, *args) * d[0] if len(args) == 1 else slope(here, *args, *d)
+                )
+        results += [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
 
     def operand(value: Value) -> float | int:
         if isinstance(value, Expression):
@@ -352,45 +372,7 @@ def with_jacobian(
         return value if isinstance(value, Number) else float(value)
 
     steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(names) :])
-    return Program(names, steps, tuple(map(operand, results))).prune()
-
-
-def _differentiate(
-    graph: Graph, last: int, outputs: Sequence[Value], direction: Mapping[str, Value]
-) -> list[Value]:
-    """Differentiate outputs among the first `last` nodes along a direction (forward mode).
-
-    It has a number or an expression for the names of some inputs.
-    """
-    slopes: list[Value] = []
-    for index, (op, args) in enumerate(graph.nodes[:last]):
-        d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
-        here = Expression(graph, index)
-        slopes.append(direction.get(args[0], 0.0) if op == "input" else _chain(op, args, d, here))
-    return [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
-
-
-def _chain(op: str, args: tuple[Value, ...], d: list[Value], here: Expression) -> Value:
-    x = args[0]
-    if op in ("add", "sub"):
-        return d[0] + d[1] if op == "add" else d[0] - d[1]
-    if op == "mul":
-        return d[0] * args[1] + x * d[1]
-    if op == "div":
-        return (d[0] - here * d[1]) / args[1]
-    if op == "atan2":
-        return (d[0] * args[1] - x * d[1]) / (x * x + args[1] * args[1])
-    inner: dict[str, Callable[[], Value]] = {
-        "neg": lambda: -1.0,
-        "sqrt": lambda: 0.5 / here,
-        "tanh": lambda: 1.0 - here * here,
-        "exp": lambda: here,
-        "sin": lambda: x.apply("cos"),
-        "cos": lambda: -x.apply("sin"),
-        "positive": lambda: x.apply("step"),
-        "step": lambda: 0.0,
-    }
-    return 0.0 if _is(d[0], 0.0) else inner[op]() * d[0]
+    return Program(names, steps, ()).prune([operand(result) for result in results])
 
 
 def compile_program(
@@ -400,7 +382,7 @@ def compile_program(
 
     The function raises ArithmeticError or ValueError where a float has no value.
     """
-    names = dict(functions or {name: getattr(math, name) for name in FUNCTIONS})
+    names: dict[str, Any] = {**(functions or FUNCTIONS)}
     exec(program.source("function"), names)
     function: Callable[..., tuple[Any, ...]] = names["function"]
     return function

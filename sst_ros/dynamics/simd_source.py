@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text of loops over SIMD lanes: many evaluations of one program at once.
+"""Text of loops for SIMD: many evaluations of one program at once, columns of a Jacobian at once.
 
 All numbers live in one flat array, a row of lanes each, at offsets that are constants in the text,
 and loops have a fixed length and no branches: so a compiler need not ask at run time what overlaps
@@ -13,6 +13,9 @@ from dataclasses import replace
 from itertools import accumulate
 
 from sst_ros.dynamics.expression import Program, Slots
+
+_COLUMNS = 4
+"""The loop over the columns of a Jacobian is a multiple of this long: numbers in a register."""
 
 
 class Layout:
@@ -46,16 +49,9 @@ def split(
     Inputs are called u0, u1, ... here, and results of lines v0, v1, ...; `early` says of each input
     whether it is known earlier than others.
     """
-    count = len(program.inputs)
-    lines, results = replace(program, inputs=tuple(f"u{i}" for i in range(count))).body(slots)
-    before, after = list[str](), list[str]()
-    late = {i for i, known in enumerate(early) if not known}
-    steps = zip(lines, program.steps, strict=True)
-    for number, (line, (_, operands)) in enumerate(steps, start=count):
-        if any(isinstance(x, int) and x in late for x in operands):
-            late.add(number)
-        (after if number in late else before).append(line)
-    return before, after, results
+    names = tuple(f"u{i}" for i in range(len(program.inputs)))
+    late = [name for name, known in zip(names, early, strict=True) if not known]
+    return replace(program, inputs=names).split(late, slots)
 
 
 def evaluate_lanes(
@@ -99,6 +95,58 @@ def loop(at: Layout, body: list[str]) -> list[str]:
 def indent(spaces: int, lines: list[str]) -> list[str]:
     """Move lines to the right."""
     return [" " * spaces + line for line in lines]
+
+
+def linearise_by_columns(
+    program: Program, state: Sequence[str], drive: Sequence[str], slots: Slots
+) -> str:
+    """Text of `linearise` for numba: all columns of a Jacobian in a loop over directions.
+
+    The program is the derivative by t, state and drive and its own along directions, the last
+    inputs; of them the one of t, if it is there, comes last.
+
+    It is half as long as the operations of each column in a row, which takes half the time to
+    compile, and the compiler takes four columns at once; the digits are those of the columns.
+
+        def linearise(t, state, d, p, slope, by_time, matrix):
+            x = state[0]
+            t1 = d[0]
+            c0 = p[0]
+            v0 = x * x
+            slope[0] = v7
+            columns = vector(64)
+            for k in range(8):
+                d_x = 1.0 if k == 0 else 0.0
+                v8 = d_x * v0
+                columns[0 + k] = v9
+            for i in range(8):
+                by_time[i] = columns[8 * i + 7]
+                for k in range(7):
+                    matrix[i][k] = columns[8 * i + k]
+    """
+    size, directions = len(state), program.inputs[1 + len(state) + len(drive) :]
+    before, along, results = program.split(directions, slots)
+    width = -(-len(directions) // _COLUMNS) * _COLUMNS
+    by_time = "d_t" in directions
+    states = len(directions) - by_time
+    body = [
+        *(f"{name} = state[{i}]" for i, name in enumerate(state)),
+        *(f"{name} = d[{i}]" for i, name in enumerate(drive)),
+        *slots.reads([*before, *along, *results]),
+        *before,
+        *(f"slope[{i}] = {result}" for i, result in enumerate(results[:size])),
+        f"columns = vector({size * width})",
+        f"for k in range({width}):",
+        *(f"    {name} = 1.0 if k == {k} else 0.0" for k, name in enumerate(directions)),
+        *(f"    {line}" for line in along),
+        *(f"    columns[{i * width} + k] = {x}" for i, x in enumerate(results[size:])),
+        f"for i in range({size}):",
+        *([f"    by_time[i] = columns[{width} * i + {states}]"] if by_time else []),
+        f"    for k in range({states}):",
+        f"        matrix[i][k] = columns[{width} * i + k]",
+    ]
+    head = "def linearise(t, state, d, p, slope, by_time, matrix):"
+    return "\n    ".join([head, *body]) + "\n"
 
 
 def flat_sin(x: float) -> float:

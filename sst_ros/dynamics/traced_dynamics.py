@@ -1,29 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions of one scene, traced: those that a run calls, and the ODE that is integrated."""
+"""Functions of scenes, traced: those that a run calls, the ODE that is integrated, many scenarios.
+
+The programs of many scenarios have the numbers that differ as inputs. What is the same in all of
+them stays a constant that `trace` folds, so a batch computes only what varies. A term whose
+coefficients are zero in some scenarios changes no bit there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache, partial
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import (
+    Expression,
     Program,
-    Slots,
+    compile_for_arrays,
     compile_program,
+    mark_present,
     number_constants,
     trace,
     with_jacobian,
 )
-from sst_ros.dynamics.model import Limit
+from sst_ros.dynamics.model import Limit, limits_of
+from sst_ros.errors import refuse_unless
 from sst_ros.mechanism.generic_math import Scalar, positive, sin
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import SineTorque
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import Scenarios, Scene
+from sst_ros.scene.schema import Place, leaves, rebuild
+from sst_ros.state import Joints
 
 Function = Callable[..., tuple[float, ...]]
 
@@ -34,8 +45,8 @@ TORQUE = ("t1", "t2", "t3")
 MOMENT = ("n1", "n2", "n3")
 BODY_ACCELERATION = ("ax", "ay", "az")
 
-_LANES = 4
-"""The loop over the columns of a Jacobian is a multiple of this long: numbers in a register."""
+OUTPUTS = (*Joints._fields, "energy")
+"""Quantities of a state that depend on the numbers of its scenario."""
 
 
 class Dynamics:
@@ -47,8 +58,7 @@ class Dynamics:
 
     def __init__(self, model: kernel.Model, *, has_moment_topic: bool = False) -> None:
         self.model, self.has_moment_topic = model, has_moment_topic
-        lagging = model.time_constant is not None
-        self.state = (*QUATERNION, *RATE, *(LAG if lagging else ()))
+        self.state = (*QUATERNION, *RATE, *(LAG if model.time_constant is not None else ()))
         self.drive = (*TORQUE, *(MOMENT if has_moment_topic else ()))
 
     @staticmethod
@@ -60,8 +70,11 @@ class Dynamics:
     @cached_property
     def program(self) -> Program:
         """Derivative of the state by time; inputs are state and drive."""
-        function = partial(kernel.derivative, self.numbers)
-        return trace(lambda *given: function(*self._split(given)), (*self.state, *self.drive))
+
+        def derivative(*inputs: Any) -> tuple[Any, ...]:
+            return kernel.derivative(self.numbers, *self._split(inputs))
+
+        return trace(derivative, (*self.state, *self.drive))
 
     @cached_property
     def derivative(self) -> Function:
@@ -76,8 +89,9 @@ class Dynamics:
     @cached_property
     def joints_program(self) -> Program:
         """The program of `joints`."""
-        joints = partial(kernel.joints, self.numbers)
-        return trace(lambda *state: [*chain(*joints(state))], (*QUATERNION, *RATE))
+        return trace(
+            lambda *state: [*chain(*kernel.joints(self.numbers, state))], (*QUATERNION, *RATE)
+        )
 
     @cached_property
     def inverse(self) -> Function:
@@ -150,6 +164,7 @@ class ODE:
         self.state = (*dynamics.state, *(("work",) if work else ()))
         self.drive = dynamics.drive if torque is None or phases else dynamics.drive[3:]
         self._inputs = ("t", *self.state, *self.drive)
+        self._of_numbers = partial(self.derivative, numbered=True)
 
     @cached_property
     def program(self) -> Program:
@@ -163,61 +178,13 @@ class ODE:
 
     @cached_property
     def directional(self) -> Program:
-        """The derivative, and its own along the direction d_x, .. of further inputs."""
-        return with_jacobian(self._of_numbers, self._inputs, (), self._variables)
+        """The derivative, and its own along the direction d_x, .. of further inputs.
 
-    def linearise_by_columns(self, slots: Slots) -> str:
-        """Source of `linearise` for numba: all columns of the Jacobian in a loop over directions.
-
-        It is half as long as the operations of each column in a row, which takes half the time to
-        compile, and the compiler takes four columns at once; the digits are those of the columns.
-
-            def linearise(t, state, d, p, slope, by_time, matrix):
-                x = state[0]
-                t1 = d[0]
-                c0 = p[0]
-                v0 = x * x
-                slope[0] = v7
-                columns = vector(64)
-                for k in range(8):
-                    d_x = 1.0 if k == 0 else 0.0
-                    v8 = d_x * v0
-                    columns[0 + k] = v9
-                for i in range(8):
-                    by_time[i] = columns[8 * i + 7]
-                    for k in range(7):
-                        matrix[i][k] = columns[8 * i + k]
+        They are of the state but the work, and of the time under a torque.
         """
-        size, variables = len(self.state), self._variables
-        directions = [f"d_{name}" for name in variables]
-        lines, results = self.directional.body(slots)
-        inner = self.directional.steps_of(directions)
-        width = -(-len(variables) // _LANES) * _LANES
-        states = len(variables) - ("t" in variables)
-        body = [
-            *(f"{name} = state[{i}]" for i, name in enumerate(self.state)),
-            *(f"{name} = d[{i}]" for i, name in enumerate(self.drive)),
-            *slots.reads([*lines, *results]),
-            *(line for line, along in zip(lines, inner, strict=True) if not along),
-            *(f"slope[{i}] = {result}" for i, result in enumerate(results[:size])),
-            f"columns = vector({size * width})",
-            f"for k in range({width}):",
-            *(f"    {name} = 1.0 if k == {k} else 0.0" for k, name in enumerate(directions)),
-            *(f"    {line}" for line, along in zip(lines, inner, strict=True) if along),
-            *(f"    columns[{i * width} + k] = {x}" for i, x in enumerate(results[size:])),
-            f"for i in range({size}):",
-            *([f"    by_time[i] = columns[{width} * i + {states}]"] if "t" in variables else []),
-            f"    for k in range({states}):",
-            f"        matrix[i][k] = columns[{width} * i + k]",
-        ]
-        head = "def linearise(t, state, d, p, slope, by_time, matrix):"
-        return "\n    ".join([head, *body]) + "\n"
-
-    @property
-    def _variables(self) -> tuple[str, ...]:
-        """What the derivative depends on: the state but the work, and the time under a torque."""
         state = self.state[:-1] if self._work else self.state
-        return state if self._torque is None else (*state, "t")
+        along = state if self._torque is None else (*state, "t")
+        return with_jacobian(self._of_numbers, self._inputs, (), along)
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
@@ -244,18 +211,15 @@ class ODE:
         """Nine angles and nine rates, of quaternion and body rate."""
         return self._dynamics.joints_program
 
-    def derivative(self, time: Any, *inputs: Any) -> tuple[Any, ...]:
-        """Return the derivative at the time, the state and the drive given, of any kind."""
-        return self._slope((self._dynamics.model, self._torque, self._limit), time, *inputs)
+    def derivative(self, time: Any, *inputs: Any, numbered: bool = False) -> tuple[Any, ...]:
+        """Return the derivative at the time, the state and the drive given, of any kind.
 
-    def _of_numbers(self, *inputs: Any) -> tuple[Any, ...]:
-        """Return the derivative with numbers that may be others in another scene."""
-        torque = number_constants(self._torque, ("torque",))
-        limit = number_constants(self._limit, ("limit",))
-        return self._slope((self._dynamics.numbers, torque, limit), *inputs)
-
-    def _slope(self, constants: tuple[Any, Any, Any], time: Any, *inputs: Any) -> tuple[Any, ...]:
-        model, sine, limit = constants
+        If `numbered` it is that of constants that may be others in another scene.
+        """
+        model, sine, limit = self._dynamics.model, self._torque, self._limit
+        if numbered:
+            model, sine = self._dynamics.numbers, number_constants(sine, ("torque",))
+            limit = number_constants(limit, ("limit",))
         state, drive = inputs[: len(self._dynamics.state)], inputs[len(self.state) :]
         torque, moment = drive[:3], drive[3:]
         if sine is not None:
@@ -263,16 +227,12 @@ class ODE:
             moment = moment if self._phases else drive
             rows = zip(sine.amplitude, sine.frequency, phase, strict=True)
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
-            if limit is not None:
-                torque = tuple(_clamp(tau, limit) for tau in torque)
+            if limit is not None:  # clamps to -limit and limit, numbers of any kind
+                most = 2.0 * limit
+                torque = tuple(limit - positive(most - positive(tau + limit)) for tau in torque)
         slope = kernel.derivative(model, state, torque, moment or None)
         work = (kernel.power(model, state, torque, moment or None),) if self._work else ()
         return (*slope, *work)
-
-
-def _clamp(torque: Any, limit: float) -> Any:
-    """Clamp a torque, of any kind of number."""
-    return limit - positive(2.0 * limit - positive(torque + limit))
 
 
 @lru_cache(maxsize=32)
@@ -299,21 +259,155 @@ def limit_distances(
     each limit; the state is quaternion and body rate.
     """
     legs = list(kernel.leg_motions(model, state))
-    pairs = [
-        _distance(limit, *end, legs[limit.joint % 3])
-        for limit, end in zip(limits, ends, strict=True)
-    ]
-    return tuple(pair[0] for pair in pairs) + tuple(pair[1] for pair in pairs)
+    distances, rates = [], []
+    for limit, (cosine, sine) in zip(limits, ends, strict=True):
+        kind, at = limit.joint // 3, legs[limit.joint % 3]
+        if kind == 1:  # sin(mu)^2 - sin(end)^2
+            distance, rate = at.u - sine * sine, -2.0 * at.a * at.a_dot
+        else:  # sqrt(u) sin(sign * (angle - end))
+            across, along = kernel.direction_of(at, kind)
+            distance = limit.sign * (across * cosine - along * sine)
+            rate = limit.sign * (along * cosine + across * sine) * kernel.joint_rate(at, kind)
+            rate = rate - distance * at.a * at.a_dot / at.u
+        distances.append(distance)
+        rates.append(rate)
+    return (*distances, *rates)
 
 
-def _distance(
-    limit: Limit, cosine: Scalar, sine: Scalar, at: kernel.LegMotion
-) -> tuple[Scalar, Scalar]:
-    """sqrt(u) sin(sign * (angle - end)) and its rate; of mu sin(mu)^2 - sin(end)^2."""
-    kind = limit.joint // 3
-    if kind == 1:
-        return at.u - sine * sine, -2.0 * at.a * at.a_dot
-    across, along = kernel.direction_of(at, kind)
-    distance = limit.sign * (across * cosine - along * sine)
-    turning = limit.sign * (along * cosine + across * sine) * kernel.joint_rate(at, kind)
-    return distance, turning - distance * at.a * at.a_dot / at.u
+class Constants(NamedTuple):
+    """All numbers that the traced programs of a scene are made of: a tree of numbers or columns."""
+
+    model: kernel.Model
+    ends: tuple[tuple[float, float], ...]  # cosine and sine of the end of each of `limits_of`
+    torque: SineTorque | None  # the scene's own over time; None where it does not act
+
+
+class ParameterColumns(NamedTuple):
+    """Numbers of the scenarios of a batch."""
+
+    inputs: Array  # the program's varied numbers, shape (numbers, N)
+    geometries: Geometry  # the distinct ones, or one for all rows
+    geometry: NDArray[np.intp]  # index of the geometry of each row, shape (N,)
+    torque_limit: Array  # largest torque of an actuator [N m], infinite without one, shape (N,)
+
+
+class ParametricModel:
+    """The programs of a scene, with the numbers that differ between scenarios as inputs.
+
+    With `profile` the scene's own torques act. `ode` has the names of the state and the drive,
+    `names` those of the varied numbers.
+    """
+
+    def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
+        self.scene, self._profile = scenarios.document, profile
+        self._tree = self._constants_of(scenarios)[0]
+        numbers = leaves(self._tree)
+        varied = [place for place, x in numbers.items() if np.max(x) != np.min(x)]
+        self._varied = {place: f"p{i}" for i, place in enumerate(varied)}
+        self.names = tuple(self._varied.values())
+        rest = (place for place in numbers if place not in self._varied)
+        self._fixed = {place: float(np.ravel(numbers[place])[0]) for place in rest}
+        self.ode = ODE(Dynamics.of(self.scene), self.scene.torque if profile else None)
+
+    def columns(self, scenarios: Scenarios) -> ParameterColumns:
+        """Return the numbers of scenarios.
+
+        Refused are actuators that cannot give the torques of the profile, and numbers that differ
+        but do not in the scenarios that this model was made from.
+        """
+        tree, geometries, which = self._constants_of(scenarios)
+        numbers = leaves(tree)
+        inputs = np.empty((len(self._varied), len(which)))
+        for row, place in zip(inputs, self._varied, strict=True):
+            row[:] = numbers[place]
+            if place[-1] == "static":
+                # static = 0 is no breakaway torque, which is as if it were the Coulomb torque.
+                level: Place = (*place[:-1], "coulomb")
+                row[:] = np.where(row == 0.0, numbers[level], row)
+            elif place[-1] == "rest":
+                np.nan_to_num(row, copy=False)  # of a spring without stiffness any will do
+        actuators = scenarios.columns().actuators
+        given = None if actuators is None else actuators.torque_limit
+        limit = np.full(len(which), np.inf if given is None else given)
+        limit[limit == 0.0] = np.inf  # of actuators that are left out
+        lagging, lags = tree.model.time_constant, "must be > 0 [s] in every scenario, or in none"
+        fixed = "must be {} in all scenarios of this model"
+        checks = [
+            (str(place), numbers[place], bool(np.all(numbers[place] == x)), fixed.format(x))
+            for place, x in self._fixed.items()
+        ]
+        checks.append(("actuators.time_constant", 0.0, not np.any(lagging == 0.0), lags))
+        if tree.torque is not None:  # a fixed step does not resolve the kinks of a clamped torque
+            amplitudes = np.array(np.broadcast_arrays(*tree.torque.amplitude, limit)[:3])
+            largest = np.abs(amplitudes).max(axis=0)
+            n = int(np.argmax(largest > limit))
+            where = f"scenario {n}: " if scenarios.count else ""
+            allowed = f"must not be less than the amplitude {largest[n]} of the profile"
+            checks.append(
+                (
+                    f"{where}actuators.torque_limit",
+                    float(limit[n]),
+                    bool(largest[n] <= limit[n]),
+                    allowed,
+                )
+            )
+        refuse_unless(self.scene.name, *checks)
+        return ParameterColumns(inputs, geometries, which, limit)
+
+    @cached_property
+    def program(self) -> Program:
+        """Derivative of the state; inputs t, state, drive, and the varied numbers."""
+        known = ("t", *self.ode.state, *self.ode.drive)
+        topic = Dynamics.of(self.scene).has_moment_topic
+
+        def slope(*inputs: Expression) -> tuple[Any, ...]:
+            at = self.constants(inputs[len(known) :])
+            ode = ODE(Dynamics(at.model, has_moment_topic=topic), at.torque)
+            return ode.derivative(*inputs[: len(known)])
+
+        return trace(slope, (*known, *self.names))
+
+    @cached_property
+    def limit_distances(self) -> Program:
+        """Distances to the limits, and their rates; inputs: state (7) and the varied numbers."""
+        limits = tuple(limits_of(self.scene, Geometry.of(self.scene)))
+
+        def values(*inputs: Expression) -> tuple[Any, ...]:
+            at = self.constants(inputs[7:])
+            return limit_distances(limits, at.ends, at.model, inputs[:7])
+
+        return trace(values, (*QUATERNION, *RATE, *self.names))
+
+    @cached_property
+    def outputs(self) -> dict[str, Callable[..., tuple[Any, ...]]]:
+        """Functions of arrays for quantities of OUTPUTS by name; inputs as `limit_distances`.
+
+        Three angles [rad] or rates [rad/s] each, or the energy [J].
+        """
+
+        def values(*inputs: Expression) -> tuple[Any, ...]:
+            model, state = self.constants(inputs[7:]).model, inputs[:7]
+            joints = (number for kind in kernel.joints(model, state) for number in kind)
+            kinetic = kernel.kinetic_energy(model, state)
+            return (*joints, kinetic + kernel.potential_energy(model, state))
+
+        whole = trace(values, (*QUATERNION, *RATE, *self.names))
+        parts = (whole.prune(whole.outputs[i : i + 3]) for i in range(0, 19, 3))
+        return dict(zip(OUTPUTS, map(compile_for_arrays, parts), strict=True))
+
+    def constants(self, inputs: Sequence[Any]) -> Constants:
+        """Return the constants, with expressions or columns where they differ."""
+        given = dict(zip(self._varied, map(mark_present, inputs), strict=True))
+        tree: Constants = rebuild(self._tree, self._fixed | given)
+        return tree
+
+    def _constants_of(self, scenarios: Scenarios) -> tuple[Constants, Geometry, NDArray[np.intp]]:
+        """Return the constants of scenarios, as columns; their geometries, and that of each row."""
+        geometries, which = Geometry.of_scenarios(scenarios)
+        columns, geometry = scenarios.columns(), geometries.of_rows(which)
+        limits = limits_of(self.scene, geometry)
+        ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
+        with np.errstate(invalid="ignore"):  # 0/0 is the rest of springs without stiffness
+            model = kernel.model_of(columns, geometry)
+        torque = columns.torque if self._profile else None
+        return Constants(model, ends, torque), geometries, which

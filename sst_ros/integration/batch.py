@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
-from sst_ros.dynamics.parametric_model import ParameterColumns, ParametricModel
-from sst_ros.dynamics.traced_dynamics import TORQUE
+from sst_ros.dynamics.model import limits_of
+from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
 from sst_ros.errors import refuse_unless
 from sst_ros.extras import require
 from sst_ros.host import compiled_module
@@ -394,7 +394,8 @@ class BatchResult:
         _, first, index = np.unique(both, return_index=True, return_inverse=True)
         texts = []
         for row, code in zip(first, self.code[first].tolist(), strict=True):
-            limits = self._model.limits(self._columns.geometries.of_rows(geometry[row]))
+            own = self._columns.geometries.of_rows(geometry[row])
+            limits = tuple(limits_of(self._model.scene, own))
             texts.append(_REASONS.get(code) or limits[code - 1].reason)
         return np.array(texts, dtype=object), index
 

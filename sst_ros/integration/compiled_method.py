@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics.expression import Slots
+from sst_ros.dynamics.simd_source import linearise_by_columns
 from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, Function, ode_with_work
 from sst_ros.host import compiled_module
 from sst_ros.host.cache_folder import cache_folder
@@ -278,7 +279,8 @@ def _source(
         constants |= method.constants
         slope = [f"slope[{i}]" for i in range(size)]
         if slots is not None:
-            texts.append(system.linearise_by_columns(slots))
+            columns = system.directional, system.state, system.drive
+            texts.append(linearise_by_columns(*columns, slots))
         else:  # without a compiler the columns in a row take less time
             texts.append(system.jacobian.source("jacobian"))
             texts.append(inspect.getsource(step_loops.linearise))

@@ -175,11 +175,11 @@ def source(ode: ODE, nodes: int, limits: Program | None) -> tuple[list[str], Lay
     slots, of_time = Slots(), [True, *(False,) * size, *(True,) * (inputs - 1 - size)]
     before, after, results = split(ode.program, of_time, slots)
     held, moving, _ = split(ode.program, [False, *(True,) * (inputs - 1)], slots)
-    _, turn, turned = split(ode.program.first(4), of_time, slots)
+    _, turn, turned = split(ode.program.prune(ode.program.outputs[:4]), of_time, slots)
     # What is known from time and drive alone, and is needed where the state is known, too.
     needed = set(re.findall(r"\bv\d+\b", "\n".join([*after, *results])))
     known = [name for line in before if (name := line.split(" = ")[0]) in needed]
-    limited = len(limits.body(slots)[1]) if limits else 0
+    limited = len(limits.split((), slots)[-1]) if limits else 0
     count, monitored = len(slots.values), max(1, limited)
     head, begin, numbers = (-(-n // nodes) for n in (3, inputs, count))
     at = Layout(
