@@ -69,7 +69,7 @@ def run_demo(options: argparse.Namespace) -> None:
             refuse_unknown(options, "--mode", mode, MODES)
         out = free_out(options, "demo_out/feedforward")
         for bag, folder in demo.record_feedforward(out, **chosen):
-            print(function("report.run:write_tracking_report")(bag, folder), flush=True)
+            print(function("report.tracking:write_tracking_report")(bag, folder), flush=True)
         return
     if chosen:
         refuse(options, "--scene, --mode", chosen, "are options of `demo feedforward`")

@@ -15,14 +15,14 @@ mechanism of the paper: loads that a scene may have beside it are left out on bo
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
+import pandas as pd
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import accelerate_by_paper, initial_state
 from sst_ros.errors import SingularConfiguration
-from sst_ros.extras import require
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import Bar, slices
 from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
@@ -72,15 +72,10 @@ class TickPropagator(Propagator):
     def follow(self, ticks: Held, starts: Array) -> Array:
         """Propagate through m ticks.
 
-        Args:
-            ticks: m of them.
-            starts: states (quaternion, body rate, lagged torques) at which ticks begin, shape
-                (m, 7 or 10); NaN where a tick goes on from the one before, and before the first.
-
-        Returns:
-            Solution and second solution at the end of each tick, with the work since the start
-            [J], shape (m, 2, 8 or 11); NaN from a tick that no step resolves to the next start.
-
+        They begin at the states `starts` (quaternion, body rate, lagged torques), shape
+        (m, 7 or 10); NaN where a tick goes on from the one before, and before the first. Returns
+        solution and second solution at the end of each tick, with the work since the start [J],
+        shape (m, 2, 8 or 11); NaN from a tick that no step resolves to the next start.
         """
         start_ns, end_ns, drives = ticks
         parts = np.maximum(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
@@ -119,19 +114,15 @@ class TickPropagator(Propagator):
         return np.asarray(np.asarray(reached)[first + parts - 1])
 
 
-def takes_moment(scene: Scene) -> bool:
-    """Return whether the moment on the star of a scene comes from a topic."""
-    return scene.moment is not None and scene.moment.topic
-
-
 def held_torques(recording: Recording) -> Held | None:
     """Return the recorded ticks; None where the moment came from a topic and is not recorded."""
-    ticks, drives = recording.ticks, recording.ticks.torque
-    if takes_moment(recording.scene):
+    ticks, moment = recording.ticks, recording.scene.moment
+    drives = [ticks.torque]
+    if moment is not None and moment.topic:
         if ticks.moment is None:
             return None
-        drives = np.hstack([drives, ticks.moment])
-    return ticks.start_ns, ticks.end_ns, drives
+        drives.append(ticks.moment)
+    return ticks.start_ns, ticks.end_ns, np.hstack(drives)
 
 
 def initial(scene: Scene) -> tuple[float, ...]:
@@ -263,30 +254,25 @@ def ideal(recording: Recording) -> Comparison | None:
     None where the scene has no torques, its moment comes from a topic, or the recording lacks the
     start of the run. Raises what `initial` does.
     """
-    torque, time = recording.scene.torque, recording.time_ns
-    if torque is None or takes_moment(recording.scene) or not begins(recording):
+    scene, time = recording.scene, recording.time_ns
+    pushed = scene.moment is not None and scene.moment.topic
+    if scene.torque is None or pushed or not begins(recording):
         return None
-    return _compare(recording, torque, (time[:-1], time[1:], np.empty((len(time) - 1, 0))))
+    held = time[:-1], time[1:], np.empty((len(time) - 1, 0))
+    return _compare(recording, scene.torque, held, known=True)
 
 
 def _compare(
-    recording: Recording, torque: SineTorque | None, held: Held, *, known: bool = True
+    recording: Recording, torque: SineTorque | None, held: Held, *, known: bool
 ) -> Comparison:
     """Propagate a run with a second solution, and compare both at its samples.
 
     The state at time zero is `known` or not. Under recorded torques, which may have gaps, the
     reference begins again at a sample after each.
     """
-    start_ns, end_ns, drives = held
-    compiled = len(recording.ticks.start_ns) > COMPILED_FROM
-    motion = TickPropagator(recording.scene, torque, compiled=compiled)
-    tick_ns, count, reasons, restarts = recording.ticks.period_ns, len(start_ns), [], []
-    if not motion.compiled:
-        longest = PLAIN_TICKS * tick_ns // np.median(end_ns - start_ns)
-        count = min(count, int(longest))
-    if count < len(start_ns):
-        until = end_ns[count - 1] / NANOSECONDS
-        reasons.append(f"only the first {until:g} s are compared: there is no numba for more")
+    (start_ns, end_ns, drives), restarts = held, list[int]()
+    motion, until_ns, reason = _begin(recording, torque)
+    count = int(np.searchsorted(end_ns, until_ns, side="right"))
     samples = recording.quaternion, recording.gamma, recording.gamma_dot
     distances = np.full((2, len(recording.time_ns), 3), np.nan)
 
@@ -333,12 +319,23 @@ def _compare(
         bar.draw(min(first / count, 1.0))
     distances[0, np.isin(recording.time_ns, restarts)] = np.nan
     error, own = map(_frame, distances)
-    steps = -(-tick_ns // LONGEST_TICK_NS)
-    return Comparison(error, own, tuple(restarts), steps, tuple(reasons))
+    steps = -(-recording.ticks.period_ns // LONGEST_TICK_NS)
+    return Comparison(error, own, tuple(restarts), steps, (reason,) if reason else ())
+
+
+def _begin(recording: Recording, torque: SineTorque | None) -> tuple[TickPropagator, int, str]:
+    """Return what propagates a run, up to when [ns], and the reason why not to its end, or ""."""
+    ends_ns = recording.ticks.end_ns
+    motion = TickPropagator(recording.scene, torque, compiled=len(ends_ns) > COMPILED_FROM)
+    if motion.compiled or len(ends_ns) <= PLAIN_TICKS:
+        return motion, max(int(ends_ns[-1]), int(recording.time_ns[-1])), ""
+    until_ns = int(ends_ns[PLAIN_TICKS - 1])
+    until = until_ns / NANOSECONDS
+    return motion, until_ns, f"only the first {until:g} s are compared: there is no numba for more"
 
 
 def _frame(distances: Array) -> DataFrame:
-    return cast("DataFrame", require("pandas").DataFrame(distances, columns=[*QUANTITIES]))
+    return pd.DataFrame(distances, columns=[*QUANTITIES])
 
 
 def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
@@ -356,24 +353,19 @@ def energy_residual(recording: Recording) -> tuple[Array, str]:
     It is the residual since the start [J], shape (n,), nan where it is not known; where ticks are
     lost, it goes on without them. Beside it is the reason why it ends or is not there, or "".
     """
-    count, held, reason = len(recording.time_ns), held_torques(recording), ""
-    stored, work = np.full((2, count), np.nan)
+    time, held = recording.time_ns, held_torques(recording)
+    stored, work = np.full((2, len(time)), np.nan)
     if held is None:
         return stored, "the moment on the star is not recorded: no energy residual"
-    many = len(held[0]) > COMPILED_FROM
-    motion = TickPropagator(recording.scene, None, compiled=many)
-    if many and not motion.compiled:
-        count = int(np.searchsorted(recording.time_ns, held[1][PLAIN_TICKS - 1])) + 1
-        until = recording.seconds[count - 1]
-        reason = f"energy after {until:g} s: there is no numba to balance it"
-    model = motion.dynamics.model
+    motion, until_ns, reason = _begin(recording, None)
+    model, count = motion.dynamics.model, int(np.searchsorted(time, until_ns, side="right"))
     for part in slices(count, CHUNK, "energy", shown=False):
         rows = slice(part.start, min(part.stop + 1, count))
         state = of_samples(recording, rows)
         columns = tuple(state.T)
         kinetic = kernel.kinetic_energy(model, columns)
         stored[rows] = kinetic + kernel.potential_energy(model, columns)
-        work[rows.start : rows.stop - 1] = _work(motion, held, state, recording.time_ns[rows])
+        work[rows.start : rows.stop - 1] = _work(motion, held, state, time[rows])
     change = np.diff(stored, prepend=stored[0]) - np.append(0.0, work[:-1])
     change[~np.isfinite(change)] = 0.0
     return np.where(np.isfinite(stored), np.cumsum(change), np.nan), reason

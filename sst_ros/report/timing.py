@@ -19,9 +19,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from sst_ros.extras import require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.recording import Recording
 from sst_ros.state import NANOSECONDS
@@ -42,11 +42,7 @@ STATISTICS = {"min": "min", "mean": "mean", "99%": "p99", "99.9%": "p99_9", "max
 class Timing(NamedTuple):
     """Timing of a recording by its clocks."""
 
-    late_us: Array
-    """How much later each sample was received than the fastest one, by its stamp [us], shape (n,):
-    it grows where the simulator falls behind."""
     period_us: Array  # between receptions of samples that follow each other [us], shape (p,)
-    nominal_us: float  # what it should be [us]
     lost_s: Array  # times of lost samples [s], shape (l,)
     gaps_s: Array  # times at which a tick does not begin where the one before ended [s]
     pace: Series[float]  # simulated time per time on the recorder's clock, over time [s]
@@ -57,40 +53,23 @@ class Timing(NamedTuple):
     """A row for each command that was followed: time_s, when the tick begins that applied it;
     received_us, from its reception to the step; stamped_us, from its stamp to the beginning of the
     tick, nan where it has none; tick, its number."""
-    answers: dict[str, float | None]
-    """samples_answered_percent, the share of the samples after which a new command was received,
-    and command_age_mean_s, for which ticks have held theirs; None without any."""
+    numbers: dict[str, Any]  # all in all: flat, units in the names, None for what is not known
     missing: list[str]  # what is not known, and why
-
-    def numbers(self) -> dict[str, Any]:
-        """Sum it up: flat, units in the names, None for what is not known."""
-        delays = {
-            "period": require("pandas").Series(self.period_us, dtype=float),
-            "command_latency": self.commands.received_us,
-            "command_stamp_to_tick": self.commands.stamped_us,
-        }
-        found: dict[str, Any] = {}
-        for name, values in delays.items():
-            described = values.describe([0.99, 0.999]).dropna()
-            found |= {f"{name}_{word}_us": described.get(key) for key, word in STATISTICS.items()}
-        return found | {"commands_followed": len(self.commands), **self.answers}
 
 
 def measure(recording: Recording) -> Timing:
     """Measure a recording."""
-    pandas, missing = require("pandas"), list[str]()
     time, received_ns, ticks = recording.time_ns, recording.received_ns, recording.ticks
-    spacing, period = np.diff(time), recording.period_ns
+    spacing, period, missing = np.diff(time), recording.period_ns, list[str]()
     period_us = np.diff(received_ns)[spacing == period] / 1e3
     if np.any(period_us < 0.0):
         missing.append("receptions are not in the order of the samples: periods are as recorded")
-    lost = [
+    lost_ns = [
         time[row] + period * np.arange(1, round(spacing[row] / period))
         for row in np.flatnonzero(spacing > period).tolist()
     ]
     # Simulated time per received time, over pieces of the run.
-    pieces = min(60, len(time) - 1)
-    rows = np.unique(np.linspace(0, len(time) - 1, pieces + 1).round().astype(int))
+    rows = np.unique(np.linspace(0, len(time) - 1, min(61, len(time))).round().astype(int))
     with np.errstate(divide="ignore", invalid="ignore"):
         pace = np.diff(time[rows]) / np.diff(received_ns[rows])
     middle = 0.5 * (time[rows][1:] + time[rows][:-1]) / NANOSECONDS
@@ -102,22 +81,28 @@ def measure(recording: Recording) -> Timing:
         missing.append("no commands are recorded: their latency is not known")
     elif commands.empty:
         missing.append("no recorded command is found among the applied torques")
-    late, first = received_ns - time, int(received_ns[0])
+    first = int(received_ns[0])
     reports = [values for _, values in recording.reports]
-    reported = pandas.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
-    at = [when_ns - first for when_ns, _ in recording.reports]
-    since = (received_ns - first).astype(float)
-    reported.insert(0, "time_s", np.interp(at, since, recording.seconds))
+    reported = pd.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
+    at, since = [when_ns - first for when_ns, _ in recording.reports], received_ns - first
+    reported.insert(0, "time_s", np.interp(at, since.astype(float), recording.seconds))
+    delays = {
+        "period": pd.Series(period_us, dtype=float),
+        "command_latency": commands.received_us,
+        "command_stamp_to_tick": commands.stamped_us,
+    }
+    numbers = {"commands_followed": len(commands), **_measure_answers(recording, commands)}
+    for name, values in delays.items():
+        described = values.describe([0.99, 0.999]).dropna()
+        numbers |= {f"{name}_{word}_us": described.get(key) for key, word in STATISTICS.items()}
     return Timing(
-        late_us=(late - late.min()) / 1e3,
         period_us=period_us,
-        nominal_us=period / 1e3,
-        lost_s=np.concatenate([np.empty(0), *lost]) / NANOSECONDS,
+        lost_s=np.concatenate([np.empty(0), *lost_ns]) / NANOSECONDS,
         gaps_s=ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]] / NANOSECONDS,
-        pace=pandas.Series(pace[good], middle[good]),
+        pace=pd.Series(pace[good], middle[good]),
         reported=reported,
         commands=commands,
-        answers=_measure_answers(recording, commands),
+        numbers=numbers,
         missing=missing,
     )
 
@@ -128,8 +113,7 @@ def pair_commands(recording: Recording) -> DataFrame:
     Each has the first tick of its values from its reception on, or from a tick before it: the
     recorder may have received it a little later than the simulator.
     """
-    pandas, legs = require("pandas"), ["1", "2", "3"]
-    commands, ticks = recording.commands, recording.ticks
+    legs, commands, ticks = ["1", "2", "3"], recording.commands, recording.ticks
     limit = recording.scene.torque_limit
     most = np.inf if limit is None else limit
     asked, applied = (np.clip(each.torque, -most, most) + 0.0 for each in (commands, ticks))
@@ -137,14 +121,13 @@ def pair_commands(recording: Recording) -> DataFrame:
     # When the steps of ticks began, interpolated between the receptions of samples.
     first = recording.received_ns[0]
     since = (recording.received_ns - first).astype(float)
-    passed = np.interp(ticks.end_ns, recording.time_ns, since)
-    step_ns = first + passed.astype(np.int64)
-    left = pandas.DataFrame(asked[new], columns=legs)
+    step_ns = first + np.interp(ticks.end_ns, recording.time_ns, since).astype(np.int64)
+    left = pd.DataFrame(asked[new], columns=legs)
     left = left.assign(command=new, ns=commands.received_ns[new] - ticks.period_ns)
-    right = pandas.DataFrame(applied[changed], columns=legs)
+    right = pd.DataFrame(applied[changed], columns=legs)
     right = right.assign(tick=changed, ns=step_ns[changed])
     left, right = (table.sort_values("ns", kind="stable") for table in (left, right))
-    found = pandas.merge_asof(left, right, on="ns", by=legs, direction="forward")
+    found = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
     # Commands are in order of reception: the last of those that share a tick is the one it took.
     found = found.dropna(subset="tick").sort_values("command").drop_duplicates("tick", keep="last")
     command, tick = (found[name].to_numpy(dtype=int) for name in ("command", "tick"))
@@ -156,8 +139,7 @@ def pair_commands(recording: Recording) -> DataFrame:
         "stamped_us": np.where(stamps > 0, age, np.nan),
         "tick": tick,
     }
-    paired: DataFrame = pandas.DataFrame(columns)
-    return paired
+    return pd.DataFrame(columns)
 
 
 def _changes(torque: Array) -> NDArray[np.intp]:

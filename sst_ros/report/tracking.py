@@ -3,24 +3,35 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sst_ros.control.tracking import Track, TrackingMetrics, track_of
+from sst_ros.control.tracking import Track, TrackingMetrics, track_of, tracking_table
 from sst_ros.errors import InputError, SingularConfiguration
+from sst_ros.host.output import write_into
 from sst_ros.mechanism import continuation
-from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import (
+    Array,
+    Geometry,
+    angle_between,
+    quaternion_of,
+    rotation_matrix,
+)
+from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, places
-from sst_ros.state import NANOSECONDS, Array
+from sst_ros.state import NANOSECONDS
 
 KEYS = (REFERENCE.key, TRACKING_ERROR.key)
+DRAWN = ("tracking", "tracking_error", "control_torques")
+"""Pictures of `plot` that the report has, too."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +40,7 @@ class TrackedRun:
 
     recording: Recording
     track: Track  # reference, tracking error and torques
-    rows: np.ndarray[Any, np.dtype[np.intp]]  # which samples of the recording these are, (n,)
+    rows: NDArray[np.intp]  # which samples of the recording these are, (n,)
 
     @property
     def metrics(self) -> TrackingMetrics:
@@ -50,14 +61,12 @@ class TrackedRun:
         """
         run, gamma = self.recording, self.track.gamma
         geometry, measured = Geometry.of(run.scene), run.quaternion[self.rows]
-        try:
-            if np.isfinite(measured[0]).all():
+        if np.isfinite(measured[0]).all():
+            with suppress(SingularConfiguration):
                 first = rotation_matrix(measured[0])
                 start = continuation.advance(geometry, first, run.gamma[self.rows[0]], gamma[0])
                 branch = continuation.follow(geometry, gamma, start)
                 return angle_between(quaternion_of(branch.rotation), measured)
-        except SingularConfiguration:
-            pass
         return np.full(len(gamma), np.nan)
 
 
@@ -80,8 +89,6 @@ def read_tracking(path: Path) -> TrackedRun:
 
 def of(run: Recording) -> TrackedRun | None:
     """Return reference and tracking error of a run; None where fewer than two samples have one."""
-    if not all(key in run.signals.topic_series for key in KEYS):
-        return None
     series = [run.signals.topic_series[key] for key in KEYS]
     at = [places(one.stamp_ns, run.time_ns + run.start_ns) for one in series]
     rows = np.flatnonzero(np.min(at, axis=0) >= 0)
@@ -97,3 +104,22 @@ def of(run: Recording) -> TrackedRun | None:
     seconds = times[:, None] / NANOSECONDS
     columns = seconds, reference[:, :6], error[:, :6], feedforward, feedback, torque
     return TrackedRun(run, track_of(np.hstack(columns)), rows)
+
+
+def write_tracking_report(bag: Path, out: Path) -> str:
+    """Evaluate how a recorded run followed its reference: write table and pictures into `out`.
+
+    The table is returned. Raises InputError as `read_tracking`, or where `out` cannot be written.
+    """
+    tracked = read_tracking(bag)
+    title, error = (
+        f"Tracking of {tracked.recording.scene.name}, from {bag}",
+        tracked.orientation_error,
+    )
+    text = f"{title}\n\n{tracking_table(tracked.metrics)}"
+    if np.isfinite(error).any():
+        text += f"\n{'orientation, largest [rad]':26}{np.nanmax(error):10.3e}\n"
+    with write_into(out, "report"):
+        (out / "tracking.txt").write_text(text, encoding="utf-8")
+    pictures.draw_run(tracked.recording.signals, out, DRAWN, ["png"])
+    return text

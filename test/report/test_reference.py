@@ -16,7 +16,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.recording import recording
 from sst_ros.report import reference
-from sst_ros.report.run import summarise
+from sst_ros.report.run import evaluate_run
 from sst_ros.scene import scene, yaml_document
 from sst_ros.scene.loads import Actuators, Moment
 
@@ -133,9 +133,8 @@ def test_example_1_keeps_to_its_centre(read, bags):
 
 def judged(run):
     """The comparisons and the notes of a report."""
-    integration, ideal = reference.integration(run), reference.ideal(run)
-    said = summarise(run, integration, ideal)
-    return integration, ideal, " ".join(said["notes"])
+    _, _, integration, ideal, summary = evaluate_run(run)
+    return integration, ideal, " ".join(summary["notes"])
 
 
 @pytest.fixture
