@@ -135,10 +135,7 @@ class ActuatorSpaceMap:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         rows = zip(geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True)
-        self._legs = [
-            kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1], 0.0, 0.0, 0.0, 0.0, 0.0, None)
-            for w, v, e in rows
-        ]
+        self._legs = [kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1]) for w, v, e in rows]
         self._actuators = compile_program(trace(self._of_star, _STAR))
         self._star = compile_program(trace(self.star_accelerations, _MOVING))
         # sin(mu) and beta [rad] of the legs, six numbers, and det J2, of a quaternion.

@@ -326,21 +326,16 @@ class Slots:
         return [f"c{slot} = p[{slot}]" for slot in sorted(used)]
 
 
-def trace(function: Callable[..., Sequence[Value]], inputs: Sequence[str]) -> Program:
-    """Run `function` on one expression per input and return what it does."""
-    return with_jacobian(function, inputs, ())
-
-
-def with_jacobian(
+def trace(
     function: Callable[..., Sequence[Value]],
     inputs: Sequence[str],
-    by: Sequence[str],
+    by: Sequence[str] = (),
     along: Sequence[str] = (),
 ) -> Program:
-    """Trace `function` and its exact derivatives; outputs are f, then df/dx for each x in `by`.
+    """Run `function` on one expression per input and return what it does, then df/dx for x in `by`.
 
-    With `along` the last ones are the derivative along one direction, which is given by further
-    inputs, d_x for each x in `along`.
+    With `along` the last outputs are the derivative along one direction, which is given by further
+    inputs, d_x for each x in `along`. Derivatives are exact.
     """
     graph = Graph()
     names = (*inputs, *(f"d_{name}" for name in along))

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of a run from the paper's quantities: its begin, and its derivative by Eqs. 1 to 92.
 
-The derivative is the paper's own, in plain Python. It has the inputs and outputs of the traced one
-(quaternion, body rate, work; drive), so that the same integrators step it. Each evaluation solves
-Eq. 90 for gamma_ddot and takes omega_dot from Eq. 40.
+The derivative is the paper's own, in plain Python. Each evaluation solves Eq. 90 for gamma_ddot
+and takes omega_dot from Eq. 40.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.generic_math import quaternion_rate
+from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
 
@@ -27,8 +27,6 @@ NO_ASSEMBLY, NO_RATE = -1, -2
 
 _BLOCK = 2000
 """Starts solved at once: their arrays fit the cache."""
-
-REFUSED = "the equations of the paper have no such term: use equations = quaternion"
 
 
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
@@ -126,40 +124,38 @@ def accelerate_by_paper(
     return np.asarray(rotation.T @ omega_dot), np.asarray(gamma_dot)
 
 
-class VirtualWorkDerivative:
-    """Derivative of a scene's state by Eqs. 1 to 92.
+def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
+    """Return the derivative of a scene's state by Eqs. 1 to 92, as integrators take it.
 
-    It may have bodies, payload, rotors, torque limits and an external moment, as the paper has them
-    or in its inertias and n_ext; InputError names each other term.
+    Its inputs are time, quaternion, body rate [rad/s], work [J], torques [N m], and a moment on the
+    star in {B} [N m] if it comes from a topic. In a singular posture it raises ArithmeticError.
+
+    The scene may have bodies, payload, rotors, torque limits and an external moment, as the paper
+    has them or in its inertias and n_ext; InputError names each other term.
     """
+    lag = scene.actuators and scene.actuators.time_constant
+    end, terms = scene.stroke.at_end, ("gravity", "friction", "springs")
+    refused = "the equations of the paper have no such term: use equations = quaternion"
+    refuse_unless(
+        scene.name,
+        *((name, getattr(scene, name), not getattr(scene, name), refused) for name in terms),
+        ("actuators.time_constant", lag, not scene.lags, refused),
+        ("stroke.at_end", end, end != "elastic", refused),
+    )
+    mechanism = virtual_work.Mechanism.of(scene)
+    value = scene.moment.value if scene.moment is not None else None
+    constant = np.array(value or (0.0, 0.0, 0.0))
 
-    def __init__(self, scene: Scene) -> None:
-        lag = scene.actuators and scene.actuators.time_constant
-        end, terms = scene.stroke.at_end, ("gravity", "friction", "springs")
-        refuse_unless(
-            scene.name,
-            *((name, getattr(scene, name), not getattr(scene, name), REFUSED) for name in terms),
-            ("actuators.time_constant", lag, not scene.lags, REFUSED),
-            ("stroke.at_end", end, end != "elastic", REFUSED),
-        )
-        self._mechanism = virtual_work.Mechanism.of(scene)
-        value = scene.moment.value if scene.moment is not None else None
-        self._moment = np.array(value or (0.0, 0.0, 0.0))
-
-    def __call__(self, _: float, *inputs: float) -> tuple[float, ...]:
-        """Differentiate quaternion, body rate [rad/s] and work [J] by time.
-
-        Torques [N m] follow, and a moment on the star in {B} [N m] if it comes from a topic. In a
-        singular posture ArithmeticError is raised.
-        """
-        x, y, z, w, *rate = inputs[:7]
-        torque = np.array(inputs[8:11])
-        moment = self._moment + inputs[11:14] if len(inputs) > 11 else self._moment
+    def derivative(_: float, *inputs: float) -> tuple[float, ...]:
+        (x, y, z, w, *rate), torque = inputs[:7], np.array(inputs[8:11])
+        moment = constant + inputs[11:14] if len(inputs) > 11 else constant
         try:
-            found = accelerate_by_paper(self._mechanism, inputs[:7], torque, moment)
+            found = accelerate_by_paper(mechanism, inputs[:7], torque, moment)
         except SingularConfiguration as error:
             raise ArithmeticError(str(error)) from None
         acceleration, gamma_dot = found
-        turning = quaternion_rate((x, y, z, w), (rate[0], rate[1], rate[2]))
-        omega = rotation_matrix(np.array(inputs[:4])) @ rate
+        turning = quaternion_rate((x, y, z, w), triple(rate))
+        omega = rotation_matrix(inputs[:4]) @ rate
         return (*turning, *acceleration.tolist(), float(torque @ gamma_dot + moment @ omega))
+
+    return derivative

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from sst_ros.dynamics.model import ElasticStops, Leg, LegLoads, Model, model_of
+from sst_ros.dynamics.model import ElasticStops, Leg, Model, model_of
 from sst_ros.mechanism.generic_math import (
     ZERO,
     Quadruple,
@@ -116,8 +116,13 @@ def balance(
     """
     rows = rotation_rows(q)
     inertia: tuple[Scalar, ...] = model.star
-    force = _on_star(model, rows, rate, moment)
+    force = cross3(triple(dot3(row, rate) for row in symmetric_rows(model.star)), rate)
     field = field_of(model, rows)
+    if model.gravity is not None:
+        force = add(force, cross3(model.weight, field))
+    for external in (model.moment, moment):
+        if external is not None:
+            force = add(force, rotate_back(rows, external))
     jacobian = []
     for leg, drive in zip(model.legs, torque, strict=True):
         at = leg_motion(leg, rows, rate)
@@ -138,12 +143,11 @@ def balance(
         force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
         toward_a = multiply(c_inertia, g)
         toward_gamma = axpy(a_inertia, g, c_inertia, p)
-        if leg.loads is not None:
-            at_gamma, at_mu, at_beta = joint_torques(at, leg.loads, field)
-            force_gamma = force_gamma - at_gamma
-            if not (type(at_mu) is float and at_mu == 0.0):
-                force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
-            force = triple(f + at_beta * b for f, b in zip(force, at.b, strict=True))
+        at_gamma, at_mu, at_beta = joint_torques(at, field)
+        force_gamma = force_gamma - at_gamma
+        if not (type(at_mu) is float and at_mu == 0.0):
+            force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
+        force = triple(f + at_beta * b for f, b in zip(force, at.b, strict=True))
         force = triple(
             f - force_a * along - force_gamma * across
             for f, along, across in zip(force, p, g, strict=True)
@@ -158,13 +162,9 @@ def balance(
 
 def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
-    angles, rates = [], []
-    for at in leg_motions(model, state):
-        angles.append([joint_angle(at, kind) for kind in range(3)])
-        rates.append([joint_rate(at, kind) for kind in range(3)])
-    gamma, mu, beta = zip(*angles, strict=True)
-    gamma_dot, mu_dot, beta_dot = zip(*rates, strict=True)
-    return Joints(gamma, mu, beta, gamma_dot, mu_dot, beta_dot)
+    parts = [(part, kind) for part in (joint_angle, joint_rate) for kind in range(3)]
+    of_legs = [[part(at, kind) for part, kind in parts] for at in leg_motions(model, state)]
+    return Joints(*zip(*of_legs, strict=True))
 
 
 def leg_motions(model: Model, state: Sequence[Scalar]) -> Iterator[LegMotion]:
@@ -200,17 +200,6 @@ def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
     return a_rest, at.a_dot * (2.0 * at.a * at.gamma_dot - along) / at.u
 
 
-def _on_star(model: Model, rows: Rows, rate: Triple, moment: Triple | None) -> Triple:
-    """Moments on the star in {E}: gyroscopic, weight, external."""
-    total = cross3(triple(dot3(row, rate) for row in symmetric_rows(model.star)), rate)
-    if model.gravity is not None:
-        total = add(total, cross3(model.weight, field_of(model, rows)))
-    for external in (model.moment, moment):
-        if external is not None:
-            total = add(total, rotate_back(rows, external))
-    return total
-
-
 def field_of(model: Model, rows: Rows) -> Triple:
     """Gravity in {E}."""
     return ZERO if model.gravity is None else rotate_back(rows, model.gravity)
@@ -239,8 +228,20 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     field = field_of(model, rotation_rows((x, y, z, w)))
     total: Scalar = 0.0 if model.gravity is None else -dot3(model.weight, field)
     for at in leg_motions(model, state):
-        if at.leg.loads is not None:
-            total = total + spring_and_weight_energy(at, at.leg.loads, field)
+        leg, own = at.leg, 0.0
+        for kind, spring in enumerate(leg.springs):
+            if spring is not None:
+                stretch = joint_angle(at, kind) - spring.rest
+                own = own + 0.5 * spring.stiffness * stretch * stretch
+        if leg.stops is not None:
+            gamma = joint_angle(at, 0)
+            for depth in (positive(-gamma), positive(gamma - leg.stops.arc)):
+                own = own + 0.5 * leg.stops.stiffness * depth * depth
+        if any(leg.drive) or any(leg.link):
+            first, second = _directions(at)
+            own = own - dot3(_combine(leg.drive, *first), field)
+            own = own - dot3(_combine(leg.link, *second), field)
+        total = total + own
     return total
 
 
@@ -257,8 +258,16 @@ def power(
     total: Scalar = 0.0
     for at, drive in zip(leg_motions(model, state), acting, strict=True):
         total = total + drive * at.gamma_dot
-        if at.leg.loads is not None:
-            total = total - dissipation(at, at.leg.loads)
+        leg, lost = at.leg, 0.0
+        for kind, friction in enumerate(leg.friction):
+            if friction is not None:
+                lost = lost + friction_torque(friction, joint_rate(at, kind)) * joint_rate(at, kind)
+        if leg.stops is not None and leg.stops.damping:
+            gamma, speed = joint_angle(at, 0), at.gamma_dot
+            elastic = leg.stops._replace(damping=0.0)
+            excess = stop_torque(elastic, gamma, speed) - stop_torque(leg.stops, gamma, speed)
+            lost = lost + excess * speed
+        total = total - lost
     for external in (model.moment, moment):
         if external is not None:
             total = total + dot3(external, triple(dot3(row, (wx, wy, wz)) for row in rows))
@@ -269,54 +278,29 @@ def power(
 # Python's 0.0, which leaves nothing behind in a traced program.
 
 
-def joint_torques(at: LegMotion, loads: LegLoads, field: Triple) -> Triple:
+def joint_torques(at: LegMotion, field: Triple) -> Triple:
     """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
+    leg = at.leg
     friction = triple(
         0.0 if one is None else -friction_torque(one, joint_rate(at, kind))
-        for kind, one in enumerate(loads.friction)
+        for kind, one in enumerate(leg.friction)
     )
     springs = triple(
         0.0 if spring is None else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
-        for kind, spring in enumerate(loads.springs)
+        for kind, spring in enumerate(leg.springs)
     )
-    at_gamma, at_mu = _weight(loads, at, field)
-    if loads.stops is not None:
-        at_gamma = at_gamma + stop_torque(loads.stops, joint_angle(at, 0), at.gamma_dot)
+    at_gamma: Scalar = 0.0
+    at_mu: Scalar = 0.0
+    if any(leg.drive) or any(leg.link):  # weight: moments about w_k and -r_k
+        of_drive, of_link = _directions(at)
+        on_link = cross3(_combine(leg.link, *of_link), field)
+        on_drive = cross3(_combine(leg.drive, *of_drive), field)
+        at_gamma, at_mu = dot3(add(on_link, on_drive), at.axis), -dot3(on_link, of_drive[0])
+    if leg.stops is not None:
+        at_gamma = at_gamma + stop_torque(leg.stops, joint_angle(at, 0), at.gamma_dot)
     rubbing = zip(friction, springs, strict=True)
     first, second, third = (rub + spring for rub, spring in rubbing)
     return first + at_gamma, second + at_mu, third
-
-
-def spring_and_weight_energy(at: LegMotion, loads: LegLoads, field: Triple) -> Scalar:
-    """Energy [J] in springs, elastic stops and the weight of the links."""
-    total: Scalar = 0.0
-    for kind, spring in enumerate(loads.springs):
-        if spring is not None:
-            stretch = joint_angle(at, kind) - spring.rest
-            total = total + 0.5 * spring.stiffness * stretch * stretch
-    if loads.stops is not None:
-        gamma = joint_angle(at, 0)
-        for depth in (positive(-gamma), positive(gamma - loads.stops.arc)):
-            total = total + 0.5 * loads.stops.stiffness * depth * depth
-    if any(loads.drive) or any(loads.link):
-        first, second = _directions(at)
-        total = total - dot3(_combine(loads.drive, *first), field)
-        total = total - dot3(_combine(loads.link, *second), field)
-    return total
-
-
-def dissipation(at: LegMotion, loads: LegLoads) -> Scalar:
-    """Power [W] that friction and the damping of elastic stops take out."""
-    total: Scalar = 0.0
-    for kind, friction in enumerate(loads.friction):
-        if friction is not None:
-            total = total + friction_torque(friction, joint_rate(at, kind)) * joint_rate(at, kind)
-    if loads.stops is not None and loads.stops.damping:
-        gamma, speed = joint_angle(at, 0), at.gamma_dot
-        elastic = loads.stops._replace(damping=0.0)
-        excess = stop_torque(elastic, gamma, speed) - stop_torque(loads.stops, gamma, speed)
-        total = total + excess * speed
-    return total
 
 
 def friction_torque(friction: Friction, v: Scalar) -> Scalar:
@@ -360,16 +344,6 @@ def direction_of(at: LegMotion, kind: int) -> tuple[Scalar, Scalar]:
         return sqrt(at.u), at.a
     # r.(t x s) and r.s with s = (0, 0, 1).
     return at.p[0] * at.along[1] - at.p[1] * at.along[0], at.p[2]
-
-
-def _weight(loads: LegLoads, leg: LegMotion, field: Triple) -> tuple[Scalar, Scalar]:
-    """Torques of the links' weight at gamma and mu: moments about w_k and -r_k."""
-    if not (any(loads.drive) or any(loads.link)):
-        return 0.0, 0.0
-    first, second = _directions(leg)
-    on_link = cross3(_combine(loads.link, *second), field)
-    on_drive = cross3(_combine(loads.drive, *first), field)
-    return dot3(add(on_link, on_drive), leg.axis), -dot3(on_link, first[0])
 
 
 def _directions(leg: LegMotion) -> tuple[Rows, Rows]:

@@ -32,34 +32,28 @@ class ElasticStops(NamedTuple):
     damping: float
 
 
-class LegLoads(NamedTuple):
-    """Loads of one leg; None or zero where the scene has none."""
-
-    friction: tuple[Friction | None, Friction | None, Friction | None]  # of gamma, mu, beta
-    springs: tuple[JointSpring | None, JointSpring | None, JointSpring | None]
-    drive: Triple  # mass times centre of the actuated link in {1k} [kg m]
-    link: Triple  # mass times centre of the intermediate link in {2k} [kg m]
-    stops: ElasticStops | None
-
-
 class Leg(NamedTuple):
-    """Constants of one leg: axis w and start v of the arc in {B}, axis (e0, e1, 0) in {E}.
+    """Constants of one leg and its loads: None or zero where the scene has none.
 
     A = A0 + A2 a^2 - 2 Iyz a sqrt(u) and C = Ixz a/sqrt(u) - Ixy, with A0 = I_a(zz) + Iyy - Ixx and
     A2 = Izz - Iyy + Ixx.
     """
 
-    w: Triple
-    v: Triple
+    w: Triple  # axis of the arc in {B}
+    v: Triple  # its start
     across: Triple
-    e0: float
+    e0: float  # axis (e0, e1, 0) in {E}
     e1: float
-    a0: float
-    a2: float
-    ixy: float
-    ixz: float
-    iyz: float
-    loads: LegLoads | None
+    a0: float = 0.0
+    a2: float = 0.0
+    ixy: float = 0.0
+    ixz: float = 0.0
+    iyz: float = 0.0
+    friction: tuple[Friction | None, ...] = (None, None, None)  # of gamma, mu, beta
+    springs: tuple[JointSpring | None, ...] = (None, None, None)
+    drive: Triple = ZERO  # mass times centre of the actuated link in {1k} [kg m]
+    link: Triple = ZERO  # mass times centre of the intermediate link in {2k} [kg m]
+    stops: ElasticStops | None = None
 
 
 class Model(NamedTuple):
@@ -80,22 +74,33 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
     """
     geometry, star, legs = geometry or Geometry.of(scene), entries_of(scene.star.inertia), []
     carried: list[Star | Payload] = [scene.star]
-    damping = damping_of(scene.stroke)
+    damping, kinds = damping_of(scene.stroke), ("gamma", "mu", "beta")
     if scene.payload is not None:
         carried.append(scene.payload)
         star = [part + own for part, own in zip(star, scene.payload.entries, strict=True)]
     for k in range(3):
         w, v, e = (tuple(geometry.of_leg(name, k)) for name in ("w", "v", "e"))
-        drive_zz = entries_of(scene.actuated_links[k].inertia)[2]
+        bodies = scene.actuated_links[k], scene.intermediate_links[k]
+        drive_zz = entries_of(bodies[0].inertia)[2]
         if scene.actuators is not None:
             gear = scene.actuators.gear_ratio
             drive_zz = drive_zz + gear * gear * scene.actuators.rotor_inertia
-        xx, yy, zz, xy, xz, yz = entries_of(scene.intermediate_links[k].inertia)
-        constants = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
+        xx, yy, zz, xy, xz, yz = entries_of(bodies[1].inertia)
         turning = zip(star, PLACES, strict=True)
         star = [part + xx * (float(i == j) - e[i] * e[j]) for part, (i, j) in turning]
-        loads = _loads(scene, geometry, k, damping)
-        legs.append(Leg(w, v, cross3(w, v), e[0], e[1], *constants, loads))
+        leg = Leg(w, v, cross3(w, v), e[0], e[1], drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
+        springs = ([x for x in scene.springs if x.joint == f"{kind}_{k + 1}"] for kind in kinds)
+        leg = leg._replace(
+            friction=tuple(getattr(scene.friction, kind, None) for kind in kinds),
+            springs=tuple(map(_join, springs)),
+        )
+        if scene.gravity is not None:
+            drive, link = (multiply(body.mass, body.centre) for body in bodies)
+            leg = leg._replace(drive=drive, link=link)
+        if scene.stroke.stiffness is not None:
+            stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
+            leg = leg._replace(stops=stops)
+        legs.append(leg)
     return Model(
         star=tuple(star),
         legs=(legs[0], legs[1], legs[2]),
@@ -104,26 +109,6 @@ def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
         moment=None if scene.moment is None else scene.moment.value,
         time_constant=None if scene.actuators is None else scene.actuators.time_constant,
     )
-
-
-def _loads(scene: Scene, geometry: Geometry, k: int, damping: Any) -> LegLoads | None:
-    """Collect the loads of leg k, whose stops have this damping; None where it has none."""
-    kinds = ("gamma", "mu", "beta")
-    friction = triple(getattr(scene.friction, kind, None) for kind in kinds)
-    springs = triple(
-        _join([one for one in scene.springs if one.joint == f"{kind}_{k + 1}"]) for kind in kinds
-    )
-    drive = link = ZERO
-    if scene.gravity is not None:
-        bodies = scene.actuated_links[k], scene.intermediate_links[k]
-        drive, link = (multiply(body.mass, body.centre) for body in bodies)
-    stops = None
-    if scene.stroke.stiffness is not None:
-        stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
-    heavy = any(x.any() if isinstance(x, np.ndarray) else x for x in (*drive, *link))
-    if not (any(friction) or any(springs) or heavy or stops):
-        return None
-    return LegLoads(friction, springs, drive, link, stops)
 
 
 def damping_of(stroke: Stroke) -> Any:

@@ -25,7 +25,6 @@ from sst_ros.dynamics.expression import (
     mark_present,
     number_constants,
     trace,
-    with_jacobian,
 )
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.errors import refuse_unless
@@ -174,7 +173,7 @@ class ODE:
     @cached_property
     def jacobian(self) -> Program:
         """The derivative, and its derivatives by t and by each number of the state."""
-        return with_jacobian(self._of_numbers, self._inputs, ("t", *self.state))
+        return trace(self._of_numbers, self._inputs, ("t", *self.state))
 
     @cached_property
     def directional(self) -> Program:
@@ -184,7 +183,7 @@ class ODE:
         """
         state = self.state[:-1] if self._work else self.state
         along = state if self._torque is None else (*state, "t")
-        return with_jacobian(self._of_numbers, self._inputs, (), along)
+        return trace(self._of_numbers, self._inputs, (), along)
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
@@ -204,7 +203,7 @@ class ODE:
     def linearised_by_torque(self) -> Function:
         """The derivative, and its derivatives by t, the state and the torques of the drive."""
         by = ("t", *self.state, *TORQUE)
-        return compile_program(with_jacobian(self.derivative, self._inputs, by))
+        return compile_program(trace(self.derivative, self._inputs, by))
 
     @property
     def joints(self) -> Program:

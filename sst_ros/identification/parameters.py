@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_for_arrays, mark_present, with_jacobian
+from sst_ros.dynamics.expression import compile_for_arrays, mark_present, trace
 from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.mechanism import kinematics
@@ -234,7 +234,7 @@ class Regressor:
 
         symbols = tuple(f"p{i}" for i in range(len(traced)))
         inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
-        self._torques = compile_for_arrays(with_jacobian(torques, inputs, symbols))
+        self._torques = compile_for_arrays(trace(torques, inputs, symbols))
         self._traced = [self.names.index(name) for name in traced]
         self._springs = np.array([name.startswith("springs") for name in self.names])
 

@@ -35,7 +35,7 @@ from sst_ros.dynamics.expression import (
     compile_for_arrays,
     compile_program,
     mark_present,
-    with_jacobian,
+    trace,
 )
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
@@ -258,7 +258,7 @@ class Sensitivities:
 
         varied = tuple(f"p{i}" for i in range(len(self.names)))
         inputs, by = (*self._state, *TORQUE, *varied), (*self._state, *varied)
-        return compile_program(with_jacobian(derivative, inputs, by))
+        return compile_program(trace(derivative, inputs, by))
 
     @cached_property
     def _observables(self) -> Callable[..., tuple[Any, ...]]:
@@ -276,7 +276,7 @@ class Sensitivities:
                 *(radius * row[2] for row in rows),
             )
 
-        return compile_for_arrays(with_jacobian(function, QUATERNION, QUATERNION))
+        return compile_for_arrays(trace(function, QUATERNION, QUATERNION))
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:
         """Return the initial state, and its derivatives by the parameters, shape (m, p)."""

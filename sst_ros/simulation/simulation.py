@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.initial_state import VirtualWorkDerivative, start_of
+from sst_ros.dynamics.initial_state import derive_by_paper, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, ode_with_work
 from sst_ros.errors import Diverged, StepBudgetExceeded, refuse_unless
 from sst_ros.host.compiled_module import numba_version
@@ -132,7 +132,7 @@ class Simulation:
              "needs an explicit integrator and compiled = False"),
         )  # fmt: skip
         self.scene = scene = scene_of(scene)
-        derivative = VirtualWorkDerivative(scene) if equations == "virtual_work" else None
+        derivative = derive_by_paper(scene) if equations == "virtual_work" else None
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
         self.compiled = compiled and numba_version() is not None

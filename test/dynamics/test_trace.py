@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sst_ros.dynamics.expression import compile_program, trace, with_jacobian
+from sst_ros.dynamics.expression import compile_program, trace
 from sst_ros.mechanism.generic_math import atan2, exp, positive, sqrt, tanh
 
 FINITE = st.floats(-10.0, 10.0)
@@ -46,7 +46,7 @@ def test_a_program_gives_the_bits_of_its_function(x, y):
 
 @given(FINITE, FINITE.filter(lambda y: abs(y - 1.0) > 1e-6 and abs(y - 3.0) > 1e-6))
 def test_derivatives_equal_the_complex_step(x, y):
-    program = with_jacobian(everything, ("x", "y"), ("x", "y"))
+    program = trace(everything, ("x", "y"), ("x", "y"))
     values = compile_program(program)(x, y)
     step = 1e-200
     by_x = [np.imag(f) / step for f in everything(complex(x, step), complex(y))]

@@ -133,7 +133,7 @@ def test_two_ways_to_say_the_same_move_alike(pair):
 def test_elastic_stops_push_only_beyond_the_stroke_and_never_pull():
     sample = seeded_samples(9, 1)[0]
     scene = replace(sample.scene, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
-    stops = model_of(scene).legs[0].loads.stops
+    stops = model_of(scene).legs[0].stops
     assert stop_torque(stops, 0.5 * stops.arc, 1.0) == 0.0
     assert stop_torque(stops, -0.01, 0.0) == pytest.approx(1.0)
     assert stop_torque(stops, stops.arc + 0.01, 0.0) == pytest.approx(-1.0)
