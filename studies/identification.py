@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.control.reference_motions import reference_motion
-from sst_ros.demo import CONTROL_RATE, FOLLOWED, HOLD_S, empty_bag, follow
+from sst_ros.demo import FOLLOWED, empty_bag, follow
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.plot.style import BLUE, VERMILION, hide_zeros, legend, save_figure, stack, styled
@@ -109,12 +108,9 @@ def compare(out: Path, identified: str) -> str:
 
 def _follow(out: Path, model: str) -> None:
     """Follow the motion of a model's scene on the plant, and record it in a folder of its name."""
-    path = out / f"{model}.yaml"
-    seconds = reference_motion(load(path)).duration + HOLD_S
-    seconds = math.ceil(seconds * CONTROL_RATE) / CONTROL_RATE
-    bag = empty_bag(out / model)
-    print(f"{model}: following for {seconds:g} s", flush=True)
-    follow(str(out / "plant.yaml"), bag, MODE, seconds, model=str(path))
+    print(f"following {model}", flush=True)
+    bag, path = empty_bag(out / model), out / f"{model}.yaml"
+    follow(str(out / "plant.yaml"), bag, MODE, model=str(path))
 
 
 def main(words: Sequence[str] | None = None) -> int:

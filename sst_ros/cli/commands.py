@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sst_ros.errors import InputError, Problem, SstError, printable, suggestion
+from sst_ros.errors import SstError, printable, refuse_unless, suggestion
 from sst_ros.extras import explanation, require
 from sst_ros.host.output import require_free
 from sst_ros.version import VERSION
@@ -27,11 +27,9 @@ PROGRAM = "sst-ros"
 
 
 class Arg:
-    """What `argparse.ArgumentParser.add_argument` gets, and what completes it in a shell."""
+    """An argument as argparse takes it, and `module:function` of what completes it in a shell."""
 
-    def __init__(
-        self, name: str, what: str | None = None, *, completer: str = "", **options: Any
-    ) -> None:
+    def __init__(self, name: str, what: str = "", *, completer: str = "", **options: Any) -> None:
         self.name, self.options, self.completer = name, {**options, "help": what}, completer
 
 
@@ -64,13 +62,14 @@ def _out(what: str, default: str) -> tuple[Arg, Arg]:
     return _path("--out", f"{what}; default: {default}"), force
 
 
-def _integer(least: int, most: int, text: str) -> int:
-    if not (text.isdecimal() and least <= int(text) <= most):
-        allowed = f"must be a whole number from {least} to {most}, not {text!r}"
-        raise argparse.ArgumentTypeError(allowed)
-    return int(text)
+def _whole(least: int, most: int, text: str) -> int:
+    if text.isdecimal() and least <= int(text) <= most:
+        return int(text)
+    allowed = f"must be a whole number from {least} to {most}, not {text!r}"
+    raise argparse.ArgumentTypeError(allowed)
 
 
+_port = partial(Arg, type=partial(_whole, 1024, 65535))
 _OF_SCENE = "name of a scene, or path of a .yaml file"
 SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")
@@ -154,12 +153,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
         Arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
-        Arg(
-            "--port",
-            "port, or the next free one",
-            type=partial(_integer, 1024, 65535),
-            default=8080,
-        ),
+        _port("--port", "port, or the next free one", default=8080),
         _flag("--open", "open it, where there is a desktop"),
         needs=("viser",),
         description="Show a running simulator, one that is started for it (--scene), or a bag.",
@@ -224,7 +218,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
         _path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
         Arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
-        Arg("--workers", "threads; default: one a core", type=partial(_integer, 1, 1024)),
+        Arg("--workers", "threads; default: one a core", type=partial(_whole, 1, 1024)),
         _flag("--resume", "compute only the chunks that are missing in --out"),
         description="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
@@ -333,18 +327,12 @@ def free_out(options: argparse.Namespace, default: str | Path) -> Path:
     return require_free(out, options.command, force=getattr(options, "force", False))
 
 
-def refuse(options: argparse.Namespace, option: str, value: object, allowed: str) -> NoReturn:
-    """Raise the error that refuses the value of an option."""
-    raise InputError(options.command, [Problem(option, value, allowed)])
-
-
 def refuse_unknown(
     options: argparse.Namespace, option: str, word: str, known: Sequence[str]
 ) -> None:
     """Refuse a word that is none of those known, and name the nearest."""
-    if word not in known:
-        allowed = f"must be one of {', '.join(known)}{suggestion(word, known)}"
-        refuse(options, option, word, allowed)
+    allowed = f"must be one of {', '.join(known)}{suggestion(word, known)}"
+    refuse_unless(options.command, (option, word, word in known, allowed))
 
 
 def run_command(words: list[str]) -> int:
@@ -359,7 +347,10 @@ def run_command(words: list[str]) -> int:
             traceback.print_exc()
         status, message = failure(error)
         if isinstance(error, OSError):
-            _abandon_stdout()
+            try:
+                print(end="", flush=True)
+            except (OSError, ValueError):  # or Python fails once more when it ends
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         for line in message.splitlines():
             print(f"{PROGRAM}: {printable(line)}", file=sys.stderr)
     return status
@@ -371,12 +362,11 @@ def _run(words: list[str]) -> int:
     if words and words[0] in NODES:
         status: int = function("nodes.process:run")(words)
         return status
-    commands = parser()
-    options, unknown = commands.parse_known_args(words)
+    options, unknown = parser().parse_known_args(words)
     if unknown:
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if options.command is None:
-        commands.print_help()
+        options.parser.print_help()
         return 0
     for module in options.entry.needs:
         require(module)
@@ -384,32 +374,25 @@ def _run(words: list[str]) -> int:
     return done or 0
 
 
-def _abandon_stdout() -> None:
-    """Keep Python from failing once more, when it ends, on a stdout that takes nothing."""
-    try:
-        print(end="", flush=True)
-    except (OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-
-
 def failure(error: BaseException) -> tuple[int, str]:
     """Return the exit status and the message, "" for none."""
     text = " ".join(str(error).split())
-    if isinstance(error, KeyboardInterrupt):
-        return 130, "interrupted"
-    if isinstance(error, BrokenPipeError):
-        return 1, ""
-    if isinstance(error, SstError):
-        return 1, str(error)
-    if isinstance(error, ModuleNotFoundError) and (said := explanation(error)):
-        return 1, said
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename is not None else ""
-        return 1, f"{where}{error.strerror or error}"
-    if isinstance(error, UnicodeError):
-        return 1, f"text cannot be encoded or decoded: {error}"
-    if isinstance(error, MemoryError):
-        return 1, "not enough memory"
+    match error:
+        case KeyboardInterrupt():
+            return 130, "interrupted"
+        case BrokenPipeError():
+            return 1, ""
+        case SstError():
+            return 1, str(error)
+        case ModuleNotFoundError() if said := explanation(error):
+            return 1, said
+        case OSError():
+            where = f"{error.filename}: " if error.filename is not None else ""
+            return 1, f"{where}{error.strerror or error}"
+        case UnicodeError():
+            return 1, f"text cannot be encoded or decoded: {error}"
+        case MemoryError():
+            return 1, "not enough memory"
     if type(error).__module__.partition(".")[0] in ("rclpy", "rosbags"):
         return 1, text
     report = "internal error, please report it with the output of --debug"

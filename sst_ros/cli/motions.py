@@ -12,8 +12,9 @@ from sst_ros.control.plan import examine_motion, plan_json, plan_table, time_sca
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import refuse_unless
 from sst_ros.host.output import require_free, write_into
-from sst_ros.identification.excitation import design
+from sst_ros.identification.excitation import ExcitingMotion, design
 from sst_ros.identification.identify import identify
+from sst_ros.identification.parameters import Identification
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
 from sst_ros.sweeps.engine import connect
@@ -31,9 +32,8 @@ def check_plan(options: argparse.Namespace) -> int:
     refuse_unless("plan check", ("--period", options.period, valid, allowed))
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
-    scene, read_motion = load(options.scene), "recording.recording:read_run_motion"
-    # Only a recorded motion needs rosbags.
-    motion = reference_motion(scene, lambda bag: function(read_motion)(bag))
+    scene, of_bag = load(options.scene), "recording.recording:read_run_motion"  # needs rosbags
+    motion = reference_motion(scene, lambda bag: function(of_bag)(bag))
     plan = examine_motion(motion, scene)
     write = plan_json if options.json else plan_table
     print(write(plan, time_scaling(plan)).rstrip())
@@ -71,32 +71,27 @@ def run_sweep(options: argparse.Namespace) -> None:
 
 def run_identification(options: argparse.Namespace) -> None:
     """Identify a scene from a recorded run, or design a motion that determines its parameters."""
-    designing = options.bag == DESIGN
+    designing, later = options.bag == DESIGN, "must be given after design, and only there"
     ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene", "method")
-    given = {
-        name: value for name in (*ours, *others) if (value := getattr(options, name)) is not None
-    }
-    chosen = {name: given.pop(name) for name in (ours if designing else others) if name in given}
-    absent = f"is no option of identify {DESIGN if designing else 'BAG'}"
-    after = (
-        designing == (options.designed is not None),
-        "must be given after design, and only there",
+    chosen, foreign = (
+        {name: value for name in names if (value := getattr(options, name)) is not None}
+        for names in ((ours, others) if designing else (others, ours))
     )
+    absent = f"is no option of identify {DESIGN if designing else 'BAG'}"
     refuse_unless(
         "identify",
-        *((f"--{name}", value, False, absent) for name, value in given.items()),
-        ("SCENE", options.designed, *after),
+        *((f"--{name}", value, False, absent) for name, value in foreign.items()),
+        ("SCENE", options.designed, designing == (options.designed is not None), later),
     )
     if options.out is not None:
         free_out(options, options.out)
+    found: ExcitingMotion | Identification
     if designing:
-        motion = design(load(options.designed), options.parameters, **chosen)
-        lines, scene = motion.table(), motion.scene
+        found = design(load(options.designed), options.parameters, **chosen)
     else:
         found = identify(options.bag, parameters=options.parameters, **chosen)
-        lines, scene = found.table(), found.scene
-    print(lines, end="")
+    print(found.table(), end="")
     if options.out is not None:
         with write_into(options.out.parent, "identify"):
-            options.out.write_text(dump(scene), encoding="utf-8")
+            options.out.write_text(dump(found.scene), encoding="utf-8")
         print(f"wrote {options.out}")

@@ -6,8 +6,9 @@ from __future__ import annotations
 import argparse
 
 from sst_ros import demo
-from sst_ros.cli.commands import free_out, function, refuse, refuse_unknown
+from sst_ros.cli.commands import free_out, function, refuse_unknown
 from sst_ros.control.law import MODES
+from sst_ros.errors import refuse_unless
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
@@ -62,17 +63,25 @@ def draw_pictures(options: argparse.Namespace) -> int:
 
 def run_demo(options: argparse.Namespace) -> None:
     """Run the paper's examples by the nodes, or follow a motion; evaluate each run."""
-    given = {"name": options.scene, "modes": options.mode}
-    chosen = {name: value for name, value in given.items() if value}
-    if options.kind == "feedforward":
-        for mode in options.mode or ():
-            refuse_unknown(options, "--mode", mode, MODES)
-        out = free_out(options, "demo_out/feedforward")
-        for bag, folder in demo.record_feedforward(out, **chosen):
-            print(function("report.tracking:write_tracking_report")(bag, folder), flush=True)
+    following, given = options.kind == "feedforward", (options.scene, options.mode)
+    allowed = "are options of `demo feedforward`"
+    refuse_unless("demo", ("--scene, --mode", given, following or not any(given), allowed))
+    modes = options.mode or demo.MODES
+    for mode in modes:
+        refuse_unknown(options, "--mode", mode, MODES)
+    out = free_out(options, "demo_out/feedforward" if following else "demo_out")
+    if following:
+        name = options.scene or demo.FOLLOWED
+        for mode in modes:
+            print(f"{name}, {mode}: {load(name).description}", flush=True)
+            bag = demo.empty_bag(out / mode)
+            demo.follow(name, bag, mode)
+            print(function("report.tracking:write_tracking_report")(bag, out / mode), flush=True)
         return
-    if chosen:
-        refuse(options, "--scene, --mode", chosen, "are options of `demo feedforward`")
-    for bag, folder in demo.record_examples(free_out(options, "demo_out")):
+    for name in demo.EXAMPLES:
+        folder = out if name == "example2" else out / name  # the main job
+        print(f"{name}: {load(name).description}", flush=True)
+        bag = demo.empty_bag(folder)
+        demo.record(name, bag)
         summary = function("report.run:write_run_report")(bag, folder)
         print(function("report.run:summary_text")(summary, str(folder)), flush=True)

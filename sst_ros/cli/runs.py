@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.cli.commands import free_out, function, refuse, refuse_unknown
-from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.cli.commands import free_out, function, refuse_unknown
+from sst_ros.errors import InputError, Problem, SstError, refuse_unless
 from sst_ros.extras import require
 from sst_ros.host import child_process, compiled_module
 from sst_ros.host.cache_folder import cache_folder, configured_folder
@@ -33,7 +33,9 @@ from sst_ros.simulation.simulation import INTEGRATORS, Simulation
 from sst_ros.view.source import Replay, run_simulator
 
 PICTURES = (".png", ".pdf", ".svg")
-MOST_SAMPLES = 10_000_000
+MOST = 10_000_000
+"""Samples of a trajectory."""
+
 ROUNDING = 1e-6
 """Relative rounding of inertias that a person has typed."""
 
@@ -77,11 +79,9 @@ def check(name_or_path: str | Path) -> Scene:
 
 
 def implausible(scene: Scene) -> str:
-    """Describe numbers of the star that no body can have though each is allowed; "" for none.
-
-    A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O, whatever its shape.
-    """
+    """Describe numbers of the star that no body can have though each is allowed; "" for none."""
     star = scene.star
+    # A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O.
     trace, most = float(star.inertia.matrix.trace()), 2.0 * star.mass * star.radius**2
     if star.mass == 0.0 or trace <= most * (1.0 + ROUNDING):
         return ""
@@ -111,8 +111,8 @@ def map_workspace(options: argparse.Namespace) -> None:
     """Draw the workspace of a scene and print its singular poses."""
     scene = load(options.scene)
     out = options.out or Path(f"{Path(options.scene).stem}_workspace.png")
-    if out.suffix not in PICTURES:
-        refuse(options, "--out", str(out), f"must end in {' or '.join(PICTURES)}")
+    allowed = f"must end in {' or '.join(PICTURES)}"
+    refuse_unless("workspace", ("--out", str(out), out.suffix in PICTURES, allowed))
     free_out(options, out)
     require("matplotlib")
     geometry = Geometry.of(scene)
@@ -126,30 +126,28 @@ def map_workspace(options: argparse.Namespace) -> None:
 
 def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
-    out, picture = options.out, None
+    out, picture, count = options.out, None, options.samples
+    ends, allowed = (
+        f"must end in {' or '.join(SUFFIXES)}",
+        f"must be a whole number from 1 to {MOST}",
+    )
+    refuse_unless(
+        "simulate",
+        ("--out", str(out), out is None or out.suffix in SUFFIXES, ends),
+        ("--samples", count, count is None or 1 <= count <= MOST, allowed),
+    )
     if out is not None:
-        if out.suffix not in SUFFIXES:
-            refuse(options, "--out", str(out), f"must end in {' or '.join(SUFFIXES)}")
         free_out(options, out)
         if library := {".parquet": "pyarrow", ".csv": "pandas"}.get(out.suffix):
             require(library)
-    if options.samples is not None and not 1 <= options.samples <= MOST_SAMPLES:
-        allowed = f"must be a whole number from 1 to {MOST_SAMPLES}"
-        refuse(options, "--samples", options.samples, allowed)
     if options.plot:
         picture = (out or Path(Path(options.scene).name)).with_suffix(".png")
         require_free(picture, "simulate", force=options.force)
         require("matplotlib")
-    trajectory = simulate(
-        options.scene,
-        duration=options.duration,
-        method=options.method,
-        tolerance=options.tolerance,
-        progress=True,
-    )
-    if options.samples is not None:
-        begin, end = trajectory.t[0], trajectory.t[-1]
-        trajectory = trajectory.at(np.linspace(begin, end, options.samples + 1))
+    given = {name: getattr(options, name) for name in ("duration", "method", "tolerance")}
+    trajectory = simulate(options.scene, progress=True, **given)
+    if count is not None:
+        trajectory = trajectory.at(np.linspace(trajectory.t[0], trajectory.t[-1], count + 1))
     gamma = ", ".join(f"{angle:.9f}" for angle in trajectory.gamma[-1])
     print(f"{trajectory.scene.name}: {trajectory.message}")
     print(f"simulated        {trajectory.t[-1]:.9g} s, {len(trajectory)} samples")
@@ -170,8 +168,8 @@ def run_simulation(options: argparse.Namespace) -> int:
 def view(options: argparse.Namespace) -> int:
     """Serve the page of a bag, of a running simulator, or of one that is started for it."""
     if options.bag is not None:
-        if options.scene is not None:
-            refuse(options, "--scene", options.scene, "give a bag or a scene, not both")
+        one = options.scene is None
+        refuse_unless("view", ("--scene", options.scene, one, "give a bag or a scene, not both"))
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())

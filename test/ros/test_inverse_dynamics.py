@@ -50,7 +50,7 @@ def twice(tmp_path_factory, forked_demos):
     words = ["--scene", path, "--mode", "feedforward", "--out", str(folder), "--force"]
     assert main(["demo", "feedforward", *words]) == 0
     second.mkdir()
-    demo.follow(path, second / "bag", "feedforward", MOVE.spiral.duration + demo.HOLD_S)
+    demo.follow(path, second / "bag", "feedforward")
     return first, second
 
 
