@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from sst_ros.host import child_process
 
@@ -23,16 +24,15 @@ _TICK = os.sysconf("SC_CLK_TCK")
 @contextmanager
 def own_domain(*, compiled: bool = True) -> Iterator[int]:
     """Give the processes that are started inside a ROS domain of their own, on localhost."""
-    before = os.environ.pop("SST_ROS_NUMBA", None)
-    if not compiled:
-        os.environ["SST_ROS_NUMBA"] = "0"
+    number, lock = child_process.lock_domain()
+    ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:
-        with child_process.own_domain() as number:
+        with patch.dict(os.environ, ours):
+            os.environ.pop("SST_ROS_NUMBA", None)
+            os.environ.update({} if compiled else {"SST_ROS_NUMBA": "0"})
             yield number
     finally:
-        os.environ.pop("SST_ROS_NUMBA", None)
-        if before is not None:
-            os.environ["SST_ROS_NUMBA"] = before
+        os.close(lock)
 
 
 class Process(subprocess.Popen[str]):

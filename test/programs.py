@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Programs that tests run in an interpreter of its own."""
+"""Programs that tests run in an interpreter of its own, and ROS domains for nodes."""
 
 import os
 import subprocess
 import sys
+from contextlib import contextmanager
+from unittest.mock import patch
+
+from sst_ros.host import child_process
 
 
 def python(*words, env=None, status=0, **options):
@@ -15,3 +19,15 @@ def python(*words, env=None, status=0, **options):
     done = subprocess.run([sys.executable, *words], env=environment, **given)
     assert done.returncode == status, done.stderr
     return done
+
+
+@contextmanager
+def own_domain():
+    """Have nodes use a ROS domain that nothing else on this machine has, without the network."""
+    number, lock = child_process.lock_domain()
+    ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    try:
+        with patch.dict(os.environ, ours):
+            yield number
+    finally:
+        os.close(lock)

@@ -120,7 +120,7 @@ PATHS = """
 import pathlib, sys, threading, time
 import bags, sst_ros
 from sst_ros import Simulation, load_scene, read_bag, simulate
-from sst_ros.host.child_process import own_domain
+from programs import own_domain
 from sst_ros.report.run import evaluate_run, summary_table
 
 files, counts = set(), True

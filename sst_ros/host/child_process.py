@@ -56,28 +56,11 @@ def run_beside(command: str, given: dict[str, object], **more: Any) -> Iterator[
 def keep_domain() -> None:
     """Use the ROS domain that the environment names, or else one that this process then keeps."""
     if "ROS_DOMAIN_ID" not in os.environ:
-        os.environ["ROS_DOMAIN_ID"] = str(_lock_domain()[0])
+        os.environ["ROS_DOMAIN_ID"] = str(lock_domain()[0])
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
-@contextmanager
-def own_domain() -> Iterator[int]:
-    """Have nodes use a ROS domain that nothing else on this machine has, without the network."""
-    number, lock = _lock_domain()
-    ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    before = {name: os.environ.get(name) for name in ours}
-    os.environ.update(ours)
-    try:
-        yield number
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
-        os.close(lock)
-
-
-def _lock_domain() -> tuple[int, int]:
+def lock_domain() -> tuple[int, int]:
     """Return the number of a domain, and the descriptor that keeps it until it is closed."""
     for _ in range(_DOMAINS):
         number = 1 + next(_next) % _DOMAINS

@@ -60,35 +60,31 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
     problems += [Problem(word, word, _advice(word, known)) for word in unknown]
     options: list[str] = []
     for name, word in vars(given).items():
-        spec, option = known[name], _option(name)
-        if word is None and spec.kind != "flag":
-            problems.append(Problem(option, None, f"needs a value, which {spec.describe()}"))
-            continue
+        spec = known[name]
         try:
-            options += ["-p", f"{name}:={_as_yaml(spec, 'true' if word is None else word)}"]
+            options += ["-p", f"{name}:={_as_yaml(spec, word)}"]
         except ValueError:
-            problems.append(Problem(option, word, spec.describe()))
+            needs = "" if word else "needs a value, which "
+            problems.append(Problem(_option(name), word or None, needs + spec.describe()))
     if problems:
         raise InputError(command, problems)
     return ["--ros-args", *ros, *options] if ros or options else []
 
 
-def params_file_warnings(command: str, words: Sequence[str]) -> list[str]:
-    """Return one line for each parameter file that has no parameters for the node of the words."""
-    given, _ = _ros_parser().parse_known_args(_split(words)[1])
+def params_file_warnings(command: str, words: Sequence[str]) -> Iterator[str]:
+    """Yield a line for each parameter file that has no parameters for the node of the words."""
+    given, _ = _parse_ros(_split(words)[1])
     rules = [re.fullmatch(r"(?:[^:]*:)?__(node|name|ns):=(.+)", rule) for rule in given.remap]
     renamed = {rule[1].replace("name", "node"): rule[2] for rule in rules if rule}
     space, name = renamed.get("ns", "").strip("/"), renamed.get("node", f"sst_{command}")
     full = f"/{space}/{name}".replace("//", "/")
-    lines = []
     for path in given.params_file:
-        patterns = [*_nodes_of(path)]
+        patterns = _nodes_of(path)
         # ** stands for any number of names, * for one.
         forms = [re.escape(one).replace(r"/\*\*", "(/[^/]+)*") for one in patterns]
         if not any(re.fullmatch(form.replace(r"/\*", "/[^/]+"), full) for form in forms):
             names = ", ".join(patterns)
-            lines.append(f"{path} has no parameters for {full}, only for {names} (/** is any node)")
-    return lines
+            yield f"{path} has no parameters for {full}, only for {names} (/** is any node)"
 
 
 def unknown_parameter(name: str, known: Sequence[str]) -> Problem:
@@ -135,19 +131,21 @@ def _parser(command: str) -> argparse.ArgumentParser:
         value = getattr(defaults, name, False)
         shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
         text = f"{spec.doc}; {spec.describe()}; default: {shown}".replace("%", "%%")
-        parser.add_argument(_option(name), nargs="?", metavar="VALUE", help=text)
+        word = "true" if spec.kind == "flag" else ""  # of an option without a value
+        parser.add_argument(_option(name), nargs="?", const=word, metavar="VALUE", help=text)
     return parser
 
 
-def _ros_parser() -> argparse.ArgumentParser:
+def _parse_ros(words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Return ROS arguments, each with all of its values, and the words that are none."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for names in _ROS:
         parser.add_argument(*names, nargs="?", action="append", default=[])
-    return parser
+    return parser.parse_known_args(words)
 
 
 def _ros_faults(ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]:
-    given, unknown = _ros_parser().parse_known_args(ros)
+    given, unknown = _parse_ros(ros)
     listed = ", ".join(name for names in _ROS for name in names)
     for word in unknown:
         if not _FLAGS.fullmatch(word):
@@ -164,28 +162,30 @@ def _ros_faults(ros: Sequence[str], known: dict[str, Spec]) -> Iterator[Problem]
             yield unknown_parameter(key, [*known])
     for path in filter(None, given.params_file):
         try:
-            if not [*_nodes_of(path)]:
-                raise ValueError("no ros__parameters")
+            _nodes_of(path)
         except (OSError, ValueError, yaml.YAMLError) as error:
             reason = str(error).splitlines()[0]
             allowed = "must be a parameter file, NODE: {ros__parameters: {NAME: VALUE}}"
             yield Problem("--params-file", path, f"{allowed} ({reason})")
 
 
-def _nodes_of(path: str) -> Iterator[str]:
-    """Names of the nodes that a parameter file has parameters for."""
-
-    def names(of: dict[Any, Any], prefix: str = "") -> Iterator[str]:
-        for key, value in of.items():
-            name = f"{prefix}/{str(key).strip('/')}"
-            if isinstance(value, dict):
-                own = isinstance(value.get("ros__parameters"), dict)
-                yield from [name] if own else names(value, name)
-
+def _nodes_of(path: str) -> list[str]:
+    """Names of the nodes that a parameter file has parameters for, of one at least."""
     document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     if not isinstance(document, dict):
         raise ValueError("no mapping")
-    return names(document)
+    found, trees = list[str](), [("", document)]
+    for prefix, tree in trees:  # which grows
+        for key, value in tree.items():
+            if isinstance(value, dict):
+                name = f"{prefix}/{str(key).strip('/')}"
+                if isinstance(value.get("ros__parameters"), dict):
+                    found.append(name)
+                else:
+                    trees.append((name, value))
+    if not found:
+        raise ValueError("no ros__parameters")
+    return found
 
 
 def _advice(word: str, known: dict[str, Spec]) -> str:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from array import array
 from typing import Any
 
 from rclpy.action.server import CancelResponse, GoalResponse
+from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -16,10 +18,9 @@ from sst_ros.control.controller import Measurement
 from sst_ros.control.law import Command
 from sst_ros.control.tracking import TrackingMetrics, tracking_table
 from sst_ros.errors import SstError
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
-from sst_ros.nodes.process import Worker, every
-from sst_ros.nodes.topics import ActionGoal, TorqueCommands
+from sst_ros.nodes.process import AnsweringWorker, every
+from sst_ros.nodes.topics import ActionGoal
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
@@ -54,80 +55,72 @@ _SPIN_S = 0.01
 """Least time to deliver the result of a goal that the end of the node aborts: 0.2 s."""
 
 
-class InverseDynamicsController(Worker[ControllerNodeParameters]):
+class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
     """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`."""
 
     def __init__(self) -> None:
         super().__init__("sst_inverse_dynamics", ControllerNodeParameters)
-        given = self.parameters
+        given, own = self.parameters, topics.CONTROLLER
         self.follower = TrajectoryFollower(scene.load(given.scene), given)
-        self._commands = TorqueCommands(self.node, given)
         names = ("reference", "tracking_error", "diagnostics")
-        own = (topics.CONTROLLER[name].publisher(self.node) for name in names)
-        self._reference, self._error, self._diagnostics = own
+        self._reference, self._error, self._diagnostics = (
+            own[name].publisher(self.node) for name in names
+        )
         self._seen: Measurement | None = None
         self._refused, self._last_refusal = 0, ""
-        self._began = self._finished = self._heard = False
-        heard = {"phase": self._hear, "joint_states": self._answer}
-        heard["joint_trajectory"] = self._replace
-        topics.subscribe(self.node, topics.CONTROLLER, given.simulator, **heard)
+        self._finished = self._has_heard = False
+        self.connect(own, joint_trajectory=self._replace)
         self._goals = FollowJointTrajectoryServer(self)
-        every(self.node, 0.5, self._watch)
         every(self.node, 1.0, self._report)
 
     def close(self) -> None:
         """Leave the actuators without torque, and print the tracking errors."""
         self._goals.close()
-        if self._began and not self.done.is_set():
-            self._commands.send(ZERO)
+        super().close()
         self._report()
         _print(self.follower.tracking())
 
-    def _hear(self, phase: String) -> None:
+    def hear(self, phase: String) -> None:
         """End with the simulator; begin anew when it does.
 
         The first phase that is heard is no news: discovery may find this topic after joint_states,
         and the simulator's "waiting" then comes after the first samples of the run.
         """
-        news, self._heard = self._heard, True
-        if phase.data.startswith("fault") and self._began:
-            raise SstError(f"the simulator stopped: {phase.data}")
-        if phase.data == "finished" and self._began:
-            self._finished = True
-        if phase.data == "waiting" and self._began and news:
+        super().hear(phase)
+        news, self._has_heard = self._has_heard, True
+        self._finished = self._finished or (phase.data == "finished" and self.begun)
+        if phase.data == "waiting" and self.begun and news:
             self.node.get_logger().info("the simulator was reset: beginning anew")
             self._goals.interrupt("the simulator was reset")
             _print(self.follower.tracking())
             self.follower.restart()
-            self._began = False
+            self.begun = False
 
-    def _answer(self, state: JointState) -> None:
-        """Answer a state: of the run, or shown before it."""
-        self._commands.restart_timeout()
+    def receive(self, state: JointState) -> None:
+        """Answer a state where there is a motion; trajectories begin at the last one."""
         self._seen = _measure(state)
-        if not self._has_subscribers():
+        super().receive(state)
+
+    def may_begin(self) -> bool:
+        """Whether all have subscribed who are to hear the whole run."""
+        recorded = (self._reference, self._error) if self.parameters.wait_for_recorder else ()
+        return super().may_begin() and all(one.get_subscription_count() for one in recorded)
+
+    def preview(self) -> Vector3 | None:
+        """Return what answers the last state before the run [N m], if there is a motion."""
+        command = self.follower.preview(self._seen) if self._seen else None
+        return None if command is None else command.torque
+
+    def answer(self, state: JointState, stamp_ns: int) -> None:
+        """Answer a sample of the run."""
+        if self._seen is None or (command := self.follower.answer(stamp_ns, self._seen)) is None:
             return
-        stamp_ns = self._commands.answer_to(state)
-        if stamp_ns == 0:
-            command = None if self._began else self.follower.preview(self._seen)
-            if command is not None:
-                self._commands.send(command.torque)
-            return
-        command = self.follower.answer(stamp_ns, self._seen)
-        if command is None:
-            return
-        self._began = True
-        self._commands.send(command.torque)
+        self.begun = True
+        self.send(command.torque)
         self._publish(state, command)
         self._goals.sample(state, self._seen, command)
         if self.follower.stage is Stage.ENDED:
             self.done.set()
-
-    def _has_subscribers(self) -> bool:
-        if self._began or not self._commands.has_subscribers():
-            return self._began
-        recorded = (self._reference, self._error) if self.parameters.wait_for_recorder else ()
-        return all(publisher.get_subscription_count() for publisher in recorded)
 
     def _publish(self, state: JointState, command: Command) -> None:
         at = command.desired
@@ -154,7 +147,7 @@ class InverseDynamicsController(Worker[ControllerNodeParameters]):
             self.refuse(error)
             return False
         finally:
-            self._commands.restart_timeout()  # no message could be received during the check
+            self.heard_s = time.monotonic()  # no message could be received during the check
         _print(tracking)
         self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
         return True
@@ -165,11 +158,12 @@ class InverseDynamicsController(Worker[ControllerNodeParameters]):
         self.node.get_logger().error(f"trajectory refused: {error}")
         self._report()
 
-    def _watch(self) -> None:
+    def watch(self) -> None:
+        """End after the run, when its last samples have been answered."""
         if self._finished:
             self.done.set()
         else:
-            self._commands.watch()
+            super().watch()
 
     def _report(self) -> None:
         follower = self.follower
@@ -301,6 +295,5 @@ def _point(time: float, angles: Vector3, rates: Vector3, torques: Vector3) -> Jo
     point = JointTrajectoryPoint()
     point.positions, point.velocities = array("d", angles), array("d", rates)
     point.effort = array("d", torques)
-    nanoseconds = round(time * NANOSECONDS)
-    point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, NANOSECONDS)
+    point.time_from_start = Duration(nanoseconds=round(time * NANOSECONDS)).to_msg()
     return point

@@ -24,21 +24,24 @@ from rcl_interfaces.msg import SetParametersResult as Result
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    ParameterException,
-)
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.host.child_process import is_orphan
-from sst_ros.nodes import arguments, signals
+from sst_ros.mechanism.generic_math import ZERO
+from sst_ros.nodes import arguments, signals, topics
+from sst_ros.nodes.topics import Endpoint
+from sst_ros.runtime.settings import AnsweringParameters
+from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.schema import Section, Spec, specs
+from sst_ros.state import Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _FIRST_RCLPY_ON_FAST_DDS_3 = 9
@@ -64,6 +67,7 @@ _TYPES = {
 _WIDEST = 1e300
 
 P = TypeVar("P", bound=Section)
+A = TypeVar("A", bound=AnsweringParameters)
 
 
 class Worker(Generic[P]):
@@ -113,23 +117,20 @@ def _declare(
 ) -> P:
     # rclpy has no public call for the values that were given; Jazzy and Kilted have this.
     given: dict[str, Any] = {name: one.value for name, one in node._parameter_overrides.items()}
-    changeable = getattr(cls, "CHANGEABLE", ())
-    values: dict[str, Any] = {}
+    defaults, values = {**vars(cls()), **more_defaults(given)}, dict[str, Any]()
     problems: list[Problem] = []
-    defaults = {**vars(cls()), **more_defaults(given)}
     for name, spec in specs(cls).items():
-        default = defaults[name]
-        value = given.get(name, list(default) if isinstance(default, tuple) else default)
-        if spec.kind == "number":  # "-p duration:=1" means 1.0
-            value = float(value) if type(value) is int else value
-            value = list(map(float, value)) if isinstance(value, array) else value
+        value = given.get(name, defaults[name])
+        if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
+            value = float(value)
+        elif isinstance(value, (array, tuple)):
+            value = [float(x) if type(x) is int else x for x in value]
+        values[name], descriptor = value, _descriptor(name, spec)
+        descriptor.read_only = name not in getattr(cls, "CHANGEABLE", ())
         try:
-            node.declare_parameter(
-                name, value, _descriptor(name, spec, name not in changeable), ignore_override=True
-            )
-        except (InvalidParameterTypeException, InvalidParameterValueException):
+            node.declare_parameter(name, value, descriptor, ignore_override=True)
+        except ParameterException:  # of another type, or out of range
             problems.append(Problem(name, value, spec.describe()))
-        values[name] = value
     ours = {name for _, parameters in arguments.COMMANDS.values() for name in specs(parameters)}
     for name in sorted(given.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
@@ -144,14 +145,10 @@ def _declare(
         raise InputError(node.get_fully_qualified_name(), error.problems) from None
 
 
-def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
-        name=name,
-        type=(Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]).value,
-        description=spec.doc + (f" [{spec.unit}]" if spec.unit else ""),
-        additional_constraints=spec.describe(),
-        read_only=read_only,
-    )
+def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(name=name, additional_constraints=spec.describe())
+    descriptor.type = (Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]).value
+    descriptor.description = spec.doc + (f" [{spec.unit}]" if spec.unit else "")
     low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
     if spec.kind == "number" and not spec.shape:
         # Only a parameter with a range refuses NaN.
@@ -160,6 +157,75 @@ def _descriptor(name: str, spec: Spec, read_only: bool) -> ParameterDescriptor:
     if spec.kind == "integer":
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return descriptor
+
+
+class AnsweringWorker(Worker[A]):
+    """A node that answers the joint states of a simulator with torques.
+
+    It has `begun` with its first answer to a sample of the run. It fails where the simulator stops
+    by a fault, or says nothing for longer than the parameter `timeout`.
+    """
+
+    def connect(self, own: dict[str, Endpoint], **more: Callable[[Any], None]) -> None:
+        """Publish commands, and listen to topics of its own table, as soon as it can answer."""
+        given, self.begun, self.heard_s = self.parameters, False, time.monotonic()
+        topic, torques = own["commands_stamped" if given.stamped else "commands"], array("d", ZERO)
+        if given.stamped:
+            self._message: Any = topic.kind(name=list(ACTUATORS), effort=torques)
+        else:
+            self._message = topic.kind(data=torques)
+        self._torques = self._message.effort if given.stamped else self._message.data
+        self._commands = topic.publisher(self.node, simulator=given.simulator)
+        heard = {"phase": self.hear, "joint_states": self.receive, **more}
+        topics.subscribe(self.node, own, given.simulator, **heard)
+        every(self.node, 0.5, self.watch)
+
+    def close(self) -> None:
+        """Leave the actuators without torque where the work is not done."""
+        if self.begun and not self.done.is_set():
+            self.send(ZERO)
+
+    def answer(self, state: JointState, stamp_ns: int) -> None:
+        """Answer a sample of the run by `send`."""
+        raise NotImplementedError
+
+    def preview(self) -> Vector3 | None:
+        """Return what answers a state before the run [N m], if anything does."""
+        raise NotImplementedError
+
+    def may_begin(self) -> bool:
+        """Whether the commands have as many subscribers as the parameters ask for."""
+        return self._commands.get_subscription_count() >= self.parameters.min_subscribers
+
+    def hear(self, phase: String) -> None:
+        """End with the simulator."""
+        if self.begun and phase.data.startswith("fault"):
+            raise SstError(f"the simulator stopped: {phase.data}")
+
+    def receive(self, state: JointState) -> None:
+        """Have a state answered: one of the run, or shown before it."""
+        self.heard_s = time.monotonic()
+        # Once begun, the simulator may end before its last sample has arrived.
+        if not (self.begun or self.may_begin()):
+            return
+        if self.parameters.stamped:
+            self._message.header.stamp = state.header.stamp
+        stamp_ns = nanoseconds(state.header.stamp)
+        if not is_idle(stamp_ns, state.header.frame_id):
+            self.answer(state, stamp_ns)
+        elif not self.begun and (torque := self.preview()) is not None:
+            self.send(torque)
+
+    def send(self, torque: Vector3) -> None:
+        """Publish torques [N m], with the stamp of the state that they answer."""
+        self._torques[0], self._torques[1], self._torques[2] = torque
+        self._commands.publish(self._message)
+
+    def watch(self) -> None:
+        """Raise an SstError where no joint_states came for too long."""
+        silent = time.monotonic() - self.heard_s
+        if silent > self.parameters.timeout:
+            raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")
 
 
 def run(words: Sequence[str]) -> int:
@@ -213,49 +279,34 @@ def _bound_time() -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
 
 
-class _Callbacks(threading.Thread):
-    """Thread of the executor: it sleeps until there is work, where signals would not wake it.
-
-    It runs callbacks until `end`, or until one fails, with this `error`.
-    """
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(name="executor", daemon=True)
-        self.error: BaseException | None = None
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(node)
-        self._wake = node.create_guard_condition(lambda: None)
-        self._ends = False
-
-    def run(self) -> None:
-        try:
-            while not self._ends:
-                self._executor.spin_once()
-        except BaseException as error:
-            self.error = error
-
-    def end(self) -> None:
-        """Begin no other callback; wait for the one in progress."""
-        self._ends = True
-        self._wake.trigger()
-        self.join(_CALLBACK_S)
-
-    def shut_down(self) -> None:
-        self.join(_CALLBACK_S)
-        self._executor.shutdown()
-
-
 def spin(worker: Worker[Any]) -> None:
-    """Run a worker until it is done or asked to end, or a callback raises; then close it."""
-    callbacks = _Callbacks(worker.node)
+    """Run a worker until it is done or asked to end, or a callback raises; then close it.
+
+    The executor has a thread, which sleeps until there is work: signals would not wake it.
+    """
+    node, ends, errors = worker.node, threading.Event(), list[BaseException]()
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    wake = node.create_guard_condition(lambda: None)
+
+    def call_back() -> None:
+        try:
+            while not ends.is_set():
+                executor.spin_once()
+        except BaseException as error:
+            errors.append(error)
+
+    callbacks = threading.Thread(target=call_back, name="executor", daemon=True)
     callbacks.start()
     try:
         while callbacks.is_alive() and not (signals.came or is_orphan()):
             if worker.done.wait(_POLL_S):
                 break
-        callbacks.end()
-        if callbacks.error is not None:
-            raise callbacks.error
+        ends.set()  # no other callback begins
+        wake.trigger()
+        callbacks.join(_CALLBACK_S)
+        if errors:
+            raise errors[0]
     finally:
         try:
             worker.close()
@@ -263,11 +314,12 @@ def spin(worker: Worker[Any]) -> None:
             with _bound_time():
                 # What was published is received first, if that takes no longer than this.
                 deadline = time.monotonic() + _ACKNOWLEDGE_S
-                for publisher in worker.node.publishers:
+                for publisher in node.publishers:
                     left = max(0.0, deadline - time.monotonic())
                     publisher.wait_for_all_acked(Duration(seconds=left))
-                callbacks.shut_down()
-                worker.node.destroy_node()
+                callbacks.join(_CALLBACK_S)
+                executor.shutdown()
+                node.destroy_node()
 
 
 def configure_middleware() -> None:

@@ -22,7 +22,6 @@ from sst_ros.errors import InputError, SstError
 from sst_ros.host import compiled_module, scheduling
 from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import compiled_method
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
@@ -61,15 +60,21 @@ class Simulator(Worker[SimulatorParameters]):
             names.append("external_moment")
         readers = [Reader(self.node, topics.SIMULATOR[name]) for name in names]
         self._input = TorqueInput(run, simulated.actuators, *readers)
-        if follows_clock(self.node):
-            source, longest_ns = FollowedClock(self.node), FOLLOWED_STEP_NS
-            self._pacer = Pacer(run.period_ns, given.real_time_factor, source, longest_ns)
-        else:
-            self._pacer = Pacer(run.period_ns, given.real_time_factor, SteadyTime())
+        followed = follows_clock(self.node)
+        source = FollowedClock(self.node) if followed else SteadyTime()
+        longest_ns = FOLLOWED_STEP_NS if followed else 0
+        self._pacer = Pacer(run.period_ns, given.real_time_factor, source, longest_ns)
         compiles = given.compiled and given.equations == "quaternion"
         self._code = CodeCompiler(self.node, simulated, given) if compiles else None
+        build = partial(
+            Simulation,
+            integrator=given.integrator,
+            tolerance=given.tolerance,
+            compiled=self._code is not None and self._code.available,
+            equations=given.equations,
+        )
         self._latency = scheduling.CpuDmaLatency()
-        self._loop = RunLoop(simulated, self._build, run, self._input, self._pacer, self._topics)
+        self._loop = RunLoop(simulated, build, run, self._input, self._pacer, self._topics)
         period_s = run.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
         serve(self.node, self._loop)
@@ -109,16 +114,6 @@ class Simulator(Worker[SimulatorParameters]):
             if self._loop.failed:
                 self.done.set()
 
-    def _build(self, simulated: Scene) -> Simulation:
-        given = self.parameters
-        return Simulation(
-            simulated,
-            given.integrator,
-            tolerance=given.tolerance,
-            compiled=self._code is not None and self._code.available,
-            equations=given.equations,
-        )
-
     def change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
         before, self.parameters, run = self.parameters, changed, changed.run
@@ -136,22 +131,22 @@ class Simulator(Worker[SimulatorParameters]):
 
         The machine may sleep as it likes where no deadlines are kept.
         """
-        given, thread = self.parameters, self._thread.native_id
+        given, thread, shown = self.parameters, self._thread.native_id, self._diagnostics
         if thread is None or not self._thread.is_alive():
             return
-        paced, log = given.real_time_factor > 0.0, self.node.get_logger()
+        paced, running = given.real_time_factor > 0.0, self._loop.phase is Phase.RUNNING
+        before = shown.scheduling, shown.cpu_dma_latency
         try:
-            granted = scheduling.schedule(given.realtime_priority if paced else 0, thread)
+            shown.scheduling = scheduling.schedule(given.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
             return
-        if granted != self._diagnostics.scheduling:
-            self._diagnostics.scheduling = granted
-            log.info(f"scheduling of the run: {granted}")
-        running = self._loop.phase is Phase.RUNNING
-        granted = self._latency.request(given.cpu_dma_latency if paced and running else -1)
-        if granted != self._diagnostics.cpu_dma_latency:
-            self._diagnostics.cpu_dma_latency = granted
-            log.info(f"exit latency of idle states: {granted}")
+        latency_us = given.cpu_dma_latency if paced and running else -1
+        shown.cpu_dma_latency = self._latency.request(latency_us)
+        words = "scheduling of the run", "exit latency of idle states"
+        now = shown.scheduling, shown.cpu_dma_latency
+        for what, old, new in zip(words, before, now, strict=True):
+            if new != old:
+                self.node.get_logger().info(f"{what}: {new}")
 
     def _read_gauges(self) -> None:
         self._diagnostics.gauges = read_gauges(self._loop.simulation, self._loop.held)
@@ -161,8 +156,7 @@ class Simulator(Worker[SimulatorParameters]):
         self._schedule()  # the threads that have begun since: of callbacks and of DDS
         own = self.node.get_fully_qualified_name()
         commands = [topics.SIMULATOR[name].at(own) for name in ("commands", "commands_stamped")]
-        publishers = sum(map(self.node.count_publishers, commands))
-        values = self._diagnostics.values(publishers)
+        values = self._diagnostics.values(sum(map(self.node.count_publishers, commands)))
         level, text, news = self._diagnostics.status(values, [*self._warnings(commands)])
         for line in news:
             self.node.get_logger().warning(line)
@@ -199,22 +193,16 @@ def _scene_duration(given: dict[str, Any]) -> dict[str, Any]:
 def serve(node: Node, loop: RunLoop) -> None:
     """Offer the services and the topic by which a run is controlled; the run loop decides."""
 
-    def offer(name: str, request_of: Callable[[Any], Callable[[], Reply]]) -> None:
-        def answer(request: Any, response: Any) -> Any:
-            response.success, response.message = loop.ask(request_of(request))
-            return response
-
-        service = topics.SIMULATOR[name]
-        qos = topics.SERVICE_QOS
-        node.create_service(service.kind, service.name, answer, qos_profile=qos)
+    def answer(request: Any, response: Any, act: Callable[[Any], Reply]) -> Any:
+        response.success, response.message = loop.ask(lambda: act(request))
+        return response
 
     def set_state(message: JointState) -> None:
         """Take the angles and rates of the actuators; the log has the reply."""
         try:
             gamma = by_name(message.name, message.position, "angles [rad] in position")
-            gamma_dot = ZERO
-            if len(message.velocity):
-                gamma_dot = by_name(message.name, message.velocity, "rates [rad/s] in velocity")
+            rates = message.velocity or [0.0] * len(message.name)
+            gamma_dot = by_name(message.name, rates, "rates [rad/s] in velocity")
         except MessageRefused as refused:
             node.get_logger().warning(f"set_state refused: {refused}")
             return
@@ -224,9 +212,13 @@ def serve(node: Node, loop: RunLoop) -> None:
         else:
             node.get_logger().warning(f"set_state: {reply.message}")
 
-    offer("pause", lambda request: partial(loop.pause, request.data))
-    offer("step", lambda _: loop.step)
-    offer("reset", lambda _: loop.reset)
+    for name, act in {
+        "pause": lambda request: loop.pause(request.data),
+        "step": lambda _: loop.step(),
+        "reset": lambda _: loop.reset(),
+    }.items():
+        one, qos = topics.SIMULATOR[name], topics.SERVICE_QOS
+        node.create_service(one.kind, one.name, partial(answer, act=act), qos_profile=qos)
     topics.subscribe(node, topics.SIMULATOR, set_state=set_state)
 
 
@@ -282,15 +274,11 @@ class FollowedClock:
     """The ROS clock of a node with use_sim_time, as a time source of the pacer."""
 
     def __init__(self, node: Node) -> None:
-        self._clock = node.get_clock()
-        self._moved = threading.Event()
-        threshold = JumpThreshold(
-            min_forward=Duration(nanoseconds=1),
-            min_backward=Duration(nanoseconds=-1),
-            on_clock_change=True,
-        )
+        self._clock, self._moved = node.get_clock(), threading.Event()
+        on, back = Duration(nanoseconds=1), Duration(nanoseconds=-1)
         self._jumps = self._clock.create_jump_callback(
-            threshold, post_callback=lambda _: self._moved.set()
+            JumpThreshold(min_forward=on, min_backward=back),
+            post_callback=lambda _: self._moved.set(),
         )
 
     def now_ns(self) -> int:

@@ -2,33 +2,28 @@
 """Topics, services and actions of the nodes: one table that they, the docs and the policies follow.
 
 Who is at the other end of a topic, subscriptions whose owner takes the messages when he needs them,
-commands that answer joint states, and goals of actions that end later than they are accepted.
+and goals of actions that end later than they are accepted.
 """
 
 from __future__ import annotations
 
 import importlib
 import math
+import re
 import time
-from array import array
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rclpy.task import Future
-from sensor_msgs.msg import JointState
 
-from sst_ros.errors import SstError
-from sst_ros.mechanism.generic_math import ZERO
-from sst_ros.runtime.settings import AnsweringParameters
-from sst_ros.runtime.torque_input import ACTUATORS, MOST_WAITING
-from sst_ros.state import NANOSECONDS, Vector3, is_idle, nanoseconds
+from sst_ros.runtime.torque_input import MOST_WAITING
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 EXECUTES = "executes"
@@ -144,8 +139,6 @@ COUNT_NS = 20_000_000
 """A run counts the other ends of its topics this often, not at each tick: to count the subscribers
 of four topics takes as long as a tick."""
 UNNAMED = "a node whose name is not known yet"
-_UNKNOWN = "_UNKNOWN_"
-"""Part of the names that DDS has for nodes whose discovery is not finished."""
 
 
 class Endpoint(NamedTuple):
@@ -181,20 +174,19 @@ class Endpoint(NamedTuple):
         return QoSProfile(depth=self.depth or depth, durability=durability)
 
 
+_ROW = re.compile(r"(\w+) (\S+) (\S+) ?(\w*)( latched)?\n((?:    (?!if ).*\n)*)(?:    if (.*)\n)?")
+
+
 def _read(table: str) -> dict[str, dict[str, Endpoint]]:
     """Return the endpoints by node and by the last part of their names."""
     nodes: dict[str, dict[str, Endpoint]] = {}
     for part in table.replace("MOST_WAITING", str(MOST_WAITING)).split("\n[")[1:]:
         node, _, rows = part.partition("]\n")
         nodes[node] = {}
-        for row in rows.replace("\n    ", "\t").split("\n"):
-            if row:
-                head, *text = row.split("\t")
-                when = text.pop().removeprefix("if ") if text[-1].startswith("if ") else ""
-                use, name, kind, *more = head.split()
-                depth, latched = int(more[0]) if more else 10, "latched" in more
-                last = name.rpartition("/")[2]
-                nodes[node][last] = Endpoint(use, name, kind, depth, latched, when, " ".join(text))
+        for use, name, kind, depth, latched, doc, when in _ROW.findall(rows):
+            text = " ".join(doc.split())
+            one = Endpoint(use, name, kind, int(depth or 10), bool(latched), when, text)
+            nodes[node][name.rpartition("/")[2]] = one
     return nodes
 
 
@@ -224,7 +216,7 @@ def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str
     """Full names of the nodes that publish a topic, one for each (best-effort) publisher."""
     return [
         UNNAMED
-        if _UNKNOWN in info.node_name
+        if "_UNKNOWN_" in info.node_name  # to DDS, until its discovery is finished
         else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
         for info in node.get_publishers_info_by_topic(topic)
         if not best_effort or info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
@@ -235,15 +227,15 @@ def diagnostics(
     node: Node, what: str, level: int, text: str, values: dict[str, Any]
 ) -> DiagnosticArray:
     """Build a DiagnosticArray of one status of a node; the level is 0, 1 or 2 for an error."""
-    message = DiagnosticArray(status=[DiagnosticStatus(level=bytes([level]), message=text)])
-    message.status[0].name = f"{node.get_fully_qualified_name()}: {what}"
-    message.status[0].values = [KeyValue(key=key, value=str(x)) for key, x in values.items()]
-    now = node.get_clock().now().nanoseconds
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, NANOSECONDS)
+    status = DiagnosticStatus(level=bytes([level]), message=text)
+    status.name = f"{node.get_fully_qualified_name()}: {what}"
+    status.values = [KeyValue(key=key, value=str(x)) for key, x in values.items()]
+    message = DiagnosticArray(status=[status])
+    message.header.stamp = node.get_clock().now().to_msg()
     return message
 
 
-class NeverSpun(CallbackGroup):
+class NeverSpun(MutuallyExclusiveCallbackGroup):
     """Keeps subscriptions out of the executor, and their events; their owner takes the messages.
 
     An executor wakes a thread for each message, which costs far more than taking it. In a wait for
@@ -253,11 +245,6 @@ class NeverSpun(CallbackGroup):
     def can_execute(self, entity: object) -> bool:
         """Refuse."""
         return False
-
-    beginning_execution = can_execute
-
-    def ending_execution(self, entity: object) -> None:
-        """Do nothing."""
 
 
 def take(subscription: Subscription[Any]) -> tuple[bytes, dict[str, Any]] | None:
@@ -319,48 +306,6 @@ class Reader:
         message = deserialize_message(data, self._subscription.msg_type)
         ago = max(0, time.time_ns() - information["received_timestamp"])
         return message, time.monotonic_ns() - ago
-
-
-class TorqueCommands:
-    """Publisher of the commands, and the time-out of the joint states that they answer."""
-
-    def __init__(self, node: Node, given: AnsweringParameters) -> None:
-        self._given = given
-        topic = PLAYER["commands_stamped" if given.stamped else "commands"]
-        if given.stamped:
-            self._message: Any = topic.kind(name=list(ACTUATORS), effort=array("d", ZERO))
-            self._torques = self._message.effort
-        else:
-            self._message = topic.kind(data=array("d", ZERO))
-            self._torques = self._message.data
-        self._publisher = topic.publisher(node, simulator=given.simulator)
-        self.restart_timeout()
-
-    def has_subscribers(self) -> bool:
-        """Whether they have as many subscribers as the parameters ask for."""
-        return self._publisher.get_subscription_count() >= self._given.min_subscribers
-
-    def answer_to(self, state: JointState) -> int:
-        """Give the next commands the stamp of a state; return it [ns], 0 where it is no sample."""
-        if self._given.stamped:
-            self._message.header.stamp = state.header.stamp
-        stamp_ns = nanoseconds(state.header.stamp)
-        return 0 if is_idle(stamp_ns, state.header.frame_id) else stamp_ns
-
-    def send(self, torque: Vector3) -> None:
-        """Publish torques [N m]."""
-        self._torques[0], self._torques[1], self._torques[2] = torque
-        self._publisher.publish(self._message)
-
-    def restart_timeout(self) -> None:
-        """Count the time-out of joint_states from now on."""
-        self._received = time.monotonic()
-
-    def watch(self) -> None:
-        """Raise an SstError if no joint_states came for longer than the parameter `timeout`."""
-        silent = time.monotonic() - self._received
-        if silent > self._given.timeout:
-            raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")
 
 
 class ActionGoal:

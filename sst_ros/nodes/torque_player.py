@@ -8,61 +8,41 @@ the period, that of its start first order only.
 from __future__ import annotations
 
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 
-from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
-from sst_ros.nodes.process import Worker, every
+from sst_ros.nodes.process import AnsweringWorker
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
 from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
 
 
-class TorquePlayer(Worker[PlayerParameters]):
+class TorquePlayer(AnsweringWorker[PlayerParameters]):
     """Worker of the process `torque_player`."""
 
     def __init__(self) -> None:
         super().__init__("sst_torque_player", PlayerParameters)
-        given = self.parameters
-        self._profile, self._duration = _load(given)
-        self._commands = topics.TorqueCommands(self.node, given)
-        self._start_ns: int | None = None
-        self._last_ns = 0
-        self._warned = given.hold != "middle"
-        heard = {"phase": self._hear, "joint_states": self._answer}
-        topics.subscribe(self.node, topics.PLAYER, given.simulator, **heard)
-        every(self.node, 0.5, self._commands.watch)
+        self._profile, self._duration = _load(self.parameters)
+        self._start_ns = self._last_ns = 0
+        self._warned = self.parameters.hold != "middle"
+        self.connect(topics.PLAYER)
 
-    def close(self) -> None:
-        """Leave the actuators without torque if the profile was cut short."""
-        if self._start_ns is not None and not self.done.is_set():
-            self._commands.send(ZERO)
+    def preview(self) -> Vector3:
+        """Return the torque of the first hold [N m]."""
+        return self._hold(0)
 
-    def _hear(self, phase: String) -> None:
-        if self._start_ns is not None and phase.data.startswith("fault"):
-            raise SstError(f"the simulator stopped: {phase.data}")
-
-    def _answer(self, state: JointState) -> None:
-        """Play the torque of the hold that a sample begins; before the run, that of the first."""
-        self._commands.restart_timeout()
-        # Once begun, the simulator may end before its last sample has arrived.
-        if self._start_ns is None and not self._commands.has_subscribers():
-            return
-        stamp_ns = self._commands.answer_to(state)
-        if stamp_ns == 0:
-            if self._start_ns is None:
-                self._commands.send(self._hold(0))
-            return
-        if self._start_ns is None:
-            self._start_ns = self._last_ns = stamp_ns
+    def answer(self, state: JointState, stamp_ns: int) -> None:
+        """Play the torque of the hold that a sample begins."""
+        if not self.begun:
+            self.begun, self._start_ns, self._last_ns = True, stamp_ns, stamp_ns
         elapsed_ns = stamp_ns - self._start_ns
         if elapsed_ns / NANOSECONDS < self._duration:
             self._check_period(stamp_ns)
-            self._commands.send(self._hold(elapsed_ns))
+            self.send(self._hold(elapsed_ns))
         else:
-            self._commands.send(ZERO)
+            self.send(ZERO)
             self.node.get_logger().info(f"the profile of {self._duration:g} s is played")
             self.done.set()
 

@@ -127,10 +127,7 @@ class TrajectoryGoal:
         ]
         own = {"position": defaults.path_tolerance, "velocity": 0.0}
         self._path = self._resolve_all("path_tolerance", message.path_tolerance, own)
-        own = {
-            "position": defaults.goal_tolerance,
-            "velocity": defaults.stopped_velocity_tolerance,
-        }
+        own = {"position": defaults.goal_tolerance, "velocity": defaults.stopped_velocity_tolerance}
         self._goal = self._resolve_all("goal_tolerance", message.goal_tolerance, own)
         time, name = nanoseconds(message.goal_time_tolerance) / NANOSECONDS, "goal_time_tolerance"
         self._late = self._resolve(name, time, defaults.goal_time_tolerance)

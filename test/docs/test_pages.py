@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 from docs.blocks import ROOT, blocks, links, pages, prose
+from programs import own_domain
 
 from sst_ros.cli.commands import NODES, parser
-from sst_ros.host import child_process
 
 PAGES = pages()
 LONG = (
@@ -34,10 +34,7 @@ def test_every_block_of_a_page_runs(page, tmp_path):
         pytest.importorskip("pyarrow", reason="needs pyarrow: pip install .[record]")
     from docs.session import Session
 
-    with (
-        child_process.own_domain() as domain,
-        contextlib.closing(Session(tmp_path, domain)) as session,
-    ):
+    with own_domain() as domain, contextlib.closing(Session(tmp_path, domain)) as session:
         for block in blocks(page):
             session.run(block)
         session.settle()

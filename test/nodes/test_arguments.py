@@ -105,7 +105,7 @@ def test_a_parameter_file_for_another_node_is_reported(tmp_path, nodes, words, m
     path = tmp_path / "file.yaml"
     path.write_text(yaml.safe_dump({nodes: {"ros__parameters": {"scene": "swing"}}}))
     ros = ros_arguments("simulator", ["--ros-args", "--params-file", str(path), *words])
-    assert (not params_file_warnings("simulator", ros)) == matches
+    assert (not [*params_file_warnings("simulator", ros)]) == matches
 
 
 @pytest.mark.parametrize("command", COMMANDS)

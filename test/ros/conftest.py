@@ -16,6 +16,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from programs import own_domain  # noqa: E402
 from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
@@ -290,13 +291,9 @@ class Observer:
         rclpy.try_shutdown(context=self.context)
 
 
-def own_domain():
-    with child_process.own_domain() as number:
-        yield number
-
-
-domain = pytest.fixture(own_domain)
-domain_of_module = pytest.fixture(own_domain, scope="module")
+# Of the generator in the context manager.
+domain = pytest.fixture(own_domain.__wrapped__)
+domain_of_module = pytest.fixture(own_domain.__wrapped__, scope="module")
 
 
 @pytest.fixture
