@@ -12,12 +12,11 @@ IV.3). The eigenvalues lambda are those of the linearised dynamics.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import textwrap
-import time
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from timeit import timeit
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +26,6 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, SstError
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE, RK4, Method, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
@@ -127,27 +125,22 @@ each term take turns, and each has the time of its fastest turn, which no other 
 
 def cost_table(scene: Scene) -> list[dict[str, Any]]:
     """Return operations and times [ns] of an evaluation: the whole, then each term present."""
-    found, runs = costs(scene), []
+    found, turns = costs(scene), list[Callable[[], object]]()
     for one in (scene, *(without(scene, cost.name) for cost in found)):
-        ode, start = ODE(Dynamics.of(one)), [*initial_state(one, Geometry.of(one))]
-        start += [0.0] * (len(ode.state) - len(start))
-        method = CompiledMethod(ode, RK4, compiled=numba_version() is not None)
-        runs.append((method.step_fixed, start, (0.0,) * len(ode.drive)))
-        method.step_fixed(0.0, 1e-7, 1, *runs[-1][1:])  # compiles
-    count, rounds = (TIMED_STEPS, ROUNDS) if method.compiled else (TIMED_STEPS // 100, 3)
-    times = np.full(len(runs), np.inf)
-    for _, (k, (step, start, drive)) in itertools.product(range(rounds), enumerate(runs)):
-        began = time.perf_counter()
-        step(0.0, 1e-7, count, start, drive)
-        times[k] = min(times[k], time.perf_counter() - began)
+        method = CompiledMethod(ODE(Dynamics.of(one)), RK4, compiled=True)
+        count, rounds = (TIMED_STEPS, ROUNDS) if method.compiled else (TIMED_STEPS // 100, 3)
+        y = initial_state(one, Geometry.of(one))
+        y, d = (*y, *(0.0,) * (len(method.system.state) - 7)), (0.0,) * len(method.system.drive)
+        method.step_fixed(0.0, 1e-7, 1, y, d)  # compiles
+        turns.append(partial(method.step_fixed, 0.0, 1e-7, count, y, d))
+    times = np.min([[timeit(turn, number=1) for turn in turns] for _ in range(rounds)], axis=0)
     whole, *bare = (1e9 * times / (len(RK4.b) * count)).tolist()
-    rows = [("all", operations(scene), whole)]
-    # A term that folds into constants leaves the same number of operations, and its time.
-    rows += [
-        (x.name, x.adds, whole - ns if x.adds else 0.0) for x, ns in zip(found, bare, strict=True)
-    ]
-    names = ("scene", "term", "operations", "ns")
-    return [dict(zip(names, (scene.name, *row), strict=True)) for row in rows]
+    rows = [{"scene": scene.name, "term": "all", "operations": operations(scene), "ns": whole}]
+    for cost, ns in zip(found, bare, strict=True):
+        # A term that folds into constants leaves the same number of operations, and its time.
+        row = {"term": cost.name, "operations": cost.adds, "ns": whole - ns if cost.adds else 0.0}
+        rows.append({"scene": scene.name, **row})
+    return rows
 
 
 LONGEST_S = 10.0  # the advice is for a run of the scene's duration, but not of more [s]

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +28,7 @@ from sst_ros.host.output import slices
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
-from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, legend, note, styled
+from sst_ros.plot.style import BLUE, MARKERS, VERMILION, legend, note, styled
 from sst_ros.report import scene_summary as advised
 from sst_ros.report.results import WHOLE_RUN_S, data_frame, provenance, publish, records, render
 from sst_ros.scene.scene import Scene, with_initial
@@ -109,56 +108,47 @@ def examine_stability(
     if shown:
         about = max(1.0, 2.0 * (time.perf_counter() - began)) * len(chosen)
         print(f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about {about:.0f} s")
-    rows: list[dict[str, Any]] = []
-    for part in slices(len(chosen), 1, f"{scene.name:<16}", shown):
-        name = chosen[part.start]
-        what, change = ROWS[name]
-        rows.append({"name": name, "change": what} | _run(change(scene, motion), seconds))
-    steps = _steps(scene, motion)
-    return StabilityReport(scene.name, steps, advised.step_advice(scene).text, data_frame(rows))
-
-
-def _steps(scene: Scene, motion: Trajectory) -> DataFrame:
-    """Linearise the motion at INSTANTS."""
+    steps = []
     instants = motion.at(np.linspace(motion.t[0], motion.t[-1], INSTANTS))
-    rows = []
-    for k, t in enumerate(instants.t.tolist()):
-        state = (*instants.quaternion[k].tolist(), *instants.body_rate[k].tolist())
-        torque = instants.torque[k].tolist()
-        values = advised.eigenvalues(scene, (*state, *torque) if scene.lags else state, torque)
-        decay, oscillation = max(0.0, -values.real.min()), np.abs(values.imag).max()
-        limits = {
+    states = np.hstack([instants.quaternion, instants.body_rate, instants.torque])
+    for t, state in zip(instants.t.tolist(), states.tolist(), strict=True):
+        values = advised.eigenvalues(scene, state if scene.lags else state[:7], state[7:])
+        fastest = {"decay": max(0.0, -values.real.min()), "oscillation": abs(values.imag).max()}
+        longest = {
             name: advised.largest_stable_step(method, values) for name, method in METHODS.items()
         }
-        rows.append({"t_s": t, "decay": float(decay), "oscillation": float(oscillation), **limits})
-    return data_frame(rows)
+        steps.append({"t_s": t, **fastest, **longest})
+    runs = []
+    for part in slices(len(chosen), 1, f"{scene.name:<16}", shown):
+        what, change = ROWS[chosen[part.start]]
+        row = {"name": chosen[part.start], "change": what}
+        runs.append(row | _run(change(scene, motion), seconds))
+    advice = advised.step_advice(scene).text
+    return StabilityReport(scene.name, data_frame(steps), advice, data_frame(runs))
 
 
 def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
     """Run a scene at two tolerances, and say how it ended: the last columns of a row."""
-    nothing = {"method": "", "error": math.nan, "estimate": math.nan}
-    if isinstance(changed, str):
-        return {"passed": None, "result": changed, **nothing, "wall_s": 0.0}
+    row = {"passed": None, "result": changed, "method": "", "error": math.nan, "estimate": math.nan}
     began = time.perf_counter()
     try:
-        with np.errstate(all="ignore"):
-            run, fine = (
-                simulate(changed, duration=seconds, tolerance=tolerance)
-                for tolerance in (advised.TOLERANCE, FINER * advised.TOLERANCE)
-            )
+        if isinstance(changed, Scene):
+            with np.errstate(all="ignore"):
+                run, fine = (
+                    simulate(changed, duration=seconds, tolerance=tolerance)
+                    for tolerance in (advised.TOLERANCE, FINER * advised.TOLERANCE)
+                )
+            at, estimate = min(float(run.t[-1]), float(fine.t[-1])), run.error_estimate
+            error = float(angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine))))
+            # A run that ends where it starts has no estimate.
+            holds = run.status < 0 or bool(error <= np.fmax(FACTOR * estimate, ROUNDING))
+            same = run.status == fine.status
+            result = run.message if same else f"{run.message}; finer: {fine.message}"
+            row |= {"passed": same and holds, "result": result, "method": run.method}
+            row |= {"error": error, "estimate": estimate}
     except SstError as fault:
-        result, passed = f"{type(fault).__name__}: {str(fault).splitlines()[0]}", True
-    else:
-        at = min(float(run.t[-1]), float(fine.t[-1]))
-        error = float(angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine))))
-        # A run that ends where it starts has no estimate.
-        holds = bool(error <= np.fmax(FACTOR * run.error_estimate, ROUNDING))
-        passed, result = run.status == fine.status and (run.status < 0 or holds), run.message
-        if run.status != fine.status:
-            result += f"; finer: {fine.message}"
-        nothing = {"method": run.method, "error": error, "estimate": run.error_estimate}
-    wall = time.perf_counter() - began
-    return {"passed": passed, "result": result, **nothing, "wall_s": wall}
+        row |= {"passed": True, "result": f"{type(fault).__name__}: {str(fault).splitlines()[0]}"}
+    return row | {"wall_s": time.perf_counter() - began}
 
 
 def _scale(factor: float, keys: str, absent: str) -> Change:
@@ -182,40 +172,40 @@ def _faster(scene: Scene, motion: Trajectory) -> Scene | str:
     return scene.with_values({"initial.gamma_dot": 10.0 * rates})
 
 
-def _at_limit(name: str) -> Change:
-    """Start at the nearest pose in which a distance to a limit is zero, going into it."""
+def _turn_to(*names: str, spin: float = 0.0, before: float = 0.0) -> Change:
+    """Start at the nearest pose in which a measure of the workspace is zero, turning on by `spin`.
+
+    Or by an angle `before` it.
+    """
 
     def change(scene: Scene, motion: Trajectory) -> Scene | str:
-        axes, angles, poses = _first_zeros(scene, motion, name)
+        found = [_first_zeros(scene, motion, name, before) for name in names]
+        axes, angles, poses = (np.concatenate(parts) for parts in zip(*found, strict=True))
         if not len(angles):
             return "no turn of the star meets it"
-        # Where another limit is met as well, or before, that one ends the run.
-        beyond = _measure(Geometry.of(scene), poses).margin < -1e-9
+        # Where a limit is met as well, or before, that one ends the run.
+        geometry, beyond = Geometry.of(scene), _measure(scene, poses).margin < -1e-9
         nearest = int(np.lexsort((angles, beyond))[0])
-        return _start(scene, poses[nearest], SPIN * axes[nearest])
+        rotation, rate = poses[nearest], poses[nearest].T @ (spin * axes[nearest])
+        quaternion = quaternion_of(rotation)
+        state = (*quaternion.tolist(), *rate.tolist())
+        rates = np.array(kernel.joints(kernel.model_of(scene), state).gamma_dot)
+        gamma = kinematics.inverse(geometry, rotation)[0]
+        start = {"gamma": gamma, "gamma_dot": rates, "orientation": quaternion}
+        return with_initial(scene, start)
 
     return change
 
 
-def _beside_singularity(scene: Scene, motion: Trajectory) -> Scene | str:
-    """Start at rest beside the nearest pose with det J1 = 0 or det J2 = 0."""
-    found = (_first_zeros(scene, motion, name, BESIDE) for name in ("det_j1", "det_j2"))
-    _, angles, poses = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    if not len(angles):
-        return "no turn of the star meets one"
-    outside = ~_measure(Geometry.of(scene), poses).admissible
-    return _start(scene, poses[np.lexsort((angles, outside))[0]], np.zeros(3))
-
-
 def _first_zeros(
-    scene: Scene, motion: Trajectory, name: str, before: float = 0.0
+    scene: Scene, motion: Trajectory, name: str, before: float
 ) -> tuple[Array, Array, Array]:
     """Turn the star from its start about many axes up to where a measure becomes zero.
 
     Returns axes (n, 3) and angles (n,) [rad] where it does, and the poses (n, 3, 3) there, or by an
     angle `before` it.
     """
-    geometry, start = Geometry.of(scene), rotation_matrix(motion.quaternion[0])
+    start = rotation_matrix(motion.quaternion[0])
     axes = np.array([u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)])
     axes /= np.linalg.norm(axes, axis=1)[:, None]
 
@@ -223,7 +213,7 @@ def _first_zeros(
         return np.asarray(Rotation.from_rotvec(angles[:, None] * axes).as_matrix() @ start)
 
     def values(axes: Array, angles: Array) -> Array:
-        return np.asarray(getattr(_measure(geometry, turn(axes, angles)), name))
+        return np.asarray(getattr(_measure(scene, turn(axes, angles)), name))
 
     angles = np.linspace(0.0, np.pi, TURNS)
     every = values(np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
@@ -239,17 +229,9 @@ def _first_zeros(
     return axes, low, turn(axes, np.maximum(low - before, 0.0))
 
 
-def _measure(geometry: Geometry, rotation: Array) -> workspace.Measures:
+def _measure(scene: Scene, rotation: Array) -> workspace.Measures:
+    geometry = Geometry.of(scene)
     return workspace.measures(geometry, kinematics.inverse(geometry, rotation)[0], rotation)
-
-
-def _start(scene: Scene, rotation: Array, rate: Array) -> Scene:
-    """Start a scene at an orientation with an angular velocity in {B} [rad/s]."""
-    gamma, quaternion = kinematics.inverse(Geometry.of(scene), rotation)[0], quaternion_of(rotation)
-    state = (*quaternion.tolist(), *(rotation.T @ rate).tolist())
-    rates = kernel.joints(kernel.model_of(scene), state).gamma_dot
-    start = {"gamma": gamma, "gamma_dot": np.array(rates), "orientation": quaternion}
-    return with_initial(scene, start)
 
 
 ROWS: dict[str, tuple[str, Change]] = {
@@ -264,10 +246,13 @@ ROWS: dict[str, tuple[str, Change]] = {
         "a hundred times the friction",
         _scale(100.0, r"friction\..*\.(viscous|coulomb|static)", "friction"),
     ),
-    "stroke": ("from an end of the stroke into it", _at_limit("stroke")),
-    "edge": ("from beta = 0 into it", _at_limit("edge")),
-    "reach": ("from the largest beta into it", _at_limit("reach")),
-    "singularity": (f"from {BESIDE:g} rad beside the nearest singularity", _beside_singularity),
+    "stroke": ("from an end of the stroke into it", _turn_to("stroke", spin=SPIN)),
+    "edge": ("from beta = 0 into it", _turn_to("edge", spin=SPIN)),
+    "reach": ("from the largest beta into it", _turn_to("reach", spin=SPIN)),
+    "singularity": (
+        f"from {BESIDE:g} rad beside the nearest singularity",
+        _turn_to("det_j1", "det_j2", before=BESIDE),
+    ),
 }
 """Rows by the name that `--only` takes: what is other than in the scene, and who makes it."""
 
@@ -280,49 +265,25 @@ def stability_page(found: StabilityReport) -> str:
 
 @styled
 def draw_stability(found: StabilityReport) -> Figure:
-    """Draw eigenvalues and stable steps along the motion, and how the runs ended."""
-    runs = found.runs[found.runs.passed.notna()]
-    below = 0.36 * max(len(runs), 1) + 0.6
-    figure = Figure(figsize=(11.0, 4.6 + below))
-    parts: Any = figure.subfigures(2, 1, height_ratios=[4.6, below])
-    left, right = parts[0].subplots(1, 2)
+    """Draw eigenvalues and stable steps along the motion."""
+    figure = Figure(figsize=(11.0, 4.6))
+    left, right = figure.subplots(1, 2)
     times, free = found.steps.t_s, []
     for name, colour, line in (("decay", BLUE, "-"), ("oscillation", VERMILION, "--")):
         values = found.steps[name].where(found.steps[name] > 0.0)
-        left.plot(times, values, line, color=colour, linewidth=1.8, label=name)
+        left.plot(times, values, line, color=colour, label=name)
     for name in METHODS:
         longest = found.steps[name].where(np.isfinite(found.steps[name]))
         if longest.isna().all():
             free.append(name)
         else:
-            right.plot(times, longest, color=MARKERS[name][0], linewidth=1.8, label=name)
+            right.plot(times, longest, color=MARKERS[name][0], label=name)
     right.plot([], [], " ", label=f"{', '.join(free)}: every step")
-    for axes, label in (
-        (left, "fastest rate of the eigenvalues [1/s]"),
-        (right, "longest stable step [s]"),
-    ):
-        axes.set(yscale="log", xlabel="time t [s]", ylabel=label)
+    left.set_ylabel("fastest rate of the eigenvalues [1/s]")
+    right.set_ylabel("longest stable step [s]")
+    for axes in (left, right):
+        axes.set(yscale="log", xlabel="time t [s]")
         legend(axes)
-    if len(runs):
-        _draw_ends(parts[1].subplots(), runs)
     figure.suptitle(f"Stability of {found.scene}", fontsize=12)
     note(figure, provenance(), 185)
     return figure
-
-
-def _draw_ends(axes: Axes, runs: DataFrame) -> None:
-    """Draw error (dot) and estimate (bar) of each run, with how it ended beside them."""
-    axes.set(xscale="log", xlim=(1e-17, 1e3), ylim=(len(runs) - 0.5, -0.5))
-    for place, run in enumerate(runs.itertuples()):
-        colour = GREEN if run.passed else VERMILION
-        error, estimate = (max(value, 2e-17) for value in (run.error, run.estimate))
-        axes.plot([error, estimate], [place, place], color=colour, linewidth=1.0)
-        axes.plot(estimate, place, "|", color=colour, markersize=13, markeredgewidth=2.0)
-        axes.plot(error, place, "o", color=colour, markersize=6)
-        text = run.result if len(run.result) < 68 else f"{run.result[:66]} ..."
-        words = text if run.passed else f"FAILED: {text}"
-        axes.text(3e-7, place, words, va="center", fontsize=8, color=INK)
-    axes.set_yticks(range(len(runs)), runs.name)
-    axes.set_xticks([1e-16, 1e-14, 1e-12, 1e-10, 1e-8])
-    axes.grid(axis="y", visible=False)
-    axes.set_xlabel("error of the orientation (dot), its estimate (bar) [rad]", loc="left")
