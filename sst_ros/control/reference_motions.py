@@ -31,11 +31,11 @@ from sst_ros.control.actuator_space import (
     follow_assembly,
 )
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.errors import InputError, Problem, SingularConfiguration
+from sst_ros.errors import InputError, Problem, SingularConfiguration, refuse_unless
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.generic_math import ZERO, axpy, multiply, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.scene.loads import Spiral, Sweep, ToAngles
+from sst_ros.scene.loads import Spiral, Sweep
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Quaternion, Vector3
 
@@ -68,15 +68,14 @@ def reference_motion(
         SingularConfiguration: the motion meets a parallel singularity.
 
     """
-    motion = scene.motion
+    motion, geometry = scene.motion, Geometry.of(scene)
     if motion is None:
         raise InputError(scene.name, [Problem("motion", None, "the scene has no desired motion")])
-    geometry = Geometry.of(scene)
     if motion.recorded:
+        bag, allowed = motion.recorded.bag, "a recorded motion cannot be read here"
         if read_motion is None:
-            allowed = "a recorded motion cannot be read here"
-            raise InputError(scene.name, [Problem("motion.recorded", motion.recorded.bag, allowed)])
-        found = read_motion(motion.recorded.bag)
+            raise InputError(scene.name, [Problem("motion.recorded", bag, allowed)])
+        found = read_motion(bag)
         x, y, z, w = found.quaternion[0].tolist()
         return through_samples(geometry, (x, y, z, w), found.t, found.gamma, found.gamma_dot)
     gamma = scene.initial.gamma
@@ -86,22 +85,26 @@ def reference_motion(
         return geodesic_motion(geometry, start, turn.orientation, turn.duration)
     if motion.spiral:
         return spiral_motion(geometry, start, motion.spiral)
-    if points := motion.waypoints:
-        rows = zip(
-            *((at.time, at.gamma, at.gamma_dot, at.gamma_ddot) for at in points), strict=True
-        )
+    if motion.waypoints:
+        points = [(at.time, at.gamma, at.gamma_dot, at.gamma_ddot) for at in motion.waypoints]
         try:
-            return through_points(geometry, start, *rows)
+            return through_points(geometry, start, *zip(*points, strict=True))
         except InputError as error:
             raise InputError(f"{scene.name}: motion.waypoints", error.problems) from None
     if motion.sweep:
         centre = motion.sweep.centre or gamma
         if centre != gamma:
             start = follow_assembly(geometry, start, gamma, centre)
-        return move_actuators(geometry, *sweep_path(motion.sweep, centre), start)
-    assert motion.to_angles is not None
-    pieces = equal_pieces(motion.to_angles.duration, 2 * PIECES)
-    return move_actuators(geometry, straight_path(gamma, motion.to_angles), pieces, start)
+        return move_actuators(geometry, *_sweep_path(motion.sweep, centre), start)
+    goal = motion.to_angles
+    assert goal is not None
+    span, duration = axpy(1.0, goal.gamma, -1.0, gamma), goal.duration
+
+    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
+        s, rate, acceleration = minimum_jerk(time, duration)
+        return axpy(1.0, gamma, s, span), multiply(rate, span), multiply(acceleration, span)
+
+    return move_actuators(geometry, path, equal_pieces(duration, 2 * PIECES), start)
 
 
 def minimum_jerk(time: float, duration: float = 1.0) -> tuple[float, float, float]:
@@ -125,10 +128,8 @@ def move_star(
     def inside(time: float) -> Reference:
         s, rate, acceleration = minimum_jerk(time, duration)
         turned, u, slope = path(s)
-        body_acceleration = axpy(acceleration, u, rate * rate, slope)
-        return space.of_star(
-            quaternion_product(begin, turned), multiply(rate, u), body_acceleration
-        )
+        quaternion, moving = quaternion_product(begin, turned), multiply(rate, u)
+        return space.of_star(quaternion, moving, axpy(acceleration, u, rate * rate, slope))
 
     count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
     return ReferenceMotion(inside, equal_pieces(duration, count))
@@ -203,7 +204,11 @@ def move_actuators(
     except continuation.BranchEnds as error:
         said = f"parallel singularity before t = {times[error.row]:.9g} s"
         raise SingularConfiguration(f"{said}, least singular value of J2", error.measure) from error
-    sigma, known = branch.sigma.tolist(), _align(quaternion_of(branch.rotation), start)
+    sigma, quaternions = branch.sigma.tolist(), quaternion_of(branch.rotation)
+    # Their signs change as little as they can.
+    turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
+    signs = np.cumprod(np.where(turns < 0.0, -1.0, 1.0))
+    known = list(map(tuple, (signs[:, None] * quaternions).tolist()))
 
     def inside(time: float) -> Reference:
         gamma, gamma_dot, gamma_ddot = path(time)
@@ -234,25 +239,7 @@ def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
     return [*fine[kept].tolist(), pieces[-1]]
 
 
-def _align(quaternions: Array, before: Quaternion) -> list[Quaternion]:
-    """Return quaternions, shape (n, 4), with signs that change as little as they can."""
-    rows = np.vstack([before, quaternions])
-    flips = np.where(np.sum(rows[1:] * rows[:-1], axis=1) < 0.0, -1.0, 1.0)
-    return list(map(tuple, (np.cumprod(flips)[:, None] * quaternions).tolist()))
-
-
-def straight_path(start: Vector3, goal: ToAngles) -> ActuatorPath:
-    """From one gamma straight to another, with minimum jerk."""
-    span = axpy(1.0, goal.gamma, -1.0, start)
-
-    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
-        s, rate, acceleration = minimum_jerk(time, goal.duration)
-        return axpy(1.0, start, s, span), multiply(rate, span), multiply(acceleration, span)
-
-    return path
-
-
-def sweep_path(sweep: Sweep, centre: Vector3) -> tuple[ActuatorPath, tuple[float, ...]]:
+def _sweep_path(sweep: Sweep, centre: Vector3) -> tuple[ActuatorPath, tuple[float, ...]]:
     """Sines that fade in and out, and pieces of a quarter of a period or less."""
     last, fade, duration = sweep.last_frequency or sweep.frequency, sweep.fade, sweep.duration
     slopes = [(b - a) / duration for a, b in zip(sweep.frequency, last, strict=True)]
@@ -295,13 +282,8 @@ def through_points(
     the start, an orientation (x, y, z, w), and `begin`, gamma_dot and gamma_ddot there; one at time
     0 is the start itself, at rest. The motion ends at rest. Rates and accelerations that are not
     given (no rows, or None or nothing in place of a row) are zero at the ends and chosen for
-    minimum jerk between them.
-
-    Raises:
-        InputError: no points, wrong shapes, numbers that are not finite, times that do not rise,
-            a beginning or an end that moves, a first point that is not where the motion starts.
-        SingularConfiguration: the motion meets a parallel singularity.
-
+    minimum jerk between them. Raises InputError for points that make no motion, and as
+    `move_actuators`.
     """
     count = len(times)
     problems = [] if count else [Problem("points", 0, "must be one or more")]
@@ -321,16 +303,14 @@ def through_points(
     if at[0] > 0.0:
         at, gamma = np.append(0.0, at), np.vstack([here, gamma])
         rates, seconds = np.vstack([begin[0], rates]), np.vstack([begin[1], seconds])
-    elif np.abs(gamma[0] - here).max() > NEAR:
-        said = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
-        problem = Problem("positions[0]", gamma[0].tolist(), said.format(NEAR, *here))
-        raise InputError("trajectory", [problem])
+    allowed = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
+    first, near = gamma[0].tolist(), np.abs(gamma[0] - here).max() <= NEAR
+    refuse_unless("trajectory", ("positions[0]", first, near, allowed.format(NEAR, *here)))
     for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
         ends[np.isnan(ends)] = 0.0
     begun = follow_assembly(geometry, start, here, gamma[0])
-    return move_actuators(
-        geometry, _quintic_path(at, gamma, rates, seconds), tuple(at.tolist()), begun
-    )
+    path = _quintic_path(at, gamma, rates, seconds)
+    return move_actuators(geometry, path, tuple(at.tolist()), begun)
 
 
 def through_samples(
@@ -351,19 +331,16 @@ def _read_rows(
     name: str, rows: OpenPoints | None, count: int, problems: list[Problem]
 ) -> list[list[float]]:
     """Read rows of numbers; one that is open becomes NaN. What is wrong joins the problems."""
-    size, may_be_open = 1 if name == "times" else 3, name in ("velocities", "accelerations")
     rows = [None] * count if rows is None else rows
     if len(rows) != count:
         problems.append(Problem(name, len(rows), f"must have a row for each of {count} points"))
-    found = []
-    for index, row in enumerate(rows):
-        numbers = [] if row is None else [float(number) for number in row]
-        if not numbers and may_be_open:
-            numbers = [math.nan] * size
+    size, allowed = (1, "must be finite") if name == "times" else (3, "must be 3 finite numbers")
+    found = [[] if row is None else list(map(float, row)) for row in rows]
+    for index, numbers in enumerate(found):
+        if not numbers and name in ("velocities", "accelerations"):
+            numbers += [math.nan] * size
         elif len(numbers) != size or not all(map(math.isfinite, numbers)):
-            allowed = f"must be {size} finite numbers" if size > 1 else "must be finite"
             problems.append(Problem(f"{name}[{index}]", numbers, allowed))
-        found.append(numbers)
     return found
 
 
