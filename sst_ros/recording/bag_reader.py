@@ -42,10 +42,7 @@ RawMessage: TypeAlias = tuple[str, str, int, bytes]
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic to look for: the last word of its name, its message type.
-
-    Any namespace and node name may precede the key where it is `anywhere`.
-    """
+    """A topic to look for: the last word of its name, which may be `anywhere`, its message type."""
 
     key: str
     type: str
@@ -86,20 +83,18 @@ class Bag:
                 empty; or two topics match one that is requested.
 
         """
-        count, files, store = 0, self._mcap_files(), message_types()
-        for name, message_type, received_ns, data in (
-            self._read_mcap(files) if files else self._read_by_rosbags()
-        ):
-            count += 1
-            topic = self._topic(name, message_type)
-            if topic is None:
+        files, store, empty = self._mcap_files(), message_types(), True
+        stored = self._read_mcap(files) if files else self._read_by_rosbags()
+        for name, message_type, received_ns, data in stored:
+            empty = False
+            if (topic := self._topic(name, message_type)) is None:
                 continue
             try:
                 content = store.deserialize_cdr(data, message_type)
             except Exception as error:  # rosbags raises anything on bad bytes
                 raise self._not_whole(error, f" in {topic.key}") from None
             yield topic.key, received_ns, content
-        if not count:
+        if empty:
             raise refusal(self.path, "messages", 0, "the recording is empty")
 
     @property
@@ -160,17 +155,16 @@ class Bag:
 
     def _topic(self, name: str, message_type: str) -> Topic | None:
         """Return the requested topic of a channel, and note that it was found."""
-        if (name, message_type) in self._channels:
-            return self._channels[name, message_type]
-        topic = next(
-            (one for one in self._requested if one.matches(name) and one.type == message_type), None
-        )
-        self._channels[name, message_type] = topic
-        if topic is not None and self.topics.setdefault(topic.key, name) != name:
-            names = ", ".join(sorted([self.topics[topic.key], name]))
-            allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
-            raise refusal(self.path, topic.key, names, allowed)
-        return topic
+        channel = name, message_type
+        if channel not in self._channels:
+            named = (one for one in self._requested if one.matches(name))
+            topic = next((one for one in named if one.type == message_type), None)
+            self._channels[channel] = topic
+            if topic is not None and self.topics.setdefault(topic.key, name) != name:
+                names = ", ".join(sorted([self.topics[topic.key], name]))
+                allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
+                raise refusal(self.path, topic.key, names, allowed)
+        return self._channels[channel]
 
     def _not_whole(self, reason: object, where: str = "", advice: str = "") -> InputError:
         allowed = "must be a whole rosbag2 recording, MCAP or sqlite3; "
@@ -189,15 +183,6 @@ class Damage:
     begin_ns: int = 0  # first reception of them
     end_ns: int = 0  # last one
 
-    def describe(self, origin_ns: int) -> str:
-        """Name offset, reason and time range, in seconds after `origin_ns`."""
-        text = f"byte {self.offset}: {self.reason}"
-        if self.end_ns:
-            first, last = ((time - origin_ns) / 1e9 for time in (self.begin_ns, self.end_ns))
-            count = f"{self.messages} messages, " if self.messages else ""
-            text += f" ({count}{first:.3f} s to {last:.3f} s)"
-        return text
-
 
 class McapFile:
     """Reads one MCAP file; the attributes are complete when `messages` is exhausted."""
@@ -213,8 +198,14 @@ class McapFile:
 
     def describe(self) -> list[str]:
         """Name what is damaged or lost, a line for each part; none of a whole file."""
-        lines = [one.describe(self._origin_ns) for one in self.damage]
-        lines = [f"{self.path.name}, {line}" for line in lines]
+        lines = []
+        for one in self.damage:
+            line = f"{self.path.name}, byte {one.offset}: {one.reason}"
+            if one.end_ns:  # seconds after the first message
+                first, last = ((ns - self._origin_ns) / 1e9 for ns in (one.begin_ns, one.end_ns))
+                count = f"{one.messages} messages, " if one.messages else ""
+                line += f" ({count}{first:.3f} s to {last:.3f} s)"
+            lines.append(line)
         if self.cut:
             lines.append(f"{self.path.name}: the file ends before its index")
         if self.lost:
@@ -280,9 +271,9 @@ class McapFile:
             # Each channel of the chunk has a message index: 15 bytes, and 16 for a message.
             indexed = one.message_index_length - 15 * len(one.message_index_offsets)
             times = one.message_start_time, one.message_end_time
-            file.seek(one.chunk_start_offset)
+            begin = file.seek(one.chunk_start_offset)
             stored = _records(file.read(one.chunk_length), chunks=True)
-            yield from self._open(stored, Damage(one.chunk_start_offset, "", indexed // 16, *times))
+            yield from self._open(stored, Damage(begin, "", indexed // 16, *times))
 
     def _read_on(self, file: IO[bytes]) -> Iterator[McapRecord]:
         """Yield the records from the beginning to where they end, or to what is no record."""
@@ -339,11 +330,9 @@ class McapFile:
 
     def _check_data(self, file: IO[bytes], end: int) -> None:
         """Check the data section, which ends at `end`: also what lies between its chunks."""
-        begin, checksum = end - _DATA_END_SIZE, 0
-        file.seek(0)
-        for _ in range(0, begin, _PIECE):
-            checksum = zlib.crc32(file.read(min(_PIECE, begin - file.tell())), checksum)
-        record = None
+        begin, checksum, record = end - _DATA_END_SIZE, file.seek(0), None
+        while piece := file.read(min(_PIECE, begin - file.tell())):
+            checksum = zlib.crc32(piece, checksum)
         with contextlib.suppress(Exception):  # mcap raises anything on bad bytes
             record = next(_records(file))
         if not isinstance(record, records.DataEnd) or file.tell() != end:

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.writer import MCAP0_MAGIC, CompressionType
 from mcap.writer import Writer as McapWriter
@@ -19,7 +19,6 @@ from rosbags.rosbag2.enums import CompressionMode
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.recording.bag_reader import McapFile, message_types, refusal
 
-VERSION: Final = 9
 FLUSH_PERIOD_S = 1.0  # a process that is killed loses the messages of this time at most
 _CHUNK_BYTES = 512 * 1024
 """Bounds what the writer holds when a flush comes late. Without a bound a recorder that was held
@@ -38,10 +37,7 @@ class _McapStorage:
         self.path = path / f"{path.name}.mcap"
         self._file = self.path.open("xb")
         self._writer: Any = McapWriter(  # partly untyped
-            self._file,
-            chunk_size=_CHUNK_BYTES,
-            compression=CompressionType.NONE,
-            enable_data_crcs=True,
+            self._file, _CHUNK_BYTES, CompressionType.NONE, enable_data_crcs=True
         )
         self._writer.start("ros2", "sst_ros")
         self._schemas: dict[str, int] = {}
@@ -51,16 +47,13 @@ class _McapStorage:
     def add_msgtype(self, connection: Connection) -> None:
         definition = connection.msgdef
         encoding = "ros2msg" if definition.format == MessageDefinitionFormat.MSG else "ros2idl"
-        self._schemas[connection.msgtype] = self._writer.register_schema(
-            connection.msgtype, encoding, definition.data.encode()
-        )
+        named = connection.msgtype, encoding, definition.data.encode()
+        self._schemas[connection.msgtype] = self._writer.register_schema(*named)
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
         offered = {"offered_qos_profiles": offered_qos_profiles}
-        schema = self._schemas[connection.msgtype]
-        self._channels[connection.id] = self._writer.register_channel(
-            connection.topic, "cdr", schema, offered
-        )
+        named = connection.topic, "cdr", self._schemas[connection.msgtype], offered
+        self._channels[connection.id] = self._writer.register_channel(*named)
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
         self._sequence[connection.id] += 1
@@ -80,22 +73,12 @@ class _McapStorage:
         self._file.close()
 
 
-class _McapBagWriter(Writer):
-    """rosbag2 folder with metadata.yaml around `_McapStorage`."""
-
-    STORAGE_PLUGINS = {StoragePlugin.MCAP: _McapStorage}  # noqa: RUF012  # as in its base
-
-    def flush(self) -> None:
-        if isinstance(self.storage, _McapStorage):
-            self.storage.flush()
-
-
-class BagWriter:
+class BagWriter(Writer):
     """Writes messages; once a second all of them go to the file.
 
     A recording gets its index when it is closed. If that does not happen (kill -9, a full disk, a
     power cut) the messages that were flushed are in its .mcap file, and `recover` makes a
-    whole recording of them.
+    whole recording of them. Methods do nothing after `close` and after an abort.
 
     Raises:
         InputError: the folder exists, or cannot be made.
@@ -103,18 +86,22 @@ class BagWriter:
 
     """
 
+    STORAGE_PLUGINS = {StoragePlugin.MCAP: _McapStorage}  # noqa: RUF012  # as in its base
+
     def __init__(self, path: Path) -> None:
-        self.path, self.messages = path, 0
-        self._typestore = message_types()
-        self._flushed = time.monotonic()
-        self._open = True
+        self._typestore, self._flushed = message_types(), time.monotonic()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = _McapBagWriter(path, version=VERSION, storage_plugin=StoragePlugin.MCAP)
-            self._writer.open()
+            super().__init__(path, version=self.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+            self.open()
         except (WriterError, OSError) as error:
             allowed = f"must be a new folder ({error})"
             raise InputError("recorder", [Problem("output", str(path), allowed)]) from None
+
+    @property
+    def messages(self) -> int:
+        """Number of messages that were written."""
+        return sum(self.counts.values())
 
     def knows(self, message_type: str) -> bool:
         """Return whether messages of a type can be written."""
@@ -122,36 +109,32 @@ class BagWriter:
 
     def connect(self, topic: str, message_type: str, offered: Sequence[Qos] = ()) -> Connection:
         """Add a topic; each only once."""
-        return self._writer.add_connection(
+        return self.add_connection(
             topic, message_type, typestore=self._typestore, offered_qos_profiles=offered
         )
 
-    def write(self, connection: Connection, received_ns: int, data: bytes) -> None:
-        """Add a serialized message."""
-        if self._open:
-            self._try(self._writer.write, connection, received_ns, data)
-            self.messages += 1
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        """Add a serialized message, received at a time [ns]."""
+        self._try(super().write, connection, timestamp, data)
 
     def save(self) -> None:
         """Write all messages to the file, if that was a second ago."""
         now = time.monotonic()
-        if self._open and now - self._flushed >= FLUSH_PERIOD_S:
+        if isinstance(self.storage, _McapStorage) and now - self._flushed >= FLUSH_PERIOD_S:
             self._flushed = now
-            self._try(self._writer.flush)
+            self._try(self.storage.flush)
 
     def close(self) -> None:
-        """Write the index; does nothing the second time and after an abort."""
-        if self._open:
-            self._try(self._writer.close)
-            self._open = False
+        """Write the index."""
+        self._try(super().close)
 
     def _try(self, act: Callable[..., None], *given: Any) -> None:
         try:
-            act(*given)
+            if self.storage is not None:
+                act(*given)
         except OSError as error:
-            self._open = False
             with contextlib.suppress(OSError):
-                self._writer.abort()
+                self.abort()
             raise RecordingAborted(
                 f"{self.path} is cut: {error}. Recording stopped after {self.messages} messages; "
                 f"recover those that were written by: python -m sst_ros recover {self.path}"
@@ -184,8 +167,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
         raise refusal(path, "bag", str(files[0]), f"must be readable ({problem})") from None
     if sum(one != right for one, right in zip(begin, MCAP0_MAGIC, strict=False)) > 1 or not begin:
         raise refusal(path, "bag", files[0].name, "must be an MCAP file")
-    file = McapFile(files[0])
-    target = out or path.with_name(f"{path.stem}_recovered")
+    file, target = McapFile(files[0]), out or path.with_name(f"{path.stem}_recovered")
     if target.exists():
         raise refusal(target, "bag", str(target), "must be a new folder")
     writer: BagWriter | None = None

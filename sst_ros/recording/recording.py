@@ -8,6 +8,7 @@ what is not a whole run.
 
 from __future__ import annotations
 
+import contextlib
 from array import array
 from dataclasses import dataclass
 from functools import cached_property
@@ -88,13 +89,13 @@ class Signals:
         """Time of each row since the start of the run [s]."""
         return np.asarray(self.time_ns(table) / NANOSECONDS)
 
-    def legs(self, name: str, table: str = "samples") -> Array:
-        """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
-        return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
-
     def take(self, *names: str, table: str = "samples") -> Array:
         """Columns of quantities, shape (n, number of names)."""
         return self.tables[table].take(*names)
+
+    def legs(self, name: str, table: str = "samples") -> Array:
+        """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
+        return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
 
     def columns(self, table: str) -> dict[Column, NDArray[Any]]:
         """Columns of a table, times first, whole numbers where they are in ns; see `table`."""
@@ -115,7 +116,7 @@ class Signals:
         """
         columns = self.columns(name)
         numbers = {column.name: values for column, values in columns.items()}
-        result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index(topics.TIMES[0].name)
+        result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index("time_ns")
         result.attrs = {column.name: column.text for column in columns}
         return result
 
@@ -129,14 +130,11 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
         InputError: there is no recording, it is damaged, or it has nothing of a run.
 
     """
-    path = Path(path)
-    bag = Bag(path, [*topics.TOPIC_TABLES, topics.SCENE, topics.DIAGNOSTICS], damaged=damaged)
-    tables = {table.key: table for table in topics.TOPIC_TABLES}
+    path, tables = Path(path), {table.key: table for table in topics.TOPIC_TABLES}
+    bag = Bag(path, [*tables.values(), topics.SCENE, topics.DIAGNOSTICS], damaged=damaged)
     # Compact: an hour at 500 Hz has 1.8 million rows.
-    times, numbers = {key: array("q") for key in tables}, {key: array("d") for key in tables}
-    scenes: set[str] = set()
-    statuses: list[Status] = []
-    idle = 0
+    stored = {key: (array("q"), array("d")) for key in tables}
+    scenes, statuses, idle = set[str](), list[Status](), 0
     for key, received_ns, content in bag.messages():
         if key == topics.SCENE.key:
             scenes.add(content.data)
@@ -150,29 +148,23 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
             except topics.InvalidMessage as error:
                 raise refusal(path, key, *error.args) from None
             idle += key == topics.JOINT_STATES.key and not rows
+            times, numbers = stored[key]
             for stamp, values in rows:
-                times[key].extend((stamp, received_ns))
-                numbers[key].extend(values)
-    found = {
-        key: topics.sort_rows(table, times.pop(key), numbers.pop(key), path)
-        for key, table in tables.items()
-    }
+                times.extend((stamp, received_ns))
+                numbers.extend(values)
+    found = {key: topics.sort_rows(one, *stored.pop(key), path) for key, one in tables.items()}
     if not any(map(len, found.values())):
-        allowed = "must have at least one of " + ", ".join(t.ending for t in topics.TOPIC_TABLES)
+        allowed = "must have at least one of " + ", ".join(one.ending for one in tables.values())
         raise refusal(path, "topics", None, allowed)
     if len(scenes) > 1:
         raise refusal(path, topics.SCENE.key, len(scenes), "the recording must hold one scene")
     stamped = [one.key for one in (*topics.TABLES["samples"], topics.TICKS)]
     starts = [int(found[key].stamp_ns[0]) for key in stamped if len(found[key])]
+    start_ns = min(starts or [int(one.received_ns[0]) for one in found.values() if len(one)])
     origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
-    return Signals(
-        bag=bag,
-        scene=yaml_document.read(Scene, scenes.pop(), origin) if scenes else None,
-        start_ns=min(starts or [int(one.received_ns[0]) for one in found.values() if len(one)]),
-        topic_series=found,
-        idle_states=idle,
-        statuses=tuple(sorted(statuses, key=lambda status: status.received_ns)),
-    )
+    scene = yaml_document.read(Scene, scenes.pop(), origin) if scenes else None
+    statuses.sort(key=lambda status: status.received_ns)
+    return Signals(bag, scene, start_ns, found, idle, tuple(statuses))
 
 
 @dataclass(frozen=True)
@@ -271,8 +263,16 @@ class Recording:
         if len(wrong):
             allowed = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), allowed)
-        self.ticks, series = _ticks(self.path, ticks, self.start_ns), found.topic_series
-        parts = [series[one.key] for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
+        begin_ns = ticks.stamp_ns - self.start_ns
+        end_ns = begin_ns + ticks.values[:, 0].astype(np.int64)
+        overlap = ticks.stamp_ns[1:][begin_ns[1:] < end_ns[:-1]]
+        if len(overlap):
+            allowed = f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
+            raise refusal(self.path, topics.TICKS.key, int(overlap[0]), allowed)
+        moment = ticks.values[:, 4:]
+        known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
+        self.ticks = Ticks(begin_ns, end_ns, ticks.torque, moment if known else None)
+        parts = [found.topic_series[one.key] for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
         order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
         names = ("stamp_ns", "received_ns", "values")
         columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
@@ -291,10 +291,8 @@ class Recording:
         [N m], shape (n,); nan where that tick is not recorded. Where actuators lag it is the lag.
         """
         at = places(self.ticks.end_ns, self.time_ns)
-        result = np.where(at >= 0, 0.0, np.nan)
-        for effort, torque in zip(self.effort.T, self.ticks.torque.T, strict=True):
-            np.maximum(result, np.abs(effort - torque[at]), out=result)  # nan stays
-        return result
+        largest = np.abs(self.effort - self.ticks.torque[at]).max(axis=1)
+        return np.where(at >= 0, largest, np.nan)
 
     @property
     def seconds(self) -> Array:
@@ -308,15 +306,13 @@ class Recording:
         Between samples `Trajectory.at` integrates under the recorded torques. Its error estimate,
         method and message are those that the simulator reported.
         """
-        known = np.isfinite(self.quaternion).all(axis=1)
+        known, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
         rates = (self.gamma_dot, self.mu_dot, self.beta_dot)
         body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
         joints = np.hstack([self.gamma, self.mu, self.beta, *rates])
-        reported, ticks = self.diagnostics, self.ticks
-        try:
+        reported, error_estimate = self.diagnostics, np.nan
+        with contextlib.suppress(ValueError):
             error_estimate = float(reported.get("error_estimate", "nan"))
-        except ValueError:
-            error_estimate = np.nan
         fault = reported.get("fault", "")
         return Trajectory(
             self.scene,
@@ -341,20 +337,6 @@ def _finite_rows(found: Signals, table: TopicTable) -> Series:
         stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
         raise refusal(found.bag.path, table.key, row, f"is not finite at stamp {stamp} ns")
     return series
-
-
-def _ticks(path: Path, series: Series, start_ns: int) -> Ticks:
-    """Return the ticks of a run that starts at `start_ns`; they must not overlap."""
-    starts = series.stamp_ns
-    ends = starts + series.values[:, 0].astype(np.int64)
-    overlap = starts[1:] < ends[:-1]
-    if overlap.any():
-        at = int(starts[1:][overlap][0])
-        allowed = f"ticks overlap at stamp {at} ns; record one simulator a bag"
-        raise refusal(path, topics.TICKS.key, at, allowed)
-    moment = series.values[:, 4:]
-    known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
-    return Ticks(starts - start_ns, ends - start_ns, series.torque, moment if known else None)
 
 
 def _usual(lengths_ns: Integers) -> int:
@@ -398,10 +380,10 @@ def export(bag: Path, out: Path, form: str = "csv", *, force: bool = False) -> l
     """
     require_free(out, "export", force=force)
     run = read_signals(bag)
-    paths = {name: out / f"{name}.{form}" for name in run.tables}
+    paths = [out / f"{name}.{form}" for name in run.tables]
     with write_into(out, "export"):
-        for name, path in paths.items():
+        for name, path in zip(run.tables, paths, strict=True):
             columns = run.columns(name)
             about = {one.name: {"unit": one.unit, "description": one.text} for one in columns}
             write_table({one.name: values for one, values in columns.items()}, path, about)
-    return list(paths.values())
+    return paths

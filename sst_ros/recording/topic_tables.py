@@ -40,9 +40,8 @@ class Column(NamedTuple):
     @property
     def name(self) -> str:
         """Name with the unit, as in "gamma_dot_1_rad_per_s"."""
-        if self.unit == "1":
-            return self.quantity
-        return f"{self.quantity}_{self.unit.replace('/', '_per_').replace(' ', '_')}"
+        unit = f"_{self.unit.replace('/', '_per_').replace(' ', '_')}"
+        return self.quantity + unit * (self.unit != "1")
 
     @property
     def text(self) -> str:
@@ -80,8 +79,8 @@ class Series:
 
     def take(self, *names: str) -> Array:
         """Columns of quantities, as in "gamma_1", shape (n, number of names)."""
-        names_of = [column.quantity for column in self.columns]
-        return np.asarray(self.values[:, [names_of.index(name) for name in names]])
+        quantities = [column.quantity for column in self.columns]
+        return np.asarray(self.values[:, list(map(quantities.index, names))])
 
     @property
     def torque(self) -> Array:
@@ -175,13 +174,11 @@ def _read_ticks(message: Any) -> Rows:
     names = tuple(message.joint_names) or ACTUATED
     at = _places(ACTUATED, names)
     moments = _places(MOMENTS, names) if set(MOMENTS) <= set(names) else []
-    rows: Rows = []
-    end = start
+    rows, end = Rows(), start
     for point in message.points:
         effort = point.effort.tolist()
         if len(effort) != len(names):
-            allowed = f"must be a torque for each actuator (stamp {start} ns)"
-            raise InvalidMessage(effort, allowed)
+            raise InvalidMessage(effort, f"must be a torque for each actuator (stamp {start} ns)")
         begin, end = end, start + nanoseconds(point.time_from_start)
         if end <= begin:
             allowed = f"ticks must have a length; one at stamp {begin} ns has none"
