@@ -30,7 +30,8 @@ from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
 from sst_ros.runtime.tick_loop import TickLoop
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import build, plain
+from sst_ros.scene.schema import build
+from sst_ros.scene.yaml_document import plain
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS, State, Vector3
 from sst_ros.sweeps.sweep_study import SampledControl

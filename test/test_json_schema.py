@@ -11,7 +11,7 @@ import yaml
 
 from sst_ros import __main__ as cli
 from sst_ros.scene.scene import Scene, names, text_of
-from sst_ros.scene.schema import json_schema
+from sst_ros.scene.yaml_document import json_schema
 
 jsonschema = pytest.importorskip("jsonschema")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 import unicodedata
-from dataclasses import FrozenInstanceError, dataclass, replace
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from sst_ros.errors import InputError
 from sst_ros.scene.bodies import Base, Inertia, Link, Star
 from sst_ros.scene.loads import Initial, Stroke, Workspace
 from sst_ros.scene.scene import Scene, load
-from sst_ros.scene.schema import Section, flag, integer, texts
+from sst_ros.scene.schema import Section, entry
 from sst_ros.scene.yaml_document import dump, read
 from test.test_scene_refusals import SOURCE, refusal
 
@@ -96,11 +96,10 @@ def test_long_values_are_cut_in_messages():
     assert "..." in said
 
 
-@dataclass(frozen=True)
 class Switches(Section):
-    on: bool = flag("a switch", default=False)
-    count: int = integer("how many", "1", default=2, least=1, most=9)
-    words: tuple[str, ...] = texts("some words", default=())
+    on: bool = entry("a switch", default=False)
+    count: int = entry("how many", "1", default=2, least=1, most=9)
+    words: tuple[str, ...] = entry("some words", default=())
 
 
 @pytest.mark.parametrize(

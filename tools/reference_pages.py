@@ -14,7 +14,6 @@ Tests hold the files against this module, and this module against running nodes.
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -31,7 +30,7 @@ from sst_ros.report.results import markdown
 from sst_ros.runtime import diagnostics
 from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section, Spec, specs
+from sst_ros.scene.schema import REQUIRED, Section, Spec
 
 ROOT = Path(__file__).resolve().parents[1]
 SIMULATOR = "sst_simulator"
@@ -105,25 +104,23 @@ def scenes_tables() -> Iterator[tuple[str, str]]:
 def _sections(cls: type[Section], path: str) -> Iterator[tuple[type[Section], str]]:
     """Yield a section and all those in it, each with its key."""
     yield cls, path
-    for field in dataclasses.fields(cls):
-        spec: Spec = field.metadata["spec"]
+    for name, spec in cls.SPECS.items():
         if spec.section is not None:
-            entry = f"{field.name}[]" if spec.kind == "sections" else field.name
+            entry = f"{name}[]" if spec.kind == "sections" else name
             yield from _sections(spec.section, f"{path}.{entry}" if path else entry)
 
 
 def _section(cls: type[Section], paths: list[str]) -> str:
     title = ", ".join(f"`{path}`" if path else "The document" for path in paths)
     rows = []
-    for field in dataclasses.fields(cls):
-        spec: Spec = field.metadata["spec"]
-        rows.append((f"`{field.name}`", spec.doc, _allowed(spec), _default(field.default)))
+    for name, spec in cls.SPECS.items():
+        rows.append((f"`{name}`", spec.doc, _allowed(spec), _default(spec.default)))
     keys = _table(("key", "meaning", "must be", "default"), rows)
     return f"## {title}\n\n{inspect.getdoc(cls) or ''}\n\n{keys}"
 
 
 def _default(value: Any) -> str:
-    if value is dataclasses.MISSING:
+    if value is REQUIRED:
         return "required"
     if isinstance(value, bool):
         return str(value).lower()
@@ -220,7 +217,7 @@ def _names(node: Described, use: str) -> Iterator[str]:
 
 def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
     defaults, changeable = cls(), getattr(cls, "CHANGEABLE", ())
-    for name, spec in specs(cls).items():
+    for name, spec in cls.SPECS.items():
         value = getattr(defaults, name)
         shown = str(value).lower() if isinstance(value, bool) else value
         if spec.kind == "texts":

@@ -8,7 +8,7 @@ import json
 
 from sst_ros.description.robot import urdf, urdf_with_ros2_control
 from sst_ros.scene.scene import Scene, load, names
-from sst_ros.scene.schema import json_schema
+from sst_ros.scene.yaml_document import json_schema
 
 
 def list_all(_: argparse.Namespace) -> None:

@@ -53,7 +53,7 @@ from sst_ros.mechanism.generic_math import (
 )
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section, choice, coefficient, integer, number, positive
+from sst_ros.scene.schema import Section, coefficient, entry, positive
 from sst_ros.state import Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
@@ -64,10 +64,9 @@ _ROUND = 1.5 * 2.0**52  # added and subtracted, it rounds to whole numbers, halv
 
 def _joint_gain(name: str, unit: str, instead: str) -> Any:
     doc = f"{name} of the feedback, in place of {instead}; zeros for that of bandwidth"
-    return number(doc, unit, shape=(3,), default=ZERO, least=0.0, most=1e9)
+    return entry(doc, unit, default=ZERO, least=0.0, most=1e9)
 
 
-@dataclass(frozen=True)
 class ControllerSettings(Section):
     """Mode and gains.
 
@@ -77,16 +76,16 @@ class ControllerSettings(Section):
     feedforward_pd have equal gains. computed_torque takes them over M_kk, as accelerations.
     """
 
-    mode: str = choice(
+    mode: str = entry(
         "feedforward: torque of the desired motion; feedforward_pd: and feedback; computed_torque: "
         "the model at the measured state, and feedback; pd: feedback alone; gravity_pd: and the "
         "weight at the measured position",
-        MODES,
+        choices=MODES,
         default="feedforward",
     )
-    space: str = choice(
+    space: str = entry(
         "where computed_torque is linear: the actuator angles, or the orientation",
-        SPACES,
+        choices=SPACES,
         default="gamma",
     )
     bandwidth: float = positive("natural frequency of the error", "rad/s", default=30.0, most=1e6)
@@ -103,8 +102,10 @@ class ControllerSettings(Section):
         "N m",
         most=1e9,
     )
-    feedforward_at: str = choice(
-        "instant of a control period whose feedforward is held over it", INSTANTS, default="start"
+    feedforward_at: str = entry(
+        "instant of a control period whose feedforward is held over it",
+        choices=INSTANTS,
+        default="start",
     )
 
     def check(self) -> Iterator[Problem]:
@@ -131,7 +132,6 @@ class ControllerSettings(Section):
         return self.mode in ("gravity_pd", "computed_torque")
 
 
-@dataclass(frozen=True)
 class ControlChannel(Section):
     """What lies between plant and controller; zeros change nothing.
 
@@ -139,9 +139,9 @@ class ControlChannel(Section):
     is the difference of its last two angles over the period. Noise is new at every sample.
     """
 
-    period: float = number("control period", "s", default=1e-3, least=1e-6, most=1.0)
-    delay: int = integer("delay of commands", "periods", default=0, least=0, most=100)
-    counts: int = integer(
+    period: float = entry("control period", "s", default=1e-3, least=1e-6, most=1.0)
+    delay: int = entry("delay of commands", "periods", default=0, least=0, most=100)
+    counts: int = entry(
         "encoder steps per turn; 0 for exact angles and rates", "1", default=0, least=0, most=2**31
     )
     angle_noise: float = coefficient("standard deviation of noise on gamma", "rad", most=1.0)

@@ -201,9 +201,7 @@ def urdf(scene: Scene) -> str:
 
 
 def urdf_with_ros2_control(
-    scene: Scene,
-    commands: str = "/sst_simulator/commands_stamped",
-    states: str = "/joint_states",
+    scene: Scene, commands: str = "/sst_simulator/commands_stamped", states: str = "/joint_states"
 ) -> str:
     """Write a scene as URDF with the ros2_control tag of its actuators.
 

@@ -36,7 +36,8 @@ from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
 from sst_ros.scene.bodies import Link, Star
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.yaml_document import build, build_unchecked, find_fields, plain, replace_values
+from sst_ros.scene.schema import build, build_unchecked, drop_idle
+from sst_ros.scene.yaml_document import find_fields, plain, replace_values
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 
@@ -122,7 +123,7 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
     notes = document.setdefault("provenance", {})
     known = {re.sub(r"\[\d\]", "", name).split(".")[0] for name in found}
     notes |= dict.fromkeys(sorted(known & document.keys()), note)
-    return build(Scene, document, scene.name, of_row=True)
+    return build(Scene, drop_idle(Scene, document), scene.name)
 
 
 def _list_names(scene: Scene) -> tuple[list[str], list[str]]:

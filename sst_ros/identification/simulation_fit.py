@@ -48,8 +48,9 @@ from sst_ros.identification.parameters import STANDARD, Identification, value_of
 from sst_ros.mechanism.generic_math import ZERO, atan2, quaternion_rate, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import build_unchecked
 from sst_ros.scene.torque_profile import TorqueProfile, torque_at
-from sst_ros.scene.yaml_document import build_unchecked, plain, replace_values
+from sst_ros.scene.yaml_document import plain, replace_values
 
 NOT_DETERMINED = 1.0
 """Relative standard deviation of a combination from which on it counts as not determined."""

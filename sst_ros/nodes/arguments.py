@@ -18,7 +18,7 @@ import yaml
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.runtime import settings
-from sst_ros.scene.schema import Section, Spec, accept, specs
+from sst_ros.scene.schema import Section, Spec, accept
 
 USE_SIM_TIME = "use_sim_time"
 FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
@@ -109,7 +109,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _specs_of(command: str) -> dict[str, Spec]:
-    return {**specs(COMMANDS[command][1]), USE_SIM_TIME: Spec("flag", "follow /clock")}
+    return {**COMMANDS[command][1].SPECS, USE_SIM_TIME: Spec("flag", "follow /clock")}
 
 
 def _option(name: str) -> str:

@@ -40,7 +40,7 @@ from sst_ros.nodes import arguments, signals, topics
 from sst_ros.nodes.topics import Endpoint
 from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.scene.schema import Section, Spec, specs
+from sst_ros.scene.schema import Section, Spec
 from sst_ros.state import Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -98,7 +98,7 @@ class Worker(Generic[P]):
         self.parameters = changed
 
     def _set(self, given: list[Parameter[Any]]) -> Result:
-        known, values = specs(type(self.parameters)), {one.name: one.value for one in given}
+        known, values = self.parameters.SPECS, {one.name: one.value for one in given}
         if "use_sim_time" in values:
             reason = "use_sim_time is read when the node starts, and cannot be changed"
             return Result(successful=False, reason=reason)
@@ -119,7 +119,7 @@ def _declare(
     given: dict[str, Any] = {name: one.value for name, one in node._parameter_overrides.items()}
     defaults, values = {**vars(cls()), **more_defaults(given)}, dict[str, Any]()
     problems: list[Problem] = []
-    for name, spec in specs(cls).items():
+    for name, spec in cls.SPECS.items():
         value = given.get(name, defaults[name])
         if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
             value = float(value)
@@ -131,7 +131,7 @@ def _declare(
             node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
             problems.append(Problem(name, value, spec.describe()))
-    ours = {name for _, parameters in arguments.COMMANDS.values() for name in specs(parameters)}
+    ours = {name for _, parameters in arguments.COMMANDS.values() for name in parameters.SPECS}
     for name in sorted(given.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")

@@ -6,14 +6,13 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from sst_ros.control.law import ControllerSettings
 from sst_ros.errors import Problem
 from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.scene import share_directory
-from sst_ros.scene.schema import Section, choice, flag, integer, number, text, texts
+from sst_ros.scene.schema import Section, entry
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
 from sst_ros.state import NANOSECONDS
 
@@ -21,31 +20,30 @@ _OF_A_GOAL = ", where the goal does not give it; 0 for none"
 
 
 def _number(doc: str, unit: str, default: float, least: float = 0.0, most: float = 1e6) -> Any:
-    return number(doc, unit, default=default, least=least, most=most)
+    return entry(doc, unit, default=default, least=least, most=most)
 
 
 def _positive(doc: str, unit: str, default: float) -> Any:
-    return number(doc, unit, default=default, above=0.0, most=1.0)
+    return entry(doc, unit, default=default, above=0.0, most=1.0)
 
 
 def _whole(doc: str, unit: str, default: int, least: int, most: int) -> Any:
-    return integer(doc, unit, default=default, least=least, most=most)
+    return entry(doc, unit, default=default, least=least, most=most)
 
 
-@dataclass(frozen=True)
 class SimulatorParameters(Section):
     """Parameters of sst_simulator."""
 
     CHANGEABLE: ClassVar = ("real_time_factor", "command_timeout", "lockstep_timeout")
 
-    scene: str = text("scene, by name or by path of a .yaml file", default="example2")
+    scene: str = entry("scene, by name or by path of a .yaml file", default="example2")
     rate: int = _whole(
         "steps per second of simulated time, a divisor of 1e9", "Hz", 1000, 1, 100000
     )
     publish_rate: int = _whole(
         "published samples per second of simulated time, a divisor of rate", "Hz", 500, 1, 100000
     )
-    wait_for_command: bool = flag("start the run at the first command, not at once", default=False)
+    wait_for_command: bool = entry("start the run at the first command, not at once", default=False)
     duration: float = _number(
         "length of the run, after which the node ends, by default the duration of the scene; 0 for "
         "no end",
@@ -59,11 +57,13 @@ class SimulatorParameters(Section):
         default=1.0,
         most=1000.0,
     )
-    publish_clock: bool = flag(
+    publish_clock: bool = entry(
         "publish the simulated time on /clock; refused where there is a clock", default=False
     )
-    publish_description: bool = flag("publish the scene as URDF on robot_description", default=True)
-    wait_for_subscribers: tuple[str, ...] = texts(
+    publish_description: bool = entry(
+        "publish the scene as URDF on robot_description", default=True
+    )
+    wait_for_subscribers: tuple[str, ...] = entry(
         "topics of the node, such as joint_states or ~/orientation, that must have a subscriber "
         "before the run starts",
         default=(),
@@ -71,9 +71,9 @@ class SimulatorParameters(Section):
     subscriber_timeout: float = _number(
         "longest wait for them, after which the node ends with an error", "s", 10.0
     )
-    sync: str = choice(
+    sync: str = entry(
         "free: run by the clock; lockstep: wait for the command that answers each sample",
-        ("free", "lockstep"),
+        choices=("free", "lockstep"),
         default="free",
     )
     lockstep_timeout: float = _number(
@@ -82,22 +82,22 @@ class SimulatorParameters(Section):
     command_timeout: float = _number(
         "age at which a command is no longer held (steady clock); 0 for never", "s", 0.5
     )
-    partial_commands: bool = flag(
+    partial_commands: bool = entry(
         "an effort of commands_stamped that is nan means that the actuator is not commanded, as "
         "ros2_control sends it: zero torque; else such a command is refused",
         default=False,
     )
-    integrator: str = choice("method of integration", INTEGRATORS, default="auto")
+    integrator: str = entry("method of integration", choices=INTEGRATORS, default="auto")
     tolerance: float = _positive(
         "largest local error of a step of the integrator", "rad, relative", 1e-10
     )
-    equations: str = choice(
+    equations: str = entry(
         "equations of motion: those in the quaternion and the body rate, or the paper's Eqs. 1 to "
         "92, which give the same motion by explicit methods in plain Python, about 20 times slower",
-        EQUATIONS,
+        choices=EQUATIONS,
         default="quaternion",
     )
-    compiled: bool = flag(
+    compiled: bool = entry(
         "run machine code where numba is installed; the first run of a scene is plain Python, with "
         "the same bits, and a process of low priority compiles the scene for the next",
         default=True,
@@ -146,7 +146,6 @@ class SimulatorParameters(Section):
         )
 
 
-@dataclass(frozen=True)
 class AnsweringParameters(Section):
     """Parameters of the nodes that answer joint states with torques."""
 
@@ -157,8 +156,8 @@ class AnsweringParameters(Section):
         least=1,
         most=100000,
     )
-    simulator: str = text("name of the simulator's node", default="sst_simulator")
-    stamped: bool = flag(
+    simulator: str = entry("name of the simulator's node", default="sst_simulator")
+    stamped: bool = entry(
         "answer on commands_stamped, as a simulator in lockstep asks", default=False
     )
     min_subscribers: int = _whole(
@@ -178,29 +177,27 @@ class AnsweringParameters(Section):
         return NANOSECONDS // self.rate
 
 
-@dataclass(frozen=True)
 class PlayerParameters(AnsweringParameters):
     """Parameters of sst_torque_player."""
 
-    scene: str = text("scene whose torque is played, by name or by path", default="example2")
-    csv: str = text("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
-    hold: str = choice(
+    scene: str = entry("scene whose torque is played, by name or by path", default="example2")
+    csv: str = entry("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
+    hold: str = entry(
         "instant whose torque is held from a sample until the next: the middle of the hold gives "
         "an error of second order in the period, its start one of first order",
-        ("middle", "start"),
+        choices=("middle", "start"),
         default="middle",
     )
 
 
-@dataclass(frozen=True)
 class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
     """Parameters of sst_inverse_dynamics: those of the control law and those of the node."""
 
-    scene: str = text("scene of the controller's model, by name or by path", default="reach")
-    motion: str = choice(
+    scene: str = entry("scene of the controller's model, by name or by path", default="reach")
+    motion: str = entry(
         "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory and goals of "
         "~/follow_joint_trajectory, until it is stopped",
-        ("scene", "topic"),
+        choices=("scene", "topic"),
         default="scene",
     )
     hold: float = _number("time for which the end of the scene's motion is held", "s", 0.0)
@@ -225,7 +222,7 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
         default=0.2,
         least=0.001,
     )
-    wait_for_recorder: bool = flag(
+    wait_for_recorder: bool = entry(
         "start when ~/reference and ~/tracking_error have subscribers, for a complete recording",
         default=False,
     )
@@ -236,14 +233,13 @@ def default_topics() -> tuple[str, ...]:
     return tuple((share_directory() / "config" / "topics.txt").read_text().split())
 
 
-@dataclass(frozen=True)
 class RecorderParameters(Section):
     """Parameters of sst_recorder."""
 
-    output: str = text(
+    output: str = entry(
         "folder of the bag, which must not exist yet; - for a dated name", default="-"
     )
-    topics: tuple[str, ...] = texts("topics to record", default=default_topics())
+    topics: tuple[str, ...] = entry("topics to record", default=default_topics())
     timeout: float = _number(
         "longest wait until they are recorded, after which the node ends with an error; 0 for no "
         "end",
@@ -252,14 +248,13 @@ class RecorderParameters(Section):
     )
 
 
-@dataclass(frozen=True)
 class ViewerParameters(Section):
     """Parameters of sst_viewer."""
 
-    simulator: str = text("name of the simulator's node", default="sst_simulator")
-    host: str = text(
+    simulator: str = entry("name of the simulator's node", default="sst_simulator")
+    host: str = entry(
         "address to serve the page at; another than this opens the actuators to all who reach it",
         default="127.0.0.1",
     )
     port: int = _whole("port of the page; the next free one is taken", "1", 8080, 1024, 65535)
-    open: bool = flag("open the page in a browser, where there is a desktop", default=False)
+    open: bool = entry("open the page in a browser, where there is a desktop", default=False)

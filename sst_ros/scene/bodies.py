@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,16 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import Problem, refuse_unless
-from sst_ros.scene.schema import (
-    Rules,
-    Section,
-    choice,
-    coefficient,
-    number,
-    positive,
-    section,
-    vector,
-)
+from sst_ros.scene.schema import Rules, Section, coefficient, entry, positive
 from sst_ros.state import Vector3
 
 RELATIVE_ROUNDING = 1e-9
@@ -43,19 +33,18 @@ SMALLEST_MOMENT = 1e-18
 """Moment of inertia [kg m^2] of a microgram at a millimetre; its inverse must not overflow."""
 
 
-@dataclass(frozen=True)
 class Inertia(Section):
     """A symmetric inertia tensor, about O for all but the payload.
 
     Off-diagonal entries are those of the tensor: xy = -sum(m x y), the negative product of inertia.
     """
 
-    xx: float = number("inertia tensor, xx", "kg m^2")
-    yy: float = number("inertia tensor, yy", "kg m^2")
-    zz: float = number("inertia tensor, zz", "kg m^2")
-    xy: float = number("inertia tensor, xy", "kg m^2", default=0.0)
-    xz: float = number("inertia tensor, xz", "kg m^2", default=0.0)
-    yz: float = number("inertia tensor, yz", "kg m^2", default=0.0)
+    xx: float = entry("inertia tensor, xx", "kg m^2")
+    yy: float = entry("inertia tensor, yy", "kg m^2")
+    zz: float = entry("inertia tensor, zz", "kg m^2")
+    xy: float = entry("inertia tensor, xy", "kg m^2", default=0.0)
+    xz: float = entry("inertia tensor, xz", "kg m^2", default=0.0)
+    yz: float = entry("inertia tensor, yz", "kg m^2", default=0.0)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -79,7 +68,6 @@ class Inertia(Section):
             yield broken, "", lambda: np.linalg.eigvalsh(self.matrix).tolist(), allowed
 
 
-@dataclass(frozen=True)
 class Base(Section):
     """The fixed spherical triangle P1 P2 P3 in {B}, by directions v or by its arcs.
 
@@ -90,16 +78,15 @@ class Base(Section):
 
     ONE_OF = "v", "arcs_deg"
 
-    v: tuple[Vector3, Vector3, Vector3] = number(
+    v: tuple[Vector3, Vector3, Vector3] = entry(
         "directions of P1, P2, P3 seen from O, right-handed; their lengths do not matter",
         "1",
-        shape=(3, 3),
         least=-1e6,
         most=1e6,
         default=None,
     )
-    arcs_deg: Vector3 | None = vector(
-        "lengths of the arcs 1-2, 2-3, 3-1, in place of v", "deg", least=1e-6, default=None
+    arcs_deg: Vector3 | None = entry(
+        "lengths of the arcs 1-2, 2-3, 3-1, in place of v", "deg", least=1e-6
     )
     radius: float = positive("radius of the base sphere", "m")
 
@@ -149,22 +136,21 @@ def _directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3
     )
 
 
-@dataclass(frozen=True)
 class Link(Section):
     """One rigid link of a leg; without `inertia` it has none, without `mass` no weight."""
 
-    inertia: Inertia | None = section("inertia of the link in its own frame", Inertia, default=None)
+    inertia: Inertia | None = entry("inertia of the link in its own frame")
     mass: float = coefficient("mass, for gravity", "kg")
-    centre: Vector3 = vector(
+    centre: Vector3 = entry(
         "centre of mass in the frame of the inertia",
         "m",
         default=(0.0, 0.0, 0.0),
         acts_on=("mass",),
         needs="needs mass > 0 [kg]",
     )
-    inertia_about: str = choice(
+    inertia_about: str = entry(
         "point of the inertia; the scene that is read has it about O",
-        (ABOUT_O, ABOUT_CENTRE),
+        choices=(ABOUT_O, ABOUT_CENTRE),
         default=ABOUT_O,
     )
 
@@ -207,12 +193,11 @@ class Link(Section):
         yield given & ~fits, "centre", self.centre, allowed
 
 
-@dataclass(frozen=True)
 class Star(Link):
     """The moving spherical star."""
 
-    inertia: Inertia = section("inertia of the star in {E}", Inertia)
-    alpha_deg: Vector3 = vector("angles between the planes of arcs 1-2, 2-3, 3-1", "deg", above=0.0)
+    inertia: Inertia = entry("inertia of the star in {E}")
+    alpha_deg: Vector3 = entry("angles between the planes of arcs 1-2, 2-3, 3-1", "deg", above=0.0)
     radius: float = positive("radius of the star's sphere, distance O E", "m")
 
     def rules(self) -> Rules:
@@ -224,18 +209,15 @@ class Star(Link):
         yield from super().rules()
 
 
-@dataclass(frozen=True)
 class Payload(Section):
     """A body carried by the star; its inertia is about its own centre of mass."""
 
     EFFECTS = "mass", "inertia"
 
     mass: float = positive("mass", "kg")
-    centre: Vector3 = vector("centre of mass in {E}", "m")
-    inertia: Inertia | None = section(
-        "inertia about the payload's centre of mass, axes of {E}; none for a point",
-        Inertia,
-        default=None,
+    centre: Vector3 = entry("centre of mass in {E}", "m")
+    inertia: Inertia | None = entry(
+        "inertia about the payload's centre of mass, axes of {E}; none for a point"
     )
 
     @property

@@ -9,27 +9,13 @@ that names no start begins in the initial pose of the scene.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.scene.schema import (
-    Rules,
-    Section,
-    angles,
-    choice,
-    coefficient,
-    flag,
-    number,
-    positive,
-    section,
-    sections,
-    text,
-    vector,
-)
+from sst_ros.scene.schema import Rules, Section, angles, coefficient, entry, positive
 from sst_ros.state import Quaternion, Vector3
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
@@ -37,25 +23,23 @@ JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1
 NANOSECOND = 1e-9
 """Resolution of time [s]."""
 
-_duration = partial(number, "time that it takes", "s", least=NANOSECOND)
+_duration = partial(entry, "time that it takes", "s", least=NANOSECOND)
 
 
-@dataclass(frozen=True)
 class Gravity(Section):
     """A uniform field."""
 
     EFFECTS = ("acceleration",)
     IDLE = "acceleration", "must not be zero: leave gravity out"
 
-    acceleration: Vector3 = vector("acceleration of free fall in {B}", "m/s^2")
+    acceleration: Vector3 = entry("acceleration of free fall in {B}", "m/s^2")
 
 
-@dataclass(frozen=True)
 class Moment(Section):
     """An external moment on the star: constant, or received on the topic ~/external_moment."""
 
-    value: Vector3 | None = vector("constant moment in {B}", "N m", default=None)
-    topic: bool = flag("take it from the topic ~/external_moment", default=False)
+    value: Vector3 | None = entry("constant moment in {B}", "N m")
+    topic: bool = entry("take it from the topic ~/external_moment", default=False)
 
     def rules(self) -> Rules:
         """Refuse both and neither."""
@@ -63,7 +47,6 @@ class Moment(Section):
         yield both_or_none, "", self.value, "give either value or topic: true"
 
 
-@dataclass(frozen=True)
 class Friction(Section):
     """Friction torque of a joint against its rate v.
 
@@ -92,30 +75,27 @@ class Friction(Section):
         yield below, "static", self.static, lambda: f"must be >= coulomb = {self.coulomb:g} N m"
 
 
-@dataclass(frozen=True)
 class JointFriction(Section):
     """Friction by kind of joint, the same in all legs."""
 
     EFFECTS = "gamma", "mu", "beta"
     IDLE = "", "names no joint: give gamma, mu or beta, or leave it out"
 
-    gamma: Friction | None = section("actuated revolute joints", Friction, default=None)
-    mu: Friction | None = section("passive revolute joints", Friction, default=None)
-    beta: Friction | None = section("passive curved prismatic joints", Friction, default=None)
+    gamma: Friction | None = entry("actuated revolute joints")
+    mu: Friction | None = entry("passive revolute joints")
+    beta: Friction | None = entry("passive curved prismatic joints")
 
 
-@dataclass(frozen=True)
 class Spring(Section):
     """A torsional spring at one joint: torque -stiffness (angle - rest)."""
 
     EFFECTS = ("stiffness",)
 
-    joint: str = choice("joint", JOINTS)
+    joint: str = entry("joint", choices=JOINTS)
     stiffness: float = positive("stiffness", "N m/rad")
-    rest: float = number("angle without torque", "rad")
+    rest: float = entry("angle without torque", "rad")
 
 
-@dataclass(frozen=True)
 class Actuators(Section):
     """What stands between a command and the torque of a joint; the same in all legs.
 
@@ -137,25 +117,20 @@ class Actuators(Section):
         acts_on=("rotor_inertia",),
         needs="acts on rotor_inertia only (torques are those at the joint): give it",
     )
-    torque_limit: float | None = positive("largest torque", "N m", default=None)
-    time_constant: float | None = positive(
-        "time constant of a first-order lag of the torque", "s", default=None
-    )
+    torque_limit: float | None = positive("largest torque", "N m")
+    time_constant: float | None = positive("time constant of a first-order lag of the torque", "s")
     idle_damping: float = coefficient(
         "torque -idle_damping gamma_dot in place of a command that is too old; 0 for no torque",
         "N m s/rad",
     )
     velocity_limit: float | None = positive(
-        "largest rate of a desired motion; a simulation does not hold it", "rad/s", default=None
+        "largest rate of a desired motion; a simulation does not hold it", "rad/s"
     )
     acceleration_limit: float | None = positive(
-        "largest acceleration of a desired motion; a simulation does not hold it",
-        "rad/s^2",
-        default=None,
+        "largest acceleration of a desired motion; a simulation does not hold it", "rad/s^2"
     )
 
 
-@dataclass(frozen=True)
 class Stroke(Section):
     """The range of the actuators, 0 < gamma_k < arc P_k P_k+1.
 
@@ -163,23 +138,22 @@ class Stroke(Section):
     damping is given as such, or by the restitution at one impact rate.
     """
 
-    at_end: str = choice(
-        "what happens at an end of the stroke", ("stop", "ignore", "elastic"), default="stop"
+    at_end: str = entry(
+        "what happens at an end of the stroke",
+        choices=("stop", "ignore", "elastic"),
+        default="stop",
     )
-    stiffness: float | None = positive("stiffness of elastic stops", "N m/rad", default=None)
+    stiffness: float | None = positive("stiffness of elastic stops", "N m/rad")
     damping: float = coefficient(
         "damping of elastic stops: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
     )
-    restitution: float | None = number(
+    restitution: float | None = entry(
         "rate after an impact / rate before, at impact_rate; in place of damping",
         "1",
-        default=None,
         least=0.01,
         most=1.0,
     )
-    impact_rate: float | None = positive(
-        "rate of the impacts that have this restitution", "rad/s", default=None
-    )
+    impact_rate: float | None = positive("rate of the impacts that have this restitution", "rad/s")
 
     def rules(self) -> Rules:
         """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
@@ -197,40 +171,36 @@ class Stroke(Section):
             yield broken, name, getattr(self, name), allowed
 
 
-@dataclass(frozen=True)
 class Workspace(Section):
     """Where E may be: on the base triangle, 0 < beta_k <= beta_max."""
 
     beta_max_deg: float = positive(
         "largest angle between E and the intermediate link", "deg", default=90.0, most=180.0
     )
-    at_edge: str = choice(
-        "what happens at the edge of the workspace", ("stop", "ignore"), default="stop"
+    at_edge: str = entry(
+        "what happens at the edge of the workspace", choices=("stop", "ignore"), default="stop"
     )
 
 
-@dataclass(frozen=True)
 class Initial(Section):
     """The state at t = 0."""
 
     gamma: Vector3 = angles("actuator angles at t = 0")
-    gamma_dot: Vector3 = vector("actuator rates at t = 0", "rad/s", default=(0.0, 0.0, 0.0))
-    orientation: Quaternion | None = number(
+    gamma_dot: Vector3 = entry("actuator rates at t = 0", "rad/s", default=(0.0, 0.0, 0.0))
+    orientation: Quaternion | None = entry(
         "quaternion (x, y, z, w) of {E} in {B} that selects the assembly mode where gamma has "
         "several admissible ones; within 0.1 rad",
         "1",
-        shape=(4,),
         default=None,
     )
 
 
-@dataclass(frozen=True)
 class SineTorque(Section):
     """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
 
-    amplitude: Vector3 = vector("amplitudes", "N m")
-    frequency: Vector3 = vector("angular frequencies", "rad/s", least=0.0)
-    phase: Vector3 = vector("phases", "rad", default=(0.0, 0.0, 0.0))
+    amplitude: Vector3 = entry("amplitudes", "N m")
+    frequency: Vector3 = entry("angular frequencies", "rad/s", least=0.0)
+    phase: Vector3 = entry("phases", "rad", default=(0.0, 0.0, 0.0))
 
     def at(self, time: float) -> Vector3:
         """Torques [N m] at a time [s]."""
@@ -247,7 +217,6 @@ class SineTorque(Section):
 # Desired motions, which `control.reference_motions` makes reference motions.
 
 
-@dataclass(frozen=True)
 class ToAngles(Section):
     """The actuators go straight from their initial angles to others, with minimum jerk."""
 
@@ -255,12 +224,11 @@ class ToAngles(Section):
     duration: float = _duration()
 
 
-@dataclass(frozen=True)
 class ToOrientation(Section):
     """The star turns about one axis from its initial orientation to another, with minimum jerk."""
 
-    orientation: Quaternion = number(
-        "quaternion (x, y, z, w) of {E} in {B} at the end, of any length", "1", shape=(4,)
+    orientation: Quaternion = entry(
+        "quaternion (x, y, z, w) of {E} in {B} at the end, of any length", "1"
     )
     duration: float = _duration()
 
@@ -270,7 +238,6 @@ class ToOrientation(Section):
         yield np.equal(square, 0.0), "orientation", self.orientation, "must not be zero"
 
 
-@dataclass(frozen=True)
 class Sweep(Section):
     """Sines of the actuators, gamma_k = centre_k + fading amplitude_k sin(angle_k).
 
@@ -280,12 +247,12 @@ class Sweep(Section):
     """
 
     amplitude: Vector3 = angles("amplitudes")
-    frequency: Vector3 = vector("angular frequencies at the beginning", "rad/s")
-    last_frequency: Vector3 | None = vector(
-        "angular frequencies at the end; by default those at the beginning", "rad/s", default=None
+    frequency: Vector3 = entry("angular frequencies at the beginning", "rad/s")
+    last_frequency: Vector3 | None = entry(
+        "angular frequencies at the end; by default those at the beginning", "rad/s"
     )
-    centre: Vector3 | None = angles("centres; by default the initial angles", default=None)
-    fade: float = number("time to grow and to fade", "s", least=NANOSECOND)
+    centre: Vector3 | None = angles("centres; by default the initial angles")
+    fade: float = entry("time to grow and to fade", "s", least=NANOSECOND)
     duration: float = _duration()
 
     def rules(self) -> Rules:
@@ -295,52 +262,46 @@ class Sweep(Section):
         yield np.greater(self.fade, most), "fade", self.fade, allowed
 
 
-@dataclass(frozen=True)
 class Spiral(Section):
     """E winds outwards from where it is: tilt phi, its direction theta, and psi about E.
 
     R = R(0) Rz(theta) Ry(phi) Rz(psi - theta). All three grow from zero by one minimum jerk.
     """
 
-    phi: float = number("tilt at the end", "rad", least=0.0, most=3.141592653589793)
-    theta: float = number("how far the direction of the tilt turns", "rad")
-    psi: float = number("turn about E at the end", "rad", default=0.0)
+    phi: float = entry("tilt at the end", "rad", least=0.0, most=3.141592653589793)
+    theta: float = entry("how far the direction of the tilt turns", "rad")
+    psi: float = entry("turn about E at the end", "rad", default=0.0)
     duration: float = _duration()
 
 
-@dataclass(frozen=True)
 class Waypoint(Section):
     """Where the actuators are at a time. What is not given is chosen for minimum jerk."""
 
-    time: float = number("time since the beginning", "s", least=0.0)
+    time: float = entry("time since the beginning", "s", least=0.0)
     gamma: Vector3 = angles("actuator angles")
-    gamma_dot: Vector3 | None = vector("actuator rates", "rad/s", default=None)
-    gamma_ddot: Vector3 | None = vector("actuator accelerations", "rad/s^2", default=None)
+    gamma_dot: Vector3 | None = entry("actuator rates", "rad/s")
+    gamma_ddot: Vector3 | None = entry("actuator accelerations", "rad/s^2")
 
 
-@dataclass(frozen=True)
 class Recorded(Section):
     """What the actuators did in a recorded run."""
 
-    bag: str = text("folder of the bag, as seen from where the program runs")
+    bag: str = entry("folder of the bag, as seen from where the program runs")
 
 
-@dataclass(frozen=True)
 class DesiredMotion(Section):
     """What the manipulator is to do, for a controller and for `plan`; give one kind."""
 
     ONE_OF = "to_angles", "to_orientation", "sweep", "spiral", "waypoints", "recorded"
 
-    to_angles: ToAngles | None = section("actuators from point to point", ToAngles, default=None)
-    to_orientation: ToOrientation | None = section(
-        "star from point to point", ToOrientation, default=None
+    to_angles: ToAngles | None = entry("actuators from point to point")
+    to_orientation: ToOrientation | None = entry("star from point to point")
+    sweep: Sweep | None = entry("sines of the actuators")
+    spiral: Spiral | None = entry("spiral of E")
+    waypoints: tuple[Waypoint, ...] = entry(
+        "points of the actuators in time, quintic between them", default=()
     )
-    sweep: Sweep | None = section("sines of the actuators", Sweep, default=None)
-    spiral: Spiral | None = section("spiral of E", Spiral, default=None)
-    waypoints: tuple[Waypoint, ...] = sections(
-        "points of the actuators in time, quintic between them", Waypoint, default=()
-    )
-    recorded: Recorded | None = section("motion of a recorded run", Recorded, default=None)
+    recorded: Recorded | None = entry("motion of a recorded run")
 
     @property
     def kind(self) -> str:

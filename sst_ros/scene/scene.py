@@ -8,8 +8,9 @@ friction whose coefficients are zero there, the gear of a rotor without inertia.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,43 +18,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.scene import loads
 from sst_ros.scene.bodies import Base, Link, Payload, Star
-from sst_ros.scene.loads import (
-    Actuators,
-    DesiredMotion,
-    Gravity,
-    Initial,
-    JointFriction,
-    Moment,
-    SineTorque,
-    Spring,
-    Stroke,
-    Workspace,
-)
 from sst_ros.scene.schema import (
     Place,
     Rules,
     Section,
     Spec,
-    has_key,
+    build,
+    drop_idle,
+    entry,
+    has_effect,
     key_of,
-    notes,
     positive,
     rebuild,
-    section,
-    sections,
-    specs,
-    text,
     walk,
 )
-from sst_ros.scene.yaml_document import (
-    NO_NUMBER,
-    build,
-    find_fields,
-    plain,
-    read,
-    replace_values,
-)
+from sst_ros.scene.yaml_document import NO_NUMBER, find_fields, plain, read, replace_values
 
 Matrix = NDArray[np.float64]
 
@@ -62,35 +43,34 @@ LARGEST, SMALLEST = 1e9, 1e-12
 its powers leave the range of double precision."""
 
 
-@dataclass(frozen=True)
 class Scene(Section):
     """All that is simulated."""
 
-    name: str = text("short name")
-    description: str = text("what the scene shows")
-    base: Base = section("the fixed spherical triangle", Base)
-    star: Star = section("the moving spherical star", Star)
-    actuated_links: tuple[Link, Link, Link] = sections(
-        "actuated links in {1k}; one entry stands for all three", Link, (1, 3)
+    name: str = entry("short name")
+    description: str = entry("what the scene shows")
+    base: Base = entry("the fixed spherical triangle")
+    star: Star = entry("the moving spherical star")
+    actuated_links: tuple[Link, Link, Link] = entry(
+        "actuated links in {1k}; one entry stands for all three"
     )
-    intermediate_links: tuple[Link, Link, Link] = sections(
-        "intermediate links in {2k}; one entry stands for all three", Link, (1, 3)
+    intermediate_links: tuple[Link, Link, Link] = entry(
+        "intermediate links in {2k}; one entry stands for all three"
     )
-    payload: Payload | None = section("body carried by the star", Payload, default=None)
-    gravity: Gravity | None = section("gravity", Gravity, default=None)
-    moment: Moment | None = section("external moment on the star", Moment, default=None)
-    friction: JointFriction | None = section("friction in the joints", JointFriction, default=None)
-    springs: tuple[Spring, ...] = sections("springs at joints", Spring, (), default=())
-    actuators: Actuators | None = section("the actuators", Actuators, default=None)
-    stroke: Stroke = section("range of the actuators", Stroke, default=Stroke())
-    workspace: Workspace = section("where E may be", Workspace, default=Workspace())
-    initial: Initial = section("state at t = 0", Initial)
-    torque: SineTorque | None = section(
-        "torques that torque_player plays", SineTorque, default=None
+    payload: Payload | None = entry("body carried by the star")
+    gravity: loads.Gravity | None = entry("gravity")
+    moment: loads.Moment | None = entry("external moment on the star")
+    friction: loads.JointFriction | None = entry("friction in the joints")
+    springs: tuple[loads.Spring, ...] = entry("springs at joints", default=())
+    actuators: loads.Actuators | None = entry("the actuators")
+    stroke: loads.Stroke = entry("range of the actuators", default=loads.Stroke())
+    workspace: loads.Workspace = entry("where E may be", default=loads.Workspace())
+    initial: loads.Initial = entry("state at t = 0")
+    torque: loads.SineTorque | None = entry("torques that torque_player plays")
+    motion: loads.DesiredMotion | None = entry("desired motion")
+    duration: float | None = positive("length of a run", "s")
+    provenance: tuple[tuple[str, str], ...] = entry(
+        "where the values come from, by key", default=()
     )
-    motion: DesiredMotion | None = section("desired motion", DesiredMotion, default=None)
-    duration: float | None = positive("length of a run", "s", default=None)
-    provenance: tuple[tuple[str, str], ...] = notes("where the values come from, by key")
 
     def with_values(self, values: Mapping[str, Any]) -> Scene:
         """Return the scene with other values by key, as in {"star.inertia.zz": 0.3}.
@@ -122,21 +102,21 @@ class Scene(Section):
         return self.actuators is not None and self.actuators.time_constant is not None
 
     def check(self) -> Iterator[Problem]:
-        """Refuse numbers of another unit, and what contradicts itself across sections."""
-        for place, value, spec in _numbers(self):
-            for x in np.ravel(value).tolist():
-                allowed = f"must not exceed {LARGEST:g} in size" if abs(x) > LARGEST else ""
-                if spec.above == 0.0 and x < SMALLEST:
-                    allowed = f"must be at least {SMALLEST:g}"
-                if allowed:
-                    yield Problem(key_of(place), x, f"{allowed}: use m, kg, s, rad, N")
+        """Refuse provenance of what no scene has."""
         yield from super().check()
         for key, note in self.provenance:
-            if not has_key(type(self), key):
+            if not _has_key(type(self), key):
                 yield Problem(f"provenance.{key}", note, "is about a key that no scene has")
 
     def rules(self) -> Rules:
-        """Refuse a centre of mass far from the bodies, and gravity without a mass."""
+        """Refuse slips of units, a centre of mass far from the bodies, gravity without a mass."""
+        for place, value, spec in _numbers(self):
+            parts = np.reshape(value, (math.prod(spec.shape), -1))
+            large = (abs(parts) > LARGEST).any(axis=0)
+            small = (parts < SMALLEST).any(axis=0) & (spec.above == 0.0)
+            key, units = key_of(place), "use m, kg, s, rad, N"
+            yield large, key, value, f"must not exceed {LARGEST:g} in size: {units}"
+            yield small, key, value, f"must be at least {SMALLEST:g}: {units}"
         reach = np.maximum(self.base.radius, self.star.radius)
         bodies = {"star": self.star}
         for name in ("actuated_links", "intermediate_links"):
@@ -155,10 +135,19 @@ class Scene(Section):
 def _numbers(scene: Scene) -> Iterator[tuple[Place, Any, Spec]]:
     """Yield place, value and specification of each number that a scene has."""
     for place, part in walk(scene):
-        for name, spec in specs(type(part)).items() if isinstance(part, Section) else ():
+        for name, spec in part.SPECS.items() if isinstance(part, Section) else ():
             value = getattr(part, name)
             if spec.kind == "number" and value is not None:
                 yield (*place, name), value, spec
+
+
+def _has_key(cls: type[Section], key: str) -> bool:
+    """Return whether documents of a class may have a key without indices."""
+    name, _, rest = key.partition(".")
+    spec = cls.SPECS.get(name)
+    if spec is None or not rest:
+        return spec is not None
+    return spec.section is not None and _has_key(spec.section, rest)
 
 
 def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
@@ -180,7 +169,7 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
     """
     if initial is None:
         return scene
-    if not isinstance(initial, (Initial, Mapping)):
+    if not isinstance(initial, (loads.Initial, Mapping)):
         try:
             gamma, gamma_dot = initial
         except (TypeError, ValueError):
@@ -190,7 +179,7 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
     if isinstance(initial, Mapping):
         # As in `Initial`, None is no orientation.
         given = {key: x for key, x in initial.items() if key != "orientation" or x is not None}
-        initial = build(Initial, given, "initial")
+        initial = build(loads.Initial, given, "initial")
     return replace(scene, initial=initial)
 
 
@@ -268,9 +257,17 @@ class Scenarios:
 
     def scene(self, row: int) -> Scene:
         """Build the scene of a row; InputError names the numbers that make none."""
-        values = {place: self.rows[key][row].tolist() for place, (key, _) in self._fields.items()}
+        numbers = {key: self.rows[key][row].tolist() for key in self.rows}
+        faults = [
+            Problem(key, numbers[key], spec.refuse())
+            for key, spec in dict(self._fields.values()).items()
+            if has_effect(numbers[key]) and not np.all(spec.allows(self.rows[key][row]))
+        ]
         try:
-            return build(Scene, rebuild(self.document, values), "", of_row=True)
+            if faults:  # though the section that they are in may be left out
+                raise InputError("", faults)
+            values = {place: numbers[key] for place, (key, _) in self._fields.items()}
+            return build(Scene, drop_idle(Scene, plain(rebuild(self.document, values))))
         except InputError as error:
             faults = [replace(one, key=f"scenario {row}: {one.key}") for one in error.problems]
             raise InputError(self.document.name, faults) from None
@@ -296,11 +293,8 @@ class Scenarios:
         """Rows whose scene may be refused: a zero may refuse a number, or leave its section out."""
         doubtful: Any = np.zeros(self.count or 0, dtype=bool)
         for key, spec in self._fields.values():
-            flat = self.rows[key].reshape(len(self.rows[key]), -1)
-            fits = spec.allows(flat) & (abs(flat) <= LARGEST)
-            if spec.above == 0.0:
-                fits &= flat >= SMALLEST
-            doubtful = doubtful | ~fits.all(axis=1)
+            allowed = spec.allows(self.rows[key])
+            doubtful = doubtful | ~allowed.reshape(len(allowed), -1).all(axis=1)
         with np.errstate(all="ignore"):
             for _, part in walk(self.columns()):
                 for broken, *_ in part.rules() if isinstance(part, Section) else ():

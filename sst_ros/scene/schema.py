@@ -2,32 +2,46 @@
 """Documents as trees of frozen dataclasses: every field has a unit and bounds, which are checked.
 
 A class that derives from `Section` is checked whenever it is built, from YAML or from Python.
-Reading a document gives either the object or one `InputError` with every fault and its line. The
-JSON schema is from the same declarations: editors complete and check YAML with it; what no schema
-can express (inertias, angles that must sum to 360 deg) is left to reading.
+Building one gives either the object or one `InputError` with every fault.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
-from typing import Any, ClassVar, TypeAlias
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, suggestion
+
+if TYPE_CHECKING:
+    from typing_extensions import dataclass_transform
+else:
+
+    def dataclass_transform(**_):
+        """Leave a class as it is: only type checkers need this."""
+        return lambda cls: cls
+
 
 _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 """A decimal number of YAML 1.2 and JSON: no 3_5, 0x10 or 1:30, of which YAML 1.1 makes others."""
 
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """What a terminal obeys, and halves of characters."""
-
-_DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_TEXT = {"type": "string", "pattern": "\\S"}
 
 TURN = 2.0 * math.pi
 """No initial or desired angle of an actuator [rad] is larger: it is in degrees."""
@@ -37,6 +51,10 @@ REQUIRED: Any = object()
 
 Place = tuple[str | int, ...]
 """Names and indices of a part of a tree from the root on."""
+
+
+class Switch(str):
+    """A word of YAML 1.1 for true or false, of which YAML 1.2 has those two."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +76,7 @@ class Spec:
     lengths: tuple[int, ...] = ()
     acts_on: tuple[str, ...] = ()
     needs: str = ""
-    default: Any = REQUIRED
+    default: Any = None
 
     def allows(self, x: Any) -> Any:
         """Whether numbers keep the bounds; a nan does not."""
@@ -66,7 +84,9 @@ class Spec:
 
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
-        return self.describe() + (": in rad?" if self.most == TURN else "")
+        keys = "" if self.section is None else f" with the keys {', '.join(self.section.SPECS)}"
+        hint = keys if self.kind == "section" else ": in rad?" if self.most == TURN else ""
+        return self.describe() + hint
 
     def describe(self) -> str:
         """Describe the values that are allowed."""
@@ -90,46 +110,26 @@ class Spec:
         }[self.kind]
 
 
-def _declare(kind: str, doc: str, unit: str = "", *, default: Any = REQUIRED, **spec: Any) -> Any:
-    """Declare a field of a section; `spec` has more of what `Spec` says."""
-    metadata = {"spec": Spec(kind, doc, unit, default=default, **spec)}
-    default = MISSING if default is REQUIRED else default
-    return field(default=default, metadata=metadata, kw_only=True)
+def entry(doc: str, unit: str = "", *, default: Any = REQUIRED, **rules: Any) -> Any:
+    """Declare a field of a section, whose type says what it may hold; None in it is its default.
+
+    It may be float, a tuple of as many, or of such; int, bool, str, a section, a tuple of any
+    number of them, or of three, for which one may stand; tuple[tuple[str, str], ...] is a mapping
+    to text. `rules` has more of what `Spec` says.
+    """
+    given = MISSING if default is REQUIRED else default
+    return field(default=given, metadata={"spec": Spec("", doc, unit, **rules)}, kw_only=True)
 
 
-number, integer, flag, text, texts = (
-    partial(_declare, kind) for kind in ("number", "integer", "flag", "text", "texts")
-)
-notes = partial(_declare, "notes", default=())
-"""A mapping from keys of this document to text."""
-vector = partial(number, shape=(3,))
-angles = partial(vector, unit="rad", least=-TURN, most=TURN)
+angles = partial(entry, unit="rad", least=-TURN, most=TURN)
 """Angles of the three actuators, at most a turn."""
-positive = partial(number, above=0.0)
-coefficient = partial(number, least=0.0, default=0.0)
+positive = partial(entry, above=0.0)
+coefficient = partial(entry, least=0.0, default=0.0)
 
 
 def anything(doc: str, **default: Any) -> Any:
     """Declare what `Section.check` checks; it may be given by its place, too."""
-    return field(metadata={"spec": Spec("anything", doc, default=None)}, **default)
-
-
-def choice(doc: str, choices: Sequence[str], **rest: Any) -> Any:
-    """Declare one word out of a list."""
-    return _declare("choice", doc, choices=tuple(choices), **rest)
-
-
-def section(doc: str, cls: type[Section], **default: Any) -> Any:
-    """Declare a nested section."""
-    return _declare("section", doc, section=cls, **default)
-
-
-def sections(doc: str, cls: type[Section], lengths: Sequence[int] = (), **default: Any) -> Any:
-    """Declare a list of sections, of any length where `lengths` is empty.
-
-    Otherwise one entry stands for all of the longest allowed list.
-    """
-    return _declare("sections", doc, section=cls, lengths=tuple(lengths), **default)
+    return field(metadata={"spec": Spec("anything", doc)}, **default)
 
 
 Rules: TypeAlias = "Iterator[tuple[Any, str, Any, str | Callable[[], str]]]"
@@ -138,9 +138,12 @@ Rules: TypeAlias = "Iterator[tuple[Any, str, Any, str | Callable[[], str]]]"
 The last two may be functions, which are called where the rule is broken."""
 
 
-@dataclass(frozen=True)
+@dataclass_transform(frozen_default=True)
 class Section:
-    """Base of every part of a document; refuses what its fields do not allow."""
+    """Base of every part of a document; refuses what its fields do not allow.
+
+    Each class that derives from it is a frozen dataclass.
+    """
 
     ORIGIN: ClassVar[str] = ""
     """What messages are headed by; by default the name of the class."""
@@ -154,23 +157,41 @@ class Section:
     ONE_OF: ClassVar[tuple[str, ...]] = ()
     """Fields of which a document gives exactly one."""
 
+    SPECS: ClassVar[dict[str, Spec]] = {}
+    """What each field may hold, in order."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        for name, hint in cls.__annotations__.items():
+            declared = vars(cls).get(name)
+            if isinstance(declared, Field) and str(hint).endswith("| None"):
+                declared.default = None if declared.default is MISSING else declared.default
+        dataclass(frozen=True)(cls)
+        hints, specs = get_type_hints(cls), {}
+        for one in fields(cls):
+            spec: Spec = one.metadata["spec"]
+            if not spec.kind:
+                default = REQUIRED if one.default is MISSING else one.default
+                spec = replace(spec, **_read_type(hints[one.name]), default=default)
+            specs[one.name] = replace(spec, kind="choice") if spec.choices else spec
+        cls.SPECS = specs
+
     def __post_init__(self) -> None:
-        problems = []
-        for name, spec in specs(type(self)).items():
-            value = getattr(self, name)
-            if value is not None or spec.default is not None:
-                try:
-                    object.__setattr__(self, name, accept(spec, value))
-                except ValueError:
-                    problems.append(Problem(name, value, spec.refuse()))
-        problems = problems or [*self.settle()] or [*self._find_idle(), *self.check()]
+        given = ((name, spec, getattr(self, name)) for name, spec in self.SPECS.items())
+        kept = (one for one in given if one[2] is not None or one[1].default is not None)
+        try:
+            vars(self).update(_freeze_all(kept))
+            problems = [*self.settle()] or [*self._find_idle(), *self.check()]
+        except InputError as error:
+            problems = [*error.problems]
         if problems:
             raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
 
     def _find_idle(self) -> Iterator[Problem]:
         """Yield what has no effect, and what is not one of several."""
         acts = True
-        for name, spec in specs(type(self)).items():
+        for name, spec in self.SPECS.items():
             value = getattr(self, name)
             if spec.acts_on and value != spec.default and not self._has_any(spec.acts_on):
                 given = "it" if len(spec.acts_on) == 1 else "one"
@@ -186,7 +207,7 @@ class Section:
             yield Problem(key, getattr(self, key, None), text)
 
     def _has_any(self, names: tuple[str, ...]) -> bool:
-        return any(has_effect(getattr(self, name)) for name in names)
+        return has_effect([getattr(self, name) for name in names])
 
     def settle(self) -> Iterator[Problem]:
         """Put what may be given in several forms into one; yield what forbids that."""
@@ -207,90 +228,105 @@ class Section:
         return iter(())
 
 
-def has_effect(value: Any) -> bool:
-    """Return whether a value, or any in a list, is given and not zero."""
-    return any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
+S = TypeVar("S", bound=Section)
 
 
-# The tree: sections and tuples, whose leaves are numbers or columns, words and None.
+_KINDS = {
+    float: "number", int: "integer", bool: "flag", str: "text", tuple[str, ...]: "texts",
+    tuple[tuple[str, str], ...]: "notes",
+}  # fmt: skip
 
 
-def specs(cls: type[Section]) -> dict[str, Spec]:
-    """List the declared fields of a section, in order."""
-    return {one.name: one.metadata["spec"] for one in fields(cls)}
+def _read_type(hint: Any) -> dict[str, Any]:
+    """Return what the type of a field says of its `Spec`."""
+    if get_origin(hint) is UnionType:
+        hint = get_args(hint)[0]
+    if kind := _KINDS.get(hint):
+        return {"kind": kind}
+    if not (parts := get_args(hint)):
+        return {"kind": "section", "section": hint}
+    inner = _read_type(parts[0])
+    if inner["kind"] == "section":
+        lengths = () if parts[1] is Ellipsis else (1, len(parts))
+        return inner | {"kind": "sections", "lengths": lengths}
+    return inner | {"shape": (len(parts), *inner.get("shape", ()))}
 
 
-def make_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
-    """Return a section with any values, as columns or symbols, which are not checked."""
-    found = object.__new__(cls)
-    vars(found).update(values)
+# From what is given to what is kept.
+
+
+def build(cls: type[S], values: Any, origin: str = "") -> S:
+    """Build a section from nested mappings and lists, in which arrays are allowed.
+
+    Messages are headed by `origin`; InputError lists every fault.
+    """
+    known, problems = cls.SPECS, []
+    if not isinstance(values, Mapping):
+        raise InputError(origin, [Problem("", values, Spec("section", "", section=cls).refuse())])
+    for name, value in values.items():
+        if name not in known:
+            allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(str(name), known)}"
+            problems.append(Problem(str(name), value, allowed))
+    for name, spec in known.items():
+        if spec.default is REQUIRED and name not in values:
+            problems.append(Problem(name, None, "is missing; " + spec.describe()))
+    try:
+        frozen = _freeze_all((name, known[name], x) for name, x in values.items() if name in known)
+        if not problems:
+            return cls(**frozen)
+    except InputError as error:
+        problems += error.problems
+    raise InputError(origin, problems)
+
+
+def _freeze_all(given: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:
+    """Accept values by their keys; InputError lists what is refused, and what in it is."""
+    found: dict[str, Any] = {}
+    problems = []
+    for key, spec, value in given:
+        try:
+            found[key] = accept(spec, value)
+        except (ValueError, TypeError, OverflowError):
+            problems.append(Problem(key, value, spec.refuse()))
+        except InputError as error:
+            for one in error.problems:
+                dot = "." if one.key and one.key[0] != "[" else ""
+                problems.append(replace(one, key=f"{key}{dot}{one.key}"))
+    if problems:
+        raise InputError("", problems)
     return found
 
 
-def parts_of(tree: Any) -> list[tuple[Any, Any]]:
-    """List the parts of a section or tuple by name or index; there are none of anything else."""
-    if isinstance(tree, tuple):
-        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
-    return list(vars(tree).items()) if isinstance(tree, Section) else []
-
-
-def walk(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """Yield the place of a tree and the tree, then those of all that is in it."""
-    yield place, tree
-    for name, part in parts_of(tree):
-        yield from walk(part, (*place, name))
-
-
-def leaves(tree: Any) -> dict[Place, Any]:
-    """Return the numbers and columns of a tree by their places."""
-    return {place: x for place, x in walk(tree) if isinstance(x, (float, np.ndarray))}
-
-
-def rebuild(tree: Any, values: Mapping[Place, Any], place: Place = ()) -> Any:
-    """Return a tree with other values at some places; its sections are not checked."""
-    if place in values:
-        return values[place]
-    parts = {name: rebuild(part, values, (*place, name)) for name, part in parts_of(tree)}
-    if isinstance(tree, tuple):
-        return type(tree)(*parts.values()) if hasattr(tree, "_fields") else tuple(parts.values())
-    return make_unchecked(type(tree), parts) if parts else tree
-
-
-def has_key(cls: type[Section], key: str) -> bool:
-    """Return whether documents of a class may have a key without indices."""
-    name, _, rest = key.partition(".")
-    spec = specs(cls).get(name)
-    if spec is None or not rest:
-        return spec is not None
-    return spec.section is not None and has_key(spec.section, rest)
-
-
-def key_of(place: Place) -> str:
-    """Return a place as a key."""
-    return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")
-
-
-# What a value may be.
-
-
 def accept(spec: Spec, value: Any) -> Any:
-    """Return `value` in its frozen form, or raise ValueError."""
-    kind, is_list, section = spec.kind, isinstance(value, (list, tuple)), spec.section or Section
+    """Return a value in its frozen form.
+
+    ValueError, TypeError or OverflowError is raised where it is refused, InputError where parts of
+    it are, with their keys.
+    """
+    kind, section = spec.kind, spec.section or Section
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
     if kind == "number":
-        try:
-            return _freeze_numbers(spec, value, spec.shape)
-        except (TypeError, OverflowError):
-            raise ValueError from None
+        return _freeze_numbers(spec, value, spec.shape)
     if kind == "text":
-        return freeze_text(value)
-    if kind == "texts" and is_list:
-        return tuple(map(freeze_text, value))
-    if kind == "notes" and isinstance(value, (dict, tuple)):
-        return tuple((freeze_text(name), freeze_text(x)) for name, x in dict(value).items())
-    if kind == "sections" and is_list and len(value) in (spec.lengths or [len(value)]):
-        if not all(isinstance(entry, section) for entry in value):
-            raise ValueError
-        return tuple(value) * (max(spec.lengths) if spec.lengths and len(value) == 1 else 1)
+        return _freeze_text(str(value) if isinstance(value, (int, float)) else value)
+    if kind == "notes" and isinstance(value, (Mapping, tuple)):
+        each = ((_freeze_text(name), _NOTE, x) for name, x in dict(value).items())
+        return tuple(_freeze_all(each).items())
+    if kind == "section" and isinstance(value, Mapping):
+        return build(section, value)
+    if isinstance(value, (list, tuple)):
+        if kind == "texts":
+            return tuple(map(_freeze_text, value))
+        if kind == "sections" and len(value) in (spec.lengths or [len(value)]):
+            entry = replace(spec, kind="section")
+            parts = _freeze_all((f"[{i}]", entry, x) for i, x in enumerate(value))
+            times = max(spec.lengths) if spec.lengths and len(value) == 1 else 1
+            return (*parts.values(),) * times
+    if kind == "flag" and isinstance(value, Switch):
+        value = {"true": True, "false": False}.get(value.lower())
+    elif kind == "integer" and isinstance(value, str) and re.fullmatch("[-+]?[0-9]+", value):
+        value = int(value)
     fits = {
         "anything": True,
         "flag": isinstance(value, bool),
@@ -301,6 +337,9 @@ def accept(spec: Spec, value: Any) -> Any:
     if not fits.get(kind):
         raise ValueError
     return value
+
+
+_NOTE = Spec("text", "a note")
 
 
 def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
@@ -316,48 +355,90 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     return result
 
 
-def freeze_text(value: Any) -> str:
+def _freeze_text(value: Any) -> str:
     """Return text without its outer blanks, or raise ValueError."""
     if not isinstance(value, str) or not value.strip() or _UNPRINTABLE.search(value):
         raise ValueError
     return value.strip()
 
 
-def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
-    """Describe the documents that `read(cls, ...)` accepts."""
-    return {"$schema": _DRAFT, "title": title, **_object_schema(cls)}
+def has_effect(value: Any) -> bool:
+    """Return whether a value, or any in a list, is given and not zero."""
+    return any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
 
 
-def _object_schema(cls: type[Section]) -> dict[str, Any]:
-    described: dict[str, Any] = {"type": "object", "additionalProperties": False}
-    if cls.__doc__:
-        described["description"] = cls.__doc__.partition("\n")[0]
-    if cls.ONE_OF:
-        described["oneOf"] = [{"required": [name]} for name in cls.ONE_OF]
-    known = specs(cls)
-    properties = {name: _property_schema(spec) for name, spec in known.items()}
-    required = [name for name, spec in known.items() if spec.default is REQUIRED]
-    return {**described, "properties": properties, "required": required}
+def drop_idle(cls: type[Section], values: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return a document without what has no effect in it; None if nothing has.
+
+    A document that says such things is refused, as a friction whose coefficients are zero.
+    """
+    known, given = cls.SPECS, dict(values)
+    for name, value in values.items():
+        inner = known[name].section
+        if inner and isinstance(value, list):
+            parts = [drop_idle(inner, part) for part in value]
+            given[name] = [part for part in parts if part is not None]
+        elif inner:
+            given[name] = drop_idle(inner, value)
+
+    def acts(names: tuple[str, ...]) -> bool:
+        return not names or has_effect([given.get(name) for name in names])
+
+    kept = {name: x for name, x in given.items() if x is not None and acts(known[name].acts_on)}
+    return kept if acts(cls.EFFECTS) else None
 
 
-def _property_schema(spec: Spec) -> dict[str, Any]:
-    described: dict[str, Any] = {"description": spec.doc + (f" [{spec.unit}]" if spec.unit else "")}
-    if isinstance(spec.default, (bool, int, float, str)):
-        described["default"] = spec.default
-    bounds = {"exclusiveMinimum": spec.above, "minimum": spec.least, "maximum": spec.most}
-    known: dict[str, dict[str, Any]] = {
-        "number": {"type": "number"} | {name: x for name, x in bounds.items() if math.isfinite(x)},
-        "integer": {"type": "integer", "minimum": spec.least, "maximum": spec.most},
-        "choice": {"enum": list(spec.choices)},
-        "notes": {"type": "object", "additionalProperties": _TEXT},
-        "texts": {"type": "array", "items": _TEXT},
-        "flag": {"type": "boolean"},
-    }
-    own = _object_schema(spec.section) if spec.section else known.get(spec.kind, _TEXT)
-    for size in reversed(spec.shape):
-        own = {"type": "array", "items": own, "minItems": size, "maxItems": size}
-    if spec.kind == "sections":
-        own = {"type": "array", "items": own}
-    if spec.lengths:
-        own["anyOf"] = [{"minItems": length, "maxItems": length} for length in spec.lengths]
-    return own | described
+# The tree: sections and tuples, whose leaves are numbers or columns, words and None.
+
+
+def build_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
+    """Build a section from nested dicts and lists of any values, which are not checked.
+
+    They may be columns or symbols. A number that a section must have and these values have not is
+    zero.
+    """
+
+    def make(inner: type[Section] | None, value: Any) -> Any:
+        if isinstance(value, list):
+            return tuple(make(inner, entry) for entry in value)
+        return build_unchecked(inner, value) if inner and isinstance(value, dict) else value
+
+    found = object.__new__(cls)
+    for name, spec in cls.SPECS.items():
+        default = 0.0 if spec.default is REQUIRED else spec.default
+        vars(found)[name] = make(spec.section, values.get(name, default))
+    return found
+
+
+def walk(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
+    """Yield the place of a tree and the tree, then those of all that is in it."""
+    yield place, tree
+    for name, part in _parts_of(tree):
+        yield from walk(part, (*place, name))
+
+
+def _parts_of(tree: Any) -> list[tuple[Any, Any]]:
+    """List the parts of a section or tuple by name or index; there are none of anything else."""
+    if isinstance(tree, tuple):
+        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
+    return list(vars(tree).items()) if isinstance(tree, Section) else []
+
+
+def leaves(tree: Any) -> dict[Place, Any]:
+    """Return the numbers and columns of a tree by their places."""
+    return {place: x for place, x in walk(tree) if isinstance(x, (float, np.ndarray))}
+
+
+def rebuild(tree: Any, values: Mapping[Place, Any], place: Place = ()) -> Any:
+    """Return a tree with other values at some places; its sections are not checked."""
+    if place in values:
+        return values[place]
+    parts = {name: rebuild(part, values, (*place, name)) for name, part in _parts_of(tree)}
+    if isinstance(tree, tuple):
+        return type(tree)(*parts.values()) if hasattr(tree, "_fields") else tuple(parts.values())
+    return build_unchecked(type(tree), parts) if parts else tree
+
+
+def key_of(place: Place) -> str:
+    """Return a place as a key."""
+    return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")

@@ -3,33 +3,24 @@
 
 Text is read into nested dicts and lists, which are built into a checked `Section`, and back; every
 fault has its key and its line. A key is "star.inertia.zz" or "springs[0].rest"; a list without an
-index means all of its entries.
+index means all of its entries. The JSON schema is from the same declarations: editors complete and
+check YAML with it; what no schema can express (inertias, angles that must sum to 360 deg) is left
+to reading.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import yaml
 
-from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.schema import (
-    REQUIRED,
-    Place,
-    Section,
-    Spec,
-    accept,
-    freeze_text,
-    has_effect,
-    make_unchecked,
-    specs,
-)
-
-S = TypeVar("S", bound=Section)
+from sst_ros.errors import InputError, Problem
+from sst_ros.scene.schema import REQUIRED, Place, S, Section, Spec, Switch, build
 
 NO_NUMBER = "must name a number, as star.mass does"
 
@@ -64,10 +55,6 @@ class _Loader(yaml.SafeLoader):
         if fault:
             raise InputError("", [Problem("", *fault, _line(event))])
         return event
-
-
-class Switch(str):
-    """A word of YAML 1.1 for true or false, of which YAML 1.2 has those two."""
 
 
 def read(cls: type[S], source: str, origin: str) -> S:
@@ -155,7 +142,7 @@ def plain(value: Any) -> Any:
     """Turn sections, arrays, NumPy numbers, tuples and mappings into what YAML has."""
     if isinstance(value, Section):
         given = {name: x for name, x in vars(value).items() if x is not None and x != ()}
-        notes = (name for name, spec in specs(type(value)).items() if spec.kind == "notes")
+        notes = (name for name, spec in value.SPECS.items() if spec.kind == "notes")
         return plain(given | {name: dict(given[name]) for name in notes if name in given})
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
@@ -173,139 +160,30 @@ def replace_values(document: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     changed: dict[str, Any] = plain(document)
     for key, value in values.items():
         try:
-            _set(changed, [_split(word) for word in str(key).split(".")], value)
-        except (AttributeError, IndexError, TypeError, ValueError):
+            _set(changed, *_split(str(key)), value=value)
+        except (AttributeError, LookupError, TypeError):
             raise KeyError(key) from None
     return changed
 
 
-def _set(section: dict[str, Any], words: list[tuple[str, int | None]], value: Any) -> None:
-    (name, index), *rest = words
-    if rest:
-        below = section.setdefault(name, {} if index is None else [])
-        entries = below if isinstance(below, list) else [below]
-        for entry in entries if index is None else [entries[index]]:
-            _set(entry, rest, value)
-    elif index is not None:
-        section[name][index] = value
-    elif value is None:
-        section.update({name: None})
-        del section[name]
-    else:
-        known = section.get(name)
-        if isinstance(known, list) and not isinstance(value, (str, list, tuple, Mapping)):
-            value = [value] * len(known)
-        section.update({name: value})
+def _set(tree: Any, name: str | int, *rest: str | int, value: Any) -> None:
+    """Set a value below a tree; a name of an entry means that of each in a list."""
+    for part in tree if isinstance(tree, list) and isinstance(name, str) else [tree]:
+        if rest:
+            below = part.setdefault(name, {}) if isinstance(name, str) else part[name]
+            _set(below, *rest, value=value)
+        elif value is None and isinstance(name, str):
+            part.pop(name, None)
+        else:
+            known = part.get(name) if isinstance(name, str) else part[name]
+            single = not isinstance(value, (str, list, tuple, Mapping))
+            part[name] = [value] * len(known) if isinstance(known, list) and single else value
 
 
-def build_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
-    """Build a section from nested dicts and lists of any values, which are not checked.
-
-    A number that a section must have and these values have not is zero.
-    """
-
-    def make(inner: type[Section] | None, value: Any) -> Any:
-        if isinstance(value, list):
-            return tuple(make(inner, entry) for entry in value)
-        return build_unchecked(inner, value) if inner and isinstance(value, dict) else value
-
-    found = {}
-    for name, spec in specs(cls).items():
-        default = 0.0 if spec.default is REQUIRED else spec.default
-        found[name] = make(spec.section, values.get(name, default))
-    return make_unchecked(cls, found)
-
-
-def build(cls: type[S], values: Any, origin: str, *, path: str = "", of_row: bool = False) -> S:
-    """Build a section from nested dicts and lists, in which arrays are allowed.
-
-    Messages are headed by `origin`, and `path` is the section's key in a larger document. A
-    document that says what has no effect is refused, as a friction whose coefficients are zero;
-    with `of_row` that is left out. InputError lists every fault.
-    """
-    builder = _Builder(of_row, [])
-    result = builder.section(cls, plain(values), path)
-    if builder.problems or result is None:
-        raise InputError(origin, builder.problems)
-    return result
-
-
-@dataclass
-class _Builder:
-    """Builds sections; what it cannot build is None, with a problem."""
-
-    of_row: bool
-    problems: list[Problem]
-
-    def section(self, cls: type[S], values: Any, path: str) -> S | None:
-        known, before = specs(cls), len(self.problems)
-        if not isinstance(values, Mapping):
-            self._refuse(path, values, f"must be a mapping with the keys {', '.join(known)}")
-            return None
-        given: dict[str, Any] = {}
-        for name, value in values.items():
-            if name in known:
-                given[name] = self._value(known[name], value, _join(path, name))
-            else:
-                allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(name, known)}"
-                self._refuse(_join(path, name), value, allowed)
-        for name, spec in known.items():
-            if spec.default is REQUIRED and name not in given:
-                self._refuse(_join(path, name), None, "is missing; " + spec.describe())
-        if len(self.problems) > before:
-            return None
-
-        def acts(names: tuple[str, ...]) -> bool:
-            return not names or any(has_effect(given.get(name)) for name in names)
-
-        if self.of_row:
-            given = {name: x for name, x in given.items() if acts(known[name].acts_on)}
-            if not acts(cls.EFFECTS):
-                return None
-        try:
-            return cls(**given)
-        except InputError as error:
-            for one in error.problems:
-                self._refuse(".".join(filter(None, [path, one.key])), one.value, one.allowed)
-        return None
-
-    def _value(self, spec: Spec, value: Any, key: str) -> Any:
-        if spec.kind == "section" and spec.section:
-            return self.section(spec.section, value, key)
-        if spec.kind == "sections" and spec.section and isinstance(value, list):
-            parts = [self.section(spec.section, x, f"{key}[{i}]") for i, x in enumerate(value)]
-            return tuple(part for part in parts if part is not None or not self.of_row)
-        if spec.kind == "notes" and isinstance(value, dict):
-            for name, note in value.items():
-                try:
-                    freeze_text(note)
-                except ValueError:
-                    self._refuse(f"{key}.{name}", note, "must be text")
-            return value
-        if spec.kind == "number" and self.of_row and not has_effect(value):
-            return value  # the section refuses zero, or is left out
-        given = value
-        if spec.kind == "flag" and isinstance(value, Switch):
-            given = {"true": True, "false": False}.get(value.lower(), value)
-        elif spec.kind == "integer" and re.fullmatch("[-+]?[0-9]+", str(value)):
-            given = int(value)
-        elif spec.kind == "text" and isinstance(value, (int, float)):
-            given = str(value)
-        try:
-            return accept(spec, given)
-        except ValueError:
-            return self._refuse(key, value, spec.refuse())
-
-    def _refuse(self, key: str, value: Any, allowed: str) -> None:
-        self.problems.append(Problem(key, value, allowed))
-
-
-def _split(word: str) -> tuple[str, int | None]:
-    """Return name and index of a word of a key; raises ValueError where it is none."""
-    parts = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", word, re.A)
-    if parts is None:
-        raise ValueError(word)
-    return parts[1], None if parts[2] is None else int(parts[2])
+def _split(key: str) -> Place:
+    """Return a key as a place."""
+    words = re.sub(r"\[(\d+)\]", r".\1", key).split(".")
+    return tuple(int(word) if word.isdecimal() else word for word in words)
 
 
 def find_fields(
@@ -316,30 +194,73 @@ def find_fields(
     With `components` an index may also pick a component of a vector. `place` is that of the tree in
     a larger one. ValueError says why there is no such field, or not in this scene.
     """
-    word, _, rest = key.partition(".")
-    try:
-        name, index = _split(word)
-    except ValueError:
-        name, index = word, None
-    known = specs(type(tree))
-    if name not in known:
-        raise ValueError("unknown key; allowed are " + ", ".join(known))
-    spec, value, here = known[name], getattr(tree, name), (*place, name)
-    if not rest and index is None:
-        yield here, value, spec
-    elif not rest and components and spec.shape and value is not None:
-        if index is None or index >= len(value):
-            raise ValueError(NO_NUMBER)
-        yield (*here, index), value[index], replace(spec, shape=spec.shape[1:])
-    elif rest and spec.kind == "section" and index is None:
-        if value is None:
-            raise ValueError(f"the scene has no {name}")
-        yield from find_fields(value, rest, components=components, place=here)
-    elif rest and spec.kind == "sections":
-        chosen = range(len(value)) if index is None else [index]
-        if not chosen or max(chosen) >= len(value):
-            raise ValueError(f"the scene has {len(value)} {name}")
+    found = [(place, tree, Spec("section", ""))]
+    for word in _split(key):
+        found = [one for part in found for one in _below(*part, word, components)]
+    yield from found
+
+
+def _below(
+    place: Place, value: Any, spec: Spec, word: str | int, components: bool
+) -> Iterator[tuple[Place, Any, Spec]]:
+    """Yield what the next word of a key names in a field; a name in a list is that of each."""
+    if value is None:
+        raise ValueError(f"the scene has no {place[-1]}")
+    if spec.kind == "sections":
+        chosen = [word] if isinstance(word, int) else range(len(value))
+        if not chosen or chosen[-1] >= len(value):
+            raise ValueError(f"the scene has {len(value)} {place[-1]}")
         for i in chosen:
-            yield from find_fields(value[i], rest, components=components, place=(*here, i))
+            entry = (*place, i), value[i], replace(spec, kind="section")
+            yield from [entry] if i == word else _below(*entry, word, components)
+    elif spec.kind == "section" and isinstance(word, str):
+        known = value.SPECS
+        if word not in known:
+            raise ValueError("unknown key; allowed are " + ", ".join(known))
+        yield (*place, word), getattr(value, word), known[word]
+    elif components and spec.shape and isinstance(word, int) and word < len(value):
+        yield (*place, word), value[word], replace(spec, shape=spec.shape[1:])
     else:
         raise ValueError(NO_NUMBER)
+
+
+def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
+    """Describe the documents that `read(cls, ...)` accepts."""
+    draft = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": draft, "title": title, **_object_schema(cls)}
+
+
+def _object_schema(cls: type[Section]) -> dict[str, Any]:
+    described: dict[str, Any] = {"type": "object", "additionalProperties": False}
+    if cls.__doc__:
+        described["description"] = cls.__doc__.partition("\n")[0]
+    if cls.ONE_OF:
+        described["oneOf"] = [{"required": [name]} for name in cls.ONE_OF]
+    known = cls.SPECS
+    properties = {name: _property_schema(spec) for name, spec in known.items()}
+    required = [name for name, spec in known.items() if spec.default is REQUIRED]
+    return {**described, "properties": properties, "required": required}
+
+
+def _property_schema(spec: Spec) -> dict[str, Any]:
+    described: dict[str, Any] = {"description": spec.doc + (f" [{spec.unit}]" if spec.unit else "")}
+    if isinstance(spec.default, (bool, int, float, str)):
+        described["default"] = spec.default
+    bounds = {"exclusiveMinimum": spec.above, "minimum": spec.least, "maximum": spec.most}
+    text = {"type": "string", "pattern": "\\S"}
+    known: dict[str, dict[str, Any]] = {
+        "number": {"type": "number"} | {name: x for name, x in bounds.items() if math.isfinite(x)},
+        "integer": {"type": "integer", "minimum": spec.least, "maximum": spec.most},
+        "choice": {"enum": list(spec.choices)},
+        "notes": {"type": "object", "additionalProperties": text},
+        "texts": {"type": "array", "items": text},
+        "flag": {"type": "boolean"},
+    }
+    own = _object_schema(spec.section) if spec.section else known.get(spec.kind, text)
+    for size in reversed(spec.shape):
+        own = {"type": "array", "items": own, "minItems": size, "maxItems": size}
+    if spec.kind == "sections":
+        own = {"type": "array", "items": own}
+    if spec.lengths:
+        own["anyOf"] = [{"minItems": length, "maxItems": length} for length in spec.lengths]
+    return own | described

@@ -140,7 +140,7 @@ class ControlledBatch:
     """
 
     def __init__(self, batch: Batch, study: SweepStudy) -> None:
-        assert study.motion is not None
+        assert study.motion is not None and study.control is not None
         self._batch, self._scene, self._seed = batch, study.scene, study.seed
         self._motion: ReferenceMotion = study.motion
         self._control: SampledControl = study.control

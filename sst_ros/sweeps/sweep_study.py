@@ -9,7 +9,6 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,8 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.schema import Section, anything, choice, integer, positive, section, specs, texts
-from sst_ros.scene.yaml_document import build, plain
+from sst_ros.scene.schema import Section, anything, entry, positive
+from sst_ros.scene.yaml_document import plain
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
     LARGEST_HYPERCUBE,
@@ -47,16 +46,14 @@ OUTPUTS = (*QUANTITIES, "energy", "extremes")
 
 MOST = 10_000_000
 
-_count: Any = partial(integer, default=None, least=1, most=MOST)
+_count: Any = partial(entry, default=None, least=1, most=MOST)
 _NO_TORQUE = "has no effect: the controller gives the torques"
 
 
-@dataclass(frozen=True)
 class SampledControl(ControlChannel, ControllerSettings):
     """A controller, and the channel between it and the plant."""
 
 
-@dataclass(frozen=True)
 class SweepStudy(Section):
     """Many runs of a scene; raises InputError with the key of a value that is not allowed."""
 
@@ -69,13 +66,13 @@ class SweepStudy(Section):
     n: int | None = _count(
         "number of runs; by default that of the grid or of the table", most=2**53
     )
-    seed: int = integer("of the random numbers", default=0, least=0, most=2**64 - 1)
-    sampling: str = choice("of random numbers", SAMPLINGS, default="random")
+    seed: int = entry("of the random numbers", default=0, least=0, most=2**64 - 1)
+    sampling: str = entry("of random numbers", choices=SAMPLINGS, default="random")
     table: Any = anything(
         "values by column in place of distributions: DataFrame, mapping or file", default=None
     )
     duration: float | None = positive(
-        "length of a run; by default that of the scene, or of its motion", "s", default=None
+        "length of a run; by default that of the scene, or of its motion", "s"
     )
     tolerance: float = positive(
         "error of the orientation at the end, for the number of steps", "rad", default=1e-9
@@ -86,24 +83,19 @@ class SweepStudy(Section):
         "or a SineTorque as a mapping",
         default=None,
     )
-    control: Any = section(
-        "settings of a controller and its channel, also as a mapping; see `ControlChannel`",
-        SampledControl,
-        default=None,
+    control: SampledControl | None = entry(
+        "settings of a controller and its channel, also as a mapping; see `ControlChannel`"
     )
-    outputs: tuple[str, ...] = texts(
+    outputs: tuple[str, ...] = entry(
         "quantities of the final state, and `extremes` of joints at the ends of the steps",
         default=DEFAULT_OUTPUTS,
     )
     trajectory: Mapping[str, int] | None = anything(
-        "{rows: m, samples: k}: k + 1 states of each of the first m runs", default=None
+        "{rows: m, samples: k}: k + 1 states of each of the first m runs"
     )
     chunk: int = _count("rows of a task and of a file", default=CHUNK)
 
     def __post_init__(self) -> None:
-        if isinstance(self.control, Mapping):
-            control = build(SampledControl, self.control, "sweep", path="control")
-            object.__setattr__(self, "control", control)
         if self.table is not None:
             object.__setattr__(self, "table", read_table(self.table))
         super().__post_init__()
@@ -129,7 +121,7 @@ class SweepStudy(Section):
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what was given, not what has been computed from it."""
-        return {name: getattr(self, name) for name in specs(SweepStudy)}
+        return {name: getattr(self, name) for name in SweepStudy.SPECS}
 
     @classmethod
     def read(cls, path: Path) -> SweepStudy:
@@ -147,7 +139,7 @@ class SweepStudy(Section):
     @classmethod
     def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
         """Build a study from a mapping; names of files are relative to a folder."""
-        known = specs(cls)
+        known = cls.SPECS
         for key in values:
             if key not in known:
                 hint = suggestion(str(key), known)
@@ -269,7 +261,7 @@ class SweepStudy(Section):
             raise ValueError("acts with control only")
         if key in ("initial.orientation", "control.period") or section in ("motion", "duration"):
             raise ValueError("cannot vary")
-        if section == "control":
+        if section == "control" and self.control is not None:
             return targets_of(self.control, name, ("control",))
         if section == "torque" and self.control is not None:
             raise ValueError(_NO_TORQUE)

@@ -27,7 +27,7 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
-from sst_ros.scene.schema import Place, Section, Spec, key_of, specs
+from sst_ros.scene.schema import Place, Section, Spec, key_of
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
 
 KINDS = ("uniform", "normal", "grid", "linspace")
@@ -126,7 +126,7 @@ def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
         if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {here}")
         if isinstance(value, Inertia):
-            parts = ((part, getattr(value, part), of) for part, of in specs(Inertia).items())
+            parts = ((part, getattr(value, part), of) for part, of in Inertia.SPECS.items())
             found += [Target(f"{here}.{part}", np.array(x), of) for part, x, of in parts if x]
         elif spec.kind == "number":
             found.append(Target(here, np.array(value, dtype=float), spec))

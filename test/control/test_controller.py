@@ -16,7 +16,7 @@ from sst_ros.errors import InputError
 from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene import scene
-from sst_ros.scene.scene import Actuators, Initial, Moment
+from sst_ros.scene.loads import Actuators, Initial, Moment
 from sst_ros.simulation.simulation import Simulation
 from test.models import seeded_samples
 

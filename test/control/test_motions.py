@@ -28,6 +28,7 @@ from sst_ros.mechanism.generic_math import quaternion_product
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.loads import (
     DesiredMotion,
+    Initial,
     Recorded,
     Spiral,
     Sweep,
@@ -35,7 +36,7 @@ from sst_ros.scene.loads import (
     ToOrientation,
     Waypoint,
 )
-from sst_ros.scene.scene import Initial, load
+from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 
 START = (0.75, 0.7, 0.75)

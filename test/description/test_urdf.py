@@ -34,8 +34,8 @@ from sst_ros.description.robot import (
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import rates, virtual_work
 from sst_ros.mechanism.geometry import Geometry, quaternion_of
-from sst_ros.scene.loads import JOINTS
-from sst_ros.scene.scene import Actuators, load, names
+from sst_ros.scene.loads import JOINTS, Actuators
+from sst_ros.scene.scene import load, names
 
 ACTUATORS = list(JOINTS[:3])
 CONTROLLERS = Path(__file__).parents[2] / "config" / "controllers.yaml"

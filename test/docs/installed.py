@@ -12,7 +12,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.nodes.arguments import COMMANDS, ros_arguments
 from sst_ros.nodes.topics import EXECUTES, PUBLISHES, SERVES, SUBSCRIBES
-from sst_ros.scene.schema import specs
 from tools.reference_pages import NODES
 
 ENDPOINTS = {
@@ -60,7 +59,7 @@ def _ros2(words):
     elif words[0] == "param":
         assert words[1] in ("get", "set"), words
         (node,) = (node for node in NODES if f"/{node.name}" == words[2])
-        spec = specs(node.parameters)[words[3]]
+        spec = node.parameters.SPECS[words[3]]
         if words[1] == "set":
             assert words[3] in node.parameters.CHANGEABLE, f"{words[3]} is read-only"
             _value(spec, words[4])
@@ -75,7 +74,7 @@ def run(words):
     """Check an executable and its parameters, as plain options or as --ros-args has them."""
     command, *rest = words
     assert (ROOT / "executables" / command).is_file(), command
-    known = specs(COMMANDS[command][1])
+    known = COMMANDS[command][1].SPECS
     for name, assigned, text in (w.partition(":=") for w in ros_arguments(command, rest)):
         if assigned and name in known:
             _value(known[name], text)

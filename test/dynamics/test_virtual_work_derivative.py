@@ -8,7 +8,7 @@ import pytest
 
 from sst_ros import Simulation, load_scene
 from sst_ros.errors import InputError
-from sst_ros.scene.scene import Moment
+from sst_ros.scene.loads import Moment
 
 
 def largest_difference(one, other):

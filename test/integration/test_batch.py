@@ -18,7 +18,7 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
-from sst_ros.scene.scene import Initial, Moment
+from sst_ros.scene.loads import Initial, Moment
 from sst_ros.state import QUANTITIES
 
 pytest.importorskip("numba", reason="a batch needs numba")

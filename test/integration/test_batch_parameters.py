@@ -16,7 +16,8 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Actuators, Scenarios
+from sst_ros.scene.loads import Actuators
+from sst_ros.scene.scene import Scenarios
 from sst_ros.scene.yaml_document import find_fields
 
 pytest.importorskip("numba", reason="a batch needs numba")

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from sst_ros.errors import InputError
 from sst_ros.nodes.arguments import COMMANDS, help_text, params_file_warnings, ros_arguments
-from sst_ros.scene.schema import specs
 
 
 def values(command, *words):
@@ -111,7 +110,7 @@ def test_a_parameter_file_for_another_node_is_reported(tmp_path, nodes, words, m
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_has_every_parameter_with_default_and_bounds(command):
     text = " ".join(help_text(command).split())
-    for name, spec in specs(COMMANDS[command][1]).items():
+    for name, spec in COMMANDS[command][1].SPECS.items():
         assert f"--{name.replace('_', '-')} " in text
         assert spec.describe() in text
 

@@ -24,8 +24,7 @@ from sst_ros.report import tracking
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
 from sst_ros.scene import scene, yaml_document
-from sst_ros.scene.loads import DesiredMotion, Spiral, ToAngles
-from sst_ros.scene.scene import Actuators, Stroke, Workspace
+from sst_ros.scene.loads import Actuators, DesiredMotion, Spiral, Stroke, ToAngles, Workspace
 
 pytestmark = pytest.mark.ros
 NODE = "/sst_inverse_dynamics"

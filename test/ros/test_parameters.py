@@ -13,7 +13,6 @@ from rcl_interfaces.srv import DescribeParameters
 from ros.conftest import NODE
 
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.scene.schema import specs
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[2]
@@ -101,7 +100,7 @@ def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(no
 
 def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
     nodes.run("simulator")
-    known = specs(SimulatorParameters)
+    known = SimulatorParameters.SPECS
     reply = observer.call(DescribeParameters, f"{NODE}/describe_parameters", names=list(known))
     for descriptor in reply.descriptors:
         assert descriptor.description.startswith(known[descriptor.name].doc)
@@ -142,7 +141,7 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     document = yaml.safe_load(path.read_text())
     given = document["/**"]["ros__parameters"]
     defaults = SimulatorParameters()
-    names = specs(SimulatorParameters).keys() - {"duration", "wait_for_subscribers"}
+    names = SimulatorParameters.SPECS.keys() - {"duration", "wait_for_subscribers"}
     assert given == {name: getattr(defaults, name) for name in names}
     told = ["--ros-args", "--params-file", str(path), "-r", "__ns:=/left", "-r", "__node:=other"]
     process = nodes.run("simulator", *told)

@@ -8,7 +8,7 @@ import pytest
 from sst_ros import load_scene
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.runtime.tick_loop import HeldTorques
-from sst_ros.scene.scene import Actuators
+from sst_ros.scene.loads import Actuators
 from sst_ros.simulation.simulation import Simulation
 
 

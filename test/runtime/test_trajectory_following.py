@@ -20,8 +20,7 @@ from sst_ros.runtime.trajectory_following import (
     TrajectoryGoal,
 )
 from sst_ros.scene import scene
-from sst_ros.scene.loads import DesiredMotion, Spiral, ToAngles
-from sst_ros.scene.scene import Actuators, Initial
+from sst_ros.scene.loads import Actuators, DesiredMotion, Initial, Spiral, ToAngles
 from sst_ros.simulation.simulation import Simulation
 
 PERIOD_NS = 2_000_000

@@ -17,7 +17,8 @@ from models import inertia_of
 from sst_ros.dynamics import kernel
 from sst_ros.errors import AssemblyError, RunStopped, SingularConfiguration, SstError
 from sst_ros.mechanism.geometry import quaternion_of
-from sst_ros.scene.scene import Initial, load
+from sst_ros.scene.loads import Initial
+from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 from studies import extreme
 from studies.extreme import FACTOR, estimate_check, evaluate_case, run_case
