@@ -16,7 +16,7 @@ from sst_ros.integration.compiled_method import (
     JACOBIAN_COST,
     CompiledMethod,
     JointRanges,
-    Most,
+    Periods,
     Vector,
     methods_of,
 )
@@ -218,26 +218,18 @@ class AdaptiveStepper:
         the method is looked at, or `ranges` may be left. One call takes at most the evaluations of
         one period's budget.
         """
-        machine = self._machine(at.method)
-        most = self._most(at, machine, 1)
-        done, end = machine.step_many(h, count, self.tolerance, most, at, d)
-        self.budget.spent += 3 * (end.steps - at.steps) * machine.cost
-        return done, end
+        return self.step_through(0, count, self._machine(at.method).hold(h, d), at, 1)
 
-    def step_sequence(
-        self, first: int, periods: tuple[Any, Any, Any], at: Point, reached: Any
+    def step_through(
+        self, first: int, end: int, periods: Periods, at: Point, budgets: int, reached: Any = None
     ) -> tuple[int, Point]:
-        """Advance through periods from the first on, as `CompiledMethod.step_sequence`."""
-        machine, last = self._machine(at.method), len(periods[0])
-        most = self._most(at, machine, last - first)
-        done, end = machine.step_sequence(first, last, periods, at, self.tolerance, most, reached)
-        self.budget.spent += 3 * (end.steps - at.steps) * machine.cost
-        return done, end
-
-    def _most(self, at: Point, machine: CompiledMethod, periods: int) -> Most:
-        """Bound what a call takes by the budget of periods and the next look at the method."""
-        steps = max(periods * self.budget.per_period // (3 * machine.cost), 1)
-        return self._max_step, self._most_attempts, at.steps + steps
+        """Advance as `CompiledMethod.step_many`, by the evaluations of so many budgets at most."""
+        machine = self._machine(at.method)
+        steps = max(budgets * self.budget.per_period // (3 * machine.cost), 1)
+        most = self._max_step, self._most_attempts, at.steps + steps
+        done, after = machine.step_many(first, end, periods, at, self.tolerance, most, reached)
+        self.budget.spent += 3 * (after.steps - at.steps) * machine.cost
+        return done, after
 
     def part(self, step: Step, x: float) -> Point:
         """Return the point x [s] after the begin of an accepted step, by a shorter one."""

@@ -45,6 +45,9 @@ JointRanges = Sequence[tuple[int, float, float]]
 Most = tuple[float, float, float]
 """What one call may take: longest step [s], attempts since the method was chosen, and steps since
 the start of the run; then another method may be chosen, or a bound is met."""
+Periods = tuple[Any, Any, Any]
+"""Of n periods, or of all, the lengths [s], shape (n,), the drives, (n, m), and the states at which
+they begin, (n, size), NaN where they continue; lists in plain Python."""
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
@@ -128,7 +131,7 @@ class CompiledMethod:
         """Have the code that a run calls loaded, or made where it is not there."""
         size, drive = len(self.system.state), (0.0,) * len(self.system.drive)
         y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
-        self.step_many(1e-3, 1, 1.0, (math.inf,) * 3, Point(y, y, (0.0,) * 18, self.method), drive)
+        self.step_pair(0.0, 1e-3, Point(y, y, (0.0,) * 18, self.method), drive)
 
     def step_pair(self, t: float, h: float, at: Point, d: Vector) -> tuple[Point, float]:
         """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
@@ -138,11 +141,8 @@ class CompiledMethod:
             the step has no finite result.
 
         """
-        self._length[0], self._drive[0][:] = h, d
-        periods = self._length, self._drive, self._no_start
-        at = at._replace(h=math.inf)
-        one = 0, 1, periods, at, math.inf, (math.inf,) * 3, self._not_kept
-        done, end = self._advance(*one, self._no_ranges, t)
+        one, begin = self.hold(h, d), at._replace(h=math.inf)
+        done, end = self.step_many(0, 1, one, begin, ranges=self._no_ranges, t=t)
         return end, float(self._run[8]) if done else math.inf
 
     def slope(self, t: float, y: Vector, d: Vector) -> tuple[float, ...]:
@@ -150,46 +150,41 @@ class CompiledMethod:
         found: tuple[float, ...] = self._module.rhs(t, *y, *d, *self._extra)
         return found
 
-    def step_many(
-        self, h: float, count: int, tolerance: float, most: Most, at: Point, d: Vector
-    ) -> tuple[int, Point]:
-        """Advance by up to `count` periods of h [s], as `step_sequence`."""
+    def hold(self, h: float, d: Vector) -> Periods:
+        """Return periods that all have the length h [s] and the drive d."""
         self._length[0], self._drive[0][:] = h, d
-        periods = self._length, self._drive, self._no_start
-        return self.step_sequence(0, count, periods, at, tolerance, most, self._not_kept)
+        return self._length, self._drive, self._no_start
 
-    def step_sequence(
+    def step_many(
         self,
         first: int,
         end: int,
-        periods: tuple[Any, Any, Any],
+        periods: Periods,
         at: Point,
-        tolerance: float,
-        most: Most,
-        reached: Any,
+        tolerance: float = math.inf,
+        most: Most = (math.inf,) * 3,
+        reached: Any = None,
+        *,
+        ranges: Any = None,
+        t: float = 0.0,
     ) -> tuple[int, Point]:
         """Advance from period `first` to `end`; stop before one that needs more than steps.
 
         Args:
             first: number of the period that begins.
             end: number of the last one, and one.
-            periods: of n periods the lengths [s], shape (n,), the drives, (n, m), and the states
-                (n, size) at which they begin, NaN where they continue; lists in plain Python.
+            periods: what they are.
             at: where the first one begins.
             tolerance: largest local error estimate of a step.
             most: what they may take.
             reached: takes both solutions at the ends, shape (n, 2, size).
+            ranges: in place of those of the method.
+            t: time at which periods begin, as the system takes it [s].
 
         Returns:
             The first period that was not done, and where it begins.
 
         """
-        return self._advance(first, end, periods, at, tolerance, most, reached, self._ranges)
-
-    def _advance(
-        self, first: int, end: int, periods: tuple[Any, Any, Any], at: Point, tolerance: float,
-        most: Most, reached: Any, ranges: Any, t: float = 0.0,
-    ) -> tuple[int, Point]:  # fmt: skip
         y, z, joints = self._place
         run = self._run
         y[:], z[:], joints[:] = at[:3]
@@ -198,8 +193,9 @@ class CompiledMethod:
         run[7] = t
         try:
             done = self._module.step_many(
-                first, end, *periods, self._numbers, tolerance, y, z, ranges, joints,
-                run, reached,
+                first, end, *periods, self._numbers, tolerance, y, z,
+                self._ranges if ranges is None else ranges, joints,
+                run, self._not_kept if reached is None else reached,
             )  # fmt: skip
         except (ArithmeticError, ValueError):  # plain Python, of a number without a value
             done = int(run[3])

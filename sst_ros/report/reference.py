@@ -99,7 +99,7 @@ class TickPropagator(Propagator):
         k = int(np.flatnonzero(np.isfinite(begins[:, 0]))[0])
         at = stepper.begin(begins[k, :-1].tolist())
         while k < len(length):
-            k, at = stepper.step_sequence(k, given, at, reached)
+            k, at = stepper.step_through(k, len(length), given, at, len(length) - k, reached)
             if k == len(length):
                 break
             torque = self._sine or (float(held[k, 0]), float(held[k, 1]), float(held[k, 2]))

@@ -13,6 +13,7 @@ from loaded_scenes import IGNORE, REST, loaded, run, viscous
 
 from sst_ros.errors import Diverged, InputError, RunStopped, StepBudgetExceeded, StrokeExceeded
 from sst_ros.host.compiled_module import numba_version
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.scene.bodies import Inertia, Link
@@ -152,14 +153,14 @@ BY_NUMBA = [
 @pytest.fixture
 def glided(monkeypatch):
     """Count the ticks that were done without a look at each."""
-    counts, step_many = [], CompiledMethod.step_many
+    counts, step_many = [], AdaptiveStepper.step_many
 
     def counted(self, h, count, *more):
         found = step_many(self, h, count, *more)
         counts.append((count, found[0]))
         return found
 
-    monkeypatch.setattr(CompiledMethod, "step_many", counted)
+    monkeypatch.setattr(AdaptiveStepper, "step_many", counted)
     return counts
 
 
