@@ -20,9 +20,17 @@ from sst_ros.extras import MissingDependency, require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, angle_between, quaternion_of, rotation_matrix
-from sst_ros.plot.motion import ASSUMPTION, NUMBERS, Solution, angle, caption, position_of_e
-from sst_ros.plot.motion import path as path_of_e
-from sst_ros.plot.pictures import PICTURES, save
+from sst_ros.plot.pictures import (
+    ASSUMPTION,
+    NUMBERS,
+    PICTURES,
+    Solution,
+    caption,
+    draw_angle,
+    draw_path,
+    draw_position,
+    save,
+)
 from sst_ros.plot.style import BLUE, VERMILION, hide_zeros, stack, styled
 from sst_ros.recording import recording
 from sst_ros.scene.scene import Scene, load
@@ -156,9 +164,12 @@ def _difference(
 def _draw(scene: Scene, solutions: Sequence[Solution], out: Path) -> list[Path]:
     """Draw the paper's figures of a scene."""
     drawn = {
-        "path_of_E": partial(path_of_e, scene, solutions),
-        "position_of_E": partial(position_of_e, scene, solutions),
-        **{name: partial(angle, solutions, i) for i, name in enumerate(("theta", "phi", "psi"))},
+        "path_of_E": partial(draw_path, scene, solutions),
+        "position_of_E": partial(draw_position, scene, solutions),
+        **{
+            name: partial(draw_angle, scene, solutions, i)
+            for i, name in enumerate(("theta", "phi", "psi"))
+        },
     }
     paths: list[Path] = []
     for name in NUMBERS[scene.name]:

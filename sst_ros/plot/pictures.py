@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a recorded run: what each shows, what it needs, how it is drawn."""
+"""The pictures of a recorded run: what each shows, what it needs, how it is drawn.
+
+The motion of the star, Figs. 8 to 14 of the paper, takes any number of solutions: a run, the
+continuous solution, an independent engine. Several are drawn over each other, with their
+differences from the first below, on a logarithmic axis.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import CubicHermiteSpline
 
 from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.output import write_into
-from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix
+from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
 from sst_ros.mechanism.rates import body_rates
-from sst_ros.plot import motion, style, workspace
-from sst_ros.plot.style import BLUE, GREY, VERMILION, leg_names, lines, stack
+from sst_ros.plot import style, workspace
+from sst_ros.plot.style import BLUE, GREY, LINES, VERMILION, Looks, leg_names, lines, stack
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 from sst_ros.scene.scene import Scene
@@ -27,6 +34,14 @@ FORMATS = ("pdf", "png")
 DEGREES = float(np.degrees(1.0))  # angles are drawn in degrees, their errors in radians
 QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
+NUMBERS = {
+    "example1": {"position_of_E": 8, "psi": 9},
+    "example2": {"path_of_E": 10, "position_of_E": 11, "theta": 12, "phi": 13, "psi": 14},
+}
+"""Number of a picture in the paper, by the name of the scene."""
+ASSUMPTION = "assumed inertias: the paper's are lost"
+LEAST_POSITION_M, LEAST_ANGLE_DEG = 0.05, 1.0
+"""An axis never shows less than this, so that rounding is a flat line."""
 
 
 class Picture(NamedTuple):
@@ -72,13 +87,123 @@ def draw_legs(label: str, series: Sequence[tuple[str, Array, Array, Mapping[str,
     return figure
 
 
-def _star(draw: Callable[[Scene, list[motion.Solution]], Figure]) -> Callable[..., Figure]:
-    """Return what draws the recorded motion of the star by a figure of `motion`."""
+class Solution(NamedTuple):
+    """One solution of the motion: its name, times [s] (n,), quaternions (n, 4), ZYZ angles (n, 3).
+
+    Angles are in rad; where they are nan those of the quaternion are drawn.
+    """
+
+    name: str
+    seconds: Array
+    quaternion: Array
+    euler: Array | None = None
+
+    @property
+    def degrees(self) -> Array:
+        """ZYZ angles [deg] without jumps, over lost samples too, shape (n, 3)."""
+        angles = zyz_angles(rotation_matrix(self.quaternion))
+        if self.euler is not None:
+            angles = np.where(np.isfinite(self.euler), self.euler, angles)
+        for column in angles.T:
+            known = np.isfinite(column)
+            column[known] = np.unwrap(column[known])
+        return np.asarray(np.degrees(angles))
+
+    def position(self, scene: Scene) -> Array:
+        """Position of E in {B} [m], shape (n, 3)."""
+        return np.asarray(scene.star.radius * rotation_matrix(self.quaternion)[:, :, 2])
+
+
+def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
+    """Return the stem of a picture's file and its title.
+
+    The paper's figures have their number and name the assumption behind them.
+    """
+    title += f", {scene}" if scene else ""
+    number = NUMBERS.get(scene or "", {}).get(name)
+    if number is None:
+        return name, title
+    return f"fig{number:02d}_{name}", f"{title}\nFig. {number} of the paper; {ASSUMPTION}"
+
+
+def draw_position(scene: Scene, solutions: Sequence[Solution]) -> Figure:
+    """Draw the coordinates of E over time."""
+    values = [each.position(scene) for each in solutions]
+    return _over_time(solutions, values, "xyz", "position of E in {B} [m]", LEAST_POSITION_M)
+
+
+def draw_angle(_: Scene | None, solutions: Sequence[Solution], which: int) -> Figure:
+    """Draw one of the ZYZ angles over time: 0 theta, 1 phi, 2 psi."""
+    letter = "θφψ"[which]
+    values = [each.degrees[:, which : which + 1] for each in solutions]
+    return _over_time(solutions, values, letter, f"{letter} [deg]", LEAST_ANGLE_DEG)
+
+
+def _over_time(
+    solutions: Sequence[Solution], values: Sequence[Array], letters: str, label: str, least: float
+) -> Figure:
+    """Draw columns over time; differences from the first solution below where there are several.
+
+    All solutions have the times of the first one.
+    """
+    seconds, unit = solutions[0].seconds, label.split("[")[1].rstrip("]")
+    if len(solutions) == 1:
+        figure, (axes,) = stack([label], 3.2)
+        lines(axes, seconds, values[0], list(letters), least_span=least)
+        return figure
+    figure, (above, below) = stack([label, f"difference from\n{solutions[0].name} [{unit}]"], 2.7)
+    for solution, columns, looks in zip(solutions, values, LINES, strict=False):
+        above.plot(seconds, columns, **looks)[0].set_label(solution.name)
+        if solution is not solutions[0]:
+            apart = np.abs(columns - values[0]).max(axis=1)
+            name = f"{solution.name}: {np.nanmax(apart):.1e} {unit}"
+            below.plot(seconds, style.hide_zeros(apart), label=name, **looks)
+    style.widen(above, values[0], least)
+    if len(letters) > 1:  # each beside its last value
+        beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
+        for letter, last in zip(letters, values[0][-1], strict=True):
+            above.annotate(letter, (seconds[-1], last), (4, 0), **beside)
+    style.legend(above)
+    below.set_yscale("log")
+    below.legend(fontsize=8, loc="best", title="largest difference", title_fontsize=8)
+    return figure
+
+
+def draw_path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
+    """Draw E over the base triangle, both at their own radius, and the triangle's image at E's."""
+    figure = Figure(figsize=(6.4, 6.4))
+    axes = figure.add_subplot(projection="3d")
+    geometry = Geometry.of(scene)
+    base, star = scene.base.radius, scene.star.radius
+    outline = np.concatenate(style.sides(geometry, 40))
+    axes.plot(*(base * outline).T, color=GREY, linewidth=1.6, label="base triangle P₁P₂P₃")
+    if star != base:
+        image = {"linewidth": 0.9, "linestyle": ":", "label": "its image on the sphere of E"}
+        axes.plot(*(star * outline).T, color=GREY, **image)
+    for name, point in zip(leg_names("P"), 1.14 * max(base, star) * geometry.v, strict=True):
+        axes.text(*point, name, ha="center", va="center")
+    several = len(solutions) > 1
+    for solution, looks in zip(solutions, LINES, strict=False):
+        name = solution.name if several else "path of E"
+        axes.plot(*solution.position(scene).T, label=name, **looks)
+    style.mark_ends(axes, *solutions[0].position(scene).T)
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    axes.set_box_aspect(np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1))
+    x, y, z = geometry.v.sum(axis=0)
+    height, azimuth = np.degrees(np.arctan2(z, np.hypot(x, y))), np.degrees(np.arctan2(y, x))
+    axes.view_init(elev=height - 8.0, azim=azimuth + 8.0)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], prune="both"))
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncol=3, fontsize=9)
+    return figure
+
+
+def _star(draw: Callable[[Scene, list[Solution]], Figure]) -> Callable[..., Figure]:
+    """Return what draws the recorded motion of the star."""
 
     def make(run: Signals, scene: Scene) -> Figure:
-        quaternion = run.take(*QUATERNION)
         euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else None
-        return draw(scene, [motion.Solution("run", run.seconds(), quaternion, euler)])
+        return draw(scene, [Solution("run", run.seconds(), run.take(*QUATERNION), euler)])
 
     return make
 
@@ -224,38 +349,39 @@ def _power(run: Signals) -> Array:
     return run.legs("tau") * run.legs("gamma_dot")
 
 
-_TRACKING_ERROR = curves(  # as the controller received it
+JOINTS, ORIENTATION, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
+ERROR, REFERENCE = "tracking_error", "reference"
+KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
+_ERRORS = curves(  # as the controller received them
     legs("γ desired − γ [rad]", "gamma_error", "γ"),
     legs("γ̇ desired − γ̇ [rad/s]", "gamma_dot_error", "γ̇"),
 )
-_CONTROL_TORQUES = curves(
+_CONTROL = curves(
     legs("feedforward [N m]", "tau_feedforward", "τ"), legs("feedback [N m]", "tau_feedback", "τ")
 )
-_POWER = curves(
+_POWERS = curves(
     ("power τₖ γ̇ₖ [W]", ACTUATORS, _power),
     ("all three [W]", ["sum"], lambda run: _power(run).sum(axis=1)[:, None]),
 )
-KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
-_JOINT_ANGLES = curves(*(legs(f"{k} [deg]", name, k, DEGREES) for name, k in KINDS.items()))
-_JOINT_RATES = curves(*(legs(f"{k}̇ [rad/s]", f"{name}_dot", f"{k}̇") for name, k in KINDS.items()))
-JOINTS, ORIENTATION, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
-ERROR, REFERENCE = "tracking_error", "reference"
+_ANGLES = curves(*(legs(f"{k} [deg]", name, k, DEGREES) for name, k in KINDS.items()))
+_RATES = curves(*(legs(f"{k}̇ [rad/s]", f"{name}_dot", f"{k}̇") for name, k in KINDS.items()))
 _WORK = curves(("work [J]", ACTUATORS, work), height=3.2)
 PICTURES = {
-    "path_of_E": Picture("Path of point E", (ORIENTATION, S), _star(motion.path)),
-    "position_of_E": Picture("Position of point E", (ORIENTATION, S), _star(motion.position_of_e)),
-    "theta": Picture("The angle θ", (ORIENTATION,), _star(lambda _, star: motion.angle(star, 0))),
-    "phi": Picture("The angle φ", (ORIENTATION,), _star(lambda _, star: motion.angle(star, 1))),
-    "psi": Picture("The angle ψ", (ORIENTATION,), _star(lambda _, star: motion.angle(star, 2))),
+    "path_of_E": Picture("Path of point E", (ORIENTATION, S), _star(draw_path)),
+    "position_of_E": Picture("Position of point E", (ORIENTATION, S), _star(draw_position)),
+    **{
+        name: Picture(f"The angle {letter}", (ORIENTATION,), _star(partial(draw_angle, which=k)))
+        for k, (name, letter) in enumerate({"theta": "θ", "phi": "φ", "psi": "ψ"}.items())
+    },
     "tracking": Picture("Desired and measured angles", (JOINTS, REFERENCE), _tracking),
-    "tracking_error": Picture("Tracking error", (ERROR,), _TRACKING_ERROR),
-    "control_torques": Picture("Torques of the controller", (REFERENCE, ERROR), _CONTROL_TORQUES),
+    "tracking_error": Picture("Tracking error", (ERROR,), _ERRORS),
+    "control_torques": Picture("Torques of the controller", (REFERENCE, ERROR), _CONTROL),
     "torques": Picture("Torques", (TICKS,), _torques),
-    "power": Picture("Power of the actuators", (JOINTS,), _POWER),
+    "power": Picture("Power of the actuators", (JOINTS,), _POWERS),
     "work": Picture("Work of the actuators", (JOINTS, TICKS), _WORK),
     "energy": Picture("Energy", (JOINTS, ORIENTATION, TICKS, S), _energy),
-    "joint_angles": Picture("Joint angles", (JOINTS,), _JOINT_ANGLES),
-    "joint_rates": Picture("Joint rates", (JOINTS,), _JOINT_RATES),
+    "joint_angles": Picture("Joint angles", (JOINTS,), _ANGLES),
+    "joint_rates": Picture("Joint rates", (JOINTS,), _RATES),
     "phase": Picture("Phase portraits of the actuators", (JOINTS,), _phase),
     "margins": Picture("Distance to the limits", (JOINTS, S), _margins),
     "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), _sphere),
@@ -282,7 +408,7 @@ def draw_run(
             missing[name] = "the bag has no " + ", no ".join(absent)
             continue
         scene = run.scene.name if run.scene else None
-        stem, title = motion.caption(name, picture.title, scene)
+        stem, title = caption(name, picture.title, scene)
         paths += save(picture.make(run, run.scene), title, out, stem, formats)
     return paths, missing
 
