@@ -51,51 +51,30 @@ if TYPE_CHECKING:
 
 __version__ = VERSION
 
-# Module of each name, and its name there where that is another one.
-_MODULES = {
-    "AssemblyError": "errors",
-    "Batch": "integration.batch",
-    "Controller": "control.controller",
-    "ControllerSettings": "control.law",
-    "Geometry": "mechanism.geometry",
-    "Identification": "identification.parameters",
-    "InputError": "errors",
-    "InverseDynamics": "control.inverse_dynamics",
-    "PolynomialTorque": "scene.torque_profile",
-    "Recording": "recording.recording",
-    "ReferenceMotion": "control.actuator_space",
-    "RunStopped": "errors",
-    "Scene": "scene.scene",
-    "Simulation": "simulation.simulation",
-    "SineTorque": "scene.loads",
-    "SingularConfiguration": "errors",
-    "SstError": "errors",
-    "State": "state",
-    "TorqueTable": "scene.torque_profile",
-    "Trajectory": "simulation.trajectory",
-    "arc_inertia": "scene.bodies",
-    "direct_kinematics": "mechanism.kinematics:direct",
-    "identify": "identification.identify",
-    "inverse_kinematics": "mechanism.kinematics:inverse",
-    "load_scene": "scene.scene:load",
-    "plot_workspace": "plot.workspace",
-    "prepare": "simulation.simulate",
-    "read_bag": "recording.recording:read",
-    "reference_motion": "control.reference_motions",
-    "simulate": "simulation.simulate",
-    "sweep": "sweeps.sweep",
-    "workspace": "mechanism.workspace",
+_RENAMED = {
+    "direct_kinematics": ("sst_ros.mechanism.kinematics", "direct"),
+    "inverse_kinematics": ("sst_ros.mechanism.kinematics", "inverse"),
+    "load_scene": ("sst_ros.scene.scene", "load"),
+    "read_bag": ("sst_ros.recording.recording", "read"),
 }
 
-
 if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all others
-    __all__ = ["__version__", *_MODULES]
+
+    def _read_exports() -> dict[str, tuple[str, str]]:
+        """Read modules and names of the exports from the imports above, which are their list."""
+        lines = __spec__.loader.get_data(__file__).decode().splitlines()
+        words = [line.split() for line in lines if line.startswith("    from sst_ros.")]
+        own = {shown: (module, name) for _, module, _, name, _, shown in words if name == shown}
+        return own | _RENAMED
+
+    _EXPORTS = _read_exports()
+    __all__ = ["__version__", *sorted(_EXPORTS)]
 
     def __getattr__(name: str) -> object:
-        if name not in _MODULES:
+        if name not in _EXPORTS:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        module, _, attribute = _MODULES[name].partition(":")
-        value: object = getattr(importlib.import_module(f"sst_ros.{module}"), attribute or name)
+        module, attribute = _EXPORTS[name]
+        value: object = getattr(importlib.import_module(module), attribute)
         globals()[name] = value
         return value
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SHOWN_PROBLEMS = 20
-"""Problems of one input that are printed; `InputError.problems` has all of them."""
+SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
+SHOWN = 80  # characters of a value in a message
 
 
 class SstError(Exception):
@@ -34,7 +34,10 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
-        return f"{where}{self.key or 'document'} = {shorten(self.value)}: {self.allowed}"
+        text, half = repr(self.value), SHOWN // 2 - 2
+        if len(text) > SHOWN:  # the end of a path names the file
+            text = f"{text[:half]}...{text[-half:]}"
+        return f"{where}{self.key or 'document'} = {text}: {self.allowed}"
 
 
 class InputError(SstError):
@@ -136,14 +139,6 @@ def printable(text: str) -> str:
         letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
         for letter in text
     )
-
-
-def shorten(value: object, limit: int = 80) -> str:
-    """Return `repr(value)`, cut to `limit` characters."""
-    text = repr(value)
-    # The end of a path names the file.
-    half = limit // 2 - 2
-    return text if len(text) <= limit else f"{text[:half]}...{text[-half:]}"
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

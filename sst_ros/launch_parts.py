@@ -12,13 +12,13 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import yaml
-from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from ament_index_python.packages import get_packages_with_prefixes
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
@@ -31,24 +31,19 @@ from sst_ros.description.robot import urdf, urdf_with_ros2_control
 from sst_ros.host import child_process
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics
-from sst_ros.scene import scene
-from sst_ros.scene.scene import share_directory
+from sst_ros.scene.scene import load, share_directory
 
-Given = Mapping[str, str]
-"""Values of the launch arguments."""
+Given = Mapping[str, str]  # values of the launch arguments
 
-_FLAG = ["true", "false"]
 _CHOICES = {"sync": ["", "free", "lockstep"], "bag": ["ros2", "sst"]}
+_FLAG = ["true", "false"]
 _SHARED = {
     "namespace": ("", "namespace of the nodes"),
     "params_file": ("", "YAML file of parameters; arguments that are given here go before it"),
     "log_level": ("info", "log level of the nodes: debug, info, warn, error or fatal"),
 }
-_CLOSING_S = "60"
-"""Time that a recorder has to write its index before it is terminated [s]."""
-
-_WAIT_S = "60"
-"""Time that a simulator waits for its recorder [s]; on a busy machine one starts in 20 s."""
+_CLOSING_S = "60"  # time that a recorder has to write its index before it is terminated
+_WAIT_S = "60"  # that a simulator waits for its recorder; on a busy machine one starts in 20 s
 
 
 def recording_arguments(name: str) -> dict[str, tuple[str, str]]:
@@ -70,8 +65,12 @@ def description(
     every = {**arguments, **_SHARED}
 
     def perform(context: LaunchContext) -> list[Action]:
-        if any(word.endswith(Path(file).name) for word in sys.argv):  # not one that is included
-            _refuse_unknown(context.argv, every)
+        ours = any(word.endswith(Path(file).name) for word in sys.argv)  # not one that is included
+        for word in context.argv if ours else ():
+            name, assigned, _ = word.partition(":=")
+            if assigned and name not in every:
+                close = difflib.get_close_matches(name, every, 1) or sorted(every)
+                raise RuntimeError(f"{word}: no such argument; known: {', '.join(close)}")
         return actions({name: context.launch_configurations[name] for name in every})
 
     declared = [
@@ -92,33 +91,30 @@ def node(given: Given, executable: str, parameters: Given, *, ends: bool = True)
     Parameters that are empty are left to params_file or the default. Where it `ends`, its end is
     that of the launch; its failure always is.
     """
-    options = {key.replace("_", "-"): value for key, value in parameters.items() if value != ""}
+    words = [f"--{key.replace('_', '-')}={text}" for key, text in parameters.items() if text != ""]
     return _node(
         given,
         "sst_ros",
         executable,
-        [f"--{option}={value}" for option, value in options.items()],
-        [given["params_file"]] if given["params_file"] else [],
-        ends=ends,
+        ends,
+        arguments=words,
+        parameters=[given["params_file"]] if given["params_file"] else [],
         ros_arguments=["--log-level", given["log_level"]],
         additional_env={child_process.PARENT: str(os.getpid())},
         sigterm_timeout=_CLOSING_S,
     )
 
 
-def _node(
-    given: Given,
-    package: str,
-    executable: str,
-    arguments: Sequence[str] = (),
-    parameters: Sequence[Any] = (),
-    *,
-    ends: bool = True,
-    **more: Any,
-) -> Node:
-    more["output"], more["on_exit"] = "screen", _exit_handler(executable, ends)
-    more["arguments"], more["parameters"] = [*arguments], [*parameters]
-    return Node(package=package, executable=executable, namespace=given["namespace"], **more)
+def _node(given: Given, package: str, executable: str = "", ends: bool = True, **more: Any) -> Node:
+    """Describe a node of a package, by default of the same name; its end may be the launch's."""
+    return Node(
+        package=package,
+        executable=executable or package,
+        namespace=given["namespace"],
+        output="screen",
+        on_exit=_exit_handler(executable or package, ends),
+        **more,
+    )
 
 
 def _in_namespace(given: Given, topic: str) -> str:
@@ -134,10 +130,7 @@ def simulator(given: Given, parameters: Given, *, recorded: bool) -> Node:
 def recorder(given: Given) -> Action:
     """Describe what records the topics of config/topics.txt into `output`."""
     shared = topics.SIMULATOR["diagnostics"].name
-    names = {
-        topic: topic if topic == shared else _in_namespace(given, topic)
-        for topic in default_topics()
-    }
+    names = {t: t if t == shared else _in_namespace(given, t) for t in default_topics()}
     if given["bag"] == "sst":
         recorded = {"output": given["output"], "topics": ",".join(names.values())}
         return node(given, "recorder", recorded)
@@ -163,8 +156,8 @@ def rviz(given: Given, scene_name: str) -> list[Action]:
     require("robot_state_publisher", "rviz2")
     layout = str(share_directory() / "config" / "sst_ros.rviz")
     return [
-        _state_publisher(given, urdf(scene.load(scene_name))),
-        _node(given, "rviz2", "rviz2", ["-d", layout]),
+        _state_publisher(given, urdf(load(scene_name))),
+        _node(given, "rviz2", arguments=["-d", layout]),
     ]
 
 
@@ -178,30 +171,24 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
     require("robot_state_publisher", "controller_manager", "joint_state_broadcaster", hardware)
     topics_used = "/sst_simulator/commands_stamped", "/joint_states"
     names = (_in_namespace(given, topic) for topic in topics_used)
-    document = urdf_with_ros2_control(scene.load(given["scene"]), *names)
     path = controllers or str(share_directory() / "config" / "controllers.yaml")
     spawned = ["joint_state_broadcaster", controller, "--param-file", path]
     return [
-        _state_publisher(given, document),
+        _state_publisher(given, urdf_with_ros2_control(load(given["scene"]), *names)),
         _node(given, "controller_manager", "ros2_control_node", parameters=[path]),
-        _node(given, "controller_manager", "spawner", spawned, ends=False),
+        _node(given, "controller_manager", "spawner", ends=False, arguments=spawned),
     ]
 
 
 def _state_publisher(given: Given, document: str) -> Node:
-    model, package = ParameterValue(document, value_type=str), "robot_state_publisher"
-    return _node(given, package, package, parameters=[{"robot_description": model}])
+    described = {"robot_description": ParameterValue(document, value_type=str)}
+    return _node(given, "robot_state_publisher", parameters=[described])
 
 
 def require(*packages: str) -> None:
     """Refuse a launch for which a ROS package is missing, before anything is started."""
-    missing = []
-    for package in packages:
-        try:
-            get_package_prefix(package)
-        except PackageNotFoundError:
-            missing.append(package)
-    if missing:
+    installed = get_packages_with_prefixes()
+    if missing := [package for package in packages if package not in installed]:
         raise RuntimeError(f"this needs the ROS package(s) {', '.join(missing)}: not installed")
 
 
@@ -217,11 +204,3 @@ def _exit_handler(
         return [Shutdown(reason=f"{name} has ended")] if ends and not context.is_shutdown else None
 
     return handle
-
-
-def _refuse_unknown(argv: list[str], known: Mapping[str, object]) -> None:
-    for word in argv:
-        name, assigned, _ = word.partition(":=")
-        if assigned and name not in known:
-            close = difflib.get_close_matches(name, known, 1) or sorted(known)
-            raise RuntimeError(f"{word}: no such argument; known: {', '.join(close)}")

@@ -11,13 +11,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-NANOSECONDS = 1_000_000_000
-"""Of a second: time is integer nanoseconds."""
+NANOSECONDS = 1_000_000_000  # of a second: time is integer nanoseconds
 
 Array: TypeAlias = NDArray[np.float64]
 Vector3: TypeAlias = tuple[float, float, float]
-Quaternion: TypeAlias = tuple[float, float, float, float]
-"""(x, y, z, w)."""
+Quaternion: TypeAlias = tuple[float, float, float, float]  # (x, y, z, w)
 TorqueFunction: TypeAlias = Callable[[float], Vector3]
 """Actuator torques [N m] at a simulated time [s]."""
 
@@ -112,12 +110,8 @@ QUANTITIES = {
     "quaternion": ("1", "part"),
     "body_rate": ("rad/s", "axis"),
     "torque": ("N m", "leg"),
-    "gamma": ("rad", "leg"),
-    "mu": ("rad", "leg"),
-    "beta": ("rad", "leg"),
-    "gamma_dot": ("rad/s", "leg"),
-    "mu_dot": ("rad/s", "leg"),
-    "beta_dot": ("rad/s", "leg"),
+    **dict.fromkeys(("gamma", "mu", "beta"), ("rad", "leg")),
+    **dict.fromkeys(("gamma_dot", "mu_dot", "beta_dot"), ("rad/s", "leg")),
     "euler_zyz": ("rad", "angle"),
 }
 """Unit and dimension of each array of a motion with more than one column."""
@@ -128,18 +122,13 @@ DIMENSIONS: dict[str, list[str] | list[int]] = {
     "leg": [1, 2, 3],
     "angle": ["theta", "phi", "psi"],
 }
-"""Coordinates of each dimension."""
 
-UNITS = {
-    "t": "s",
-    **{
-        f"{name}_{part}": unit
-        for name, (unit, dimension) in QUANTITIES.items()
-        for part in DIMENSIONS[dimension]
-    },
-    "energy": "J",
-}
+UNITS = {"t": "s"}
 """Unit of each column of a table of states: of one motion, or of many at their end."""
+
+for _name, (_unit, _dimension) in QUANTITIES.items():
+    UNITS |= {f"{_name}_{_part}": _unit for _part in DIMENSIONS[_dimension]}
+UNITS["energy"] = "J"
 
 
 def columns_of(states: Any, names: Iterable[str] = (*QUANTITIES, "energy")) -> dict[str, Array]:
@@ -164,11 +153,8 @@ def arrays_of(states: Any, *first: str) -> dict[str, Any]:
     return arrays | {"energy": (first, states.energy, {"units": "J"})}
 
 
-BASE_FRAME = "base_link"
-"""Root of the robot (REP 105): frame {B} of the paper."""
-
-IDLE_FRAME_ID = "idle"
-"""header.frame_id of joint_states that show a state before the run, in a pause or in a fault."""
+BASE_FRAME = "base_link"  # root of the robot (REP 105): frame {B} of the paper
+IDLE_FRAME_ID = "idle"  # of joint_states that show a state before the run, in a pause or in a fault
 
 
 def is_idle(stamp_ns: int, frame_id: str) -> bool:

@@ -22,8 +22,7 @@ from sst_ros.sweeps.results import read_sweep, summarize
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
-PLOT, DESIGN = "plot", "design"
-"""Words in place of a study, and of a bag."""
+PLOT, DESIGN = "plot", "design"  # words in place of a study, and of a bag
 
 
 def check_plan(options: argparse.Namespace) -> int:

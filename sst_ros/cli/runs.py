@@ -33,11 +33,8 @@ from sst_ros.simulation.simulation import INTEGRATORS, Simulation
 from sst_ros.view.source import Replay, run_simulator
 
 PICTURES = (".png", ".pdf", ".svg")
-MOST = 10_000_000
-"""Samples of a trajectory."""
-
-ROUNDING = 1e-6
-"""Relative rounding of inertias that a person has typed."""
+MOST = 10_000_000  # samples of a trajectory
+ROUNDING = 1e-6  # relative, of inertias that a person has typed
 
 
 def show(options: argparse.Namespace) -> None:

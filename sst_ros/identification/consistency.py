@@ -33,21 +33,14 @@ from scipy.linalg import solve_triangular
 from sst_ros.identification.parameters import STANDARD
 from sst_ros.mechanism.geometry import Array
 
-EXACT = 1e-12
-"""Noise over RMS torque that is assumed at least: data of a simulation have no other."""
+EXACT = 1e-12  # noise over RMS torque that is assumed at least: simulations have no other
+INTERIOR = 1e-3  # share of its size by which a parameter is lifted at the start
+BARRIERS = tuple(10.0**-k for k in range(0, 11))  # the last: chi^2 off by 1e-10 at each boundary
+CENTRED = 1e-2  # squared decrement over the barrier below which Newton converges quadratically
+_NEWTON_STEPS = 100
+_CLOSE = 0.95  # share of the distance to the boundary that a step may cover
 
-INTERIOR = 1e-3
-"""Share of its size by which a parameter is lifted at the start, into the interior."""
-
-BARRIERS = tuple(10.0**-k for k in range(0, 11))
-"""Weights of the barrier; at the last, chi^2 is off by 1e-10 for each boundary that is active."""
-
-CENTRED = 1e-2
-"""Squared decrement, over the barrier, below which Newton's method converges quadratically."""
-
-_PSEUDO = np.zeros((10, 4, 4))
-"""J of each of the ten parameters alone."""
-
+_PSEUDO = np.zeros((10, 4, 4))  # J of each of the ten parameters alone
 _PSEUDO[0, 3, 3] = 1.0
 for _i in range(3):
     _PSEUDO[1 + _i, [_i, 3], [3, _i]] = 1.0
@@ -55,10 +48,6 @@ for _row, (_i, _j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     _PSEUDO[_row, [_i, _j], [_j, _i]] = -1.0
     if _i == _j:
         _PSEUDO[_row, :3, :3] += 0.5 * np.eye(3)
-
-_NEWTON_STEPS = 100
-_CLOSE = 0.95
-"""Share of the distance to the boundary that a step may cover."""
 
 
 def fit_weighted(

@@ -34,19 +34,12 @@ from sst_ros.identification.parameters import BaseParameters, Regressor, find_ba
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 
-POINTS = 12
-"""Samples, and points of the scene, in a period of the highest harmonic."""
-
-SHARE = 0.9
-"""Share of each range that the motion may use: the manipulator is not quite its model."""
-
-LEAST_SINE = 0.15
-"""Least sin(mu_k) and det J2 of a motion: torques and rates grow with their inverse."""
-
-_FIRST = 0.05
-"""Amplitude of the first guess [rad]."""
+POINTS = 12  # samples, and points of the scene, in a period of the highest harmonic
+SHARE = 0.9  # of each range that the motion may use: the manipulator is not quite its model
+LEAST_SINE = 0.15  # of mu_k, and det J2: torques and rates grow with their inverse
+_FIRST = 0.05  # amplitude of the first guess [rad]
 _PENALTY = 100.0
-_HOMOTOPY = 8
+_HOMOTOPY = 8  # steps from the centre to all samples
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,8 @@ if TYPE_CHECKING:
 
 Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any] | str | Path"
 
-FEWEST = 20
-"""Samples below which nothing is identified: filters and splines have transients at both ends."""
-
+FEWEST = 20  # samples to identify anything: filters and splines have transients at both ends
 NEEDED, OPTIONAL = ("t", "gamma", "torque"), ("gamma_dot", "quaternion", "held")
-
 OBSERVABLES = ("gamma_1", "gamma_2", "gamma_3", "theta", "phi", "psi", "x", "y", "z")
 """Actuator angles and ZYZ angles [rad], position of E in {B} [m]."""
 

@@ -40,14 +40,15 @@ from sst_ros.scene.schema import build, build_unchecked, drop_idle
 from sst_ros.scene.yaml_document import find_fields, plain, replace_values
 
 JOINT_KINDS = ("gamma", "mu", "beta")
-
+LINKS = ("actuated_links", "intermediate_links")
+NEGLIGIBLE = 1e-12  # friction coefficient below which a scene has no such friction
+# Distance of a column from the span of those before it, over its own length, below which it counts
+# as one of them: between rounding (1e-13) and the least of any mechanism tried (1e-4).
+DEPENDENT = 1e-8
+ROUNDED = 1e-10  # share of a column's length that is rounding
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 STANDARD = ("mass", *(f"moment.{axis}" for axis in "xyz"), *(f"inertia.{part}" for part in INERTIA))
 """The ten inertial parameters of a body about O, in the order of a body's columns."""
-
-LINKS = ("actuated_links", "intermediate_links")
-NEGLIGIBLE = 1e-12
-"""Friction coefficient [N m, N m s/rad] below which a scene has no such friction."""
 
 
 def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ...]:
@@ -205,14 +206,6 @@ class Identification(ABC):
     @abstractmethod
     def _notes(self) -> Iterator[str]:
         """Yield lines below the estimates."""
-
-
-DEPENDENT = 1e-8
-"""Distance of a column from the span of those before it, over its own length, below which it counts
-as one of them: between rounding (1e-13) and the least of any mechanism tried (1e-4)."""
-
-ROUNDED = 1e-10
-"""Share of a column's length that is rounding."""
 
 
 class Regressor:

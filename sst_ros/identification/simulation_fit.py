@@ -52,16 +52,9 @@ from sst_ros.scene.schema import build_unchecked
 from sst_ros.scene.torque_profile import TorqueProfile, torque_at
 from sst_ros.scene.yaml_document import plain, replace_values
 
-NOT_DETERMINED = 1.0
-"""Relative standard deviation of a combination from which on it counts as not determined."""
-
-TOLERANCE = 1e-12
-"""Relative and absolute, of a step; the latter over the size of a parameter for its column."""
-
-AT_STOPS = 0.1
-"""Of the tolerance where stops are elastic: derivatives jump there, and a step across loses its
-order."""
-
+NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
+TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size of a parameter
+AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivatives loses its order
 GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
 RESTITUTION = "stroke.restitution"
 
