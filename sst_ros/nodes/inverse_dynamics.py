@@ -225,8 +225,8 @@ class FollowJointTrajectoryServer:
         if outcome is None:
             return
         self._report()
-        self._end(outcome.code, outcome.message)
-        if outcome.code is not ErrorCode.SUCCESSFUL:
+        self._end(*outcome)
+        if outcome[0] is not ErrorCode.SUCCESSFUL:
             self._follower.stop()
 
     def interrupt(self, reason: str) -> None:

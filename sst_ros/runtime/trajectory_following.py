@@ -12,9 +12,9 @@ import dataclasses
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Iterable
 from enum import Enum, IntEnum
-from typing import Any, NamedTuple
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
@@ -45,12 +45,8 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
     """Take over a trajectory_msgs/JointTrajectory; its joints may come in any order.
 
     It begins immediately and continues the reference `begin`, which may be moving. Positions are
-    needed, velocities and accelerations may be left out.
-
-    Raises:
-        InputError: lists every fault.
-        SingularConfiguration: the path crosses a parallel singularity.
-
+    needed, velocities and accelerations may be left out. An InputError lists every fault;
+    SingularConfiguration says that the path crosses a parallel singularity.
     """
     names, stamp = list(message.joint_names), nanoseconds(message.header.stamp)
     times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points]
@@ -74,15 +70,9 @@ def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMo
         rows = [list(map(float, getattr(point, quantity))) for point in message.points]
         return [[row[k] for k in places] if len(row) == len(places) else row for row in rows]
 
-    return through_points(
-        geometry,
-        begin.quaternion,
-        times,
-        by_leg("positions"),
-        by_leg("velocities"),
-        by_leg("accelerations"),
-        begin=(begin.gamma_dot, begin.gamma_ddot),
-    )
+    rows = by_leg("positions"), by_leg("velocities"), by_leg("accelerations")
+    going = begin.gamma_dot, begin.gamma_ddot
+    return through_points(geometry, begin.quaternion, times, *rows, going)
 
 
 class ErrorCode(IntEnum):
@@ -94,17 +84,6 @@ class ErrorCode(IntEnum):
     GOAL_TOLERANCE_VIOLATED = -5
 
 
-class Outcome(NamedTuple):
-    """End of a goal."""
-
-    code: ErrorCode
-    message: str
-
-
-Tolerances = dict[tuple[str, str], float]
-"""Largest error by quantity and actuator [rad], [rad/s]; 0 where there is none."""
-
-
 class TrajectoryGoal:
     """Tolerances of a goal, a FollowJointTrajectory.Goal, and its outcome.
 
@@ -114,36 +93,34 @@ class TrajectoryGoal:
     """
 
     def __init__(self, message: Any, defaults: ControllerNodeParameters) -> None:
-        given = message.multi_dof_trajectory
-        self._problems = [
-            Problem(name, f"{len(rows)} entries", "must be empty: joints have one freedom")
-            for name, rows in (
-                ("multi_dof_trajectory.joint_names", given.joint_names),
-                ("multi_dof_trajectory.points", given.points),
-                ("component_path_tolerance", message.component_path_tolerance),
-                ("component_goal_tolerance", message.component_goal_tolerance),
-            )
-            if len(rows)
-        ]
-        own = {"position": defaults.path_tolerance, "velocity": 0.0}
-        self._path = self._resolve_all("path_tolerance", message.path_tolerance, own)
-        own = {"position": defaults.goal_tolerance, "velocity": defaults.stopped_velocity_tolerance}
-        self._goal = self._resolve_all("goal_tolerance", message.goal_tolerance, own)
-        time, name = nanoseconds(message.goal_time_tolerance) / NANOSECONDS, "goal_time_tolerance"
-        self._late = self._resolve(name, time, defaults.goal_time_tolerance)
+        self._problems = []
+        places = ("multi_dof_trajectory.joint_names", "multi_dof_trajectory.points")
+        for name in (*places, "component_path_tolerance", "component_goal_tolerance"):
+            if rows := len(attrgetter(name)(message)):
+                allowed = "must be empty: joints have one freedom"
+                self._problems.append(Problem(name, f"{rows} entries", allowed))
+        self._path = self._resolve_all(message, "path_tolerance", defaults.path_tolerance, 0.0)
+        still = defaults.stopped_velocity_tolerance
+        self._goal = self._resolve_all(message, "goal_tolerance", defaults.goal_tolerance, still)
+        name = "goal_time_tolerance"
+        late = nanoseconds(message.goal_time_tolerance) / NANOSECONDS
+        self._late = self._resolve(name, late, defaults.goal_time_tolerance)
         if self._problems:
             raise InputError("follow_joint_trajectory", self._problems)
         points = message.trajectory.points
         self._times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in points]
 
-    def _resolve_all(self, name: str, given: Iterable[Any], own: dict[str, float]) -> Tolerances:
+    def _resolve_all(
+        self, message: Any, name: str, position: float, velocity: float
+    ) -> dict[tuple[str, str], float]:
+        """Largest error by quantity and actuator [rad], [rad/s]; 0 where there is none."""
+        own = {"position": position, "velocity": velocity}
         found = {(quantity, joint): own[quantity] for quantity in own for joint in ACTUATORS}
-        for index, tolerance in enumerate(given):
+        for index, tolerance in enumerate(getattr(message, name)):
             place = f"{name}[{index}]"
             if tolerance.name not in ACTUATORS:
                 allowed = f"must be one of {', '.join(ACTUATORS)}"
                 self._problems.append(Problem(f"{place}.name", tolerance.name, allowed))
-                continue
             for quantity, default in own.items():
                 value = getattr(tolerance, quantity)
                 resolved = self._resolve(f"{place}.{quantity}", value, default)
@@ -162,8 +139,10 @@ class TrajectoryGoal:
         """Return the index of the point that is approached at a time of the motion [s]."""
         return min(bisect_right(self._times, time), len(self._times) - 1)
 
-    def outcome(self, time: float, error: Vector3, error_rate: Vector3) -> Outcome | None:
-        """Return the end of the goal at a sample; None as long as it goes on.
+    def outcome(
+        self, time: float, error: Vector3, error_rate: Vector3
+    ) -> tuple[ErrorCode, str] | None:
+        """Return how the goal ends at a sample, and why; None as long as it goes on.
 
         The time is that of the motion [s], the errors are desired - measured [rad], [rad/s].
         """
@@ -177,13 +156,13 @@ class TrajectoryGoal:
                 unmet = f"{joint}: {quantity} error {off:.6g} {unit}, {words}"
                 break
         if late < 0.0:
-            return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, unmet) if unmet else None
+            return (ErrorCode.PATH_TOLERANCE_VIOLATED, unmet) if unmet else None
         if not unmet:
-            return Outcome(ErrorCode.SUCCESSFUL, "goal reached")
+            return ErrorCode.SUCCESSFUL, "goal reached"
         if not 0.0 < self._late < late:
             return None
         when = f"{late:.3f} s after the end, goal_time_tolerance {self._late:g} s"
-        return Outcome(ErrorCode.GOAL_TOLERANCE_VIOLATED, f"{unmet} {when}")
+        return ErrorCode.GOAL_TOLERANCE_VIOLATED, f"{unmet} {when}"
 
 
 class Stage(Enum):
@@ -201,7 +180,8 @@ class TrajectoryFollower:
 
     Attributes:
         stage: present stage.
-        samples, irregular: samples answered, and those that came at another period.
+        samples: samples answered.
+        irregular: those of them that came at another period.
         limited: samples of the motion in which a torque was limited.
 
     Raises:
@@ -210,14 +190,12 @@ class TrajectoryFollower:
     """
 
     def __init__(self, model: Scene, settings: ControllerNodeParameters) -> None:
-        self._model, self._settings = model, settings
+        self._model, self._settings, self._geometry = model, settings, Geometry.of(model)
         limit = float(command_limit(settings.torque_limit, model))
         if math.isfinite(limit):  # for the check of motions, too
             actuators = model.actuators or Actuators(torque_limit=limit)
             actuators = dataclasses.replace(actuators, torque_limit=limit)
             self._model = dataclasses.replace(model, actuators=actuators)
-        self._geometry = Geometry.of(model)
-        self._period_ns = settings.period_ns
         self._planned: ReferenceMotion | None = None
         if settings.motion == "scene":
             self._planned = reference_motion(model, _read_motion)
@@ -241,17 +219,20 @@ class TrajectoryFollower:
         manipulator is, at rest. A reference that moves is replaced in lockstep only. Where an error
         is raised, nothing has changed.
         """
-        origin, given = "joint_trajectory", self._settings
-        allowed = "must be topic, for trajectories to be taken"
-        refuse_unless(origin, ("motion", given.motion, given.motion == "topic", allowed))
-        begin = self._reference_at_rest(seen) if self._last is None else self._last.desired
-        moving = any(begin.gamma_dot) or any(begin.gamma_ddot)
+        given, last = self._settings, self._last
+        begin = last.desired if last else self._reference_at_rest(seen)
+        moving = any((*begin.gamma_dot, *begin.gamma_ddot))
+        from_topic = "must be topic, for trajectories to be taken"
         # The check takes longer than a control period; in lockstep the plant waits.
-        allowed = "must come when the motion has ended, outside lockstep"
-        refuse_unless(origin, ("points", "", given.stamped or not moving, allowed))
+        free = "must come when the motion has ended, outside lockstep"
+        refuse_unless(
+            "joint_trajectory",
+            ("motion", given.motion, given.motion == "topic", from_topic),
+            ("points", "", given.stamped or not moving, free),
+        )
         motion = motion_of(message, self._geometry, begin)
         check_motion(motion, self._model)
-        if self._last is None:
+        if last is None:
             self._prepare(motion)
             return
         self._controller.follow(motion)
@@ -289,7 +270,7 @@ class TrajectoryFollower:
             self._refuse_elsewhere(measured)
             self.stage = Stage.FOLLOWING
         else:
-            self.irregular += stamp_ns - self._last_ns != self._period_ns
+            self.irregular += stamp_ns - self._last_ns != self._settings.period_ns
         if self._start_ns is None:
             self._start_ns = stamp_ns
         passed_ns = stamp_ns - self._start_ns
@@ -331,7 +312,7 @@ class TrajectoryFollower:
         return float(np.sqrt(np.mean(rms**2))), float(largest.max())
 
     def _prepare(self, motion: ReferenceMotion) -> None:
-        period = self._period_ns / NANOSECONDS
+        period = self._settings.period_ns / NANOSECONDS
         self._controller = Controller(self._model, motion, self._settings, period)
         self._begin(motion, None)
         self.stage = Stage.READY
