@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from sst_ros.host import child_process
+from sst_ros.host import processes
 
 EXECUTABLES = Path(__file__).parents[1] / "executables"
 _TICK = os.sysconf("SC_CLK_TCK")
@@ -24,7 +24,7 @@ _TICK = os.sysconf("SC_CLK_TCK")
 @contextmanager
 def own_domain(*, compiled: bool = True) -> Iterator[int]:
     """Give the processes that are started inside a ROS domain of their own, on localhost."""
-    number, lock = child_process.lock_domain()
+    number, lock = processes.lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:
         with patch.dict(os.environ, ours):
@@ -57,7 +57,7 @@ class Process(subprocess.Popen[str]):
         **given: Any,
     ) -> None:
         words = [sys.executable, "-c", command] if python else [str(EXECUTABLES / command)]
-        options = child_process.words(given)
+        options = processes.words(given)
         if namespace:
             options += ["-r", f"__ns:={namespace}"]
         if options:

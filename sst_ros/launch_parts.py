@@ -28,7 +28,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from sst_ros.description.robot import urdf, urdf_with_ros2_control
-from sst_ros.host import child_process
+from sst_ros.host import processes
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics
 from sst_ros.scene.scene import load, share_directory
@@ -100,7 +100,7 @@ def node(given: Given, executable: str, parameters: Given, *, ends: bool = True)
         arguments=words,
         parameters=[given["params_file"]] if given["params_file"] else [],
         ros_arguments=["--log-level", given["log_level"]],
-        additional_env={child_process.PARENT: str(os.getpid())},
+        additional_env={processes.PARENT: str(os.getpid())},
         sigterm_timeout=_CLOSING_S,
     )
 

@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager
 from unittest.mock import patch
 
-from sst_ros.host import child_process
+from sst_ros.host import processes
 
 
 def python(*words, env=None, status=0, **options):
@@ -24,7 +24,7 @@ def python(*words, env=None, status=0, **options):
 @contextmanager
 def own_domain():
     """Have nodes use a ROS domain that nothing else on this machine has, without the network."""
-    number, lock = child_process.lock_domain()
+    number, lock = processes.lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:
         with patch.dict(os.environ, ours):

@@ -18,10 +18,9 @@ import numpy as np
 from sst_ros.cli.commands import free_out, function, refuse_unknown
 from sst_ros.errors import InputError, Problem, SstError, refuse_unless
 from sst_ros.extras import require
-from sst_ros.host import child_process, compiled_module
+from sst_ros.host import compiled_module, processes
 from sst_ros.host.cache_folder import cache_folder, configured_folder
-from sst_ros.host.output import require_free, results_folder
-from sst_ros.host.table_file import SUFFIXES
+from sst_ros.host.output import SUFFIXES, require_free, results_folder
 from sst_ros.integration import compiled_method
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
@@ -182,7 +181,7 @@ def view(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
     words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace}"]
     with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
-        status: int = function("nodes.process:run")([*words, *child_process.words(given)])
+        status: int = function("nodes.process:run")([*words, *processes.words(given)])
     return status
 
 

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a long command leaves and shows: its folder of results, and a bar while it works.
+"""What a long command leaves and shows: its folder of results, tables, and a bar while it works.
 
 A folder is named after the recording, and is never written over unasked. A file that others may
-read has its name when it is whole.
+read has its name when it is whole. Tables of numbers are Parquet, NPZ or CSV: the first two hold
+every bit, texts about the table, and a checksum of both; Parquet has the checksums of its pages
+besides, for other readers. CSV has the columns alone, for other programs.
 """
 
 from __future__ import annotations
@@ -10,15 +12,23 @@ from __future__ import annotations
 import os
 import sys
 import uuid
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem, refuse_unless
+from sst_ros.extras import MissingDependency, require
 
 TEMPORARY = ".part-"
 """How the name of a file begins that is not whole yet, or that a killed process has left."""
 
+SUFFIXES = (".parquet", ".csv", ".npz")
+_CHECKSUM = "sst_ros_checksum"
 _BAG_SUFFIXES = (".mcap", ".db3")
 _PARTS = 50
 
@@ -102,3 +112,84 @@ def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
         done = min(start + size, total)
         yield slice(start, done)
         bar.draw(done / total)
+
+
+def write_table(
+    columns: Mapping[str, NDArray[Any]],
+    path: Path,
+    about: Mapping[str, Mapping[str, str]],
+    texts: Mapping[str, str] | None = None,
+) -> None:
+    """Write columns of equal length, shape (n,), whole numbers or doubles.
+
+    The suffix of the path, one of SUFFIXES, says what the file is. Parquet keeps texts about each
+    column, as its unit, and about the table, NPZ the latter; nan is no value in Parquet and CSV,
+    which need pyarrow and pandas.
+    """
+    texts = dict(texts or {})
+    texts[_CHECKSUM] = _checksum(texts, columns)
+    if path.suffix == ".npz":
+        named: dict[str, Any] = {**columns, **texts}
+        with replace_file(path) as own, own.open("wb") as file:
+            np.savez(file, **named)
+    elif path.suffix == ".csv":
+        # pandas writes the fewest digits that read back as the same bits.
+        table = require("pandas").DataFrame(columns)
+        with replace_file(path) as own:
+            table.to_csv(own, index=False, lineterminator="\n")
+    else:
+        pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
+        arrays = [pyarrow.array(column, from_pandas=True) for column in columns.values()]
+        fields = [
+            pyarrow.field(name, array.type, metadata=about[name])
+            for name, array in zip(columns, arrays, strict=True)
+        ]
+        whole = pyarrow.Table.from_arrays(arrays, schema=pyarrow.schema(fields, texts))
+        with replace_file(path) as own:
+            parquet.write_table(whole, own, write_page_checksum=True)
+
+
+def load_table(
+    path: Path, columns: Sequence[str], texts: Sequence[str]
+) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Read columns, shape (n,), and texts of a Parquet or NPZ file of any name.
+
+    Parquet of earlier versions has no checksum.
+
+    Raises:
+        KeyError: a column or a text is not in the file.
+        ValueError: it is another file, it cannot be read, or it is damaged.
+        MissingDependency: pyarrow is not installed.
+
+    """
+    try:
+        with path.open("rb") as file:
+            zipped = file.read(2) == b"PK"
+        if zipped:
+            with np.load(path, allow_pickle=False) as source:
+                numbers = {name: source[name] for name in columns}
+                found = {name: str(source[name]) for name in (*texts, _CHECKSUM)}
+        else:
+            parquet = require("pyarrow.parquet")
+            with parquet.ParquetFile(path, page_checksum_verification=True) as source:
+                table = source.read()
+            numbers = {name: table[name].to_numpy() for name in columns}
+            raw = table.schema.metadata or {}
+            found = {key.decode(): text.decode() for key, text in raw.items()}
+        asked = {name: found[name] for name in texts}
+    except (KeyError, MissingDependency):
+        raise
+    except Exception as error:  # pyarrow and zipfile raise anything on bad bytes
+        raise ValueError(" ".join(str(error).split())) from None
+    checksum = _checksum(asked, numbers)
+    if found.get(_CHECKSUM, checksum) != checksum:
+        raise ValueError("its checksum is another")
+    return numbers, asked
+
+
+def _checksum(texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> str:
+    """CRC-32 of texts and of the bits of columns."""
+    checksum = zlib.crc32("".join(texts.values()).encode())
+    for column in columns.values():
+        checksum = zlib.crc32(column.tobytes(), checksum)
+    return f"{checksum:08x}"

@@ -34,7 +34,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sst_ros.errors import InputError, Problem, SstError
-from sst_ros.host.child_process import is_orphan
+from sst_ros.host.processes import is_orphan
 from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import arguments, signals, topics
 from sst_ros.nodes.topics import Endpoint

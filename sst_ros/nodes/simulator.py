@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, SstError
-from sst_ros.host import compiled_module, scheduling
+from sst_ros.host import compiled_module, processes
 from sst_ros.host.cache_folder import cache_folder
 from sst_ros.integration import compiled_method
 from sst_ros.nodes import simulation_interfaces, topics
@@ -73,7 +74,7 @@ class Simulator(Worker[SimulatorParameters]):
             compiled=self._code is not None and self._code.available,
             equations=given.equations,
         )
-        self._latency = scheduling.CpuDmaLatency()
+        self._latency = processes.CpuDmaLatency()
         self._loop = RunLoop(simulated, build, run, self._input, self._pacer, self._topics)
         period_s = run.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
@@ -81,7 +82,7 @@ class Simulator(Worker[SimulatorParameters]):
         simulation_interfaces.offer(self.node, self._loop, self.done.set)
         every(self.node, 1.0, self._report)
         self._read_gauges()
-        self._loop.post(scheduling.quiet)  # once the code of all methods is loaded
+        self._loop.post(processes.quiet)  # once the code of all methods is loaded
         self._thread = threading.Thread(target=self._live, name="run", daemon=True)
         self._thread.start()
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
@@ -137,7 +138,7 @@ class Simulator(Worker[SimulatorParameters]):
         paced, running = given.real_time_factor > 0.0, self._loop.phase is Phase.RUNNING
         before = shown.scheduling, shown.cpu_dma_latency
         try:
-            shown.scheduling = scheduling.schedule(given.realtime_priority if paced else 0, thread)
+            shown.scheduling = processes.schedule(given.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
             return
         latency_us = given.cpu_dma_latency if paced and running else -1
@@ -162,7 +163,7 @@ class Simulator(Worker[SimulatorParameters]):
             self.node.get_logger().warning(line)
         message = topics.diagnostics(self.node, "run", level, text, values)
         self._topics.diagnostics.publish(message)
-        scheduling.tidy()
+        gc.collect()  # the garbage since `quiet`
         if self._loop.phase is not Phase.FINISHED:
             self._loop.post(self._read_gauges)
 

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.extras import require
-from sst_ros.host.output import require_free, write_into
-from sst_ros.host.table_file import write_table
+from sst_ros.host.output import require_free, write_into, write_table
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import topic_tables as topics

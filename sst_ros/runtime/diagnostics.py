@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from sst_ros.dynamics.model import limits_of
-from sst_ros.host import scheduling
+from sst_ros.host import processes
 from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import Phase, RunLoop
 from sst_ros.runtime.tick_loop import HeldTorques
@@ -81,7 +81,7 @@ class RunDiagnostics:
     ) -> None:
         self._loop, self._input, self._pacer, self._period_s = loop, torque_input, pacer, period_s
         self.gauges: dict[str, object] = {}
-        self.scheduling, self.cpu_dma_latency = "", scheduling.NO_LIMIT
+        self.scheduling, self.cpu_dma_latency = "", processes.NO_LIMIT
         self._before = (0, 0.0)
         self._noted: dict[str, Any] = {}
         self._warned: list[str] = []

@@ -22,7 +22,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import Diverged, InputError, Problem, refuse_unless
 from sst_ros.extras import MissingDependency, require
-from sst_ros.host.table_file import SUFFIXES, load_table, write_table
+from sst_ros.host.output import SUFFIXES, load_table, write_table
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix, unwrap_zyz, zyz_angles

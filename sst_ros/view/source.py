@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sst_ros.host import child_process
+from sst_ros.host import processes
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Vector3
@@ -151,6 +151,4 @@ class Replay:
 def run_simulator(scene: str, speed: float = 1.0) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run a simulator of a scene to look at; `speed` is simulated time per time."""
     given = {"scene": scene, "publish_rate": _PUBLISH_RATE, "real_time_factor": speed}
-    return child_process.run_beside(
-        "simulator", given | {"duration": 0.0}, stdout=subprocess.DEVNULL
-    )
+    return processes.run_beside("simulator", given | {"duration": 0.0}, stdout=subprocess.DEVNULL)

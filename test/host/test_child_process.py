@@ -10,12 +10,12 @@ import pytest
 from programs import own_domain
 
 from sst_ros.errors import SstError
-from sst_ros.host import child_process
+from sst_ros.host import processes
 
 KEEP = """
 import os, sys
-from sst_ros.host import child_process
-child_process.keep_domain()
+from sst_ros.host import processes
+processes.keep_domain()
 print(os.environ["ROS_DOMAIN_ID"], os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"], flush=True)
 sys.stdin.read()
 """
@@ -32,7 +32,7 @@ def test_two_at_the_same_time_differ_and_the_environment_comes_back():
         assert os.environ["ROS_DOMAIN_ID"] == str(first)
         with own_domain() as second:
             assert os.environ["ROS_DOMAIN_ID"] == str(second) != str(first)
-        child_process.keep_domain()  # the environment names one
+        processes.keep_domain()  # the environment names one
         assert os.environ["ROS_DOMAIN_ID"] == str(first)
     assert "ROS_DOMAIN_ID" not in os.environ
 
@@ -42,7 +42,7 @@ def test_a_process_keeps_its_domain_until_it_ends(monkeypatch):
     with subprocess.Popen([sys.executable, "-c", KEEP], **pipes) as process:
         number, network = process.stdout.readline().split()
         assert network == "LOCALHOST"
-        monkeypatch.setattr(child_process, "_next", itertools.repeat(int(number) - 1))
+        monkeypatch.setattr(processes, "_next", itertools.repeat(int(number) - 1))
         with pytest.raises(SstError, match="in use: set ROS_DOMAIN_ID"), own_domain():
             pass
         process.communicate()

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from sst_ros.host.scheduling import CpuDmaLatency
+from sst_ros.host.processes import CpuDmaLatency
 
 
 @pytest.mark.parametrize("latency_us", [0, 20])

@@ -28,7 +28,7 @@ from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
 from sst_ros.__main__ import main  # noqa: E402
-from sst_ros.host import child_process  # noqa: E402
+from sst_ros.host import processes  # noqa: E402
 from sst_ros.nodes.process import configure_middleware  # noqa: E402
 from sst_ros.state import IDLE_FRAME_ID, nanoseconds  # noqa: E402
 
@@ -91,9 +91,9 @@ class Nodes:
     def start(self, command, *words, executable=None, env=None, **given):
         """Start a command in an interpreter of its own."""
         argv = executable or [sys.executable, "-m", "sst_ros", command]
-        words = [*words, *(["--ros-args", *child_process.words(given)] if given else [])]
+        words = [*words, *(["--ros-args", *processes.words(given)] if given else [])]
         # Ends with this process, also where that is killed: the next run has the same domains.
-        ends_with = {} if executable else {child_process.PARENT: str(os.getpid())}
+        ends_with = {} if executable else {processes.PARENT: str(os.getpid())}
         process = subprocess.Popen(
             [*argv, *words],
             stdout=subprocess.PIPE,
@@ -109,7 +109,7 @@ class Nodes:
         """Fork a node, which starts in a third of the time."""
         if command == "simulator":  # by default it would end with the scene's duration
             given.setdefault("duration", 0.0)
-        words = [command, *words, "--ros-args", *child_process.words(given)]
+        words = [command, *words, "--ros-args", *processes.words(given)]
         self.running.append(ForkedNode(words, {**os.environ, "SST_ROS_NUMBA": "0"}))
         return self.running[-1]
 
@@ -142,7 +142,7 @@ def run_here(domain, capfd):
     def run(command, *words, **given):
         handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            options = ["--ros-args", *child_process.words(given)] if given else []
+            options = ["--ros-args", *processes.words(given)] if given else []
             status = main([command, *words, *options])
         finally:
             for number, handler in handlers.items():
@@ -325,11 +325,11 @@ def forked_demos(domain_of_module):
     """Have demos fork their nodes, too; test_demo.py starts them as a user does."""
 
     def start(command, given, **_):
-        words = [command, "--ros-args", *child_process.words(given)]
+        words = [command, "--ros-args", *processes.words(given)]
         return ForkedNode(words, {**os.environ, "SST_ROS_NUMBA": "0"})
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(child_process, "start", start)
+        patch.setattr(processes, "start", start)
         yield
 
 

@@ -16,7 +16,7 @@ from multiprocessing import forkserver, resource_tracker
 import pytest
 
 from sst_ros.__main__ import main
-from sst_ros.host import child_process
+from sst_ros.host import processes
 from sst_ros.nodes import inverse_dynamics, recorder, simulator, torque_player  # noqa: F401
 
 CONTEXT = multiprocessing.get_context("forkserver")
@@ -95,7 +95,7 @@ class _Call:
         # The server ends with the tests, however they end, and this node then ends without it.
         os.close(forkserver._forkserver._forkserver_alive_fd)
         os.environ.clear()
-        os.environ.update(self._env, **{child_process.PARENT: str(os.getppid())})
+        os.environ.update(self._env, **{processes.PARENT: str(os.getppid())})
         status = main(self._words)
         atexit._run_exitfuncs()  # multiprocessing leaves without
         sys.exit(status)
