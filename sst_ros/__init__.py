@@ -16,7 +16,7 @@ TYPE_CHECKING = False  # typing takes long to import, and a node handles signals
 if TYPE_CHECKING:
     from sst_ros.control.actuator_space import ReferenceMotion as ReferenceMotion
     from sst_ros.control.controller import Controller as Controller
-    from sst_ros.control.inverse_dynamics import InverseDynamics as InverseDynamics
+    from sst_ros.control.controller import InverseDynamics as InverseDynamics
     from sst_ros.control.law import ControllerSettings as ControllerSettings
     from sst_ros.control.reference_motions import reference_motion as reference_motion
     from sst_ros.errors import AssemblyError as AssemblyError

@@ -29,7 +29,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.controller import InverseDynamics
 from sst_ros.control.law import INSTANTS, MODES
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import TrackingMetrics

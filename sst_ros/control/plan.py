@@ -22,7 +22,7 @@ from scipy.integrate import simpson
 from scipy.optimize import brentq, minimize_scalar
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
-from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
@@ -35,7 +35,7 @@ SAMPLES = 16  # parts of a piece of the motion; even, for Simpson's rule
 SINGULAR_J2 = 1e-6  # det J2 within which a motion counts as singular
 SLOWEST, FASTEST = 1e-4, 1e8  # factors of speed between which ends are looked for
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
-"""Of the peaks of an `ActuatorDemand`."""
+"""Of what a motion demands of an actuator; power is negative where the actuator brakes."""
 _GRID, _BEYOND = 360, 27  # factors to try; infeasible ones, three doublings, that end it
 _ROUNDING = 1e-13
 
@@ -46,21 +46,6 @@ class Peak:
 
     value: float
     time: float
-
-
-@dataclass(frozen=True)
-class ActuatorDemand:
-    """Demand of a motion on one actuator; values of the largest magnitude, with their signs.
-
-    Units are those of UNITS; power is negative where the actuator brakes. `torque_rms` is the root
-    of the mean square over the duration.
-    """
-
-    torque: Peak
-    torque_rms: float
-    power: Peak
-    velocity: Peak
-    acceleration: Peak
 
 
 @dataclass(frozen=True)
@@ -80,13 +65,9 @@ class LimitDistance:
         return self.sign * (self.reached.value - self.end)
 
     @property
-    def is_beyond(self) -> bool:
-        """Whether the motion is refused for this limit."""
-        return self.refused and self.least < 0.0
-
-    def describe(self, digits: int) -> str:
-        """Say on which side of the limit the motion must stay."""
-        return f"{'above' if self.sign > 0.0 else 'below'} {self.end:.{digits}g}"
+    def side(self) -> str:
+        """Side of the limit on which the motion must stay."""
+        return "above" if self.sign > 0.0 else "below"
 
 
 @dataclass(frozen=True)
@@ -98,7 +79,8 @@ class MotionPlan:
     times: Array  # where it was sampled [s], shape (n,)
     references: tuple[Reference, ...]  # the motion there
     torques: Array  # actuator torques there [N m], shape (n, 3)
-    demands: tuple[ActuatorDemand, ...]  # by leg
+    peaks: dict[str, list[Peak]]  # by quantity of UNITS and leg, the largest, with their signs
+    torque_rms: list[float]  # root of the mean square over the duration, by leg [N m]
     distances: tuple[LimitDistance, ...]  # from all limits
     problems: tuple[Problem, ...]  # reasons of a refusal; empty where it is feasible
 
@@ -135,17 +117,13 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
 
     samples = np.array(list(map(measure, desired)))
     extremes = _extremes(motion, measure, times, samples)
-    peaks = [max(high, low, key=lambda peak: abs(peak.value)) for low, high in extremes]
+    largest = [max(high, low, key=lambda peak: abs(peak.value)) for low, high in extremes]
+    peaks = {name: largest[3 * k : 3 * k + 3] for k, name in enumerate(UNITS)}
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
     torques = samples[:, :3]
     squares = simpson(torques[pieces] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
-    roots = np.sqrt(squares / times[-1]).tolist()
-    demands = tuple(
-        ActuatorDemand(torque_rms=roots[leg], **dict(zip(UNITS, peaks[leg::3], strict=True)))
-        for leg in range(3)
-    )
-    problems = (*_faults(distances, demands, limits(scene.actuators)),)
-    return MotionPlan(motion, scene, times, desired, torques, demands, distances, problems)
+    rms, faults = np.sqrt(squares / times[-1]).tolist(), _faults(distances, peaks, scene)
+    return MotionPlan(motion, scene, times, desired, torques, peaks, rms, distances, (*faults,))
 
 
 def _extremes(
@@ -237,16 +215,17 @@ def _distances(
 
 
 def _faults(
-    distances: Sequence[LimitDistance], demands: Sequence[ActuatorDemand], most: dict[str, float]
+    distances: Sequence[LimitDistance], peaks: dict[str, list[Peak]], scene: Scene
 ) -> Iterator[Problem]:
-    for one in filter(lambda one: one.is_beyond, distances):
-        said = f"must stay {one.describe(9)} {one.unit} (t = {one.reached.time:.9g} s)"
-        yield Problem(one.key, one.reached.value, said)
-    for (name, limit), (leg, demand) in product(most.items(), enumerate(demands, start=1)):
-        peak: Peak = getattr(demand, name)
-        if abs(peak.value) > limit:
-            allowed = f"exceeds the limit {limit:g} {UNITS[name]} at t = {peak.time:.9g} s"
-            yield Problem(f"{name}_{leg}", peak.value, allowed)
+    for one in distances:
+        if one.refused and one.least < 0.0:
+            side = f"{one.side} {one.end:.9g} {one.unit} (t = {one.reached.time:.9g} s)"
+            yield Problem(one.key, one.reached.value, f"must stay {side}")
+    for name, limit in limits(scene.actuators).items():
+        for leg, peak in enumerate(peaks[name], start=1):
+            if abs(peak.value) > limit:
+                allowed = f"exceeds the limit {limit:g} {UNITS[name]} at t = {peak.time:.9g} s"
+                yield Problem(f"{name}_{leg}", peak.value, allowed)
 
 
 def limits(actuators: Actuators | None) -> dict[str, float]:
@@ -278,7 +257,7 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     known, torque_limit = limits(plan.scene.actuators), plan.scene.torque_limit
     caps = {"": math.inf}
     for name, power in (("velocity", 1.0), ("acceleration", 0.5)):
-        largest = max(abs(getattr(demand, name).value) for demand in plan.demands)
+        largest = max(abs(peak.value) for peak in plan.peaks[name])
         if name in known and largest:
             caps[name] = (known[name] / largest) ** power
     highest, binding = min((cap, name) for name, cap in caps.items())
@@ -343,18 +322,18 @@ def plan_table(plan: MotionPlan, fastest: TimeScaling) -> str:
     add("", ["actuator 1", "actuator 2", "actuator 3"], "", "limit")
     known = limits(plan.scene.actuators)
     for name, unit in UNITS.items():
-        peaks, limit = [getattr(demand, name) for demand in plan.demands], known.get(name)
+        peaks, limit = plan.peaks[name], known.get(name)
         end = "" if limit is None else f"{limit:g}"
         add(f"peak {name} [{unit}]", [peak.value for peak in peaks], end=end)
         add("  at t [s]", [peak.time for peak in peaks])
         if limit is not None:
             add("  margin", [1.0 - abs(peak.value) / limit for peak in peaks], ".1%")
         if name == "torque":
-            add("RMS torque [N m]", [demand.torque_rms for demand in plan.demands])
+            add("RMS torque [N m]", plan.torque_rms)
     lines.append("")
     add("distance to an end", ["least", "at t [s]"], "")
     for one in plan.distances:
-        name = f"{one.key} {one.describe(6)}" + f" [{one.unit}]" * (one.unit != "1")
+        name = f"{one.key} {one.side} {one.end:.6g}" + f" [{one.unit}]" * (one.unit != "1")
         add(name, [one.least, one.reached.time])
         lines[-1] += "" if one.refused else "   ignored"
     return "\n".join([*lines, "", *_verdict(plan, fastest)]) + "\n"
@@ -368,7 +347,7 @@ def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
         yield "The actuators lag; commands that make up for it may exceed the torques."
     yield "feasible" if not plan.problems else "not feasible"
     highest, lowest = fastest.highest, fastest.lowest
-    if any(distance.is_beyond for distance in plan.distances):
+    if any(one.refused and one.least < 0.0 for one in plan.distances):
         yield "At no speed: the path itself leaves what is allowed."
     elif highest is None:
         yield "At no speed: the torque limit is too small for this path."
@@ -392,7 +371,11 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
         "feasible": not plan.problems,
         "problems": [str(problem) for problem in plan.problems],
         "limits": limits(plan.scene.actuators),
-        "actuators": [asdict(demand) for demand in plan.demands],
+        "actuators": [
+            {name: asdict(peaks[leg]) for name, peaks in plan.peaks.items()}
+            | {"torque_rms": plan.torque_rms[leg]}
+            for leg in range(3)
+        ],
         "distances": [{**asdict(one), "least": one.least} for one in plan.distances],
         "highest_speed": None if any_speed else highest,
         "any_speed": any_speed,

@@ -15,7 +15,7 @@ from mechanism.test_loads import laden, loaded
 from models import FAST, folding_star, samples, seeded_samples
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.inverse_dynamics import InverseDynamics
+from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, SingularConfiguration
