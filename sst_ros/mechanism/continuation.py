@@ -91,7 +91,8 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
         raise AssemblyError("rotation does not close the loops", points[0])
     rotations[0] = _newton(geometry, points[0], rotations[0])
     for row in range(1, len(points)):
-        rotations[row] = _segment(geometry, points[row - 1], points[row], rotations[row - 1], row)
+        before = rotations[row - 1], points[row - 1]
+        rotations[row] = advance(geometry, *before, points[row], row)
     r = kinematics.carriage_directions(geometry, points)
     mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotations)
     mu, beta = np.unwrap(mu, axis=0), np.unwrap(beta, axis=0)
@@ -100,19 +101,17 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
     return Branch(*frozen(points, rotations, mu, beta, sigma, det_j2))
 
 
-def advance(geometry: Geometry, rotation: ArrayLike, start: ArrayLike, end: ArrayLike) -> Array:
+def advance(
+    geometry: Geometry, rotation: ArrayLike, start: ArrayLike, end: ArrayLike, row: int = 1
+) -> Array:
     """Return R, shape (3, 3), at gamma = end [rad] of the branch that has `rotation` at start.
 
-    Where a parallel singularity lies on the path, BranchEnds is raised.
+    Its steps are proved not to leave the branch. Where a parallel singularity lies on the path,
+    BranchEnds is raised; it says that the end is point `row` of a motion.
     """
-    first, last = np.array(start, dtype=float), np.array(end, dtype=float)
-    return _segment(geometry, first, last, np.array(rotation, dtype=float), 1)
-
-
-def _segment(geometry: Geometry, start: Array, end: Array, rotation: Array, row: int) -> Array:
-    """Go from start to end in steps that are proved not to leave the branch."""
+    here, end, rotation = (np.array(given, dtype=float) for given in (start, end, rotation))
+    start = here
     length, done = float(np.linalg.norm(end - start)), 0.0
-    here = start
     for _ in range(_BUDGET):
         slope = _slope(geometry, here, rotation)
         sigma = float(np.linalg.svd(slope, compute_uv=False)[2])

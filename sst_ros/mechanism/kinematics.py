@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -138,7 +137,7 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     if angles.ndim != 2 or angles.shape[1] != 3 or not np.all(np.isfinite(angles)):
         raise AssemblyError("gamma must be rows of three finite numbers", angles)
     r = carriage_directions(geometry, angles)
-    configuration, rotation, isolated = _solve_closure(r, geometry.e)
+    configuration, rotation, isolated = _solve_closure(r, np.broadcast_to(geometry.e, r.shape))
     mu, beta, det_j2, admissible = describe_assemblies(
         geometry.of_rows(configuration), r[configuration], rotation
     )
@@ -189,7 +188,7 @@ def describe_assemblies(
 
 
 def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
-    """Solve r_k . R e_k = 0 for n configurations with r (n, 3, 3) and e (3, 3), or (n, 3, 3).
+    """Solve r_k . R e_k = 0 for n configurations with r and e, (n, 3, 3) each.
 
     Rows are unit vectors, e_1 = (0, 1, 0). Returns the configuration of each root, ascending, (m,);
     the rotations, (m, 3, 3), in the order of `direct`; and whether the roots of a configuration are
@@ -213,15 +212,10 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     x, y = x[owner, root][:, None], y[owner, root, which][:, None]
     t1 = np.cos(x) * n[owner] + np.sin(x) * m[owner]
     s = np.cos(y) * r0[owner] + np.sin(y) * cross(t1, r0[owner])
-    rotation, residual = _polish(r[owner], _of(e, owner), columns(cross(t1, s), t1, s))
+    rotation, residual = _polish(r[owner], e[owner], columns(cross(t1, s), t1, s))
     good = residual <= ROUNDING
     owner, rotation = _distinct(r, e, owner[good], rotation[good])
     return (*_arrange(owner, rotation), isolated)
-
-
-def _of(e: Array, rows: Any) -> Array:
-    """Return e of some rows: the same for all, or one for each."""
-    return e if e.ndim == 2 else np.asarray(e[rows])
 
 
 def _largest(rows: Array) -> Array:
@@ -313,7 +307,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
             break
         if not open_.all():
             active, r, t, rotation = active[open_], r[open_], t[open_], rotation[open_]
-            residual, e = residual[open_], _of(e, open_)
+            residual, e = residual[open_], e[open_]
         step = _newton_step(cross(t, r), residual)
         last = np.sqrt(dot(step, step))
         if last.max() > _LONGEST_TURN:
@@ -369,7 +363,7 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
         if close.any():
             at = later[close]
             middle = rotate(0.5 * (new[close] + old[close]), np.zeros((len(at), 3)))
-            t = _of(e, owner[at]) @ middle.transpose(0, 2, 1)
+            t = e[owner[at]] @ middle.transpose(0, 2, 1)
             fresh[at] = _largest(dot(r[owner[at]], t)) > ROUNDING
     return owner[fresh], rotation[fresh]
 

@@ -177,7 +177,7 @@ def of_torque(
 ) -> Reactions:
     """Constraint moments of the motion that torques [N m] and n_ext [N m] in {B} cause."""
     gamma_ddot = virtual_work.direct_dynamics(mechanism, at, gamma_dot, torque, moment)
-    return _reactions(mechanism, at, gamma_dot, gamma_ddot, np.array(torque, dtype=float))
+    return of_motion(mechanism, at, gamma_dot, gamma_ddot, moment)
 
 
 def of_motion(
@@ -189,12 +189,6 @@ def of_motion(
 ) -> Reactions:
     """Constraint moments, and torques, that a motion gamma_dot, gamma_ddot asks for."""
     torque = virtual_work.inverse_dynamics(mechanism, at, gamma_dot, gamma_ddot, moment)
-    return _reactions(mechanism, at, gamma_dot, gamma_ddot, torque)
-
-
-def _reactions(
-    mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike, torque: Array
-) -> Reactions:
     motion = of_actuators(at, gamma_dot, gamma_ddot)
     frames = virtual_work.link_frames(at)
     inertias = mechanism.actuated, mechanism.intermediate
@@ -215,4 +209,4 @@ def _reactions(
     local = [np.einsum("kij,ki->kj", f, m) for f, m in zip(own_frames, moments, strict=True)]
     for array, axis in zip(local, (2, 0, 2), strict=True):
         array[:, axis] = 0.0  # by the equations above; what rounding left goes
-    return Reactions(*frozen(*moments, *local, np.array(torque)))
+    return Reactions(*frozen(*moments, *local, torque))

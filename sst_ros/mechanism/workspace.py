@@ -208,15 +208,18 @@ def parallel_singularities(chart: OrientationMap) -> SingularPoses:
     low = chart.psi[starts].copy()
     high = low + (chart.psi[1] - chart.psi[0])
     sign = np.sign(measured.det_j2[rows, starts])
+
+    def at(psi: Array) -> tuple[Array, ...]:
+        rotation = orientations(s, psi)
+        gamma, _, beta = kinematics.inverse(geometry, rotation)
+        return rotation, gamma, beta, measures(geometry, gamma, rotation).det_j2
+
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        same = np.sign(_det_j2(geometry, s, middle)) == sign
+        same = np.sign(at(middle)[-1]) == sign
         low, high = np.where(same, middle, low), np.where(same, high, middle)
-    rotation = orientations(s, low)
-    gamma, _, beta = kinematics.inverse(geometry, rotation)
-    leg = np.full(len(rows), -1)
-    determinant = _det_j2(geometry, s, low)
-    return SingularPoses("parallel", *frozen(rotation, gamma, beta, leg, determinant))
+    *found, determinant = at(low)
+    return SingularPoses("parallel", *frozen(*found, np.full(len(rows), -1), determinant))
 
 
 def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
@@ -258,8 +261,3 @@ def report_singularities(geometry: Geometry, chart: OrientationMap) -> str:
             f"{poses.kind}: {len(poses)} found; for example s = ({s}), gamma = ({gamma}) deg{leg}"
         )
     return "\n".join(lines)
-
-
-def _det_j2(geometry: Geometry, s: Array, psi: Array) -> Array:
-    rotation = orientations(s, psi)
-    return measures(geometry, kinematics.inverse(geometry, rotation)[0], rotation).det_j2
