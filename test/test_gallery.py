@@ -46,7 +46,7 @@ def of(name, quantity):
 
 def energies(simulation, state):
     """Kinetic and potential energy [J]."""
-    return simulation.dynamics.energies(*state.quaternion, *state.body_rate, *REST)[:2]
+    return simulation.dynamics.energies(*state.quaternion, *state.body_rate)
 
 
 @pytest.mark.parametrize("name", names())

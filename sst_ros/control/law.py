@@ -46,15 +46,14 @@ from sst_ros.mechanism.generic_math import (
     axpy,
     cross3,
     dot3,
-    relative_quaternion,
+    quaternion_product,
     rotation_rows,
     sqrt,
     triple,
 )
-from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, coefficient, entry, positive
-from sst_ros.state import Vector3, clamp
+from sst_ros.state import Array, Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 SPACES = ("gamma", "so3")
@@ -255,7 +254,8 @@ class ControlLaw(NamedTuple):
         self, desired: Reference, observed: Any, body_rate: Triple, integral: Any
     ) -> tuple[Triple, Triple]:
         """Error on SO(3) [rad], and W_dot [rad/s^2] that makes it vanish."""
-        between = relative_quaternion(observed, desired.quaternion)
+        x, y, z, w = observed
+        between = quaternion_product((-x, -y, -z, w), desired.quaternion)
         turn = rotation_rows(between)
         rate = triple(dot3(row, desired.body_rate) for row in turn)
         forward = triple(dot3(row, desired.body_acceleration) for row in turn)

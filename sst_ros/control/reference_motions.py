@@ -200,11 +200,11 @@ def move_actuators(
     space, times = ActuatorSpaceMap(geometry), _space(path, pieces)
     gammas = [path(time)[0] for time in times]
     try:
-        branch = continuation.follow(geometry, gammas, rotation_matrix(start))
+        rotations, sigmas = continuation.follow(geometry, gammas, rotation_matrix(start))
     except continuation.BranchEnds as error:
         said = f"parallel singularity before t = {times[error.row]:.9g} s"
         raise SingularConfiguration(f"{said}, least singular value of J2", error.measure) from error
-    sigma, quaternions = branch.sigma.tolist(), quaternion_of(branch.rotation)
+    sigma, quaternions = sigmas.tolist(), quaternion_of(rotations)
     # Their signs change as little as they can.
     turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
     signs = np.cumprod(np.where(turns < 0.0, -1.0, 1.0))

@@ -71,7 +71,8 @@ class Dynamics:
         """Derivative of the state by time; inputs are state and drive."""
 
         def derivative(*inputs: Any) -> tuple[Any, ...]:
-            return kernel.derivative(self.numbers, *self._split(inputs))
+            state, drive = inputs[: len(self.state)], inputs[len(self.state) :]
+            return kernel.derivative(self.numbers, state, drive[:3], drive[3:] or None)
 
         return trace(derivative, (*self.state, *self.drive))
 
@@ -109,30 +110,23 @@ class Dynamics:
 
     @cached_property
     def energies(self) -> Function:
-        """Kinetic and potential energy [J] and power put in [W], of state and drive."""
+        """Kinetic and potential energy [J] of the state."""
 
-        def energies(*inputs: Any) -> tuple[Any, ...]:
-            given = self._split(inputs)
-            kinetic = kernel.kinetic_energy(self.model, given[0])
-            potential = kernel.potential_energy(self.model, given[0])
-            return kinetic, potential, kernel.power(self.model, *given)
+        def energies(*state: Any) -> tuple[Any, ...]:
+            kinetic = kernel.kinetic_energy(self.model, state)
+            return kinetic, kernel.potential_energy(self.model, state)
 
-        return compile_program(trace(energies, (*self.state, *self.drive)))
+        return compile_program(trace(energies, self.state))
 
     def total_energy(self, state: Sequence[float]) -> float:
         """Kinetic and potential energy [J] of a state, whose further numbers are not looked at."""
-        kinetic, potential, _ = self.energies(*state[: len(self.state)], *(0.0,) * len(self.drive))
-        return kinetic + potential
+        return sum(self.energies(*state[: len(self.state)]))
 
     @cached_property
     def numbers(self) -> kernel.Model:
         """The model, in which what is not 0 or 1 may have another value in another scene."""
         model: kernel.Model = number_constants(self.model, ("model",))
         return model
-
-    def _split(self, inputs: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-        size = len(self.state)
-        return inputs[:size], inputs[size : size + 3], inputs[size + 3 :] or None
 
 
 recent = lru_cache(maxsize=32)(Dynamics)

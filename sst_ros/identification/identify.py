@@ -320,7 +320,7 @@ def _follow_orientations(
     known = np.unique(np.searchsorted(length, np.arange(0.0, length[-1] + STEP, STEP)))
     points = np.vstack([first, gamma[known[known < len(gamma)]]])
     try:
-        coarse = continuation.follow(coordinates.geometry, points, start).rotation
+        coarse, _ = continuation.follow(coordinates.geometry, points, start)
     except (AssemblyError, continuation.BranchEnds) as error:
         allowed = f"must be angles of this manipulator ({error})"
         raise InputError("identify", [Problem("gamma", first[0].tolist(), allowed)]) from None

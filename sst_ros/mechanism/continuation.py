@@ -15,8 +15,6 @@ singularity (sigma = 0). The edge of the workspace, beta_k = 0, is no place of i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -55,23 +53,14 @@ class BranchEnds(SingularConfiguration):
         )
 
 
-@dataclass(frozen=True)
-class Branch:
-    """One assembly along a motion of n points. Arrays are read-only."""
-
-    gamma: Array  #: actuator angles [rad], shape (n, 3)
-    rotation: Array  #: R, shape (n, 3, 3)
-    mu: Array  #: passive joint angles [rad], without jumps of 2 pi, shape (n, 3)
-    beta: Array  #: as mu
-    sigma: Array  #: least singular value of J2, shape (n,); 0 at a parallel singularity
-    det_j2: Array  #: determinant of J2, shape (n,); its sign never changes
-
-
-def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = None) -> Branch:
+def follow(
+    geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = None
+) -> tuple[Array, Array]:
     """Follow a branch along the straight segments between the points gamma [rad], shape (n, 3).
 
     Sample a curved motion finely enough that the chords stand for it. `rotation` is R of the
-    assembly at gamma[0], by default of the admissible one.
+    assembly at gamma[0], by default of the admissible one. Returns R, shape (n, 3, 3), and the
+    least singular values of J2, shape (n,), read-only.
 
     Raises:
         AssemblyError: rotation is None and there is no unique admissible assembly, rotation is
@@ -93,12 +82,9 @@ def follow(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = No
     for row in range(1, len(points)):
         before = rotations[row - 1], points[row - 1]
         rotations[row] = advance(geometry, *before, points[row], row)
-    r = kinematics.carriage_directions(geometry, points)
-    mu, beta, det_j2, _ = kinematics.describe_assemblies(geometry, r, rotations)
-    mu, beta = np.unwrap(mu, axis=0), np.unwrap(beta, axis=0)
-    slopes = _slope(geometry, points, rotations)
-    sigma = np.asarray(np.linalg.svd(slopes, compute_uv=False)[:, 2], dtype=float)
-    return Branch(*frozen(points, rotations, mu, beta, sigma, det_j2))
+    sigma = np.linalg.svd(_slope(geometry, points, rotations), compute_uv=False)[:, 2]
+    first, second = frozen(rotations, np.asarray(sigma, dtype=float))
+    return first, second
 
 
 def advance(

@@ -91,12 +91,6 @@ def quaternion_product(a: Quadruple, b: Quadruple) -> Quadruple:
     )
 
 
-def relative_quaternion(first: Quadruple, second: Quadruple) -> Quadruple:
-    """Quaternion of R1^T R2: the second orientation relative to the first."""
-    x, y, z, w = first
-    return quaternion_product((-x, -y, -z, w), second)
-
-
 def quaternion_rate(q: Quadruple, rate: Triple) -> tuple[Scalar, ...]:
     """Differentiate a quaternion (x, y, z, w) by time at the body rate W [rad/s]."""
     x, y, z, w = q

@@ -20,7 +20,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sst_ros.host.output import write_into
-from sst_ros.mechanism.geometry import Array
 from sst_ros.plot import pictures, style
 from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, hide_zeros
 from sst_ros.recording import recording
@@ -29,7 +28,7 @@ from sst_ros.report import reference, timing, tracking
 from sst_ros.report.reference import QUANTITIES, Comparison
 from sst_ros.report.results import made_on, provenance, render
 from sst_ros.report.timing import Timing
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import NANOSECONDS, Array
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -22,9 +22,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from sst_ros.mechanism.geometry import Array
 from sst_ros.recording.recording import Recording
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import NANOSECONDS, Array
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series

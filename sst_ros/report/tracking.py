@@ -65,8 +65,8 @@ class TrackedRun:
             with suppress(SingularConfiguration):
                 first = rotation_matrix(measured[0])
                 start = continuation.advance(geometry, first, run.gamma[self.rows[0]], gamma[0])
-                branch = continuation.follow(geometry, gamma, start)
-                return angle_between(quaternion_of(branch.rotation), measured)
+                expected, _ = continuation.follow(geometry, gamma, start)
+                return angle_between(quaternion_of(expected), measured)
         return np.full(len(gamma), np.nan)
 
 

@@ -21,10 +21,9 @@ from sst_ros.integration.adaptive_stepper import (
 from sst_ros.integration.compiled_method import CompiledMethod, has_step_code
 from sst_ros.integration.point import state_distance
 from sst_ros.integration.propagator import LimitReached, Propagator
-from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import Torque, TorqueProfile
-from sst_ros.state import NANOSECONDS, State, Vector3
+from sst_ros.state import NANOSECONDS, Array, State, Vector3
 
 _WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000
 """Evaluations after which a run goes on with compiled code that is there, and makes it: in plain

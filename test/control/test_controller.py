@@ -248,8 +248,8 @@ def test_an_assembly_is_followed_as_continuation_proves():
         begin = tuple(quaternion_of(sample.rotation).tolist())
         space, known = ActuatorSpaceMap(sample.geometry), (begin, tuple(sample.gamma.tolist()))
         way = sample.gamma + np.outer(np.sin([0.01, 0.02, 0.3, 0.31, 0.05]), (0.4, -0.3, 0.5))
-        truth = continuation.follow(sample.geometry, [sample.gamma, *way], sample.rotation)
-        for gamma, rotation in zip(way, truth.rotation[1:], strict=True):
+        truth, _ = continuation.follow(sample.geometry, [sample.gamma, *way], sample.rotation)
+        for gamma, rotation in zip(way, truth[1:], strict=True):
             there = tuple(gamma.tolist())
             known = space.follow(*known, there), there
             assert np.abs(rotation_matrix(known[0]) - rotation).max() < 1e-12

@@ -206,9 +206,11 @@ def test_an_assembly_is_followed_and_not_the_nearest_or_the_first():
         here = kinematics.inverse(GEOMETRY, assembly.rotation)[0]
         rows = np.array([1.0]), np.add([here], (0.05, -0.04, 0.03)), np.zeros((1, 3))
         last = through_points(GEOMETRY, start, *rows).at(1.0)  # lists elsewhere
-        truth = continuation.follow(GEOMETRY, np.linspace(here, last.gamma, 200), assembly.rotation)
-        assert rotation_matrix(last.quaternion) == pytest.approx(truth.rotation[-1], abs=1e-13)
-        ends.add(tuple(np.round(truth.rotation[-1].ravel(), 6)))
+        truth, _ = continuation.follow(
+            GEOMETRY, np.linspace(here, last.gamma, 200), assembly.rotation
+        )
+        assert rotation_matrix(last.quaternion) == pytest.approx(truth[-1], abs=1e-13)
+        ends.add(tuple(np.round(truth[-1].ravel(), 6)))
     assert len(ends) == len(found)
 
 

@@ -99,13 +99,12 @@ def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
     """The states of the bag are exact; the cubic between 2 ms samples errs by h^4."""
     kinetic, potential = pictures.energies(run, run.scene)
     simulation = Simulation(run.scene)
-    zero = (0.0, 0.0, 0.0)
     for tick in range(300):
         at = tuple(run.legs("tau", "ticks")[tick])
         state = simulation.step(at, 1_000_000)
         if tick % 100 == 99:
             sample = (tick + 1) // 2
-            parts = simulation.dynamics.energies(*state.quaternion, *state.body_rate, *zero)
+            parts = simulation.dynamics.energies(*state.quaternion, *state.body_rate)
             assert kinetic[sample] == pytest.approx(parts[0], rel=1e-12)
             assert potential[sample] == parts[1] == 0.0
     left = kinetic - kinetic[0] - pictures.work(run).sum(axis=1)
