@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.tri import LinearTriInterpolator, Triangulation
+from matplotlib.ticker import MaxNLocator
+from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -26,8 +26,7 @@ from sst_ros.mechanism.workspace import OrientationMap
 from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
 from sst_ros.scene.scene import Scene
 
-WORST_COND = 10.0  # from this cond J on the colour stays the same
-LABEL_INSET = math.radians(5.0)  # less far from a side of the triangle a contour has no label
+CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)  # levels of cond J; above all are the same
 _ALARM = "#d1182b"
 
 
@@ -87,55 +86,31 @@ def _panel(
 ) -> None:
     """Draw values (n,): angles [deg], or cond J: logarithmic, from 1, and the least is the best."""
     x, y = project(chart.geometry, chart.s)
-    mesh = Triangulation(x, y, faces)
-    axes.tripcolor(mesh, np.zeros(len(x)), cmap="Greys", vmin=-0.5, vmax=5)
+    axes.tripcolor(Triangulation(x, y, faces), 0.0 * x, cmap="Greys", vmin=-0.5, vmax=5)
     known = np.isfinite(values)
-    if known.any():
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        norm = LogNorm(1.0, WORST_COND) if condition else Normalize(0.0, high)
-        # Values go on past the edge of the workspace, and the picture is cut there.
-        nearest = cKDTree(chart.s[known]).query(chart.s)[1]
-        whole = np.where(known, values, values[known][nearest])
-        inside = chart.measures.margin.max(axis=1)
-        edge = axes.tricontourf(mesh, inside, levels=[0.0, np.pi], alpha=0.0)
-        looks: Looks = {"norm": norm, "shading": "gouraud", "rasterized": True}
-        filled = axes.tripcolor(mesh, whole, cmap="magma_r" if condition else "viridis", **looks)
-        lines = _contours(axes, mesh, whole, condition)
-        inset = LinearTriInterpolator(mesh, np.arcsin((chart.s @ chart.geometry.w.T).min(axis=1)))
-        for label in lines[1:]:
-            label.set_visible(bool(inset(*label.get_position()).filled(0.0) > LABEL_INSET))
-        if not known.all():
-            for part in (filled, *lines):
-                part.set_clip_path(edge.get_paths()[0], axes.transData)
-        above = "max" if condition and high > WORST_COND else "neither"
-        bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, extend=above)
+    inside = known[faces].all(axis=1)
+    if inside.any():
+        goal = float(np.nanmin(values) if condition else np.nanmax(values))
+        levels: Any = CONDITIONS if condition else MaxNLocator(10).tick_values(0.0, goal)
+        looks: Looks = {"cmap": "viridis", "levels": levels}
+        if condition:
+            looks |= {"cmap": "magma_r", "norm": LogNorm(1.0, CONDITIONS[-1]), "extend": "max"}
+        mesh = Triangulation(x, y, faces, mask=~inside)
+        filled = axes.tricontourf(mesh, np.where(known, values, goal), **looks)
+        bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, ticks=levels)
         bar.set_label("cond J" if condition else "deg", fontsize=9)
         bar.ax.tick_params(labelsize=8)
-        if condition:
-            bar.set_ticks([1, 1.5, 2, 3, 5, 10], labels=["1", "1.5", "2", "3", "5", "10"])
-            bar.ax.minorticks_off()
+        bar.ax.set_yticklabels([f"{level:g}" for level in levels])
+        bar.ax.minorticks_off()
         # On a plateau the place that is farthest from the limits.
-        goal = low if condition else high
         near = np.abs(values - goal) <= 0.01 * abs(goal)
         best = int(np.nanargmax(np.where(near, chart.best_margin, np.nan)))
-        place = x[best], y[best]
-        axes.plot(*place, "*", markersize=13, color="white", markeredgecolor=INK)
+        axes.plot(x[best], y[best], "*", markersize=13, color="white", markeredgecolor=INK)
         text = f"least {goal:.2f}" if condition else f"most {goal:.0f}°"
         box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
         beside: Looks = {"textcoords": "offset points", "fontsize": 9, "ha": "center", "bbox": box}
-        axes.annotate(text, place, (0, 8), color=INK, **beside)
+        axes.annotate(text, (x[best], y[best]), (0, 8), color=INK, **beside)
     draw_triangle(axes, chart.geometry)
-
-
-def _contours(axes: Axes, mesh: Triangulation, values: Array, condition: bool) -> list[Any]:
-    top = float(np.nanmax(values))
-    step = 5 if top < 45 else 10 if top < 75 else 20
-    levels = [1.1, 1.2, 1.5, 2.0, 3.0, 5.0] if condition else list(range(step, 360, step))
-    inside = [level for level in levels if np.nanmin(values) < level < top]
-    if not inside:
-        return []
-    lines = axes.tricontour(mesh, values, levels=inside, colors="white", linewidths=0.8)
-    return [lines, *axes.clabel(lines, fontsize=7.5, fmt="%g" if condition else "%g°")]
 
 
 def draw_triangle(axes: Axes, geometry: Geometry) -> None:

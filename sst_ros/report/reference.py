@@ -24,7 +24,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import accelerate_by_paper, initial_state
 from sst_ros.errors import SingularConfiguration
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.host.output import Bar, slices
+from sst_ros.host.output import slices
 from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import LimitReached, Propagator
@@ -96,8 +96,9 @@ class TickPropagator(Propagator):
         if not self.compiled:
             reached, given = reached.tolist(), tuple(array.tolist() for array in given)
         stepper, _ = self._begin_period(self._sine or (0.0, 0.0, 0.0), 0.0, ())
-        k = int(np.flatnonzero(np.isfinite(begins[:, 0]))[0])
-        at = stepper.begin(begins[k, :-1].tolist())
+        known = np.append(np.flatnonzero(np.isfinite(begins[:, 0])), len(length))
+        k = int(known[0])
+        at = stepper.begin(begins[min(k, len(length) - 1), :-1].tolist())
         while k < len(length):
             k, at = stepper.step_through(k, len(length), given, at, len(length) - k, reached)
             if k == len(length):
@@ -109,8 +110,7 @@ class TickPropagator(Propagator):
                 reached[k][0][:], reached[k][1][:] = at.y, at.z
                 k += 1
             except (LimitReached, CannotStep, ArithmeticError, ValueError):
-                later = np.flatnonzero(np.isfinite(begins[k + 1 :, 0]))
-                k = k + 1 + int(later[0]) if len(later) else len(length)
+                k = int(known[np.searchsorted(known, k, side="right")])
         return np.asarray(np.asarray(reached)[first + parts - 1])
 
 
@@ -270,7 +270,7 @@ def _compare(
     The state at time zero is `known` or not. Under recorded torques, which may have gaps, the
     reference begins again at a sample after each.
     """
-    (start_ns, end_ns, drives), restarts = held, list[int]()
+    start_ns, end_ns, drives = held
     motion, until_ns, reason = _begin(recording, torque)
     count = int(np.searchsorted(end_ns, until_ns, side="right"))
     samples = recording.quaternion, recording.gamma, recording.gamma_dot
@@ -287,40 +287,37 @@ def _compare(
         distances[0, rows] = _measure([values[rows] for values in samples], first)
         distances[1, rows] = _measure(second, first)
 
-    start: Array | None = None
+    unknown: Array = np.full(len(motion.ode.state) - 1, np.nan)
+    state = np.array(initial(recording.scene)) if known else unknown
     if known:
-        state = np.array(initial(recording.scene))
         note(np.array([0]), np.stack([state, state])[None])
-        start = state if start_ns[0] == 0 else None
+    known = known and start_ns[0] == 0
+    # Where ticks are lost, those up to the next sample are left out.
     at = places(recording.time_ns, start_ns)
     usable = np.flatnonzero((at >= 0) & np.isfinite(recording.quaternion[at, 0]))
-    gaps = 1 + np.flatnonzero(start_ns[1:] != end_ns[:-1])
-    ends = np.append(gaps[gaps < count], count)
-    bar, first = Bar("reference", count > CHUNK), 0
-    while first < count:
-        if start is None:
-            later = usable[(first <= usable) & (usable < count)]
-            if torque is not None or not len(later):
-                break
-            first = int(later[0])
-            start = of_samples(recording, at[[first]])[0]
-            restarts.append(int(start_ns[first]))
-        end = int(ends[np.searchsorted(ends, first, side="right")])
-        some = slice(first, min(first + CHUNK, end))
-        starts = np.full((some.stop - first, len(start)), np.nan)
-        starts[0] = start
-        reached = motion.follow((start_ns[some], end_ns[some], drives[some]), starts)[..., :-1]
-        done = int(np.isfinite(reached[:, 0, 0]).sum())
-        rows = places(recording.time_ns, end_ns[some][:done])
-        note(rows[rows >= 0], reached[:done][rows >= 0])
-        whole = done == len(starts)  # else no step resolves the next tick
-        first += done if whole else done + 1
-        start = reached[-1, 0] if whole and first < end else None
-        bar.draw(min(first / count, 1.0))
-    distances[0, np.isin(recording.time_ns, restarts)] = np.nan
+    gaps = np.flatnonzero(np.append(not known, start_ns[1:] != end_ns[:-1])[:count])
+    again = np.append(usable, count)[np.searchsorted(usable, gaps)].clip(max=count)
+    kept = np.ones(count, dtype=bool)
+    for gap, end in zip(gaps, again, strict=True):
+        kept[gap:end] = False
+    restarts = np.unique(again[again < count])
+    begun_ns, states = start_ns[restarts], of_samples(recording, at[restarts])
+    start_ns, end_ns, drives = start_ns[:count][kept], end_ns[:count][kept], drives[:count][kept]
+    state = state if known else unknown
+    for part in slices(len(start_ns), CHUNK, "reference", len(start_ns) > CHUNK):
+        starts = np.full((len(start_ns[part]), len(state)), np.nan)
+        starts[0] = state
+        place = places(start_ns[part], begun_ns)
+        starts[place[place >= 0]] = states[place >= 0]
+        reached = motion.follow((start_ns[part], end_ns[part], drives[part]), starts)[..., :-1]
+        rows = places(recording.time_ns, end_ns[part])
+        found = (rows >= 0) & np.isfinite(reached[:, 0, 0])  # nan where no step resolves a tick
+        note(rows[found], reached[found])
+        state = reached[-1, 0]
+    distances[0, np.isin(recording.time_ns, begun_ns)] = np.nan
     error, own = map(_frame, distances)
     steps = -(-recording.ticks.period_ns // LONGEST_TICK_NS)
-    return Comparison(error, own, tuple(restarts), steps, (reason,) if reason else ())
+    return Comparison(error, own, tuple(begun_ns.tolist()), steps, (reason,) if reason else ())
 
 
 def _begin(recording: Recording, torque: SineTorque | None) -> tuple[TickPropagator, int, str]:

@@ -26,6 +26,7 @@ from sst_ros.report.run import (
 )
 from sst_ros.report.tracking import read_tracking, write_tracking_report
 from sst_ros.scene import scene
+from sst_ros.scene.loads import Initial
 
 LATENCY_NS = 400_000
 SENT_NS = 50_000
@@ -173,7 +174,7 @@ def test_what_is_not_recorded_is_unknown(read, bags, example2):
 
 
 def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
-    start = scene.Initial(gamma=(1.5, 0.785, 0.785), gamma_dot=(1.0, 0.0, 0.0))
+    start = Initial(gamma=(1.5, 0.785, 0.785), gamma_dot=(1.0, 0.0, 0.0))
     near = dataclasses.replace(scene.load("example2_heavy"), name="near_the_end", initial=start)
     summary = write_run_report(
         bags.write(tmp_path / "bag", bags.simulated(near, 0.3)), tmp_path / "out"
