@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors that sst_ros raises on purpose; each carries the values that explain it."""
+"""The errors that sst_ros raises on purpose, with values that explain them; optional modules."""
 
 from __future__ import annotations
 
 import difflib
+import importlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -145,3 +146,37 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     """Return "; did you mean NAME?" for the known name nearest to `word`, "" if none is near."""
     near = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
+
+
+_RECORD = ("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard")
+EXTRAS = {
+    **{"distributed": "cluster", "matplotlib": "plot", "numba": "fast", "pinocchio": "engines"},
+    **{"viser": "view", "xarray": "all", **dict.fromkeys(_RECORD, "record")},
+}
+"""Extra of this package that installs a module."""
+
+_ROS = ("ament_index_python", "rclpy", "rcl_interfaces", "builtin_interfaces", "launch")
+
+
+class MissingDependency(SstError, ImportError):
+    """An optional dependency is not installed; the message names the command that installs it."""
+
+
+def require(module: str) -> Any:
+    """Import an optional dependency; MissingDependency says how to install it."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if message := explanation(error):
+            raise MissingDependency(message, name=error.name) from None
+        raise
+
+
+def explanation(error: ModuleNotFoundError) -> str | None:
+    """Return how to install what is missing; None for a module that is no optional dependency."""
+    module = (error.name or "").partition(".")[0]
+    ros = module in _ROS or module.endswith(("_msgs", "_srvs"))
+    extra = "ros" if ros else EXTRAS.get(module)
+    how = f"pip install 'sst_ros[{extra}]' (in the source folder: pip install '.[{extra}]')"
+    more = "source a ROS 2 installation, or " * ros
+    return f"{module} is not installed: {more}{how}" if extra else None

@@ -16,7 +16,7 @@ from scipy.interpolate import make_interp_spline
 from benchmark.peers.pinocchio_peer import Model
 from benchmark.peers.task import KINDS, Task
 from sst_ros import demo
-from sst_ros.extras import MissingDependency, require
+from sst_ros.errors import MissingDependency, require
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, angle_between, quaternion_of, rotation_matrix

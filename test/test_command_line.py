@@ -10,7 +10,7 @@ from programs import python
 
 from sst_ros.__main__ import main
 from sst_ros.cli.commands import COMMANDS, NODES, function, parser
-from sst_ros.extras import EXTRAS
+from sst_ros.errors import EXTRAS
 from sst_ros.simulation.trajectory import Trajectory
 
 BLOCKED = """

@@ -17,7 +17,7 @@ import sst_ros
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
     {"state", "version"},
-    {"errors", "extras", "host"},
+    {"errors", "host"},
     {"scene"},
     {"mechanism"},
     {"dynamics"},

@@ -16,7 +16,7 @@ import yaml
 
 import sst_ros
 from sst_ros.cli.commands import NODES
-from sst_ros.extras import EXTRAS
+from sst_ros.errors import EXTRAS
 from tools import changelog_rst
 
 ROOT = Path(__file__).parents[1]

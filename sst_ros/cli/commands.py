@@ -18,8 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sst_ros.errors import SstError, printable, refuse_unless, suggestion
-from sst_ros.extras import explanation, require
+from sst_ros.errors import SstError, explanation, printable, refuse_unless, require, suggestion
 from sst_ros.host.output import require_free
 from sst_ros.version import VERSION
 

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem, refuse_unless
-from sst_ros.extras import MissingDependency, require
+from sst_ros.errors import InputError, MissingDependency, Problem, refuse_unless, require
 
 TEMPORARY = ".part-"
 """How the name of a file begins that is not whole yet, or that a killed process has left."""

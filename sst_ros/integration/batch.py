@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
-from sst_ros.errors import refuse_unless
-from sst_ros.extras import require
+from sst_ros.errors import refuse_unless, require
 from sst_ros.host import compiled_module
 from sst_ros.host.output import slices
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem
-from sst_ros.extras import require
+from sst_ros.errors import InputError, Problem, require
 from sst_ros.host.output import require_free, write_into, write_table
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates

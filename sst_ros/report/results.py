@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import jinja2
 
-from sst_ros.extras import require
+from sst_ros.errors import require
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import write_into
 

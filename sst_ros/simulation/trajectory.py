@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import Diverged, InputError, Problem, refuse_unless
-from sst_ros.extras import MissingDependency, require
+from sst_ros.errors import Diverged, InputError, MissingDependency, Problem, refuse_unless, require
 from sst_ros.host.output import SUFFIXES, load_table, write_table
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import kinematics

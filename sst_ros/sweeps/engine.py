@@ -19,8 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from sst_ros.errors import InputError, Problem, SstError
-from sst_ros.extras import require
+from sst_ros.errors import InputError, Problem, SstError, require
 from sst_ros.host.cache_folder import cache_folder, store
 from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.results import name_part, write

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem
-from sst_ros.extras import require
+from sst_ros.errors import InputError, Problem, require
 from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.scene.scene import Scenarios

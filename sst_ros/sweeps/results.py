@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_ros.errors import InputError, Problem
-from sst_ros.extras import require
+from sst_ros.errors import InputError, Problem, require
 from sst_ros.host.output import replace_file
 from sst_ros.sweeps.sweep_study import SweepStudy
 from sst_ros.version import VERSION

@@ -13,8 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_ros.errors import refuse_unless
-from sst_ros.extras import require
+from sst_ros.errors import refuse_unless, require
 from sst_ros.host.output import TEMPORARY, Bar, require_free, write_into
 from sst_ros.scene.scene import scene_of
 from sst_ros.sweeps.engine import ChunkOutcome, run_chunk, run_local, run_on_cluster, send_code

@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.errors import InputError, Problem
-from sst_ros.extras import require
+from sst_ros.errors import InputError, Problem, require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Place, Section, Spec, key_of

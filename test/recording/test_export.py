@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from sst_ros import __main__ as cli
-from sst_ros.errors import InputError
-from sst_ros.extras import MissingDependency
+from sst_ros.errors import InputError, MissingDependency
 from sst_ros.recording.recording import export, read_signals
 from sst_ros.state import nanoseconds
 
