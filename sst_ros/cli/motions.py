@@ -8,13 +8,14 @@ import contextlib
 import math
 
 from sst_ros.cli.commands import free_out, function
-from sst_ros.control.plan import examine_motion, plan_json, plan_table, time_scaling, write_torques
+from sst_ros.control.plan import UNITS, examine_motion, plan_json, time_scaling, write_torques
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import refuse_unless
 from sst_ros.host.output import require_free, write_into
 from sst_ros.identification.excitation import ExcitingMotion, design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import Identification
+from sst_ros.report.results import render
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
 from sst_ros.sweeps.engine import connect
@@ -34,8 +35,11 @@ def check_plan(options: argparse.Namespace) -> int:
     scene, of_bag = load(options.scene), "recording.recording:read_run_motion"  # needs rosbags
     motion = reference_motion(scene, lambda bag: function(of_bag)(bag))
     plan = examine_motion(motion, scene)
-    write = plan_json if options.json else plan_table
-    print(write(plan, time_scaling(plan)).rstrip())
+    speeds = time_scaling(plan)
+    if options.json:
+        print(plan_json(plan, speeds))
+    else:
+        print(render("plan.txt", plan=plan, speeds=speeds, units=UNITS), end="")
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)
     return 1 if plan.problems else 0

@@ -28,7 +28,6 @@ from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import Scene
 
 SAMPLES = 16  # parts of a piece of the motion; even, for Simpson's rule
@@ -80,6 +79,7 @@ class MotionPlan:
     references: tuple[Reference, ...]  # the motion there
     torques: Array  # actuator torques there [N m], shape (n, 3)
     peaks: dict[str, list[Peak]]  # by quantity of UNITS and leg, the largest, with their signs
+    limits: dict[str, float]  # those that the actuators have, by quantity of UNITS
     torque_rms: list[float]  # root of the mean square over the duration, by leg [N m]
     distances: tuple[LimitDistance, ...]  # from all limits
     problems: tuple[Problem, ...]  # reasons of a refusal; empty where it is feasible
@@ -122,8 +122,11 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
     torques = samples[:, :3]
     squares = simpson(torques[pieces] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
-    rms, faults = np.sqrt(squares / times[-1]).tolist(), _faults(distances, peaks, scene)
-    return MotionPlan(motion, scene, times, desired, torques, peaks, rms, distances, (*faults,))
+    rms = np.sqrt(squares / times[-1]).tolist()
+    given = {name: getattr(scene.actuators, f"{name}_limit", None) for name in UNITS}
+    limits = {name: limit for name, limit in given.items() if limit is not None}
+    faults = tuple(_faults(distances, peaks, limits))
+    return MotionPlan(motion, scene, times, desired, torques, peaks, limits, rms, distances, faults)
 
 
 def _extremes(
@@ -215,23 +218,17 @@ def _distances(
 
 
 def _faults(
-    distances: Sequence[LimitDistance], peaks: dict[str, list[Peak]], scene: Scene
+    distances: Sequence[LimitDistance], peaks: dict[str, list[Peak]], limits: dict[str, float]
 ) -> Iterator[Problem]:
     for one in distances:
         if one.refused and one.least < 0.0:
             side = f"{one.side} {one.end:.9g} {one.unit} (t = {one.reached.time:.9g} s)"
             yield Problem(one.key, one.reached.value, f"must stay {side}")
-    for name, limit in limits(scene.actuators).items():
+    for name, limit in limits.items():
         for leg, peak in enumerate(peaks[name], start=1):
             if abs(peak.value) > limit:
                 allowed = f"exceeds the limit {limit:g} {UNITS[name]} at t = {peak.time:.9g} s"
                 yield Problem(f"{name}_{leg}", peak.value, allowed)
-
-
-def limits(actuators: Actuators | None) -> dict[str, float]:
-    """Return the limits that the actuators have, by the name of the demand."""
-    found = {name: getattr(actuators, f"{name}_limit", None) for name in UNITS}
-    return {name: limit for name, limit in found.items() if limit is not None}
 
 
 @dataclass(frozen=True)
@@ -254,7 +251,7 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     The factors that torques allow are found on a grid first, then to rounding; a feasible range
     narrower than the grid, between others that are not, may be overlooked.
     """
-    known, torque_limit = limits(plan.scene.actuators), plan.scene.torque_limit
+    known, torque_limit = plan.limits, plan.scene.torque_limit
     caps = {"": math.inf}
     for name, power in (("velocity", 1.0), ("acceleration", 0.5)):
         largest = max(abs(peak.value) for peak in plan.peaks[name])
@@ -308,59 +305,6 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
     return excess
 
 
-def plan_table(plan: MotionPlan, fastest: TimeScaling) -> str:
-    """Write a plan for people."""
-    lines = [
-        f"{plan.scene.name}: {plan.motion.duration:g} s, {len(plan.times)} samples and the extremes"
-        " between them\n"
-    ]
-
-    def add(name: str, cells: Sequence[Any], form: str = ".6g", end: str = "") -> None:
-        row = "".join(f"{format(cell, form):>14}" for cell in cells)
-        lines.append(f"{name:<28}{row}{end:>14}".rstrip())
-
-    add("", ["actuator 1", "actuator 2", "actuator 3"], "", "limit")
-    known = limits(plan.scene.actuators)
-    for name, unit in UNITS.items():
-        peaks, limit = plan.peaks[name], known.get(name)
-        end = "" if limit is None else f"{limit:g}"
-        add(f"peak {name} [{unit}]", [peak.value for peak in peaks], end=end)
-        add("  at t [s]", [peak.time for peak in peaks])
-        if limit is not None:
-            add("  margin", [1.0 - abs(peak.value) / limit for peak in peaks], ".1%")
-        if name == "torque":
-            add("RMS torque [N m]", plan.torque_rms)
-    lines.append("")
-    add("distance to an end", ["least", "at t [s]"], "")
-    for one in plan.distances:
-        name = f"{one.key} {one.side} {one.end:.6g}" + f" [{one.unit}]" * (one.unit != "1")
-        add(name, [one.least, one.reached.time])
-        lines[-1] += "" if one.refused else "   ignored"
-    return "\n".join([*lines, "", *_verdict(plan, fastest)]) + "\n"
-
-
-def _verdict(plan: MotionPlan, fastest: TimeScaling) -> Iterator[str]:
-    yield from (f"refused: {problem}" for problem in plan.problems)
-    if plan.scene.moment is not None and plan.scene.moment.topic:
-        yield "The external moment comes from a topic; it counts as zero here."
-    if plan.scene.lags:
-        yield "The actuators lag; commands that make up for it may exceed the torques."
-    yield "feasible" if not plan.problems else "not feasible"
-    highest, lowest = fastest.highest, fastest.lowest
-    if any(one.refused and one.least < 0.0 for one in plan.distances):
-        yield "At no speed: the path itself leaves what is allowed."
-    elif highest is None:
-        yield "At no speed: the torque limit is too small for this path."
-    elif math.isinf(highest):
-        yield "At any speed: the scene has no limit that it could meet."
-    else:
-        said = f"{highest:.9g} times as planned, in {plan.motion.duration / highest:.9g} s"
-        yield f"Highest speed {said}; then the {fastest.binding} limit is met."
-    if highest is not None and lowest > 0.0:
-        why = "the torque limit is too small to rest everywhere on this path."
-        yield f"Slower than {lowest:.9g} times as planned it is not feasible either: {why}"
-
-
 def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for machines: SI units, null for what does not exist."""
     highest = fastest.highest
@@ -370,7 +314,7 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
         "duration": plan.motion.duration,
         "feasible": not plan.problems,
         "problems": [str(problem) for problem in plan.problems],
-        "limits": limits(plan.scene.actuators),
+        "limits": plan.limits,
         "actuators": [
             {name: asdict(peaks[leg]) for name, peaks in plan.peaks.items()}
             | {"torque_rms": plan.torque_rms[leg]}
