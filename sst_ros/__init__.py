@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from sst_ros.recording.recording import Recording as Recording
     from sst_ros.scene import scene as _scene
     from sst_ros.scene.bodies import arc_inertia as arc_inertia
-    from sst_ros.scene.loads import SineTorque as SineTorque
     from sst_ros.scene.scene import Scene as Scene
     from sst_ros.scene.torque_profile import PolynomialTorque as PolynomialTorque
+    from sst_ros.scene.torque_profile import SineTorque as SineTorque
     from sst_ros.scene.torque_profile import TorqueTable as TorqueTable
     from sst_ros.simulation.simulate import prepare as prepare
     from sst_ros.simulation.simulate import simulate as simulate

@@ -10,8 +10,7 @@ from sst_ros import TorqueTable, load_scene, simulate
 from sst_ros.integration.compiled_method import JACOBIAN_COST
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import angle_between
-from sst_ros.scene.loads import SineTorque
-from sst_ros.scene.torque_profile import PolynomialTorque
+from sst_ros.scene.torque_profile import PolynomialTorque, SineTorque
 
 EXAMPLE2 = load_scene("example2_heavy")
 SINE = SineTorque(amplitude=(4.0, 5.0, 3.0), frequency=(9.0, 7.0, 8.0), phase=(0.1, 0.7, 2.0))

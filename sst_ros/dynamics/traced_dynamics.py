@@ -30,9 +30,9 @@ from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.errors import refuse_unless
 from sst_ros.mechanism.generic_math import Scalar, positive, sin
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import Place, leaves, rebuild
+from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.state import Joints
 
 Function = Callable[..., tuple[float, ...]]

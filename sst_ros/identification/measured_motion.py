@@ -18,7 +18,6 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import (
     ConstantTorque,
     PolynomialTorque,
-    SineProfile,
     TorqueProfile,
     TorqueTable,
     ascend,
@@ -225,4 +224,4 @@ def _take_figure(data: Mapping[str, Any], scene: Scene) -> Readings:
     spread = None if deviation is None else np.ones_like(values)
     if spread is not None:
         spread[:, columns] = deviation
-    return Readings(t, values, spread, SineProfile(scene.torque))
+    return Readings(t, values, spread, scene.torque)

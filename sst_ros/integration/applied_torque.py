@@ -13,8 +13,7 @@ import numpy as np
 
 from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_with_work
-from sst_ros.scene.loads import SineTorque
-from sst_ros.scene.torque_profile import Torque, torque_at
+from sst_ros.scene.torque_profile import SineTorque, Torque, torque_at
 from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 
 _SEARCHED = 8

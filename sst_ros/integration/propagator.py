@@ -28,9 +28,8 @@ from sst_ros.integration.events import (
 )
 from sst_ros.integration.point import Point
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import Torque
+from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import Vector3
 
 Moment = tuple[float, ...]

@@ -33,8 +33,8 @@ from sst_ros.mechanism.geometry import Array, Geometry, angle_between
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
-from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.state import NANOSECONDS
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from sst_ros.errors import RunStopped, SstError
 from sst_ros.mechanism.generic_math import ZERO, add, axpy
 from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.torque_input import TorqueInput
-from sst_ros.scene.loads import SineTorque
+from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3
 

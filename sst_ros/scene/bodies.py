@@ -16,11 +16,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sst_ros.errors import Problem, refuse_unless
 from sst_ros.scene.schema import Rules, Section, coefficient, entry, positive
-from sst_ros.state import Vector3
+from sst_ros.state import Array, Vector3
 
 RELATIVE_ROUNDING = 1e-9
 
@@ -47,7 +47,7 @@ class Inertia(Section):
     yz: float = entry("inertia tensor, yz", "kg m^2", default=0.0)
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Array:
         """The tensor, shape (3, 3) [kg m^2]."""
         return _matrix_of(entries_of(self))
 
@@ -57,15 +57,14 @@ class Inertia(Section):
         largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
         definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
         fits = _is_positive([-part for part in tensor], largest)
-        for broken, allowed in (
-            (
-                ~definite,
-                "principal moments of inertia must be > 0 (positive definite), "
-                f"at least {SMALLEST_MOMENT:g} kg m^2",
-            ),
-            (definite & ~fits, "no principal moment may exceed the sum of the other two"),
-        ):
-            yield broken, "", lambda: np.linalg.eigvalsh(self.matrix).tolist(), allowed
+
+        def moments() -> Any:
+            return np.linalg.eigvalsh(self.matrix).tolist()
+
+        least = f"> 0 (positive definite), at least {SMALLEST_MOMENT:g} kg m^2"
+        yield ~definite, "", moments, f"principal moments of inertia must be {least}"
+        allowed = "no principal moment may exceed the sum of the other two"
+        yield definite & ~fits, "", moments, allowed
 
 
 class Base(Section):
@@ -94,8 +93,8 @@ class Base(Section):
         """Replace arcs by directions; refuse those that close no triangle."""
         if (arcs := self.arcs_deg) is not None and self.v is None:
             if 2.0 * max(arcs) < sum(arcs) < 360.0:
-                object.__setattr__(self, "v", _directions_of(*np.radians(arcs).tolist()))
-                object.__setattr__(self, "arcs_deg", None)
+                v = _directions_of(*np.radians(arcs).tolist())
+                vars(self).update(v=v, arcs_deg=None)
             else:
                 allowed = "must close: each less than the sum of the others, their sum less than"
                 yield Problem("arcs_deg", arcs, f"{allowed} 360 deg")
@@ -111,17 +110,13 @@ class Base(Section):
         side = np.linalg.norm(unit - np.roll(unit, 1, axis=-2), axis=-1).max(axis=-1)
         zero = lengths.min(axis=-1) < 1e-6
         flat, small = ~zero & (abs(volume) < RELATIVE_ROUNDING), side < SMALLEST_SIDE
+        yield zero, "v", self.v, "no direction may be zero (shorter than 1e-6)"
         apart = f"P1, P2, P3 must lie {SMALLEST_SIDE:g} rad apart or more: triangle too small"
-        for broken, allowed in (
-            (zero, "no direction may be zero (shorter than 1e-6)"),
-            (flat & small, apart),
-            (flat & ~small, "P1, P2, P3 must not lie on one great circle (degenerate)"),
-            (
-                ~zero & ~flat & (volume < 0.0),
-                "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points",
-            ),
-        ):
-            yield broken, "v", self.v, allowed
+        yield flat & small, "v", self.v, apart
+        circle = "P1, P2, P3 must not lie on one great circle (degenerate)"
+        yield flat & ~small, "v", self.v, circle
+        handed = "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points"
+        yield ~zero & ~flat & (volume < 0.0), "v", self.v, handed
 
 
 def _directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3, Vector3]:
@@ -155,7 +150,7 @@ class Link(Section):
     )
 
     @property
-    def tensor(self) -> NDArray[np.float64]:
+    def tensor(self) -> Array:
         """The inertia, shape (3, 3) [kg m^2], zero without one."""
         return _matrix_of(entries_of(self.inertia))
 
@@ -165,17 +160,14 @@ class Link(Section):
             if self.mass == 0.0 or self.inertia is None:
                 yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
                 return
-            shifted = _shift(self.inertia, self.mass, self.centre)
-            object.__setattr__(self, "inertia", _inertia_of(shifted))
-            object.__setattr__(self, "inertia_about", ABOUT_O)
+            shifted = _inertia_of(_shift(self.inertia, self.mass, self.centre))
+            vars(self).update(inertia=shifted, inertia_about=ABOUT_O)
 
     def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
-        mass, (x, y, z), about_o = self.mass, self.centre, entries_of(self.inertia)
-        point = point_inertia(mass, self.centre)
-        own = [whole - part for whole, part in zip(about_o, point, strict=True)]
+        mass, (x, y, z), own = self.mass, self.centre, _shift(self.inertia, -self.mass, self.centre)
         scale = mass * (x * x + y * y + z * z)
-        for part in about_o:
+        for part in entries_of(self.inertia):
             scale = np.maximum(scale, abs(part))
         # Moments about the centre of mass: none exceeds half their sum, but for rounding.
         fits = _is_positive([-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale)
@@ -226,7 +218,7 @@ class Payload(Section):
         return _shift(self.inertia, self.mass, self.centre)
 
     @property
-    def about_o(self) -> NDArray[np.float64]:
+    def about_o(self) -> Array:
         """Inertia about O in {E}, shape (3, 3) [kg m^2]."""
         return _matrix_of(self.entries)
 
@@ -254,14 +246,13 @@ def _shift(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
     return [own + part for own, part in zip(entries_of(inertia), point, strict=True)]
 
 
-def _matrix_of(entries: Iterable[Any]) -> NDArray[np.float64]:
+def _matrix_of(entries: Iterable[Any]) -> Array:
     xx, yy, zz, xy, xz, yz = entries
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _inertia_of(entries: Iterable[float]) -> Inertia:
-    xx, yy, zz, xy, xz, yz = entries
-    return Inertia(xx=xx, yy=yy, zz=zz, xy=xy, xz=xz, yz=yz)
+    return Inertia(**dict(zip(Inertia.SPECS, entries, strict=True)))
 
 
 def _is_positive(entries: Sequence[Any], more: Any) -> Any:

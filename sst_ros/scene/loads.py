@@ -8,12 +8,10 @@ that names no start begins in the initial pose of the scene.
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_ros.scene.schema import Rules, Section, angles, coefficient, entry, positive
 from sst_ros.state import Quaternion, Vector3
@@ -193,25 +191,6 @@ class Initial(Section):
         "1",
         default=None,
     )
-
-
-class SineTorque(Section):
-    """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
-
-    amplitude: Vector3 = entry("amplitudes", "N m")
-    frequency: Vector3 = entry("angular frequencies", "rad/s", least=0.0)
-    phase: Vector3 = entry("phases", "rad", default=(0.0, 0.0, 0.0))
-
-    def at(self, time: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
-        rows = zip(self.amplitude, self.frequency, self.phase, strict=True)
-        first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)
-        return first, second, third
-
-    def values(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Torques [N m] at times [s], shape (n,) -> (n, 3), by the sine of NumPy."""
-        angles = np.multiply.outer(times, self.frequency) + self.phase
-        return np.asarray(np.array(self.amplitude) * np.sin(angles))
 
 
 # Desired motions, which `control.reference_motions` makes reference motions.

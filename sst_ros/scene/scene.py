@@ -18,25 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene import loads
+from sst_ros.scene import loads, schema
 from sst_ros.scene.bodies import Base, Link, Payload, Star
-from sst_ros.scene.schema import (
-    Place,
-    Rules,
-    Section,
-    Spec,
-    build,
-    drop_idle,
-    entry,
-    has_effect,
-    key_of,
-    positive,
-    rebuild,
-    walk,
-)
+from sst_ros.scene.schema import Place, Section, Spec, entry, key_of, positive
+from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields, plain, read, replace_values
-
-Matrix = NDArray[np.float64]
+from sst_ros.state import Array
 
 LARGEST, SMALLEST = 1e9, 1e-12
 """No number of a scene is larger, none that must be positive smaller: it is a slip of units, and
@@ -65,7 +52,7 @@ class Scene(Section):
     stroke: loads.Stroke = entry("range of the actuators", default=loads.Stroke())
     workspace: loads.Workspace = entry("where E may be", default=loads.Workspace())
     initial: loads.Initial = entry("state at t = 0")
-    torque: loads.SineTorque | None = entry("torques that torque_player plays")
+    torque: SineTorque | None = entry("torques that torque_player plays")
     motion: loads.DesiredMotion | None = entry("desired motion")
     duration: float | None = positive("length of a run", "s")
     provenance: tuple[tuple[str, str], ...] = entry(
@@ -89,7 +76,7 @@ class Scene(Section):
             key = error.args[0]
             problem = Problem(str(key), values[key], "names nothing in this scene")
             raise InputError(self.name, [problem]) from None
-        return build(Scene, changed, self.name)
+        return schema.build(Scene, changed, self.name)
 
     @property
     def torque_limit(self) -> float | None:
@@ -108,7 +95,7 @@ class Scene(Section):
             if not _has_key(type(self), key):
                 yield Problem(f"provenance.{key}", note, "is about a key that no scene has")
 
-    def rules(self) -> Rules:
+    def rules(self) -> schema.Rules:
         """Refuse slips of units, a centre of mass far from the bodies, gravity without a mass."""
         for place, value, spec in _numbers(self):
             parts = np.reshape(value, (math.prod(spec.shape), -1))
@@ -134,7 +121,7 @@ class Scene(Section):
 
 def _numbers(scene: Scene) -> Iterator[tuple[Place, Any, Spec]]:
     """Yield place, value and specification of each number that a scene has."""
-    for place, part in walk(scene):
+    for place, part in schema.walk(scene):
         for name, spec in part.SPECS.items() if isinstance(part, Section) else ():
             value = getattr(part, name)
             if spec.kind == "number" and value is not None:
@@ -155,7 +142,7 @@ def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, Mapping):
-        return build(Scene, scene, "scene")
+        return schema.build(Scene, scene, "scene")
     if isinstance(scene, (str, Path)):
         return load(scene)
     allowed = "must be a Scene, the name or path of one, or its document as a dict"
@@ -179,7 +166,7 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
     if isinstance(initial, Mapping):
         # As in `Initial`, None is no orientation.
         given = {key: x for key, x in initial.items() if key != "orientation" or x is not None}
-        initial = build(loads.Initial, given, "initial")
+        initial = schema.build(loads.Initial, given, "initial")
     return replace(scene, initial=initial)
 
 
@@ -237,45 +224,56 @@ class Scenarios:
     def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:
         self.document = scene
         self.count: int | None = None
-        self.rows: dict[str, Matrix] = {}
-        self._fields: dict[Place, tuple[str, Spec]] = {}
+        self.rows: dict[str, Array] = {}
+        self._specs: dict[str, Spec] = {}
+        self._places: dict[Place, str] = {}
         problems = []
         for key, value in parameters.items():
             try:
                 for place, _, spec in find_fields(scene, key):
                     if spec.kind != "number":
                         raise ValueError(NO_NUMBER)
-                    if place in self._fields:
+                    if place in self._places:
                         raise ValueError("is given twice")
-                    self._fields[place] = key, spec
-                self.rows[key] = rows = _rows(value, spec, self.count)
-                self.count = len(rows)
-            except ValueError as error:
+                    self._places[place], self._specs[key] = key, spec
+                self.rows[key] = self._rows_of(value, spec.shape)
+                self.count = len(self.rows[key])
+            except (TypeError, ValueError) as error:
                 problems.append(Problem(key, value, str(error)))
         if problems:
             raise InputError(scene.name, problems)
 
+    def _rows_of(self, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+        rows = np.asarray(value, dtype=float)
+        if rows.shape != (self.count or max(1, len(np.atleast_1d(rows))), *shape):
+            words = ", ".join(map(str, (self.count or "N", *shape))) + ("" if shape else ",")
+            raise ValueError(
+                f"must have the shape ({words}), a row a scenario; it has {rows.shape}"
+            )
+        return rows
+
     def scene(self, row: int) -> Scene:
         """Build the scene of a row; InputError names the numbers that make none."""
-        numbers = {key: self.rows[key][row].tolist() for key in self.rows}
+        numbers = {key: rows[row].tolist() for key, rows in self.rows.items()}
         faults = [
             Problem(key, numbers[key], spec.refuse())
-            for key, spec in dict(self._fields.values()).items()
-            if has_effect(numbers[key]) and not np.all(spec.allows(self.rows[key][row]))
+            for key, spec in self._specs.items()
+            if schema.has_effect(numbers[key]) and not np.all(spec.allows(self.rows[key][row]))
         ]
         try:
             if faults:  # though the section that they are in may be left out
                 raise InputError("", faults)
-            values = {place: numbers[key] for place, (key, _) in self._fields.items()}
-            return build(Scene, drop_idle(Scene, plain(rebuild(self.document, values))))
+            values = {place: numbers[key] for place, key in self._places.items()}
+            document = plain(schema.rebuild(self.document, values))
+            return schema.build(Scene, schema.drop_idle(Scene, document))
         except InputError as error:
             faults = [replace(one, key=f"scenario {row}: {one.key}") for one in error.problems]
             raise InputError(self.document.name, faults) from None
 
     def columns(self) -> Any:
         """Return the scene, unchecked, with columns (N,) for the numbers that vary."""
-        columns = {place: _columns(self.rows[key]) for place, (key, _) in self._fields.items()}
-        return rebuild(self.document, columns)
+        columns = {place: _columns(self.rows[key]) for place, key in self._places.items()}
+        return schema.rebuild(self.document, columns)
 
     def faults(self, most: int = 10) -> dict[int, InputError]:
         """Rows that make no scene, and why; no more than `most` rows are looked for."""
@@ -292,11 +290,11 @@ class Scenarios:
     def _doubtful(self) -> NDArray[np.bool_]:
         """Rows whose scene may be refused: a zero may refuse a number, or leave its section out."""
         doubtful: Any = np.zeros(self.count or 0, dtype=bool)
-        for key, spec in self._fields.values():
+        for key, spec in self._specs.items():
             allowed = spec.allows(self.rows[key])
             doubtful = doubtful | ~allowed.reshape(len(allowed), -1).all(axis=1)
         with np.errstate(all="ignore"):
-            for _, part in walk(self.columns()):
+            for _, part in schema.walk(self.columns()):
                 for broken, *_ in part.rules() if isinstance(part, Section) else ():
                     doubtful = doubtful | broken
         return np.asarray(doubtful)
@@ -307,19 +305,7 @@ class Scenarios:
             raise InputError(self.document.name, problems[:10])
 
 
-def _rows(value: ArrayLike, spec: Spec, count: int | None) -> Matrix:
-    words = ", ".join(map(str, (count or "N", *spec.shape))) + ("" if spec.shape else ",")
-    try:
-        rows = np.asarray(value, dtype=float)
-    except TypeError as error:
-        raise ValueError(str(error)) from None
-    number = count or max(1, len(np.atleast_1d(rows)))
-    if rows.shape != (number, *spec.shape):
-        raise ValueError(f"must have the shape ({words}), a row a scenario; it has {rows.shape}")
-    return rows
-
-
-def _columns(values: Matrix) -> Any:
+def _columns(values: Array) -> Any:
     """Contiguous columns (N,) of an array (N, ...), nested tuples where it has more dimensions."""
     if values.ndim == 1:
         return values

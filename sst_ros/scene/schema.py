@@ -9,20 +9,12 @@ from __future__ import annotations
 
 import math
 import re
+import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
 from types import UnionType
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    ClassVar,
-    TypeAlias,
-    TypeVar,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -168,7 +160,7 @@ class Section:
             if isinstance(declared, Field) and str(hint).endswith("| None"):
                 declared.default = None if declared.default is MISSING else declared.default
         dataclass(frozen=True)(cls)
-        hints, specs = get_type_hints(cls), {}
+        hints, specs = typing.get_type_hints(cls), {}
         for one in fields(cls):
             spec: Spec = one.metadata["spec"]
             if not spec.kind:
@@ -239,11 +231,11 @@ _KINDS = {
 
 def _read_type(hint: Any) -> dict[str, Any]:
     """Return what the type of a field says of its `Spec`."""
-    if get_origin(hint) is UnionType:
-        hint = get_args(hint)[0]
+    if typing.get_origin(hint) is UnionType:
+        hint = typing.get_args(hint)[0]
     if kind := _KINDS.get(hint):
         return {"kind": kind}
-    if not (parts := get_args(hint)):
+    if not (parts := typing.get_args(hint)):
         return {"kind": "section", "section": hint}
     inner = _read_type(parts[0])
     if inner["kind"] == "section":

@@ -8,31 +8,18 @@ import csv
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sst_ros.errors import InputError, Problem, refuse_unless
-from sst_ros.scene.loads import SineTorque
-from sst_ros.state import State, Vector3, finite_vector
+from sst_ros.scene.schema import Section, entry
+from sst_ros.state import Array, State, Vector3, finite_vector
 
-Array = NDArray[np.float64]
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
-
-Torque = Vector3 | SineTorque | TorqueFunction
-"""A function is called with the time [s], and with the `State` if its `feedback` is true."""
-
-
-def torque_at(torque: Any, *given: Any) -> Any:
-    """Torques [N m] of numbers, a sine or a function, given the time [s] and what it asks for."""
-    if isinstance(torque, SineTorque):
-        return torque.at(*given)
-    return torque(*given) if callable(torque) else torque
-
 
 _MOST_CROSSINGS = 1e5
 """Radians of a sine beyond which its clamping is not computed in advance."""
@@ -59,61 +46,66 @@ class TorqueProfile:
         """
         return np.empty(0)
 
-    def acting(self, begin: float, end: float) -> Torque:
+    def acting(self, begin: float, end: float) -> Any:
         """Return what acts on [begin, end], in which no kink lies, as a `Propagator` takes it."""
         return self
 
-    def __call__(self, t: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
-        first, second, third = self.values(np.array([t]))[0].tolist()
-        return first, second, third
+
+class LostTorque(TorqueProfile):
+    """Torques of a function that a file does not have: known at the samples alone."""
 
 
-@dataclass(frozen=True)
 class ConstantTorque(TorqueProfile):
-    """The same three torques [N m] at all times."""
+    """The same three torques [N m] at all times; InputError is raised where they are none."""
 
-    torque: Vector3
+    def __init__(self, torque: Any) -> None:
+        self.torque = _three(torque, "torque")
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return np.tile(self.torque, (len(t), 1))
 
-    def acting(self, begin: float, end: float) -> Torque:
+    def acting(self, begin: float, end: float) -> Vector3:
         """See `TorqueProfile`."""
         return self.torque
 
 
-@dataclass(frozen=True)
-class SineProfile(TorqueProfile):
-    """tau_k(t) = amplitude_k sin(frequency_k t + phase_k), from the section of a scene."""
+class SineTorque(TorqueProfile, Section):
+    """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
 
-    sine: SineTorque
+    amplitude: Vector3 = entry("amplitudes", "N m")
+    frequency: Vector3 = entry("angular frequencies", "rad/s", least=0.0)
+    phase: Vector3 = entry("phases", "rad", default=(0.0, 0.0, 0.0))
+
+    def at(self, time: float) -> Vector3:
+        """Torques [N m] at a time [s]."""
+        rows = zip(self.amplitude, self.frequency, self.phase, strict=True)
+        first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)
+        return first, second, third
 
     def values(self, t: Array) -> Array:
-        """See `TorqueProfile`."""
-        return self.sine.values(t)
+        """Torques [N m] at times [s], shape (n,) -> (n, 3), by the sine of NumPy."""
+        angles = np.multiply.outer(t, self.frequency) + self.phase
+        return np.asarray(np.array(self.amplitude) * np.sin(angles))
 
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
         found = [np.empty(0)]
-        rows = zip(self.sine.amplitude, self.sine.frequency, self.sine.phase, strict=True)
-        for amplitude, frequency, phase in rows:
-            if limit is None or abs(amplitude) <= limit or not frequency:
+        for amplitude, f, phase in zip(self.amplitude, self.frequency, self.phase, strict=True):
+            # The step control has to find those of a sine that is too fast.
+            if limit is None or abs(amplitude) <= limit or not 0.0 < f * end <= _MOST_CROSSINGS:
                 continue
-            if abs(frequency) * end > _MOST_CROSSINGS:
-                continue  # the step control has to find them
             angle = np.arcsin(limit / amplitude)
-            first, last = sorted((phase, phase + frequency * end))
-            turns = np.pi * np.arange(np.floor(first / np.pi) - 1, np.ceil(last / np.pi) + 2)
-            for shift in (angle, -angle):
-                found.append((turns + shift - phase) / frequency)
+            turns = np.arange(np.floor(phase / np.pi) - 1, np.ceil((phase + f * end) / np.pi) + 2)
+            found += [(np.pi * turns + shift - phase) / f for shift in (angle, -angle)]
         times = np.unique(np.concatenate(found))
         return np.asarray(times[(times > 0.0) & (times < end)])
 
-    def acting(self, begin: float, end: float) -> Torque:
-        """See `TorqueProfile`."""
-        return self.sine
+
+def _at(profile: TorqueProfile, t: float) -> Vector3:
+    """Torques [N m] at a time [s]."""
+    first, second, third = profile.values(np.array([t]))[0].tolist()
+    return first, second, third
 
 
 class PolynomialTorque(TorqueProfile):
@@ -140,6 +132,8 @@ class PolynomialTorque(TorqueProfile):
             ("coefficients", "not finite", finite, "must be finite"),
         )
 
+    __call__ = _at
+
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         from scipy.interpolate import PPoly  # takes 0.3 s; most runs have no polynomial
@@ -155,7 +149,7 @@ class PolynomialTorque(TorqueProfile):
         roots = [leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds]
         return np.unique([x for x in np.concatenate([self.x, *roots]) if np.isfinite(x)])
 
-    def acting(self, begin: float, end: float) -> Torque:
+    def acting(self, begin: float, end: float) -> Vector3 | TorqueFunction:
         """See `TorqueProfile`."""
         piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
         if not 0 <= piece < self.c.shape[1]:
@@ -171,21 +165,19 @@ class PolynomialTorque(TorqueProfile):
         return torque
 
 
-@dataclass(frozen=True)
 class FunctionTorque(TorqueProfile):
     """A function f(t) of the time [s], or f(t, state) of it and the `State` -> three torques [N m].
 
-    Attributes:
-        feedback: whether the state is an argument.
-
+    `feedback` says whether the state is an argument. InputError: it needs other arguments.
     """
 
-    function: Callable[..., Sequence[float]]
-    feedback: bool
+    def __init__(self, function: Callable[..., Sequence[float]]) -> None:
+        self._function = function
+        self.feedback = _count_arguments(function) == 2
 
     def __call__(self, t: float, *state: State) -> Vector3:
         """Torques [N m] at a time [s], and a state where it is an argument."""
-        return three(self.function(t, *state), f"torque({t:g})")
+        return _three(self._function(t, *state), f"torque({t:g})")
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -194,21 +186,26 @@ class FunctionTorque(TorqueProfile):
         return np.array([self(float(time)) for time in t]).reshape(-1, 3)
 
 
-class LostTorque(TorqueProfile):
-    """Torques of a function that a file does not have: known at the samples alone."""
-
-
-def three(value: Any, name: str) -> Vector3:
-    """Return three finite numbers as floats.
-
-    Raises:
-        InputError: `value` is something else.
-
-    """
+def _three(value: Any, name: str) -> Vector3:
+    """Return three finite numbers as floats, or refuse them."""
     if (vector := finite_vector(value)) is not None:
         return vector
     allowed = "must be three finite numbers [N m], a profile, or a function f(t) or f(t, state)"
     raise InputError("simulate", [Problem(name, value, allowed)])
+
+
+def _count_arguments(function: Callable[..., Any]) -> int:
+    """Positional arguments that a function must be given, 1 or 2, or refuse it."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return 1
+    for count in (1, 2):
+        with contextlib.suppress(TypeError):
+            signature.bind(*range(count))
+            return count
+    allowed = "must be a function f(t) or f(t, state)"
+    raise InputError("simulate", [Problem("torque", function, allowed)])
 
 
 class TorqueTable(TorqueProfile):
@@ -256,22 +253,24 @@ class TorqueTable(TorqueProfile):
         if names != header:
             allowed = "must be " + ", ".join(header)
             raise InputError(origin, [Problem("header", names or None, allowed, 1)])
-        rows: list[tuple[float, Vector3]] = []
-        problems: list[Problem] = []
+        times: list[float] = []
+        torques: list[Vector3] = []
+        problems = [] if lines else [Problem("rows", 0, "must be one or more")]
         for line, row in lines:
             time, torque = finite_vector([*row[:1], 0, 0]), finite_vector(row[1:])
             if time is None or torque is None:
                 problems.append(Problem("row", row, "must be four finite numbers", line))
-            elif rows and time[0] <= rows[-1][0]:
-                allowed = f"must be > {rows[-1][0]:g} s, the last"
+            elif times and time[0] <= times[-1]:
+                allowed = f"must be > {times[-1]:g} s, the last"
                 problems.append(Problem("time", time[0], allowed, line))
             else:
-                rows.append((time[0], torque))
-        if not (problems or rows):
-            problems.append(Problem("rows", 0, "must be one or more"))
+                times.append(time[0])
+                torques.append(torque)
         if problems:
             raise InputError(origin, problems)
-        return cls(*zip(*rows, strict=True))
+        return cls(times, torques)
+
+    __call__ = _at
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -282,9 +281,20 @@ class TorqueTable(TorqueProfile):
         """See `TorqueProfile`."""
         return self.times
 
-    def acting(self, begin: float, end: float) -> Torque:
+    def acting(self, begin: float, end: float) -> Vector3:
         """See `TorqueProfile`."""
         return self(0.5 * (begin + end))
+
+
+Torque = Vector3 | SineTorque | TorqueFunction
+"""A function is called with the time [s], and with the `State` if its `feedback` is true."""
+
+
+def torque_at(torque: Any, *given: Any) -> Any:
+    """Torques [N m] of numbers, a sine or a function, given the time [s] and what it asks for."""
+    if isinstance(torque, SineTorque):
+        return torque.at(*given)
+    return torque(*given) if callable(torque) else torque
 
 
 def profile_of(torque: Any) -> TorqueProfile:
@@ -296,59 +306,27 @@ def profile_of(torque: Any) -> TorqueProfile:
     """
     if isinstance(torque, TorqueProfile):
         return torque
-    if isinstance(torque, SineTorque):
-        return SineProfile(torque)
     if hasattr(torque, "c") and hasattr(torque, "x") and callable(torque):
         return PolynomialTorque(torque.c, torque.x)  # scipy.interpolate.PPoly, CubicSpline
-    if callable(torque):
-        return FunctionTorque(torque, feedback=_arguments(torque) == 2)
-    return ConstantTorque(three(torque, "torque"))
+    return FunctionTorque(torque) if callable(torque) else ConstantTorque(torque)
 
 
 _KINDS = {
-    "constant": ConstantTorque,
-    "sine": SineProfile,
-    "table": TorqueTable,
-    "polynomial": PolynomialTorque,
-}
+    "constant": ConstantTorque, "sine": SineTorque, "table": TorqueTable,
+    "polynomial": PolynomialTorque, "function": TorqueProfile,
+}  # fmt: skip
 
 
 def record_of(profile: TorqueProfile) -> dict[str, Any]:
     """Return kind and numbers of a profile, from which `profile_from` builds it again."""
-    for kind, profiles in _KINDS.items():
-        if isinstance(profile, profiles):
-            given = vars(profile.sine if isinstance(profile, SineProfile) else profile)
-            return {"kind": kind, **{name: np.asarray(x).tolist() for name, x in given.items()}}
-    return {"kind": "function"}
+    kind = next(kind for kind, profiles in _KINDS.items() if isinstance(profile, profiles))
+    given = {} if kind == "function" else vars(profile)
+    return {"kind": kind, **{name: np.asarray(x).tolist() for name, x in given.items()}}
 
 
 def profile_from(record: dict[str, Any]) -> TorqueProfile:
     """Build the profile that `record_of` has described."""
-    given = dict(record)
-    kind = given.pop("kind")
-    if kind == "function":
-        return LostTorque()
-    if kind == "table":
-        return TorqueTable(**given)
-    if kind == "polynomial":
-        return PolynomialTorque(*given.values())
-    return profile_of(given["torque"] if kind == "constant" else SineTorque(**given))
-
-
-def _arguments(function: Callable[..., Any]) -> int:
-    """Positional arguments that a function must be given, 1 or 2.
-
-    Raises:
-        InputError: it needs another number.
-
-    """
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return 1
-    for count in (1, 2):
-        with contextlib.suppress(TypeError):
-            signature.bind(*range(count))
-            return count
-    allowed = "must be a function f(t) or f(t, state)"
-    raise InputError("simulate", [Problem("torque", function, allowed)])
+    kind, *numbers = record.values()
+    if kind == "sine":
+        return SineTorque(**dict(zip(SineTorque.SPECS, numbers, strict=True)))
+    return LostTorque() if kind == "function" else _KINDS[kind](*numbers)

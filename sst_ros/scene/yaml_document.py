@@ -34,12 +34,6 @@ class _Loader(yaml.SafeLoader):
 
     depth = nodes = 0
 
-    def __init__(self, source: str) -> None:
-        if len(source) > LONGEST:
-            allowed = f"no more than {LONGEST} characters are allowed"
-            raise InputError("", [Problem("", f"{len(source)} characters", allowed)])
-        super().__init__(source)
-
     def get_event(self) -> yaml.Event:
         event: yaml.Event = super().get_event()  # type: ignore[no-untyped-call]
         self.depth += isinstance(event, yaml.CollectionStartEvent)
@@ -62,18 +56,18 @@ def read(cls: type[S], source: str, origin: str) -> S:
     lines: dict[str, int] = {}
     problems: list[Problem] = []
     try:
+        if len(source) > LONGEST:
+            allowed = f"no more than {LONGEST} characters are allowed"
+            raise InputError("", [Problem("", f"{len(source)} characters", allowed)])
         values = _values(yaml.compose(source, Loader=_Loader), "", lines, problems)
-    except InputError as refused:
-        raise InputError(origin, refused.problems) from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        line = None if mark is None else mark.line + 1
-        reason = getattr(error, "problem", None) or str(error)
-        raise InputError(origin, [Problem("", reason, "must be YAML", line)]) from None
-    try:
         result = build(cls, values, origin)
     except InputError as refused:
-        problems += (replace(one, line=_line_at(lines, one.key)) for one in refused.problems)
+        for one in refused.problems:
+            problems.append(replace(one, line=one.line or _line_at(lines, one.key)))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        reason = getattr(error, "problem", None) or str(error)
+        problems.append(Problem("", reason, "must be YAML", mark and mark.line + 1))
     if problems:
         raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
     return result
@@ -110,7 +104,7 @@ def _values(
     found: dict[str, Any] = {}
     for key_node, value_node in node.value:
         name = str(_values(key_node, "", {}, []))
-        key = _join(path, name)
+        key = f"{path}.{name}" if path else name
         line = lines.setdefault(key, _line(key_node))
         value = _values(value_node, key, lines, problems)
         if name in found:
@@ -119,10 +113,6 @@ def _values(
         else:
             found[name] = value
     return found
-
-
-def _join(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name
 
 
 def _line(node: yaml.Node | yaml.Event) -> int:

@@ -18,11 +18,12 @@ from sst_ros.errors import InputError, Problem
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.loads import Initial, SineTorque
+from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.scene.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
+    SineTorque,
     TorqueFunction,
     TorqueProfile,
     TorqueTable,

@@ -18,8 +18,7 @@ from sst_ros.integration.events import first_event
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.point import estimate_error, orientation_distance, state_distance
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.loads import SineTorque
-from sst_ros.scene.torque_profile import ConstantTorque, SineProfile
+from sst_ros.scene.torque_profile import ConstantTorque, SineTorque
 from sst_ros.simulation.stepped_motion import Task
 from sst_ros.simulation.trajectory import Trajectory, check_error
 from sst_ros.state import clamp
@@ -230,12 +229,12 @@ def _choose_torque(task: Task) -> tuple[SineTorque | None, tuple[float, ...]]:
     law, stroke, limit = task.torque, task.scene.stroke.at_end, task.scene.torque_limit
     if len(task.breaks) or task.max_step < task.span[1]:
         raise NotSmooth("collocation takes no breaks and no max_step")
-    if task.period is not None or not isinstance(law, (SineProfile, ConstantTorque)):
+    if task.period is not None or not isinstance(law, (SineTorque, ConstantTorque)):
         raise NotSmooth("collocation takes constant torques and sines only")
     if stroke not in ("stop", "ignore"):
         raise NotSmooth(f"collocation does not take a stroke with at_end: {stroke}")
     if isinstance(law, ConstantTorque):
         return None, clamp(law.torque, limit)
-    if limit is not None and max(map(abs, law.sine.amplitude)) > limit:
+    if limit is not None and max(map(abs, law.amplitude)) > limit:
         raise NotSmooth("collocation does not take a sine that the torque limit cuts")
-    return law.sine, ()
+    return law, ()

@@ -26,9 +26,8 @@ from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
-from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.torque_profile import Torque
+from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import NANOSECONDS, State, Vector3, finite_vector
 
 AUTO = "auto"

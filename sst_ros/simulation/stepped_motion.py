@@ -22,7 +22,7 @@ from sst_ros.integration.compiled_method import CompiledMethod, has_step_code
 from sst_ros.integration.point import state_distance
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import Torque, TorqueProfile
+from sst_ros.scene.torque_profile import Torque, TorqueProfile, torque_at
 from sst_ros.state import NANOSECONDS, Array, State, Vector3
 
 _WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000
@@ -143,7 +143,8 @@ class SteppedMotion:
             for start in range(0, last, task.period):
                 time = start / NANOSECONDS
                 self._take_if_wanted(time, self.at.y)
-                held = task.torque(time, *((self.state(),) if task.torque.feedback else ()))
+                state = (self.state(),) if task.torque.feedback else ()
+                held = torque_at(task.torque, time, *state)
                 self.held.append((time, held))
                 stop = min(start + task.period, last)
                 yield time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held

@@ -19,9 +19,9 @@ from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, suggestion
-from sst_ros.scene.loads import SineTorque
 from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.schema import Section, anything, entry, positive
+from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import plain
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (

@@ -15,7 +15,6 @@ from sst_ros.errors import InputError
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import value_of
 from sst_ros.identification.simulation_fit import Sensitivities, differentiate_damping
-from sst_ros.scene.torque_profile import SineProfile
 from tools.reading_figure import PANELS, determined
 
 
@@ -83,7 +82,7 @@ def test_sensitivities_are_derivatives_of_what_simulate_finds(build, end, name):
     """A polynomial through runs of scenes with other values; nothing jumps where a stop is met."""
     scene = build()
     value = value_of(scene, name)
-    motion = Sensitivities(scene, (name,), SineProfile(scene.torque))
+    motion = Sensitivities(scene, (name,), scene.torque)
     _, slopes = motion.run(np.array([value]), np.array([end]))
     nodes, states, width = chebyshev.chebpts1(10), [], 0.02 * value
     for node in nodes.tolist():

@@ -32,8 +32,9 @@ from sst_ros.report.scene_summary import (
     summary,
     without,
 )
-from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Moment, SineTorque
+from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Moment
 from sst_ros.scene.scene import load, names
+from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulate import simulate
 
 EXAMPLE2 = load("example2_heavy")
