@@ -6,15 +6,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from sst_ros.scene.loads import (
-    Actuators,
-    Friction,
-    JointFriction,
-    Moment,
-    Spring,
-    Stroke,
-    Workspace,
-)
+from sst_ros.scene.bodies import Stroke, Workspace
+from sst_ros.scene.loads import Actuators, Friction, JointFriction, Moment, Spring
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
 

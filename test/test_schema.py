@@ -15,8 +15,8 @@ from models import FAST
 
 from sst_ros.__main__ import main
 from sst_ros.errors import InputError
-from sst_ros.scene.bodies import Base, Inertia, Link, Star
-from sst_ros.scene.loads import Initial, Stroke, Workspace
+from sst_ros.scene.bodies import Base, Inertia, Link, Star, Stroke, Workspace
+from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene, load
 from sst_ros.scene.schema import Section, entry
 from sst_ros.scene.yaml_document import dump, read

@@ -25,7 +25,8 @@ from sst_ros.errors import (
 )
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.geometry import quaternion_of
-from sst_ros.scene.loads import Actuators, Initial, Moment, Workspace
+from sst_ros.scene.bodies import Workspace
+from sst_ros.scene.loads import Actuators, Initial, Moment
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 

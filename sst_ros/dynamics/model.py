@@ -12,8 +12,8 @@ import numpy as np
 from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, WorkspaceLeft
 from sst_ros.mechanism.generic_math import ZERO, Symmetric, Triple, cross3, multiply, triple
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.bodies import PLACES, Payload, Star, entries_of
-from sst_ros.scene.loads import Friction, Stroke
+from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
+from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene
 
 

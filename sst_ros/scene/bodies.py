@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bodies of a scene: base triangle, star, links, payload.
+"""The mechanism of a scene: base triangle, star, links and payload, and the range they move in.
 
 Bodies rotate about the fixed centre O, so every inertia here is about O but the payload's; one that
 a document gives about the centre of mass is shifted when it is read (parallel axes).
@@ -221,6 +221,57 @@ class Payload(Section):
     def about_o(self) -> Array:
         """Inertia about O in {E}, shape (3, 3) [kg m^2]."""
         return _matrix_of(self.entries)
+
+
+class Stroke(Section):
+    """The range of the actuators, 0 < gamma_k < arc P_k P_k+1.
+
+    Elastic stops give the torque stiffness depth (1 + damping rate inwards), never a pull. Their
+    damping is given as such, or by the restitution at one impact rate.
+    """
+
+    at_end: str = entry(
+        "what happens at an end of the stroke",
+        choices=("stop", "ignore", "elastic"),
+        default="stop",
+    )
+    stiffness: float | None = positive("stiffness of elastic stops", "N m/rad")
+    damping: float = coefficient(
+        "damping of elastic stops: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
+    )
+    restitution: float | None = entry(
+        "rate after an impact / rate before, at impact_rate; in place of damping",
+        "1",
+        least=0.01,
+        most=1.0,
+    )
+    impact_rate: float | None = positive("rate of the impacts that have this restitution", "rad/s")
+
+    def rules(self) -> Rules:
+        """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
+        elastic, damped = self.at_end == "elastic", np.not_equal(self.damping, 0.0)
+        bounces, has_rate = self.restitution is not None, self.impact_rate is not None
+        only = "is given with at_end: elastic, and only there"
+        for name, broken, allowed in (
+            ("stiffness", (self.stiffness is not None) != elastic, only),
+            ("restitution", bounces and not elastic, only),
+            ("impact_rate", has_rate and not elastic, only),
+            ("impact_rate", bounces != has_rate, "is given with restitution, both or none"),
+            ("damping", damped & (not elastic), only),
+            ("damping", damped & bounces, "give either damping or restitution"),
+        ):
+            yield broken, name, getattr(self, name), allowed
+
+
+class Workspace(Section):
+    """Where E may be: on the base triangle, 0 < beta_k <= beta_max."""
+
+    beta_max_deg: float = positive(
+        "largest angle between E and the intermediate link", "deg", default=90.0, most=180.0
+    )
+    at_edge: str = entry(
+        "what happens at the edge of the workspace", choices=("stop", "ignore"), default="stop"
+    )
 
 
 PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

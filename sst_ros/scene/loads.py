@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scene may have beside its bodies: loads, limits, start, torques, a desired motion.
+"""What a scene may have beside its mechanism: loads, actuators, start, a desired motion.
 
 A term that a scene does not name has no operation in its dynamics. Every desired motion begins at
 rest and ends at rest, except a recorded one, which begins and ends as the recording does. A motion
@@ -126,57 +126,6 @@ class Actuators(Section):
     )
     acceleration_limit: float | None = positive(
         "largest acceleration of a desired motion; a simulation does not hold it", "rad/s^2"
-    )
-
-
-class Stroke(Section):
-    """The range of the actuators, 0 < gamma_k < arc P_k P_k+1.
-
-    Elastic stops give the torque stiffness depth (1 + damping rate inwards), never a pull. Their
-    damping is given as such, or by the restitution at one impact rate.
-    """
-
-    at_end: str = entry(
-        "what happens at an end of the stroke",
-        choices=("stop", "ignore", "elastic"),
-        default="stop",
-    )
-    stiffness: float | None = positive("stiffness of elastic stops", "N m/rad")
-    damping: float = coefficient(
-        "damping of elastic stops: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
-    )
-    restitution: float | None = entry(
-        "rate after an impact / rate before, at impact_rate; in place of damping",
-        "1",
-        least=0.01,
-        most=1.0,
-    )
-    impact_rate: float | None = positive("rate of the impacts that have this restitution", "rad/s")
-
-    def rules(self) -> Rules:
-        """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
-        elastic, damped = self.at_end == "elastic", np.not_equal(self.damping, 0.0)
-        bounces, has_rate = self.restitution is not None, self.impact_rate is not None
-        only = "is given with at_end: elastic, and only there"
-        for name, broken, allowed in (
-            ("stiffness", (self.stiffness is not None) != elastic, only),
-            ("restitution", bounces and not elastic, only),
-            ("impact_rate", has_rate and not elastic, only),
-            ("impact_rate", bounces != has_rate, "is given with restitution, both or none"),
-            ("damping", damped & (not elastic), only),
-            ("damping", damped & bounces, "give either damping or restitution"),
-        ):
-            yield broken, name, getattr(self, name), allowed
-
-
-class Workspace(Section):
-    """Where E may be: on the base triangle, 0 < beta_k <= beta_max."""
-
-    beta_max_deg: float = positive(
-        "largest angle between E and the intermediate link", "deg", default=90.0, most=180.0
-    )
-    at_edge: str = entry(
-        "what happens at the edge of the workspace", choices=("stop", "ignore"), default="stop"
     )
 
 

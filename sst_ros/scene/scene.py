@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.scene import loads, schema
-from sst_ros.scene.bodies import Base, Link, Payload, Star
+from sst_ros.scene.bodies import Base, Link, Payload, Star, Stroke, Workspace
 from sst_ros.scene.schema import Place, Section, Spec, entry, key_of, positive
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields, plain, read, replace_values
@@ -49,8 +49,8 @@ class Scene(Section):
     friction: loads.JointFriction | None = entry("friction in the joints")
     springs: tuple[loads.Spring, ...] = entry("springs at joints", default=())
     actuators: loads.Actuators | None = entry("the actuators")
-    stroke: loads.Stroke = entry("range of the actuators", default=loads.Stroke())
-    workspace: loads.Workspace = entry("where E may be", default=loads.Workspace())
+    stroke: Stroke = entry("range of the actuators", default=Stroke())
+    workspace: Workspace = entry("where E may be", default=Workspace())
     initial: loads.Initial = entry("state at t = 0")
     torque: SineTorque | None = entry("torques that torque_player plays")
     motion: loads.DesiredMotion | None = entry("desired motion")

@@ -23,6 +23,7 @@ from sst_ros.control.reference_motions import geodesic_motion, reference_motion
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, quaternion_of
+from sst_ros.scene.bodies import Stroke, Workspace
 from sst_ros.scene.loads import (
     Actuators,
     DesiredMotion,
@@ -31,11 +32,9 @@ from sst_ros.scene.loads import (
     JointFriction,
     Spiral,
     Spring,
-    Stroke,
     Sweep,
     ToAngles,
     ToOrientation,
-    Workspace,
 )
 from sst_ros.scene.scene import load, text_of
 from sst_ros.scene.torque_profile import TorqueTable

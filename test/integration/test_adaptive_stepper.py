@@ -16,8 +16,8 @@ from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DORMAND_PRINCE
-from sst_ros.scene.bodies import Inertia, Link
-from sst_ros.scene.loads import Friction, Initial, JointFriction, Workspace
+from sst_ros.scene.bodies import Inertia, Link, Workspace
+from sst_ros.scene.loads import Friction, Initial, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 

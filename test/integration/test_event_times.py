@@ -21,8 +21,8 @@ from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
 from sst_ros.integration.events import first_crossing
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
-from sst_ros.scene.bodies import Link
-from sst_ros.scene.loads import Friction, Initial, JointFriction, Stroke, Workspace
+from sst_ros.scene.bodies import Link, Stroke, Workspace
+from sst_ros.scene.loads import Friction, Initial, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 

@@ -19,16 +19,8 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import friction_torque, stop_torque
 from sst_ros.dynamics.model import model_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.scene.bodies import Inertia, Link, Payload
-from sst_ros.scene.loads import (
-    Actuators,
-    Friction,
-    Gravity,
-    JointFriction,
-    Moment,
-    Spring,
-    Stroke,
-)
+from sst_ros.scene.bodies import Inertia, Link, Payload, Stroke
+from sst_ros.scene.loads import Actuators, Friction, Gravity, JointFriction, Moment, Spring
 
 STEP = 1e-200
 REST = (0.0, 0.0, 0.0)

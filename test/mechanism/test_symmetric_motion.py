@@ -11,7 +11,8 @@ from symmetric_motion import HOME, drift_free_rate, inertia, inertia_slope
 
 from sst_ros import Simulation, load_scene, simulate
 from sst_ros.dynamics.model import damping_of
-from sst_ros.scene.loads import Initial, Stroke, Workspace
+from sst_ros.scene.bodies import Stroke, Workspace
+from sst_ros.scene.loads import Initial
 
 EXAMPLE1 = load_scene("example1")
 HEAVY = EXAMPLE1.with_values(

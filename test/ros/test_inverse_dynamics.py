@@ -24,7 +24,8 @@ from sst_ros.report import tracking
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
 from sst_ros.scene import scene, yaml_document
-from sst_ros.scene.loads import Actuators, DesiredMotion, Spiral, Stroke, ToAngles, Workspace
+from sst_ros.scene.bodies import Stroke, Workspace
+from sst_ros.scene.loads import Actuators, DesiredMotion, Spiral, ToAngles
 
 pytestmark = pytest.mark.ros
 NODE = "/sst_inverse_dynamics"
