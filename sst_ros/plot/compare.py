@@ -51,10 +51,7 @@ def _difference(runs: Drawn) -> Figure:
             apart = np.abs(run.legs(name)[there] - first.legs(name)[here])
             largest = apart.max(axis=1, initial=0.0)
             axes.plot(run.seconds()[there], hide_zeros(largest), label=label, **style)
-            if apart.any():
-                axes.set_yscale("log")
-        if axes.get_yscale() == "linear":
-            axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center")
+        axes.set_yscale("log")
     legend(panels[0])
     return figure
 

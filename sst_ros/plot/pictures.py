@@ -298,13 +298,12 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     raised = potential - potential[first].sum()
     done = work(run).sum(axis=1)
     gained = kinetic - kinetic[first].sum() + raised
-    residual, unit = style.scale_down(gained - done)
     shown = {"kinetic": kinetic, "potential, gained": raised, "work of the actuators": done}
     if not np.nanmax(np.abs(raised), initial=0.0):
         del shown["potential, gained"]  # no gravity, no springs
-    figure, panels = stack(["energy [J]", f"energy gained − work [{unit}J]"], 2.8)
+    figure, panels = stack(["energy [J]", "energy gained − work [J]"], 2.8)
     lines(panels[0], run.seconds(), np.stack([*shown.values()], axis=1), list(shown))
-    lines(panels[1], run.seconds(), residual[:, None], ["residual"])
+    lines(panels[1], run.seconds(), (gained - done)[:, None], ["residual"])
     panels[1].axhline(0.0, color=GREY, linewidth=0.8)
     return figure
 

@@ -8,7 +8,6 @@ curve matplotlib leaves out what no picture could show (its setting "path.simpli
 from __future__ import annotations
 
 import io
-import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -142,15 +141,6 @@ def note(figure: Figure, text: str, width: int) -> None:
     """Write a note of `width` letters a line at the foot of a figure."""
     lines = [part for line in text.splitlines() for part in textwrap.wrap(line, width)]
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=6.5, color="#555555")
-
-
-def scale_down(values: Array) -> tuple[Array, str]:
-    """Return small values in a power of ten, and that power for the unit of the axis ("1e-14 ")."""
-    largest = float(np.nanmax(np.abs(values), initial=0.0))
-    if not 0.0 < largest < 1e-3:
-        return values, ""
-    exponent = math.floor(math.log10(largest))
-    return values / 10.0**exponent, f"1e{exponent} "
 
 
 def hide_zeros(values: Array) -> Array:

@@ -59,7 +59,6 @@ LONGEST_RUN_S = 0.4  # no finer settings are tried after a run that took longer 
 LEAST_SETTINGS = 3
 """So many settings of each method are tried even where they take longer: a busy machine slows one
 run, but must not empty the grid."""
-SLOWER = 5.0  # so much longer `Simulation` may take under clamped torques, in plain Python
 SAME_EQUATIONS = 1e-10  # kernel and the paper's equations must agree to this part
 
 ERROR = "largest_orientation_rad"
@@ -69,8 +68,7 @@ ERRORS = [
     for quantity in ("orientation_rad", "gamma_rad", "gamma_dot_rad_per_s")
 ]
 COLUMNS = (
-    *("scene", "method", "kind", "setting", "evaluations", "wall_min_s", *ERRORS),
-    *("below_floor", "failure"),
+    *("scene", "method", "kind", "setting", "evaluations", "wall_min_s", *ERRORS, "failure"),
 )
 """Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
 `evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
@@ -266,10 +264,9 @@ def _refine(
     below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
     for number, setting in enumerate(settings, start=1):
         row, end = _measure(setting, problem, truth)
-        yield row | {"below_floor": row[ERROR] < floor if ERROR in row else None}, end
+        yield row, end
         below += row.get(ERROR, math.inf) < max(floor, ROUNDING)
-        slower = SLOWER if problem.clamped and setting.kind == TOLERANCE else 1.0
-        if (row["wall_min_s"] > longest_s * slower and number >= LEAST_SETTINGS) or below > 1:
+        if (row["wall_min_s"] > longest_s and number >= LEAST_SETTINGS) or below > 1:
             return
 
 
@@ -309,28 +306,18 @@ def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision
 
     """
     studies: list[WorkPrecision] = []
-    documents, terms = list[dict[str, Any]](), list[dict[str, Any]]()
+    terms: list[dict[str, Any]] = []
     for each in [scenes.load(name) for name in names]:
         study = study_scene(each, shown=True)
         studies.append(study)
         terms += cost_table(each)
         print(accuracy_text(study), flush=True)
-        about = ("scene", "seconds", "ends", "measured", "formulation", "warnings")
-        documents.append(
-            {
-                **{name: getattr(study, name) for name in about},
-                "reference": study.reference.how,
-                "reference_own_error": study.reference.own._asdict(),
-                "advice": study.advice._asdict(),
-                "fastest": name_fastest(study),
-                "rows": records(study.rows),
-            }
-        )
+        rows = [row for one in studies for row in records(one.rows)]
         publish(
             out,
             "accuracy",
-            csv=data_frame(row for one in documents for row in one["rows"]),
-            document={"studies": documents, "terms": terms},
+            csv=data_frame(rows),
+            document={"rows": rows, "terms": terms},
             page=accuracy_page(studies, terms),
             figures={} if study.rests else {f"accuracy_{each.name}": draw_accuracy(study)},
         )
@@ -377,8 +364,8 @@ def accuracy_text(study: WorkPrecision) -> str:
     """Format a study for the terminal."""
     shown = study.rows.assign(setting=[_setting(row) for _, row in study.rows.iterrows()])
     shown = shown[list(HEADS)].rename(columns=HEADS)
-    below = [row is True for row in study.rows.below_floor]
-    shown[""] = ["*" if row else "" for row in below]
+    below = study.rows[ERROR].astype(float) < study.floor
+    shown[""] = below.map({True: "*", False: ""})
     shown["failure"] = [f"FAILED: {why[:60]}" if why else "" for why in study.rows.failure]
     grid = shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
     given = {"fastest": name_fastest(study), "provenance": provenance()}
@@ -422,29 +409,17 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
         looks: Looks = {"color": colour, "marker": marker, "markersize": 6.5, **hollow}
         axes.plot(1e3 * group.wall_min_s, group[ERROR], label=f"{name}, {kind}", **looks)
     errors = drawn[ERROR].astype(float) if len(drawn) else np.array([1e-3, 1.0])
-    high = 10.0 ** math.ceil(math.log10(errors.max()) + 0.01)
     low = 10.0 ** math.floor(math.log10(errors.min()) - 0.7)
-    top = high * (high / low) ** 0.1
-    across: Looks = {"transform": axes.get_yaxis_transform(), "va": "center"}
-    failed = rows[rows.failure != ""]
-    if len(failed):  # in a band above everything, at their wall time
-        axes.axhspan(high, top, color="#f4e3d7", linewidth=0)
-        middle = math.sqrt(high * top)
-        axes.text(0.99, middle, f"failed: {len(failed)}", ha="right", fontsize=8.5, **across)
-        for name, group in failed[failed.wall_min_s > 0.0].groupby("method"):
-            walls = 1e3 * group.wall_min_s
-            axes.plot(walls, walls * 0.0 + middle, "x", color=MARKERS[name][0], zorder=4)
+    axes.set_ylim(low, 10.0 ** math.ceil(math.log10(errors.max()) + 0.01))
     if floor > low:
-        axes.axhspan(low, floor, color="#999999", alpha=0.25, linewidth=0)
         text = "100 × the reference's own error: none plotted"
-        axes.text(0.02, math.sqrt(low * floor), text, fontsize=7.5, **across)
+        axes.axhspan(low, floor, color="#999999", alpha=0.25, linewidth=0, label=text)
     ring: Looks = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4}
     for target, row in study.fastest.items():
         axes.axhline(target, color=INK, linewidth=0.9, linestyle=":")
         place = 1e3 * row.wall_min_s, max(row[ERROR], floor)
         label = "fastest for a dotted line" if target == min(study.fastest) else None
         axes.plot(*place, "o", color=INK, zorder=5, label=label, **ring)
-    axes.set_ylim(low, top)
     axes.yaxis.set_major_locator(LogLocator(numticks=12))
     axes.yaxis.set_minor_formatter(NullFormatter())
     figure.legend(fontsize=8, frameon=False, loc="outside right center")

@@ -17,11 +17,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from sst_ros.host.output import write_into
 from sst_ros.plot import pictures, style
-from sst_ros.plot.style import BLUE, GREEN, GREY, LINES, VERMILION, hide_zeros
+from sst_ros.plot.style import BLUE, GREY, LINES, VERMILION, hide_zeros
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.report import reference, timing, tracking
@@ -276,9 +275,8 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     axes = panel("Integration error, against the same torques", errors)
     _draw_comparison(axes, seconds, found.integration)
     axes = panel("Energy residual", found.energy)
-    shown, unit = style.scale_down(found.energy)
-    axes.set_ylabel(f"energy residual [{unit}J]")
-    axes.plot(seconds, shown, color=BLUE, linewidth=1.4)
+    axes.set_ylabel("energy residual [J]")
+    axes.plot(seconds, found.energy, color=BLUE, linewidth=1.4)
     axes = panel("Real-time factor (recorder clock)", measured.pace)
     axes.set_ylabel("real-time factor")
     axes.plot(measured.pace.index, measured.pace, color=BLUE, marker=".")
@@ -286,8 +284,20 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     style.widen(axes, np.append(measured.pace, 1.0), 0.04)
     label = "deviation from the nominal period [µs]"
     axes = panel("Period between received samples", measured.period_us, xlabel=label)
-    _draw_periods(axes, measured.period_us, run.period_ns / 1e3, measured.numbers)
-    _draw_losses(panel("Cumulative losses", seconds), measured, seconds[-1])
+    axes.hist(measured.period_us - run.period_ns / 1e3, bins=80, color=BLUE, log=True)
+    axes.set_ylabel("samples")
+    axes.set_ylim(bottom=0.5)
+    missed = reported.dropna(subset="ticks_missed").set_index("time_s").ticks_missed
+    total = f"{missed.iloc[-1]:g}" if len(missed) else "not recorded"
+    losses = {
+        f"samples lost:\n{len(measured.lost_s)}": measured.lost_s,
+        f"gaps between\ntorques: {len(measured.gaps_s)}": measured.gaps_s,
+        f"ticks missed:\n{total}": missed.index[missed.diff().fillna(missed) > 0.0],
+    }
+    axes = panel("Losses, and reports of missed ticks", seconds)
+    axes.eventplot([*losses.values()], colors=VERMILION)
+    axes.set_yticks(range(len(losses)), list(losses))
+    axes.set_ylim(-0.6, 2.6)
     commands = measured.commands
     title = "Latency: reception of a command to the step that applies it"
     axes = panel(title, commands.received_us)
@@ -316,47 +326,3 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     figure.suptitle(f"Run of {run.scene.name}: {seconds[-1]:g} s, {len(seconds)} samples")
     style.note(figure, provenance(found.summary["report"]), 200)
     return figure
-
-
-def _draw_periods(axes: Axes, period_us: Array, nominal_us: float, numbers: dict[str, Any]) -> None:
-    """Draw the histogram of periods between received samples around the nominal one [us]."""
-    axes.set_ylabel("samples")
-    off = period_us - nominal_us
-    reach = max(1.0, 1.05 * float(np.abs(off).max(initial=0.0)))
-    axes.hist(off, bins=np.linspace(-reach, reach, 81).tolist(), color=BLUE, log=True)
-    axes.set_ylim(bottom=0.5)
-    lines = [f"nominal {nominal_us:.1f} µs"]
-    for word, name in timing.STATISTICS.items():
-        value = numbers[f"period_{name}_us"]
-        lines.append(f"{word} {value:.1f} µs")
-        if "%" in word:
-            colour, line = (VERMILION, "--") if name == "p99" else (GREEN, ":")
-            axes.axvline(value - nominal_us, color=colour, linestyle=line, label=word)
-    text = "\n".join(lines)
-    axes.text(0.02, 0.96, text, transform=axes.transAxes, va="top", fontsize=8.5)
-    axes.legend(fontsize=8, loc="upper right")
-
-
-def _draw_losses(axes: Axes, measured: Timing, end: float) -> None:
-    """Draw running counts of losses over time [s]."""
-    axes.set_ylabel("count")
-    missed = measured.reported.dropna(subset="ticks_missed")
-    losses: dict[str, Any] = {}
-    if len(missed):
-        losses["ticks missed"] = missed.time_s, missed.ticks_missed
-    for name, at in (
-        ("samples lost", measured.lost_s),
-        ("gaps between applied torques", measured.gaps_s),
-    ):
-        losses[name] = np.sort(at), np.arange(1.0, len(at) + 1.0)
-    for (name, (times, counts)), looks in zip(losses.items(), LINES, strict=False):
-        counts = np.append(0.0, counts)
-        axes.step(
-            [0.0, *times, end], [*counts, counts[-1]], where="post",
-            label=f"{name}: {counts[-1]:.0f}", **looks,
-        )  # fmt: skip
-    if not len(missed):
-        axes.plot([], [], " ", label="ticks missed: not recorded")
-    axes.set_ylim(0.0, max(1.0, 1.6 * axes.dataLim.y1))
-    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.legend(fontsize=8, loc="upper left")

@@ -115,7 +115,7 @@ def test_what_it_writes_can_be_read(short, tmp_path, monkeypatch, capsys):
     assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
     assert [float(row["wall_min_s"]) for row in rows] == short.rows.wall_min_s.tolist()
     read = json.loads((tmp_path / "accuracy.json").read_text())
-    assert read["studies"][0]["rows"][0]["method"] == "rk4" and "date" in read["report"]
+    assert read["rows"][0]["method"] == "rk4" and "date" in read["report"]
     assert "accuracy_example2_heavy.png" in (tmp_path / "accuracy.md").read_text()
     pixels = image.imread(tmp_path / "accuracy_example2_heavy.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000
