@@ -28,13 +28,13 @@ import rclpy
 from benchmark.measure import read_options
 from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.host import processes
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, TorqueLog, finite, stamp, state_messages
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
 from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import ZERO
 
 TICK_NS = 1_000_000
 LOG_TICKS = LOG_NS // TICK_NS

@@ -15,6 +15,7 @@ NANOSECONDS = 1_000_000_000  # of a second: time is integer nanoseconds
 
 Array: TypeAlias = NDArray[np.float64]
 Vector3: TypeAlias = tuple[float, float, float]
+ZERO: Vector3 = (0.0, 0.0, 0.0)
 Quaternion: TypeAlias = tuple[float, float, float, float]  # (x, y, z, w)
 TorqueFunction: TypeAlias = Callable[[float], Vector3]
 """Actuator torques [N m] at a simulated time [s]."""

@@ -25,7 +25,7 @@ from sst_ros.control.law import ControlChannel
 from sst_ros.control.tracking import Track, track_of
 from sst_ros.errors import RunStopped
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.mechanism.generic_math import ZERO, axpy
+from sst_ros.mechanism.generic_math import axpy
 from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
 from sst_ros.runtime.tick_loop import TickLoop
 from sst_ros.scene.loads import Initial
@@ -33,7 +33,7 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import build
 from sst_ros.scene.yaml_document import plain
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import NANOSECONDS, State, Vector3
+from sst_ros.state import NANOSECONDS, ZERO, State, Vector3
 from sst_ros.sweeps.sweep_study import SampledControl
 from studies.sampled_data import largest_stable, stability_limit
 

@@ -25,7 +25,6 @@ from sst_ros.dynamics.expression import compile_for_arrays, compile_program, tra
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.generic_math import (
-    ZERO,
     axpy,
     cos,
     cross3,
@@ -38,7 +37,7 @@ from sst_ros.mechanism.generic_math import (
     sqrt,
 )
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.state import Quaternion, Vector3
+from sst_ros.state import ZERO, Quaternion, Vector3
 
 ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
 CLOSED = 1e-14  # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned

@@ -23,10 +23,10 @@ from sst_ros.control.law import (
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import SingularConfiguration, SstError, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.generic_math import ZERO, triple
+from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
-from sst_ros.state import Quaternion, State, Vector3
+from sst_ros.state import ZERO, Quaternion, State, Vector3
 
 SINGULAR = 1e-10  # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
 

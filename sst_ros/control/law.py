@@ -37,7 +37,6 @@ from sst_ros.control.actuator_space import Reference
 from sst_ros.errors import Problem
 from sst_ros.mechanism import generic_math
 from sst_ros.mechanism.generic_math import (
-    ZERO,
     Quadruple,
     Scalar,
     Triple,
@@ -53,7 +52,7 @@ from sst_ros.mechanism.generic_math import (
 )
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, coefficient, entry, positive
-from sst_ros.state import Array, Vector3, clamp
+from sst_ros.state import ZERO, Array, Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 SPACES = ("gamma", "so3")

@@ -33,11 +33,11 @@ from sst_ros.control.actuator_space import (
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import InputError, Problem, SingularConfiguration, refuse_unless
 from sst_ros.mechanism import continuation, kinematics
-from sst_ros.mechanism.generic_math import ZERO, axpy, multiply, quaternion_product, triple
+from sst_ros.mechanism.generic_math import axpy, multiply, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.loads import Spiral, Sweep
 from sst_ros.scene.scene import Scene
-from sst_ros.state import Quaternion, Vector3
+from sst_ros.state import ZERO, Quaternion, Vector3
 
 PIECES = 8  # pieces of a minimum-jerk motion, and of a quarter of a turn
 SAMPLES_A_PIECE = 8  # of a recording, whose samples lie much denser than the motion turns

@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 from sst_ros.dynamics.model import ElasticStops, Leg, Model, model_of
 from sst_ros.mechanism.generic_math import (
-    ZERO,
     Quadruple,
     Rows,
     Scalar,
@@ -49,7 +48,7 @@ from sst_ros.mechanism.generic_math import (
 )
 from sst_ros.scene.bodies import PLACES
 from sst_ros.scene.loads import Friction
-from sst_ros.state import Joints
+from sst_ros.state import ZERO, Joints
 
 __all__ = ["Leg", "Model", "model_of"]
 

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, WorkspaceLeft
-from sst_ros.mechanism.generic_math import ZERO, Symmetric, Triple, cross3, multiply, triple
+from sst_ros.mechanism.generic_math import Symmetric, Triple, cross3, multiply, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import Scene
+from sst_ros.state import ZERO
 
 
 class JointSpring(NamedTuple):

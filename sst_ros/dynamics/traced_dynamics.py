@@ -67,19 +67,9 @@ class Dynamics:
         return recent(kernel.model_of(scene), has_moment_topic=has_moment_topic)
 
     @cached_property
-    def program(self) -> Program:
-        """Derivative of the state by time; inputs are state and drive."""
-
-        def derivative(*inputs: Any) -> tuple[Any, ...]:
-            state, drive = inputs[: len(self.state)], inputs[len(self.state) :]
-            return kernel.derivative(self.numbers, state, drive[:3], drive[3:] or None)
-
-        return trace(derivative, (*self.state, *self.drive))
-
-    @cached_property
     def derivative(self) -> Function:
-        """The program as a function of plain floats."""
-        return compile_program(self.program)
+        """Derivative of the state by time, of state and drive."""
+        return partial(compile_program(ODE(self).program), 0.0)
 
     @cached_property
     def joints(self) -> Function:

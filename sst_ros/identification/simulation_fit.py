@@ -45,12 +45,13 @@ from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, scales
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
 from sst_ros.identification.parameters import STANDARD, Identification, value_of
-from sst_ros.mechanism.generic_math import ZERO, atan2, quaternion_rate, rotation_rows, sqrt
+from sst_ros.mechanism.generic_math import atan2, quaternion_rate, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import build_unchecked
 from sst_ros.scene.torque_profile import TorqueProfile, torque_at
 from sst_ros.scene.yaml_document import plain, replace_values
+from sst_ros.state import ZERO
 
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
 TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size of a parameter

@@ -19,7 +19,6 @@ Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
 Rows = tuple[Triple, Triple, Triple]
 Symmetric = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 
-ZERO: Triple = (0.0, 0.0, 0.0)
 _ARRAYS = (np.ndarray, np.generic, complex)
 
 

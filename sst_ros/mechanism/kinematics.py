@@ -106,17 +106,14 @@ def inverse(
 def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     """All real assemblies at actuator angles gamma [rad], shape (3,); up to eight.
 
-    They come in pairs R, R Rot(z, pi), in the order of (s_z, s_y, s_x) of their shared s. Two
-    assemblies nearer than some 1e-7 rad are a double root in this arithmetic and come out as one
-    with det J2 near 0; see `assemblies`.
+    They come in pairs R, R Rot(z, pi), in the order of (s_z, s_y, s_x) of their shared s. A double
+    root comes out as one, with det J2 near 0.
 
     Raises:
         AssemblyError: gamma is not finite, or the assemblies are not isolated.
 
     """
     angles = np.array(gamma, dtype=float)
-    if angles.shape != (3,) or not np.all(np.isfinite(angles)):
-        raise AssemblyError("gamma must be three finite numbers", angles)
     found = direct_many(geometry, angles[None])
     if not found.isolated[0]:
         raise AssemblyError("the assemblies are not isolated", angles)

@@ -35,13 +35,12 @@ from std_msgs.msg import String
 
 from sst_ros.errors import InputError, Problem, SstError
 from sst_ros.host.processes import is_orphan
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import arguments, signals, topics
 from sst_ros.nodes.topics import Endpoint
 from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.schema import Section, Spec
-from sst_ros.state import Vector3, is_idle, nanoseconds
+from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _FIRST_RCLPY_ON_FAST_DDS_3 = 9

@@ -29,7 +29,6 @@ from std_msgs.msg import String
 
 from sst_ros.description.robot import urdf
 from sst_ros.errors import SstError, refuse_unless
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
@@ -38,7 +37,7 @@ from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, State, Vector3
+from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, ZERO, State, Vector3
 
 LOG_NS = 50_000_000
 """Torques are published once for about this time: with each sample they would take 16 us of the 180

@@ -24,12 +24,11 @@ from rclpy.node import Node
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.errors import AssemblyError
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.mechanism.geometry import angle_between, quaternion_of, rotation_matrix
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import ActionGoal
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
-from sst_ros.state import BASE_FRAME, Quaternion, Vector3
+from sst_ros.state import BASE_FRAME, ZERO, Quaternion, Vector3
 
 try:
     from simulation_interfaces import action, srv

@@ -10,13 +10,12 @@ from __future__ import annotations
 from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
 from sst_ros.scene.torque_profile import TorqueTable
-from sst_ros.state import NANOSECONDS, TorqueFunction, Vector3
+from sst_ros.state import NANOSECONDS, ZERO, TorqueFunction, Vector3
 
 
 class TorquePlayer(AnsweringWorker[PlayerParameters]):

@@ -19,14 +19,13 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sst_ros.errors import InputError
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.runtime.settings import ViewerParameters
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
-from sst_ros.state import NANOSECONDS, Vector3, is_idle, nanoseconds
+from sst_ros.state import NANOSECONDS, ZERO, Vector3, is_idle, nanoseconds
 from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 

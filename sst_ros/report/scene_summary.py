@@ -46,7 +46,7 @@ def summary(scene: Scene) -> str:
         vertices=(geometry.v + 0.0).tolist(),
         arcs_deg=np.degrees(geometry.arc).tolist(),
         dynamics=dynamics,
-        operations=dynamics.program.operations,
+        operations=ODE(dynamics).program.operations,
         costs=costs(scene),
         absent=[term for term in TERMS if not has(scene, term)],
         damping=damping_of(scene.stroke) if scene.stroke.at_end == "elastic" else 0.0,
@@ -100,7 +100,7 @@ def without(scene: Scene, term: str) -> Scene:
 
 def operations(scene: Scene) -> int:
     """Operations in one evaluation of the right-hand side."""
-    return Dynamics.of(scene).program.operations.total()
+    return ODE(Dynamics.of(scene)).program.operations.total()
 
 
 class Cost(NamedTuple):

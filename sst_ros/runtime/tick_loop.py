@@ -10,12 +10,12 @@ import time
 from typing import Any, TypeAlias
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.mechanism.generic_math import ZERO, add, axpy
+from sst_ros.mechanism.generic_math import add, axpy
 from sst_ros.runtime.pacing import Pacer, RunSettings
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import Vector3
+from sst_ros.state import ZERO, Vector3
 
 _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4

@@ -8,11 +8,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.loads import JOINTS, Actuators
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import NANOSECONDS, Vector3, clamp, finite_vector, nanoseconds
+from sst_ros.state import NANOSECONDS, ZERO, Vector3, clamp, finite_vector, nanoseconds
 
 ACTUATORS = JOINTS[:3]
 

@@ -26,14 +26,14 @@ from sst_ros.control.reference_motions import reference_motion, through_points
 from sst_ros.control.tracking import TrackingMetrics, track_of
 from sst_ros.errors import InputError, Problem, refuse_unless
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.generic_math import ZERO, axpy
+from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
+from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
 NO_TOLERANCE = -1.0
 """Of a message: the default does not hold either."""

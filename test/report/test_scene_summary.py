@@ -15,7 +15,7 @@ from loaded_scenes import IGNORE, loaded
 from models import seeded_samples
 
 from sst_ros import __main__ as cli
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.report import accuracy
@@ -53,7 +53,7 @@ def test_a_plain_scene_costs_as_a_kernel_that_knows_no_optional_terms(name, bare
 
 @every_scene
 def test_operations_are_counted_in_the_generated_source(name):
-    tree = ast.parse(Dynamics.of(load(name)).program.source("rhs"))
+    tree = ast.parse(ODE(Dynamics.of(load(name))).program.source("rhs"))
     assert operations(load(name)) == sum(
         isinstance(node, ast.BinOp | ast.Call | ast.IfExp)
         or (isinstance(node, ast.UnaryOp) and not isinstance(node.operand, ast.Constant))
@@ -67,7 +67,7 @@ def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operati
         if term not in ("actuated links", "intermediate links"):
             assert has(scene, term), term
             scene = without(scene, term)
-    assert Dynamics.of(scene).program == Dynamics.of(load("general")).program
+    assert ODE(Dynamics.of(scene)).program == ODE(Dynamics.of(load("general"))).program
 
 
 def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
@@ -78,10 +78,10 @@ def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
 
 
 def test_a_plain_scene_has_no_angle_and_no_root_and_viscous_friction_adds_few_products():
-    plain = Dynamics.of(EXAMPLE2).program.operations
+    plain = ODE(Dynamics.of(EXAMPLE2)).program.operations
     assert set(plain) == {"add", "sub", "mul", "div"}
     scene = replace(EXAMPLE2, friction=JointFriction(gamma=Friction(viscous=0.1)))
-    extra = Dynamics.of(scene).program.operations - plain
+    extra = ODE(Dynamics.of(scene)).program.operations - plain
     assert set(extra) <= {"add", "sub", "mul"}
     assert 3 <= extra.total() <= 6
 

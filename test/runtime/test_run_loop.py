@@ -12,11 +12,11 @@ from runtime.bench import Bench, HandClock, plain, run_here, stamped
 
 from sst_ros.errors import RunStopped
 from sst_ros.host import compiled_module
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime import tick_loop
 from sst_ros.runtime.diagnostics import OK, WARN, RunDiagnostics
 from sst_ros.runtime.run_loop import Phase, Reply
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import ZERO
 
 HEAVY = "example2_heavy"
 HIT = (50.0, 0.0, 0.0)

@@ -8,11 +8,11 @@ import pytest
 from runtime.bench import Arrived, Message, plain, stamped
 
 from sst_ros import load_scene
-from sst_ros.mechanism.generic_math import ZERO
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene.loads import Actuators
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import ZERO
 
 NAN = math.nan
 
