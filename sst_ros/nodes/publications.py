@@ -33,7 +33,7 @@ from sst_ros.nodes import topics
 from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation.simulation import Simulation
@@ -42,7 +42,6 @@ from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, ZERO, State, V
 LOG_NS = 50_000_000
 """Torques are published once for about this time: with each sample they would take 16 us of the 180
 of a wake."""
-MOMENTS = ("moment_x", "moment_y", "moment_z")
 _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000

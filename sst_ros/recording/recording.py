@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem, require
+from sst_ros.errors import InputError, require
 from sst_ros.host.output import require_free, write_into, write_table
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
@@ -60,12 +60,24 @@ class Signals:
 
     @cached_property
     def tables(self) -> dict[str, Series]:
-        """Rows by the names of `TABLES`; only what was recorded."""
+        """Rows by the names of `TABLES`; only what was recorded.
+
+        Topics of one table stand side by side at all stamps that any of them has.
+        """
         found = {}
         for name, listed in topics.TABLES.items():
             parts = [one for table in listed if len(one := self.topic_series[table.key])]
-            if parts:
-                found[name] = topics.join(parts) if len(parts) > 1 else parts[0]
+            if len(parts) == 1:
+                found[name] = parts[0]
+            elif parts:
+                stamps = np.unique(np.concatenate([part.stamp_ns for part in parts]))
+                received = np.zeros(len(stamps), dtype=np.int64)
+                for part in parts:
+                    at = np.searchsorted(stamps, part.stamp_ns)
+                    received[at] = np.where(received[at] > 0, received[at], part.received_ns)
+                columns = tuple(column for part in parts for column in part.columns)
+                values = np.hstack([part.at(stamps) for part in parts])
+                found[name] = Series(columns, stamps, received, values)
         return found
 
     @cached_property
@@ -361,8 +373,7 @@ def read_run_motion(bag: str | Path) -> Trajectory:
     """Read the motion of a run, to be done again: two or more samples that have an orientation."""
     motion = read(bag).trajectory
     if len(motion) < 2:
-        problem = Problem("orientation", len(motion), "two samples or more must have one")
-        raise InputError(str(bag), [problem])
+        raise refusal(Path(bag), "orientation", len(motion), "two samples or more must have one")
     return motion
 
 

@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.recording.bag_reader import Topic, refusal
-from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.state import Array, is_idle, nanoseconds
 
 ACTUATED = JOINTS[:3]
-MOMENTS = ("moment_x", "moment_y", "moment_z")
 
 Integers: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = list[tuple[int, Sequence[float]]]
@@ -129,17 +128,6 @@ def sort_rows(table: TopicTable, times: array[int], numbers: array[float], path:
     return Series(columns, stamps, received, values)
 
 
-def join(parts: Sequence[Series]) -> Series:
-    """Put topics side by side at all stamps that any of them has."""
-    stamps = np.unique(np.concatenate([part.stamp_ns for part in parts]))
-    received = np.zeros(len(stamps), dtype=np.int64)
-    for part in parts:
-        at = np.searchsorted(stamps, part.stamp_ns)
-        received[at] = np.where(received[at] > 0, received[at], part.received_ns)
-    columns = tuple(column for part in parts for column in part.columns)
-    return Series(columns, stamps, received, np.hstack([part.at(stamps) for part in parts]))
-
-
 def _read_joints(joints: Sequence[str], message: Any) -> Rows:
     """Read positions, velocities and the efforts of actuators of a JointState message."""
     stamp = nanoseconds(message.header.stamp)
@@ -186,11 +174,6 @@ def _read_ticks(message: Any) -> Rows:
         moment = [effort[k] for k in moments] or [np.nan] * 3
         rows.append((begin, [float(end - begin), *(effort[k] for k in at), *moment]))
     return rows
-
-
-def _read_commands(message: Any) -> Rows:
-    # Others are dropped by the simulator too.
-    return [(0, message.data.tolist())] if len(message.data) == 3 else []
 
 
 def _read_stamped_commands(message: Any) -> Rows:
@@ -272,7 +255,12 @@ TICKS = _table(
     (MOMENTS, "N m", f"{_MOMENT} over the tick"),
 )
 COMMANDS = _table(
-    "commands", "std_msgs/msg/Float64MultiArray", _read_commands, _COMMANDED, stamped=False
+    "commands",
+    "std_msgs/msg/Float64MultiArray",
+    # Others are dropped by the simulator too.
+    lambda message: [(0, message.data.tolist())] if len(message.data) == 3 else [],
+    _COMMANDED,
+    stamped=False,
 )
 STAMPED_COMMANDS = _table(
     "commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED, stamped=False

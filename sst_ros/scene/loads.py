@@ -17,6 +17,7 @@ from sst_ros.scene.schema import Rules, Section, angles, coefficient, entry, pos
 from sst_ros.state import Quaternion, Vector3
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
+MOMENTS = ("moment_x", "moment_y", "moment_z")  # beside the torques of a tick
 
 NANOSECOND = 1e-9
 """Resolution of time [s]."""
