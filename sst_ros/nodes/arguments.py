@@ -18,7 +18,7 @@ import yaml
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.runtime import settings
-from sst_ros.scene.schema import Section, Spec, accept
+from sst_ros.scene.schema import Section, Spec, Switch, accept
 
 USE_SIM_TIME = "use_sim_time"
 FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
@@ -202,15 +202,8 @@ def _advice(word: str, known: dict[str, Spec]) -> str:
 
 def _as_yaml(spec: Spec, word: str) -> str:
     """Return a value as rcl reads it, or raise ValueError."""
-    value: Any = word
-    if spec.kind == "flag":
-        value = {"true": True, "false": False}.get(word.lower(), word)
-    elif spec.kind == "integer":
-        value = int(word)
-    elif spec.kind == "number":
-        numbers = [float(part) for part in word.strip("[]").split(",")]
-        value = numbers if spec.shape else float(word)
-    elif spec.kind == "texts":
+    value: Any = Switch(word) if spec.kind == "flag" else word
+    if spec.shape or spec.kind == "texts":
         value = [part.strip() for part in word.strip("[]").split(",")]
     text = json.dumps(accept(spec, value), ensure_ascii=False)
     # rcl reads 1e-9 as text.

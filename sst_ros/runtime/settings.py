@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, ClassVar
 
 from sst_ros.control.law import ControllerSettings
@@ -19,12 +20,8 @@ from sst_ros.state import NANOSECONDS
 _OF_A_GOAL = ", where the goal does not give it; 0 for none"
 
 
-def _number(doc: str, unit: str, default: float, least: float = 0.0, most: float = 1e6) -> Any:
-    return entry(doc, unit, default=default, least=least, most=most)
-
-
-def _positive(doc: str, unit: str, default: float) -> Any:
-    return entry(doc, unit, default=default, above=0.0, most=1.0)
+_number = partial(entry, least=0.0, most=1e6)
+_positive = partial(entry, above=0.0, most=1.0)
 
 
 def _whole(doc: str, unit: str, default: int, least: int, most: int) -> Any:

@@ -318,15 +318,9 @@ def _is_positive(entries: Sequence[Any], more: Any) -> Any:
 def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) -> Inertia:
     """Inertia about O of a thin, uniform arc of a great circle. Inertias of several arcs add up.
 
-    Args:
-        mass: of the arc [kg].
-        radius: of its circle [m].
-        begin: direction of its beginning seen from O, of any length, shape (3,).
-        end: direction of its end, less than pi from `begin`, shape (3,).
-
-    Raises:
-        InputError: mass or radius is not positive, or the directions span no arc.
-
+    Mass [kg] and radius [m] are those of the arc; `begin` and `end` are directions from O, shape
+    (3,), of any length and less than pi apart. InputError is raised where mass or radius is not
+    positive, or the directions span no arc.
     """
     first, last = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
     fits = first.shape == last.shape == (3,) and bool(np.all(np.isfinite([first, last])))

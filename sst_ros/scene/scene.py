@@ -64,11 +64,8 @@ class Scene(Section):
 
         A list without an index means all of its entries: "actuated_links.inertia.xx",
         "springs[0].rest". A section that the scene does not have is made from the values given;
-        None takes one away.
-
-        Raises:
-            InputError: a key names nothing that a scene has, or the result is refused.
-
+        None takes one away. InputError is raised where a key names nothing that a scene has, or the
+        result is refused.
         """
         try:
             changed = replace_values(self, plain(values))
@@ -173,12 +170,9 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
 def load(name_or_path: str | Path) -> Scene:
     """Read a scene by its path (ends in .yaml) or by the name of one that comes with sst_ros.
 
-    Raises:
-        InputError: there is no such scene, or its document is refused.
-
+    InputError is raised where there is no such scene, or its document is refused.
     """
-    source, origin = text_of(name_or_path)
-    return read(Scene, source, origin)
+    return read(Scene, *text_of(name_or_path))
 
 
 def text_of(name_or_path: str | Path) -> tuple[str, str]:
@@ -214,11 +208,8 @@ class Scenarios:
     `parameters` are arrays by keys of numbers in the document, as in "star.mass",
     "springs[0].rest" or "gravity.acceleration": first the row, then what one scene has, so shape
     (N,), (N, 3) or (N, 3, 3). A list without an index means all of its entries. `rows` has these
-    arrays; the `count` N is None where nothing varies.
-
-    Raises:
-        InputError: a key names no number of the scene, or an array has another shape.
-
+    arrays; the `count` N is None where nothing varies. InputError is raised where a key names no
+    number of the scene, or an array has another shape.
     """
 
     def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:

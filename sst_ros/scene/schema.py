@@ -102,7 +102,7 @@ class Spec:
         }[self.kind]
 
 
-def entry(doc: str, unit: str = "", *, default: Any = REQUIRED, **rules: Any) -> Any:
+def entry(doc: str, unit: str = "", default: Any = REQUIRED, **rules: Any) -> Any:
     """Declare a field of a section, whose type says what it may hold; None in it is its default.
 
     It may be float, a tuple of as many, or of such; int, bool, str, a section, a tuple of any
@@ -182,10 +182,14 @@ class Section:
 
     def _find_idle(self) -> Iterator[Problem]:
         """Yield what has no effect, and what is not one of several."""
+
+        def has_any(names: tuple[str, ...]) -> bool:
+            return has_effect([getattr(self, name) for name in names])
+
         acts = True
         for name, spec in self.SPECS.items():
             value = getattr(self, name)
-            if spec.acts_on and value != spec.default and not self._has_any(spec.acts_on):
+            if spec.acts_on and value != spec.default and not has_any(spec.acts_on):
                 given = "it" if len(spec.acts_on) == 1 else "one"
                 text = spec.needs or f"acts on {' or '.join(spec.acts_on)}: give {given}"
                 yield Problem(name, value, text)
@@ -195,11 +199,8 @@ class Section:
             if len(chosen) != 1:
                 yield Problem("", chosen or None, "give one of " + ", ".join(self.ONE_OF))
         key, text = self.IDLE
-        if text and acts and not self._has_any(self.EFFECTS):
+        if text and acts and not has_any(self.EFFECTS):
             yield Problem(key, getattr(self, key, None), text)
-
-    def _has_any(self, names: tuple[str, ...]) -> bool:
-        return has_effect([getattr(self, name) for name in names])
 
     def settle(self) -> Iterator[Problem]:
         """Put what may be given in several forms into one; yield what forbids that."""

@@ -111,13 +111,9 @@ def _at(profile: TorqueProfile, t: float) -> Vector3:
 class PolynomialTorque(TorqueProfile):
     """Polynomial pieces, in the layout of `scipy.interpolate.PPoly`; zero outside of them.
 
-    Args:
-        coefficients: highest power first, shape (order + 1, pieces, 3).
-        breakpoints: beginnings of the pieces and the end of the last [s], shape (pieces + 1,).
-
-    Raises:
-        InputError: shapes, order or numbers are not allowed.
-
+    The coefficients have the highest power first, shape (order + 1, pieces, 3); the breakpoints are
+    the beginnings of the pieces and the end of the last [s], shape (pieces + 1,). InputError is
+    raised where shapes, order or numbers are not allowed.
     """
 
     def __init__(self, coefficients: ArrayLike, breakpoints: ArrayLike) -> None:
@@ -209,15 +205,10 @@ def _count_arguments(function: Callable[..., Any]) -> int:
 
 
 class TorqueTable(TorqueProfile):
-    """Held torques: each row acts from its time until the next; zero before the first.
+    """Held torques [N m], shape (n, 3): each row acts from its time until the next.
 
-    Args:
-        times: beginnings [s], shape (n,), strictly ascending.
-        torques: torques [N m], shape (n, 3).
-
-    Raises:
-        InputError: shapes, order or numbers are not allowed.
-
+    They are zero before the first; times [s], shape (n,), are strictly ascending. InputError is
+    raised where shapes, order or numbers are not allowed.
     """
 
     def __init__(self, times: ArrayLike, torques: ArrayLike) -> None:
@@ -237,9 +228,7 @@ class TorqueTable(TorqueProfile):
     def read(cls, path: str | Path) -> TorqueTable:
         """Read a CSV file with the header time, tau_1, tau_2, tau_3 [s, N m].
 
-        Raises:
-            InputError: the file cannot be read; lists every bad row with its line.
-
+        InputError says why the file cannot be read, or lists every bad row with its line.
         """
         origin, header = str(path), ["time", "tau_1", "tau_2", "tau_3"]
         try:
@@ -298,12 +287,7 @@ def torque_at(torque: Any, *given: Any) -> Any:
 
 
 def profile_of(torque: Any) -> TorqueProfile:
-    """Turn what a user gives into a profile.
-
-    Raises:
-        InputError: it is none of the kinds that `simulate` allows.
-
-    """
+    """Turn what a user gives into a profile; InputError: it is nothing that `simulate` allows."""
     if isinstance(torque, TorqueProfile):
         return torque
     if hasattr(torque, "c") and hasattr(torque, "x") and callable(torque):

@@ -18,9 +18,9 @@ import yaml
 from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.errors import InputError, Problem
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.schema import Section, anything, entry, positive
+from sst_ros.scene.schema import Section, anything, build, entry, positive
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import plain
 from sst_ros.state import QUANTITIES, finite_vector
@@ -139,18 +139,12 @@ class SweepStudy(Section):
     @classmethod
     def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
         """Build a study from a mapping; names of files are relative to a folder."""
-        known = cls.SPECS
-        for key in values:
-            if key not in known:
-                hint = suggestion(str(key), known)
-                allowed = f"unknown key; allowed are {', '.join(known)}{hint}"
-                raise InputError("sweep", [Problem(str(key), values[key], allowed)])
-        given = {"scene": None, **values}
+        given = {"scene": None} | {key: x for key, x in values.items() if x is not None}
         if isinstance(given["scene"], str) and (folder / given["scene"]).is_file():
             given["scene"] = folder / given["scene"]
         if isinstance(given.get("table"), str):
             given["table"] = folder / given["table"]
-        return cls(**given | {"scene": scene_of(given["scene"])})
+        return build(cls, given | {"scene": scene_of(given["scene"])}, "sweep")
 
     @cached_property
     def model_scene(self) -> Scene:
