@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inverse-dynamics controller: answers every sample with the torque that follows a motion."""
+"""The inverse-dynamics controller: answers every sample with the torque that follows a motion.
+
+The motion is that of the scene, of ~/joint_trajectory, or of a goal of ~/follow_joint_trajectory,
+of which there is one at a time.
+"""
 
 from __future__ import annotations
 
@@ -69,13 +73,25 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._seen: Measurement | None = None
         self._refused, self._last_refusal = 0, ""
         self._finished = self._has_heard = False
+        self._active: ActionGoal | None = None
+        self._goal: TrajectoryGoal | None = None
+        self._feedback: Any = None
         self.connect(own, joint_trajectory=self._replace)
-        self._goals = FollowJointTrajectoryServer(self)
         every(self.node, 1.0, self._report)
+        if FollowJointTrajectory is not None:
+            name = own["follow_joint_trajectory"].name
+            callbacks = {"goal_callback": self._check, "cancel_callback": self._cancel}
+            ActionGoal.serve(self.node, FollowJointTrajectory, name, self._begin, **callbacks)
+            every(self.node, _FEEDBACK_PERIOD_S, self._report_goal)
 
     def close(self) -> None:
-        """Leave the actuators without torque, and print the tracking errors."""
-        self._goals.close()
+        """Abort a goal, leave the actuators without torque, and print the tracking errors."""
+        executor = self.node.executor
+        if self._active is not None and executor is not None:
+            self._interrupt("the controller ends")
+            for _ in range(_SPINS_AT_END):
+                with contextlib.suppress(SstError):  # of other callbacks: the node ends already
+                    executor.spin_once(timeout_sec=_SPIN_S)
         super().close()
         self._report()
         _print(self.follower.tracking())
@@ -91,7 +107,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._finished = self._finished or (phase.data == "finished" and self.begun)
         if phase.data == "waiting" and self.begun and news:
             self.node.get_logger().info("the simulator was reset: beginning anew")
-            self._goals.interrupt("the simulator was reset")
+            self._interrupt("the simulator was reset")
             _print(self.follower.tracking())
             self.follower.restart()
             self.begun = False
@@ -118,7 +134,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self.begun = True
         self.send(command.torque)
         self._publish(state, command)
-        self._goals.sample(state, self._seen, command)
+        self._judge(state, self._seen, command)
         if self.follower.stage is Stage.ENDED:
             self.done.set()
 
@@ -135,16 +151,16 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def _replace(self, trajectory: JointTrajectory) -> None:
         """Follow a trajectory of the topic, and no goal any more."""
-        if self.take(trajectory):
-            self._goals.interrupt("replaced by a trajectory of ~/joint_trajectory")
+        if self._take(trajectory):
+            self._interrupt("replaced by a trajectory of ~/joint_trajectory")
 
-    def take(self, trajectory: JointTrajectory) -> bool:
+    def _take(self, trajectory: JointTrajectory) -> bool:
         """Follow a trajectory, or log why not; return whether it is followed."""
         tracking = self.follower.tracking()
         try:
             self.follower.take(trajectory, self._seen)
         except SstError as error:
-            self.refuse(error)
+            self._refuse(error)
             return False
         finally:
             self.heard_s = time.monotonic()  # no message could be received during the check
@@ -152,7 +168,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
         return True
 
-    def refuse(self, error: SstError) -> None:
+    def _refuse(self, error: SstError) -> None:
         """Count, log and publish a refusal."""
         self._refused, self._last_refusal = self._refused + 1, str(error)
         self.node.get_logger().error(f"trajectory refused: {error}")
@@ -181,6 +197,73 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         message = topics.diagnostics(self.node, "control", level, "; ".join(said), values)
         self._diagnostics.publish(message)
 
+    def _judge(self, state: JointState, measured: Measurement, command: Command) -> None:
+        """Test the tolerances of the active goal at a sample of the run that was answered."""
+        if self._goal is None or not self._is_active():
+            return
+        time = self.follower.time
+        self._feedback = state.header.stamp, self._goal.index(time), time, measured, command
+        outcome = self._goal.outcome(time, command.error, command.error_rate)
+        if outcome is None:
+            return
+        self._report_goal()
+        self._end(*outcome)
+        if outcome[0] is not ErrorCode.SUCCESSFUL:
+            self.follower.stop()
+
+    def _interrupt(self, reason: str) -> None:
+        """Abort the active goal; what is followed now is not its concern any more."""
+        if self._is_active():
+            self._end(ErrorCode.INVALID_GOAL, reason)
+
+    def _check(self, request: Any) -> GoalResponse:
+        try:
+            goal = TrajectoryGoal(request, self.parameters)
+        except SstError as error:
+            self._refuse(error)
+            return GoalResponse.REJECT
+        if not self._take(request.trajectory):
+            return GoalResponse.REJECT
+        self._goal = goal
+        return GoalResponse.ACCEPT
+
+    def _begin(self, handle: Any) -> None:
+        self._interrupt("preempted by a new goal")
+        self._active, self._feedback = ActionGoal(handle), None
+
+    def _cancel(self, handle: Any) -> CancelResponse:
+        """Stop; the goal ends after this call, when its handle has changed to canceling."""
+        if self._active is not None and self._active.handle == handle:
+            self.follower.stop()
+        return CancelResponse.ACCEPT
+
+    def _is_active(self) -> bool:
+        """Whether there is a goal; one that was canceled ends."""
+        if self._active is not None and self._active.handle.is_cancel_requested:
+            self._end(ErrorCode.SUCCESSFUL, "canceled")
+        return self._active is not None
+
+    def _end(self, code: ErrorCode, message: str) -> None:
+        active, self._active = self._active, None
+        assert active is not None
+        self.node.get_logger().info(f"follow_joint_trajectory: {message}")
+        result = FollowJointTrajectory.Result(error_code=int(code), error_string=message)
+        active.end(result, success=code is ErrorCode.SUCCESSFUL)
+
+    def _report_goal(self) -> None:
+        """Publish feedback of the last sample, once."""
+        if not self._is_active() or self._feedback is None or self._active is None:
+            return
+        (stamp, index, time, measured, command), self._feedback = self._feedback, None
+        desired = command.desired
+        message = FollowJointTrajectory.Feedback(joint_names=list(ACTUATORS))
+        message.header.stamp, message.index = stamp, index
+        message.desired = _point(time, desired.gamma, desired.gamma_dot, command.feedforward)
+        message.desired.accelerations = array("d", desired.gamma_ddot)
+        message.actual = _point(time, measured.gamma, measured.gamma_dot, command.torque)
+        message.error = _point(time, command.error, command.error_rate, command.feedback)
+        self._active.handle.publish_feedback(message)
+
 
 def _measure(state: JointState) -> Measurement:
     """Read the actuators, which may come in any order, among others; refuse what has not all."""
@@ -197,98 +280,6 @@ def _measure(state: JointState) -> Measurement:
 def _print(tracking: TrackingMetrics | None) -> None:
     if tracking is not None:
         print(tracking_table(tracking), flush=True)
-
-
-class FollowJointTrajectoryServer:
-    """Serves the action: goals for the follower of a controller, one at a time."""
-
-    def __init__(self, controller: InverseDynamicsController) -> None:
-        self._controller, self._follower = controller, controller.follower
-        self._active: ActionGoal | None = None
-        self._accepted: TrajectoryGoal | None = None
-        self._goal: TrajectoryGoal | None = None
-        self._feedback: Any = None
-        if FollowJointTrajectory is None:
-            return
-        name = topics.CONTROLLER["follow_joint_trajectory"].name
-        callbacks = {"goal_callback": self._check, "cancel_callback": self._cancel}
-        ActionGoal.serve(controller.node, FollowJointTrajectory, name, self._begin, **callbacks)
-        every(controller.node, _FEEDBACK_PERIOD_S, self._report)
-
-    def sample(self, state: JointState, measured: Measurement, command: Command) -> None:
-        """Test the tolerances of the active goal at a sample of the run that was answered."""
-        if self._goal is None or not self._is_active():
-            return
-        time = self._follower.time
-        self._feedback = state.header.stamp, self._goal.index(time), time, measured, command
-        outcome = self._goal.outcome(time, command.error, command.error_rate)
-        if outcome is None:
-            return
-        self._report()
-        self._end(*outcome)
-        if outcome[0] is not ErrorCode.SUCCESSFUL:
-            self._follower.stop()
-
-    def interrupt(self, reason: str) -> None:
-        """Abort the active goal; what is followed now is not its concern any more."""
-        if self._is_active():
-            self._end(ErrorCode.INVALID_GOAL, reason)
-
-    def close(self) -> None:
-        """Abort the active goal and deliver its result."""
-        executor = self._controller.node.executor
-        if self._active is None or executor is None:
-            return
-        self.interrupt("the controller ends")
-        for _ in range(_SPINS_AT_END):
-            with contextlib.suppress(SstError):  # of other callbacks: the node ends already
-                executor.spin_once(timeout_sec=_SPIN_S)
-
-    def _check(self, goal: Any) -> GoalResponse:
-        try:
-            self._accepted = TrajectoryGoal(goal, self._controller.parameters)
-        except SstError as error:
-            self._controller.refuse(error)
-            return GoalResponse.REJECT
-        taken = self._controller.take(goal.trajectory)
-        return GoalResponse.ACCEPT if taken else GoalResponse.REJECT
-
-    def _begin(self, handle: Any) -> None:
-        self.interrupt("preempted by a new goal")
-        self._active, self._goal, self._feedback = ActionGoal(handle), self._accepted, None
-
-    def _cancel(self, handle: Any) -> CancelResponse:
-        """Stop; the goal ends after this call, when its handle has changed to canceling."""
-        if self._active is not None and self._active.handle == handle:
-            self._follower.stop()
-        return CancelResponse.ACCEPT
-
-    def _is_active(self) -> bool:
-        """Whether there is a goal; one that was canceled ends."""
-        if self._active is not None and self._active.handle.is_cancel_requested:
-            self._end(ErrorCode.SUCCESSFUL, "canceled")
-        return self._active is not None
-
-    def _end(self, code: ErrorCode, message: str) -> None:
-        active, self._active = self._active, None
-        assert active is not None
-        self._controller.node.get_logger().info(f"follow_joint_trajectory: {message}")
-        result = FollowJointTrajectory.Result(error_code=int(code), error_string=message)
-        active.end(result, success=code is ErrorCode.SUCCESSFUL)
-
-    def _report(self) -> None:
-        """Publish feedback of the last sample, once."""
-        if not self._is_active() or self._feedback is None or self._active is None:
-            return
-        (stamp, index, time, measured, command), self._feedback = self._feedback, None
-        desired = command.desired
-        message = FollowJointTrajectory.Feedback(joint_names=list(ACTUATORS))
-        message.header.stamp, message.index = stamp, index
-        message.desired = _point(time, desired.gamma, desired.gamma_dot, command.feedforward)
-        message.desired.accelerations = array("d", desired.gamma_ddot)
-        message.actual = _point(time, measured.gamma, measured.gamma_dot, command.torque)
-        message.error = _point(time, command.error, command.error_rate, command.feedback)
-        self._active.handle.publish_feedback(message)
 
 
 def _point(time: float, angles: Vector3, rates: Vector3, torques: Vector3) -> JointTrajectoryPoint:

@@ -30,8 +30,6 @@ _DEPTH = 10000
 _TAKE_PERIOD_S = 0.02
 _LOOK_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
-
-
 _DECLARED = {
     name: one
     for name, one in {**topics.CONTROLLER, **topics.SIMULATOR}.items()
@@ -139,10 +137,16 @@ class Recorder(Worker[RecorderParameters]):
             self._unknown.add(topic)
             return
         offers = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
-        if own is None and not offers:
+        offers = [own.qos()] if own else offers
+        if not offers:
             return
-        # That of a topic of ours does not depend on the order of discovery.
-        qos = _qos([own.qos()] if own else offers)
+        # That which all publishers can serve; of a topic of ours whatever discovery has found.
+        durability, reliability = DurabilityPolicy.VOLATILE, ReliabilityPolicy.BEST_EFFORT
+        if all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offers):
+            durability = DurabilityPolicy.TRANSIENT_LOCAL
+        if all(one.reliability == ReliabilityPolicy.RELIABLE for one in offers):
+            reliability = ReliabilityPolicy.RELIABLE
+        qos = QoSProfile(depth=_DEPTH, durability=durability, reliability=reliability)
         kind, group = topics.message_type(type_name), NeverSpun()
         subscription = self.node.create_subscription(
             kind, topic, lambda _: None, qos, callback_group=group, raw=True
@@ -162,17 +166,6 @@ class Recorder(Worker[RecorderParameters]):
         except SstError as error:
             self._failure = error
             self.done.set()
-
-
-def _qos(offers: list[QoSProfile]) -> QoSProfile:
-    """QoS that all publishers can serve."""
-    latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
-    reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
-    return QoSProfile(
-        depth=_DEPTH,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-    )
 
 
 def _bag_qos(asked: QoSProfile) -> interfaces.Qos:

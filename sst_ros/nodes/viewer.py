@@ -56,15 +56,9 @@ class Viewer(Worker[ViewerParameters]):
             for name, one in topics.VIEWER.items()
             if one.use == topics.CALLS
         }
-        topics.subscribe(
-            self.node,
-            topics.VIEWER,
-            given.simulator,
-            joint_states=self._take_state,
-            scene=self._take_scene,
-            phase=self._take_phase,
-            diagnostics=self._take_diagnostics,
-        )
+        heard = {"joint_states": self._take_state, "scene": self._take_scene}
+        heard |= {"phase": self._take_phase, "diagnostics": self._take_diagnostics}
+        topics.subscribe(self.node, topics.VIEWER, given.simulator, **heard)
         every(self.node, _REPEAT_S, self._repeat)
         every(self.node, _LOOK_S, self._look)
         self._page = Page(self, given.host, given.port)
@@ -136,12 +130,9 @@ class Viewer(Worker[ViewerParameters]):
 
     def _look(self) -> None:
         """Look for another node that publishes commands, and leave the run to it."""
-        own, simulator = self.node.get_fully_qualified_name(), self.parameters.simulator
-        names = [
-            name
-            for topic in ("commands", "commands_stamped")
-            for name in topics.publishers(self.node, f"{simulator}/{topic}")
-        ]
+        own, names = self.node.get_fully_qualified_name(), list[str]()
+        for topic in ("commands", "commands_stamped"):
+            names += topics.publishers(self.node, f"{self.parameters.simulator}/{topic}")
         self._controller = next((name for name in names if name != own), "")
         if self._controller:
             self._driving = False
