@@ -32,7 +32,7 @@ from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, TorqueLog, finite, stamp, state_messages
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
-from sst_ros.runtime.pacing import Pacer, SteadyTime
+from sst_ros.runtime.tick_loop import Pacer, SteadyTime
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import ZERO
 

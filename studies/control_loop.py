@@ -26,8 +26,8 @@ from sst_ros.control.tracking import Track, track_of
 from sst_ros.errors import RunStopped
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.generic_math import axpy
-from sst_ros.runtime.pacing import Pacer, RunSettings, SteadyTime
-from sst_ros.runtime.tick_loop import TickLoop
+from sst_ros.runtime.tick_loop import Pacer, SteadyTime, TickLoop
+from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import build

@@ -28,9 +28,9 @@ from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
 from sst_ros.nodes.topics import Reader
 from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
-from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.tick_loop import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
 from sst_ros.scene.scene import Scene

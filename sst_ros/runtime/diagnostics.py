@@ -9,9 +9,8 @@ from typing import Any
 
 from sst_ros.dynamics.model import limits_of
 from sst_ros.host import processes
-from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.run_loop import Phase, RunLoop
-from sst_ros.runtime.tick_loop import HeldTorques
+from sst_ros.runtime.tick_loop import HeldTorques, Pacer
 from sst_ros.runtime.torque_input import TorqueInput
 from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import Simulation

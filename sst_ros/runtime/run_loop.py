@@ -19,9 +19,8 @@ from enum import Enum
 from typing import NamedTuple
 
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.runtime.pacing import Pacer, RunSettings
-from sst_ros.runtime.tick_loop import NoAnswer, RunOutput, TickLoop
-from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.runtime.tick_loop import NoAnswer, Pacer, RunOutput, TickLoop
+from sst_ros.runtime.torque_input import RunSettings, TorqueInput
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation

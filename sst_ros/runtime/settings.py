@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from sst_ros.control.law import ControllerSettings
 from sst_ros.errors import Problem
-from sst_ros.runtime.pacing import RunSettings
+from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Section, entry
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS

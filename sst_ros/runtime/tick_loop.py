@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks from one published sample to the next. Owned by the thread of the run."""
+"""Ticks of a run, at absolute deadlines, from one published sample to the next.
+
+Late ticks are counted, never made up for. All is owned by the thread of the run.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,19 @@ import contextlib
 import math
 import threading
 import time
-from typing import Any, TypeAlias
+from collections.abc import Callable
+from typing import Any, Protocol, TypeAlias
 
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.mechanism.generic_math import add, axpy
-from sst_ros.runtime.pacing import Pacer, RunSettings
-from sst_ros.runtime.torque_input import TorqueInput
+from sst_ros.runtime.torque_input import RunSettings, TorqueInput
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import ZERO, Vector3
 
+_LONGEST_SLEEP_S = 0.05
+_TOGETHER_NS = 2_000_000
+"""Bounds the ticks that one sleep ends in, so that few commands wait."""
 _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
@@ -25,9 +31,100 @@ _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 _LONGEST_WAIT_S = 0.1
 """Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
 
-
 RunOutput: TypeAlias = Any
 """Where a run publishes: what has the methods of `nodes.publications.SimulatorTopics`."""
+
+
+class TimeSource(Protocol):
+    """Clock that deadlines are measured by."""
+
+    def now_ns(self) -> int:
+        """Return the time [ns]."""
+
+    def sleep(self, seconds: float, /) -> None:
+        """Wait for about this time [s]; may return early."""
+
+
+class SteadyTime:
+    """The monotonic clock of the machine."""
+
+    now_ns = staticmethod(time.monotonic_ns)
+    sleep = staticmethod(time.sleep)
+
+
+class Pacer:
+    """Deadlines anchor + k period / speed. After an overrun the whole periods in it are dropped.
+
+    Lateness up to `tolerance_ns` is made up for: the step of a followed clock. With the speed 0,
+    the real-time factor, deadlines have always come.
+    """
+
+    def __init__(
+        self, period_ns: int, speed: float, source: TimeSource, tolerance_ns: int = 0
+    ) -> None:
+        self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
+        self._anchor = self._count = self._seen = 0
+        self._set(speed)
+        self.missed = self.overruns = 0  # ticks dropped, and times that some were
+        self.jumps = 0  # of the clock, back
+        self.late_ns = 0  # of the start of the last tick
+
+    def start(self) -> None:
+        """Begin now; the first deadline is one period away."""
+        self._anchor = self._seen = self._source.now_ns()
+        self._count = 1
+
+    def change(self, speed: float) -> None:
+        """Go on at another speed, without a burst."""
+        self._set(speed)
+        self.start()
+
+    def _set(self, speed: float) -> None:
+        self.speed, self._interval = speed, self._period_ns / speed if speed else 0.0
+        self.interval_ns = round(self._interval)  # between deadlines; 0 without any
+        # Ticks that one sleep may end in; a clock that is followed does not give the next deadline.
+        several = speed > 0.0 and self._tolerance_ns == 0
+        self.together = max(1, int(_TOGETHER_NS // self._interval)) if several else 1
+
+    def excuse(self, ticks: int) -> None:
+        """Put the deadlines off if the last of the next ticks is past: that is no overrun."""
+        if self.speed > 0.0:
+            self._anchor += max(0, self._source.now_ns() - self._due(ticks))
+
+    def _due(self, ticks: int) -> int:
+        """Return the deadline of the last of the next ticks [ns]."""
+        return self._anchor + round((self._count + ticks - 1) * self._interval)
+
+    def wait(self, interrupted: Callable[[], bool], ticks: int = 1) -> bool:
+        """Wait for the next deadline, or the last of several; False if interrupted before.
+
+        That is asked after each sleep, the longest of which is 50 ms.
+        """
+        if self.speed == 0.0:
+            self.late_ns = 0
+            return not interrupted()
+        due, slept = self._due(ticks), False
+        while True:
+            now = self._source.now_ns()
+            if now < self._seen:
+                self.jumps += 1
+                self.start()
+                now, due = self._anchor, self._due(ticks)
+            self._seen = now
+            if (late := now - due) >= 0:
+                break
+            if slept and interrupted():
+                return False
+            self._source.sleep(min(-late / 1e9, _LONGEST_SLEEP_S))
+            slept = True
+        if late >= self._interval and late >= self._tolerance_ns:
+            dropped = int(late // self._interval)
+            self.missed += dropped
+            self.overruns += 1
+            self._count += dropped
+        self._count += ticks
+        self.late_ns = late
+        return True
 
 
 class Counters:

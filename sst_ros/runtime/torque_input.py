@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from sst_ros.runtime.pacing import RunSettings
 from sst_ros.scene.loads import JOINTS, Actuators
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS, ZERO, Vector3, clamp, finite_vector, nanoseconds
@@ -30,6 +31,21 @@ class MessageRefused(Exception):
     def __init__(self, kind: str, reason: str) -> None:
         self.kind = kind
         super().__init__(reason)
+
+
+@dataclass
+class RunSettings:
+    """Numbers of a run, of a node or not; the times may change between two ticks."""
+
+    period_ns: int  # of a tick
+    ticks_per_sample: int = 1  # from one published sample to the next: the control period
+    last_tick: int = sys.maxsize  # after which the run ends, if at all
+    lockstep: bool = False  # each sample is answered before the next tick
+    waits: bool = False  # a command starts the run
+    partial_commands: bool = False  # an effort that is nan means zero torque
+    command_timeout_ns: float = 0.0  # age at which a command is no longer held; 0 for never
+    lockstep_timeout: float = 0.0  # longest wait for the answer to a sample [s]; 0 for no end
+    subscriber_timeout: float = 0.0  # longest wait for subscribers [s]
 
 
 class TorqueInput:

@@ -8,9 +8,9 @@ from functools import partial
 from types import SimpleNamespace as Message
 
 from sst_ros import load_scene
-from sst_ros.runtime.pacing import Pacer, SteadyTime
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.tick_loop import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import ACTUATORS, MOST_WAITING, TorqueInput
 from sst_ros.simulation.simulation import Simulation
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from runtime.bench import HandClock
 
 from sst_ros.errors import InputError
-from sst_ros.runtime.pacing import Pacer
 from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.tick_loop import Pacer
 
 MS = 1_000_000
 CHANGEABLE = SimulatorParameters.CHANGEABLE
