@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
+
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
 SHOWN = 80  # characters of a value in a message
 
@@ -67,7 +69,7 @@ class MotionRefused(InputError):
 class AssemblyError(SstError):
     """The direct kinematics has no unique admissible answer at `gamma` [rad]."""
 
-    def __init__(self, message: str, gamma: NDArray[np.float64]) -> None:
+    def __init__(self, message: str, gamma: Array) -> None:
         self.gamma = gamma
         super().__init__(f"{message} at gamma = {np.array2string(gamma, precision=9)} rad")
 
@@ -82,18 +84,11 @@ class AmbiguousAssembly(AssemblyError):
     `quaternions` (x, y, z, w) are their orientations, shape (n, 4).
     """
 
-    def __init__(
-        self,
-        gamma: NDArray[np.float64],
-        candidates: Sequence[Any],
-        quaternions: NDArray[np.float64],
-    ) -> None:
+    def __init__(self, gamma: Array, candidates: Sequence[Any], quaternions: Array) -> None:
         self.candidates = tuple(candidates)
         listed = ", ".join(np.array2string(q, precision=6, separator=", ") for q in quaternions)
-        count = len(self.candidates)
-        super().__init__(
-            f"{count} admissible assemblies, with the orientations {listed}: name one", gamma
-        )
+        found = f"{len(self.candidates)} admissible assemblies, with the orientations {listed}"
+        super().__init__(f"{found}: name one", gamma)
 
 
 class SingularConfiguration(SstError):

@@ -52,8 +52,8 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     t = np.linspace(0.0, scene.duration or 1.0, READINGS + 1)[1:]
     lengths = ERROR * (scene.star.radius if "x" in read else 1.0)
     data = {"t": t, "deviation": lengths} | {key: np.zeros(READINGS) for key in read}
-    found = take_readings(data, scene)
-    motion = Sensitivities(scene, names, found.torque)
+    torque, found = take_readings(data, scene)
+    motion = Sensitivities(scene, names, torque)
     values = np.array([value_of(scene, key) for key in names], dtype=float)
     _, slopes = motion.compare(values, found)
     _, singular, rows = np.linalg.svd(slopes * values)

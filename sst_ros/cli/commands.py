@@ -35,19 +35,13 @@ class Arg:
 class Subcommand:
     """A command: its line of help, what runs it as `module:function`, and its arguments.
 
-    The optional modules in `needs` are looked for before the module that runs it is imported.
+    Optional modules that it `needs` are looked for before the module that runs it is imported; its
+    page of help says `more`.
     """
 
-    def __init__(
-        self,
-        what: str,
-        run: str,
-        *arguments: Arg,
-        needs: tuple[str, ...] = (),
-        description: str | None = None,
-    ) -> None:
-        self.what, self.run, self.arguments = what, run, arguments
-        self.needs, self.description = needs, description
+    def __init__(self, what: str, run: str, *args: Arg, needs: str = "", more: str = "") -> None:
+        self.what, self.run, self.arguments = what, run, args
+        self.needs, self.more = needs.split(), more
 
 
 _flag = partial(Arg, action="store_true")
@@ -84,7 +78,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("--out", "trajectory, .parquet, .csv or .npz", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
         _flag("--force", "overwrite earlier results"),
-        description="Simulate a scene under its own torques. Exit status 1 if the motion ended "
+        more="Simulate a scene under its own torques. Exit status 1 if the motion ended "
         "before the duration, at a limit of the scene for example.",
     ),
     "workspace": Subcommand(
@@ -142,7 +136,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         *_out("folder of the results", "demo_out or demo_out/feedforward"),
         _scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
         Arg("--mode", "with feedforward: control modes", nargs="+", metavar="MODE"),
-        needs=("rclpy", "rosbags", "matplotlib"),
+        needs="rclpy rosbags matplotlib",
     ),
     "view": Subcommand(
         "show the manipulator in a browser, live or from a bag",
@@ -154,8 +148,8 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
         _port("--port", "port, or the next free one", default=8080),
         _flag("--open", "open it, where there is a desktop"),
-        needs=("viser",),
-        description="Show a running simulator, one that is started for it (--scene), or a bag.",
+        needs="viser",
+        more="Show a running simulator, one that is started for it (--scene), or a bag.",
     ),
     "report": "evaluate a recorded run or the integration methods",
     "report run": Subcommand(
@@ -180,7 +174,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         SCENE,
         Arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
         *_out("folder of the results", "stability_out"),
-        needs=("pandas", "matplotlib"),
+        needs="pandas matplotlib",
     ),
     "plot": Subcommand(
         "draw recorded runs, as PDF and PNG",
@@ -219,7 +213,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
         Arg("--workers", "threads; default: one a core", type=partial(_whole, 1, 1024)),
         _flag("--resume", "compute only the chunks that are missing in --out"),
-        description="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
+        more="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
     "identify": Subcommand(
         "identify inertias, friction and more from a recorded run; design excitation motions",
@@ -248,7 +242,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--seed", "of a designed motion; default: 0", type=int),
         _path("--out", "write the scene", metavar="SCENE.yaml"),
         _flag("--force", "overwrite the file of --out"),
-        description="`identify BAG` fits the torques of a recorded run by weighted least squares: "
+        more="`identify BAG` fits the torques of a recorded run by weighted least squares: "
         "what the motion determines, with standard deviations, and the nearest scene whose bodies "
         "can exist. With --method simulation the motion is integrated and fitted to the recorded "
         "angles, by any numbers of the scene. `identify design SCENE` makes a motion that "
@@ -303,7 +297,7 @@ def parser() -> Parser:
             below = groups[group].add_parser(last, help=entry)
             groups[name] = below.add_subparsers(dest="kind", required=True, metavar="KIND")
             continue
-        command = groups[group].add_parser(last, help=entry.what, description=entry.description)
+        command = groups[group].add_parser(last, help=entry.what, description=entry.more or None)
         command.set_defaults(entry=entry)
         for each in entry.arguments:
             action: Any = command.add_argument(each.name, **each.options)

@@ -2,7 +2,7 @@
 """What was measured: angles and torques of the actuators, or numbers read off a figure.
 
 Torques are samples at the times of the angles, or each is held over an interval, as a controller's
-are. Identification by torques takes a `MeasuredMotion`, identification by simulation `Readings`.
+are. Identification by torques takes a `MeasuredMotion`, identification by simulation readings.
 """
 
 from __future__ import annotations
@@ -12,16 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from sst_ros.errors import InputError, Problem, refuse_unless
+from sst_ros.scene import torque_profile as torques
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import (
-    ConstantTorque,
-    PolynomialTorque,
-    TorqueProfile,
-    TorqueTable,
-    ascend,
-)
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
 
@@ -60,23 +55,6 @@ class MeasuredMotion(NamedTuple):
     held: bool = False
 
 
-class Readings(NamedTuple):
-    """Measured numbers.
-
-    Attributes:
-        t: times of the readings, ascending from 0 or later [s], shape (n,).
-        values: the readings of `OBSERVABLES` [rad], [m], shape (n, 9); nan where there is none.
-        deviation: their standard deviations, shape (n, 9); None where they are unknown.
-        torque: torques of the motion.
-
-    """
-
-    t: Array
-    values: Array
-    deviation: Array | None
-    torque: TorqueProfile
-
-
 def open_data(data: Measured) -> Recording | Trajectory | Mapping[str, Any]:
     """Read a recording if a path is given; return other data as they are."""
     if not isinstance(data, (str, Path)):
@@ -112,7 +90,7 @@ def read_motion(data: Measured, delay: float = 0.0) -> MeasuredMotion:
     if problems:
         raise InputError("identify", problems)
     t, n = arrays["t"], arrays["t"].size
-    refuse_unless("identify", ("t", t, ascend(t), "must be rising times [s], shape (n,)"))
+    refuse_unless("identify", ("t", t, torques.ascend(t), "must be rising times [s], shape (n,)"))
     if held and arrays["torque"].shape == (n, 3):
         arrays["torque"] = arrays["torque"][:-1]
     shapes = {"t": (n,), "torque": (n - held, 3), "quaternion": (4,)}
@@ -124,7 +102,7 @@ def read_motion(data: Measured, delay: float = 0.0) -> MeasuredMotion:
     if problems:
         raise InputError("identify", problems)
     if delay and held:
-        arrays["torque"] = _average(TorqueTable(t[:-1], arrays["torque"]), t + delay)
+        arrays["torque"] = _average(torques.TorqueTable(t[:-1], arrays["torque"]), t + delay)
     elif delay:  # the last torque is held
         each = (np.interp(t + delay, t, column) for column in arrays["torque"].T)
         arrays["torque"] = np.stack([*each], axis=1)
@@ -141,12 +119,12 @@ def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
         begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
         rows = (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12)
         # With a lag the recorded effort is the torque at the joint, behind that of the tick.
-        law = "sampled" if data.scene.lags else TorqueTable(begins, ticks.torque)
+        law = "sampled" if data.scene.lags else torques.TorqueTable(begins, ticks.torque)
     else:
         allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
         raise InputError("identify", [Problem("data", data, allowed)])
     t, torque = motion.t[rows], motion.torque[rows]
-    held = law is None or isinstance(law, (TorqueTable, ConstantTorque))
+    held = law is None or isinstance(law, (torques.TorqueTable, torques.ConstantTorque))
     if held:  # without a law to their sample, see `Trajectory`
         torque = torque[1:] if law is None else _average(law, t)
     return {
@@ -159,7 +137,7 @@ def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
     }
 
 
-def _average(law: TorqueProfile, t: Array) -> Array:
+def _average(law: torques.TorqueProfile, t: Array) -> Array:
     """Means over the intervals of t of a torque that is constant between its breaks, (n - 1, 3)."""
     if len(t) < 2:
         return np.empty((0, 3))
@@ -171,7 +149,12 @@ def _average(law: TorqueProfile, t: Array) -> Array:
     return np.asarray(total / np.diff(t)[:, None])
 
 
-def take_readings(data: Measured, scene: Scene) -> Readings:
+Readings: TypeAlias = tuple[Array, Array, Array | None]
+"""Times from 0 or later [s], shape (n,); `OBSERVABLES` [rad], [m], shape (n, 9), nan where there is
+none; and their standard deviations, None where they are unknown."""
+
+
+def take_readings(data: Measured, scene: Scene) -> tuple[torques.TorqueProfile, Readings]:
     """Take measured angles from a motion as for `read_motion`, or readings off a figure.
 
     Those are a mapping with t [s] and any of OBSERVABLES, shape (n,), nan where nothing was read,
@@ -181,24 +164,22 @@ def take_readings(data: Measured, scene: Scene) -> Readings:
         return _take_figure(data, scene)
     measured = read_motion(data)
     t = measured.t - measured.t[0]
-    torque: TorqueProfile
+    torque: torques.TorqueProfile
     if hasattr(data, "ticks"):  # a recording: torques before the lag, which the model has
         begins = np.round(data.ticks.start_ns / 1e9 - measured.t[0], 9)
-        torque = TorqueTable(begins, data.ticks.torque)
+        torque = torques.TorqueTable(begins, data.ticks.torque)
     elif measured.held:
-        torque = TorqueTable(t[:-1], measured.torque)
+        torque = torques.TorqueTable(t[:-1], measured.torque)
     else:
-        from scipy.interpolate import CubicSpline
-
         spline = CubicSpline(t, measured.torque)
-        torque = PolynomialTorque(spline.c, spline.x)
+        torque = torques.PolynomialTorque(spline.c, spline.x)
     values = np.pad(measured.gamma, ((0, 0), (0, 6)), constant_values=np.nan)
-    return Readings(t, values, None, torque)
+    return torque, (t, values, None)
 
 
-def _take_figure(data: Mapping[str, Any], scene: Scene) -> Readings:
+def _take_figure(data: Mapping[str, Any], scene: Scene) -> tuple[torques.TorqueProfile, Readings]:
     t = np.atleast_1d(np.asarray(data.get("t", ()), dtype=float))
-    good = t.size > 0 and ascend(t) and bool(t[0] >= 0.0)
+    good = t.size > 0 and torques.ascend(t) and bool(t[0] >= 0.0)
     refuse_unless("identify", ("t", t, good, "must be ascending times >= 0 [s]"))
     values = np.full((t.size, len(OBSERVABLES)), np.nan)
     known, problems = f"one of {', '.join(OBSERVABLES)}", []
@@ -224,4 +205,4 @@ def _take_figure(data: Mapping[str, Any], scene: Scene) -> Readings:
     spread = None if deviation is None else np.ones_like(values)
     if spread is not None:
         spread[:, columns] = deviation
-    return Readings(t, values, spread, scene.torque)
+    return scene.torque, (t, values, spread)

@@ -31,12 +31,7 @@ from scipy.optimize import least_squares
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import (
-    compile_for_arrays,
-    compile_program,
-    mark_present,
-    trace,
-)
+from sst_ros.dynamics.expression import compile_for_arrays, compile_program, mark_present, trace
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
@@ -89,8 +84,8 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
     if not names:
         allowed = "must be keys of numbers of the scene, with method simulation"
         raise InputError("identify", [Problem("parameters", requested, allowed)])
-    read = take_readings(data, scene)
-    motion = Sensitivities(scene, names, read.torque)
+    torque, read = take_readings(data, scene)
+    motion = Sensitivities(scene, names, torque)
     given = np.array([value_of(scene, name) for name in names], dtype=float)
     size = np.abs(given) + (given == 0.0)
 
@@ -112,7 +107,7 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
     fitted = found.x * size
     scale = np.where(fitted == 0.0, 1.0, fitted)  # changes of logarithms
     unit = 1.0
-    if read.deviation is None:  # estimated from the residuals
+    if read[2] is None:  # estimated from the residuals
         unit = float(np.sqrt(np.sum(off**2) / max(len(off) - len(names), 1))) + 1e-300
     _, singular, rows = np.linalg.svd(slopes * scale / unit, full_matrices=True)
     relative = np.full(len(names), np.inf)
@@ -179,17 +174,17 @@ class Sensitivities:
         Of r readings with values of p parameters these are residuals, shape (r,), and slopes, shape
         (r, p), in order of time; those of a time follow each other.
         """
-        count = len(read.t)
-        times = read.t if read.t[-1] > 0.0 else np.append(read.t, 1e-9)
+        t, given, deviation = read
+        count, times = len(t), t if t[-1] > 0.0 else np.append(t, 1e-9)
         states, slopes = (part[:count] for part in self.run(values, times))
         found = self._observables(*states[:, :4].T)
         rows = np.stack([np.broadcast_to(row, count) for row in found]).reshape(5, -1, count)
-        off = rows[0].T - read.values
+        off = rows[0].T - given
         off[:, :6] = np.angle(np.exp(1j * off[:, :6]))
-        deviation = np.ones_like(off) if read.deviation is None else read.deviation
+        unit = np.ones_like(off) if deviation is None else deviation
         changes = np.einsum("qcn,nqp->ncp", rows[1:], slopes[:, :4])
-        there = np.isfinite(read.values)
-        return (off / deviation)[there], (changes / deviation[:, :, None])[there]
+        there = np.isfinite(given)
+        return (off / unit)[there], (changes / unit[:, :, None])[there]
 
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:
         """Integrate the motion and its sensitivities with values of the parameters, shape (p,).
