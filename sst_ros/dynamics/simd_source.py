@@ -103,24 +103,19 @@ def linearise_by_columns(
     """Text of `linearise` for numba: all columns of a Jacobian in a loop over directions.
 
     The program is the derivative by t, state and drive and its own along directions, the last
-    inputs; of them the one of t, if it is there, comes last.
-
-    It is half as long as the operations of each column in a row, which takes half the time to
-    compile, and the compiler takes four columns at once; the digits are those of the columns.
+    inputs; of them the one of t, if it is there, comes last. The text is half as long as the
+    operations of each column in a row, which takes half the time to compile, and the compiler takes
+    four columns at once; the digits are those of the columns. Ten lines of it:
 
         def linearise(t, state, d, p, slope, by_time, matrix):
             x = state[0]
-            t1 = d[0]
-            c0 = p[0]
             v0 = x * x
             slope[0] = v7
-            columns = vector(64)
             for k in range(8):
                 d_x = 1.0 if k == 0 else 0.0
                 v8 = d_x * v0
                 columns[0 + k] = v9
             for i in range(8):
-                by_time[i] = columns[8 * i + 7]
                 for k in range(7):
                     matrix[i][k] = columns[8 * i + k]
     """

@@ -118,9 +118,7 @@ def _recent(v: Any, alpha_deg: Any, beta_max_deg: float) -> Geometry:
 def rotation_matrix(quaternion: ArrayLike) -> Array:
     """Rotation R of {E} in {B}, shape (..., 3, 3), of quaternions (x, y, z, w), (..., 4).
 
-    Raises:
-        ValueError: a quaternion is zero.
-
+    A quaternion of length zero raises ValueError.
     """
     q = np.asarray(quaternion, dtype=float)
     length = np.sqrt(np.sum(q * q, axis=-1, keepdims=True))

@@ -107,11 +107,8 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     """All real assemblies at actuator angles gamma [rad], shape (3,); up to eight.
 
     They come in pairs R, R Rot(z, pi), in the order of (s_z, s_y, s_x) of their shared s. A double
-    root comes out as one, with det J2 near 0.
-
-    Raises:
-        AssemblyError: gamma is not finite, or the assemblies are not isolated.
-
+    root comes out as one, with det J2 near 0. Where gamma is not finite, or the assemblies are not
+    isolated, AssemblyError is raised.
     """
     angles = np.array(gamma, dtype=float)
     found = direct_many(geometry, angles[None])
@@ -124,11 +121,7 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
 def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     """All real assemblies of many gamma [rad], shape (n, 3), at once; the order is `direct`'s.
 
-    The geometry may be one for each of them.
-
-    Raises:
-        AssemblyError: gamma is not (n, 3) finite numbers.
-
+    The geometry may be one for each. AssemblyError refuses what is not (n, 3) finite numbers.
     """
     angles = np.asarray(gamma, dtype=float)
     if angles.ndim != 2 or angles.shape[1] != 3 or not np.all(np.isfinite(angles)):

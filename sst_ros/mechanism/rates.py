@@ -75,11 +75,8 @@ def of_star(
     """Everything from omega [rad/s] and omega_dot [rad/s^2] of the star in {B}, each shape (3,).
 
     The rotation R of {E} in {B} has the shape (3, 3); the actuator angles gamma [rad] choose the
-    branch of each leg, by default mu_k in (0, pi).
-
-    Raises:
-        SingularConfiguration: some c_k = 0 (serial).
-
+    branch of each leg, by default mu_k in (0, pi). SingularConfiguration is raised where some
+    c_k = 0 (serial).
     """
     matrix = np.asarray(rotation, dtype=float)
     if gamma is None:

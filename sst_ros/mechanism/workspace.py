@@ -108,15 +108,9 @@ def workspace(
 ) -> OrientationMap:
     """Map the workspace: every direction of E on the base triangle, every turn about it.
 
-    Args:
-        geometry: `Geometry.of(scene)`, or `Geometry.build(v, alpha)`.
-        divisions: of an edge of the base triangle, at least 1.
-        turns: values of the third ZYZ angle psi, evenly over a full turn, at least 1.
-        progress: draw a bar on a terminal.
-
-    Raises:
-        InputError: divisions or turns is less than 1.
-
+    The geometry is `Geometry.of(scene)` or `Geometry.build(v, alpha)`. An edge of the triangle has
+    `divisions`; `turns` are values of the third ZYZ angle psi, evenly over a full turn. InputError
+    refuses less than 1 of them. With `progress` a bar is drawn on a terminal.
     """
     counts = {"divisions": divisions, "turns": turns}
     checks = ((name, n, n >= 1, "must be at least 1") for name, n in counts.items())
