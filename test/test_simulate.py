@@ -209,10 +209,7 @@ def test_another_start():
         ({"initial": {"gama": 1}}, r"gama = 1: unknown key(.|\n)*gamma = None: is missing"),
         ({"torque": lambda t, state: None, "duration": 0.1}, r"torque\(0\) = None: must be three"),
         ({"duration": None}, r"duration(.|\n)*must be given"),
-        (
-            {"torque": jerk, "control_period": 1e-9},
-            "period = 1e-09: must be at least .* s",
-        ),
+        ({"torque": jerk, "control_period": 1e-9}, "period = 1e-09: must be at least .* s"),
         ({"breaks": [0.2, 0.1]}, "breaks(.|\n)*ascending"),
         ({"breaks": "x"}, "breaks(.|\n)*ascending"),
         ({"max_step": 0.0}, "max_step(.|\n)*> 0"),

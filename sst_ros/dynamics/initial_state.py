@@ -18,6 +18,7 @@ from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
+from sst_ros.state import ZERO
 
 SINGULAR = 1.5e-5
 """det J2 below which rounding, over its square, leaves a rate of gamma less than six digits."""
@@ -103,10 +104,7 @@ def start_of(scene: Scene) -> tuple[float, ...]:
 
 
 def accelerate_by_paper(
-    mechanism: virtual_work.Mechanism,
-    state: ArrayLike,
-    torque: ArrayLike,
-    moment: ArrayLike = (0.0, 0.0, 0.0),
+    mechanism: virtual_work.Mechanism, state: ArrayLike, torque: ArrayLike, moment: ArrayLike = ZERO
 ) -> tuple[Array, Array]:
     """Return W_dot in {E} [rad/s^2] and gamma_dot [rad/s], each shape (3,), by Eqs. 1 to 92.
 
@@ -144,7 +142,7 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
     )
     mechanism = virtual_work.Mechanism.of(scene)
     value = scene.moment.value if scene.moment is not None else None
-    constant = np.array(value or (0.0, 0.0, 0.0))
+    constant = np.array(value or ZERO)
 
     def derivative(_: float, *inputs: float) -> tuple[float, ...]:
         (x, y, z, w, *rate), torque = inputs[:7], np.array(inputs[8:11])

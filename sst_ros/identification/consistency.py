@@ -86,12 +86,7 @@ def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, A
 
 
 def find_consistent_values(
-    names: Sequence[str],
-    given: Array,
-    transform: Array,
-    estimate: Array,
-    root: Array,
-    reach: float,
+    names: Sequence[str], given: Array, transform: Array, estimate: Array, root: Array, reach: float
 ) -> tuple[Array, float]:
     """Values of all parameters that fit the base parameters, those of bodies that can exist.
 

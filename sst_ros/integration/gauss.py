@@ -23,15 +23,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from sst_ros.dynamics.expression import Program, Slots
-from sst_ros.dynamics.simd_source import (
-    Layout,
-    evaluate_lanes,
-    flat_sin,
-    indent,
-    loop,
-    put,
-    split,
-)
+from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, flat_sin, indent, loop, put, split
 from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.host import compiled_module
 from sst_ros.mechanism.geometry import Array

@@ -12,11 +12,7 @@ import numpy as np
 from sst_ros.dynamics.model import Limit, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_with_work
 from sst_ros.integration import step_loops
-from sst_ros.integration.adaptive_stepper import (
-    AdaptiveStepper,
-    EvaluationBudget,
-    Step,
-)
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper, EvaluationBudget, Step
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.compiled_method import compile_derivative
 from sst_ros.integration.events import (

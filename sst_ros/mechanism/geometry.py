@@ -170,9 +170,7 @@ def zyz_angles(rotation: ArrayLike) -> Array:
     pole = sine == 0.0
     theta = np.where(pole, 0.0, np.arctan2(r[..., 1, 2], r[..., 0, 2]))
     psi = np.where(
-        pole,
-        np.arctan2(r[..., 1, 0], r[..., 1, 1]),
-        np.arctan2(r[..., 2, 1], -r[..., 2, 0]),
+        pole, np.arctan2(r[..., 1, 0], r[..., 1, 1]), np.arctan2(r[..., 2, 1], -r[..., 2, 0])
     )
     return np.stack([theta, np.arctan2(sine, r[..., 2, 2]), psi], axis=-1)
 

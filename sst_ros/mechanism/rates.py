@@ -35,6 +35,7 @@ from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
 from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture
+from sst_ros.state import ZERO
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,7 @@ class BodyRates:
     omega_ipl_dot: Array
 
 
-def of_actuators(
-    at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = (0.0, 0.0, 0.0)
-) -> BodyRates:
+def of_actuators(at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = ZERO) -> BodyRates:
     """Everything from gamma_dot [rad/s] and gamma_ddot [rad/s^2], each shape (3,)."""
     rate, acceleration = np.array(gamma_dot, dtype=float), np.array(gamma_ddot, dtype=float)
     omega = at.j @ rate
@@ -69,7 +68,7 @@ def of_star(
     geometry: Geometry,
     rotation: ArrayLike,
     omega: ArrayLike,
-    omega_dot: ArrayLike = (0.0, 0.0, 0.0),
+    omega_dot: ArrayLike = ZERO,
     gamma: ArrayLike | None = None,
 ) -> BodyRates:
     """Everything from omega [rad/s] and omega_dot [rad/s^2] of the star in {B}, each shape (3,).
@@ -170,7 +169,7 @@ def of_torque(
     at: Posture,
     gamma_dot: ArrayLike,
     torque: ArrayLike,
-    moment: ArrayLike = (0.0, 0.0, 0.0),
+    moment: ArrayLike = ZERO,
 ) -> Reactions:
     """Constraint moments of the motion that torques [N m] and n_ext [N m] in {B} cause."""
     gamma_ddot = virtual_work.direct_dynamics(mechanism, at, gamma_dot, torque, moment)
@@ -182,7 +181,7 @@ def of_motion(
     at: Posture,
     gamma_dot: ArrayLike,
     gamma_ddot: ArrayLike,
-    moment: ArrayLike = (0.0, 0.0, 0.0),
+    moment: ArrayLike = ZERO,
 ) -> Reactions:
     """Constraint moments, and torques, that a motion gamma_dot, gamma_ddot asks for."""
     torque = virtual_work.inverse_dynamics(mechanism, at, gamma_dot, gamma_ddot, moment)

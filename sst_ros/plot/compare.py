@@ -33,8 +33,7 @@ Drawn: TypeAlias = "Sequence[tuple[Signals, str, dict[str, Any]]]"
 def _overlay(quantity: str, label: str, scale: float = 1.0) -> Callable[[Drawn], Figure]:
     """Return what draws a quantity of the legs of all runs."""
     return lambda runs: draw_legs(
-        label,
-        [(name, run.seconds(), scale * run.legs(quantity), look) for run, name, look in runs],
+        label, [(name, run.seconds(), scale * run.legs(quantity), look) for run, name, look in runs]
     )
 
 

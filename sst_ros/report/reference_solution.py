@@ -43,10 +43,7 @@ _MOST_STEPS = 25_000  # in extended precision: half a minute's work
 INTERVALS = 20  # solutions are compared at this many instants or more
 
 EXACT = replace(
-    DOP853,
-    b=(*DOP853.b[:-1], float(1 - sum(map(Fraction, DOP853.b[:-1])))),
-    error=(),
-    damping=(),
+    DOP853, b=(*DOP853.b[:-1], float(1 - sum(map(Fraction, DOP853.b[:-1])))), error=(), damping=()
 )
 """DOP853 without error estimates. As doubles its weights do not quite add up to 1, which no step
 size would show; here they do, exactly."""

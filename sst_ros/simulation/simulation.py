@@ -16,11 +16,7 @@ from sst_ros.dynamics.initial_state import derive_by_paper, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, ode_with_work
 from sst_ros.errors import Diverged, StepBudgetExceeded, refuse_unless
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.integration.adaptive_stepper import (
-    BudgetSpent,
-    CannotStep,
-    EvaluationBudget,
-)
+from sst_ros.integration.adaptive_stepper import BudgetSpent, CannotStep, EvaluationBudget
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.propagator import LimitReached, Propagator

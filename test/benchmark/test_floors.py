@@ -13,10 +13,7 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.scene.scene import load
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")]
 RUNS = {"kernel": ("--rounds", "1"), "batch": ("--scenarios", "200", "--rounds", "1")}
 
 

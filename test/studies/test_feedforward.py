@@ -16,14 +16,7 @@ from sst_ros.report.results import publish
 from sst_ros.scene.scene import load
 from sst_ros.sweeps.sweep_study import SampledControl
 from studies import feedforward
-from studies.control_loop import (
-    SHARE,
-    ControlLoop,
-    ideal_plant,
-    is_stable,
-    model_errors,
-    run_loop,
-)
+from studies.control_loop import SHARE, ControlLoop, ideal_plant, is_stable, model_errors, run_loop
 from studies.feedforward import (
     COLUMNS,
     RESTLESS,
