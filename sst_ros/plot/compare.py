@@ -117,9 +117,8 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
     first = runs[0]
     rows: list[dict[str, float]] = []
     for run in runs[1:]:
-        here, there = _common(first, run)
-        absent = {*first.missing, *run.missing}
-        of = len(run.tables["samples"].stamp_ns) if "samples" in run.tables else 0
+        (here, there), absent = _common(first, run), {*first.missing, *run.missing}
+        of = len(run.tables["samples"]) if "samples" in run.tables else 0
         row: dict[str, float] = {"samples": len(here), "of": of}
         for quantity, name, unit in (("gamma", "γ", "rad"), ("gamma_dot", "rate", "rad/s")):
             apart = Series(dtype=float)
@@ -144,12 +143,10 @@ def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def labels(runs: Sequence[Signals]) -> list[str]:
-    """Name each run by the shortest end of its path that no other has."""
-    parts = [run.bag.path.resolve().parts for run in runs]
-    for depth in range(1, max(map(len, parts)) + 1):
-        names = ["/".join(part[-depth:]) for part in parts]
-        if len(set(names)) == len(names):
-            return names
+    """Name each run by its folder, or by number and path where two folders have one name."""
+    names = [run.bag.path.resolve().name for run in runs]
+    if len(set(names)) == len(names):
+        return names
     return [f"{index}: {run.bag.path}" for index, run in enumerate(runs, 1)]
 
 

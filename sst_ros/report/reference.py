@@ -128,9 +128,7 @@ def held_torques(recording: Recording) -> Held | None:
 def initial(scene: Scene) -> tuple[float, ...]:
     """State at t = 0 by the paper's kinematics: quaternion, W in {E} [rad/s], lagged torques.
 
-    Raises:
-        AssemblyError: the initial gamma has no unique admissible assembly.
-
+    Raises AssemblyError where the initial gamma has no unique admissible assembly.
     """
     return (*initial_state(scene, Geometry.of(scene)), *(0.0,) * (scene.lags * 3))
 

@@ -130,7 +130,7 @@ def summarise(run: Recording, integration: Comparison, ideal: Comparison | None)
     ideals: dict[str, Any] = {}
     if ideal:
         ideals = {
-            **_largest("ideal_difference", ideal.error, run.seconds),
+            **_largest("ideal_difference", ideal.error),
             **_largest("ideal_reference_error", ideal.own),
             "hold_order": hold_order(run),
         }
@@ -141,7 +141,7 @@ def summarise(run: Recording, integration: Comparison, ideal: Comparison | None)
         "tracking_error_rms_rad": found and found.rms.tolist(),
         "tracking_error_max_rad": found and found.largest.tolist(),
         "settling_time_s": found and found.settling,
-        **_largest("integration_error", integration.error, run.seconds),
+        **_largest("integration_error", integration.error),
         **_largest("integration_reference_error", integration.own),
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,
@@ -182,9 +182,6 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "sample_period_s": period / NANOSECONDS,
         "stamp_gaps": int(np.count_nonzero(spacing > period)),
         "samples_missing_between_stamps": between,
-        # The last sample marks the end of the run, wherever that is.
-        "stamps_off_the_period": int(np.count_nonzero(spacing[:-1] % period)),
-        "orientations_lost": int(np.count_nonzero(~np.isfinite(run.quaternion[:, 0]))),
         "idle_states": run.idle_states,
         "tick_period_s": run.ticks.period_ns / NANOSECONDS,
         "ticks_recorded": len(run.ticks.start_ns),
@@ -201,13 +198,9 @@ def largest(values: Array) -> float | None:
     return float(np.nanmax(values)) if np.isfinite(values).any() else None
 
 
-def _largest(name: str, table: DataFrame, seconds: Array | None = None) -> dict[str, Any]:
-    """Largest value of each column, and when that of gamma was; None where nothing is known."""
-    found = {f"{name}_{key}_{unit}": largest(table[key]) for key, unit in QUANTITIES.items()}
-    if seconds is not None:
-        at = float(seconds[table.gamma.argmax()]) if table.gamma.count() else None
-        found[f"{name}_gamma_largest_at_s"] = at
-    return found
+def _largest(name: str, table: DataFrame) -> dict[str, float | None]:
+    """Largest value of each column; None where nothing is known."""
+    return {f"{name}_{key}_{unit}": largest(table[key]) for key, unit in QUANTITIES.items()}
 
 
 def hold_order(run: Recording) -> int | None:

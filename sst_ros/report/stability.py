@@ -268,22 +268,18 @@ def draw_stability(found: StabilityReport) -> Figure:
     """Draw eigenvalues and stable steps along the motion."""
     figure = Figure(figsize=(11.0, 4.6))
     left, right = figure.subplots(1, 2)
-    times, free = found.steps.t_s, []
-    for name, colour, line in (("decay", BLUE, "-"), ("oscillation", VERMILION, "--")):
-        values = found.steps[name].where(found.steps[name] > 0.0)
-        left.plot(times, values, line, color=colour, label=name)
-    for name in METHODS:
-        longest = found.steps[name].where(np.isfinite(found.steps[name]))
-        if longest.isna().all():
-            free.append(name)
-        else:
-            right.plot(times, longest, color=MARKERS[name][0], label=name)
-    right.plot([], [], " ", label=f"{', '.join(free)}: every step")
-    left.set_ylabel("fastest rate of the eigenvalues [1/s]")
-    right.set_ylabel("longest stable step [s]")
-    for axes in (left, right):
-        axes.set(yscale="log", xlabel="time t [s]")
-        legend(axes)
+    steps = found.steps.set_index("t_s").replace([math.inf, 0.0], math.nan)
+    looks = {"logy": True, "linewidth": 1.8, "xlabel": "time t [s]"}
+    rates, label = steps[["decay", "oscillation"]], "fastest rate of the eigenvalues [1/s]"
+    rates.plot(ax=left, ylabel=label, color=[BLUE, VERMILION], style=["-", "--"], **looks)
+    limited = [name for name in METHODS if steps[name].notna().any()]
+    colours = [MARKERS[name][0] for name in limited]
+    if limited:
+        steps[limited].plot(ax=right, ylabel="longest stable step [s]", color=colours, **looks)
+    free = ", ".join(name for name in METHODS if name not in limited)
+    right.plot([], [], " ", label=f"{free}: every step")
+    legend(left)
+    legend(right)
     figure.suptitle(f"Stability of {found.scene}", fontsize=12)
     note(figure, provenance(), 185)
     return figure
