@@ -136,7 +136,8 @@ class ActuatorSpaceMap:
         rows = zip(geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True)
         self._legs = [kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1]) for w, v, e in rows]
         self._actuators = compile_program(trace(self._of_star, _STAR))
-        self._star = compile_program(trace(self.star_accelerations, _MOVING))
+        # W and W_dot in {E}, six numbers, of a quaternion, gamma_dot and gamma_ddot.
+        self.star_motion = compile_program(trace(self.star_accelerations, _MOVING))
         # sin(mu) and beta [rad] of the legs, six numbers, and det J2, of a quaternion.
         self.posture = compile_program(trace(self._of_posture, _STAR[:4]))
         self._newton = compile_program(trace(self.newton_step, _POSE))
@@ -145,13 +146,6 @@ class ActuatorSpaceMap:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad]."""
         g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(*q, *rate, *acceleration)
         return Reference(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
-
-    def star_motion(
-        self, q: Quaternion, gamma_dot: Vector3, gamma_ddot: Vector3
-    ) -> tuple[Vector3, Vector3]:
-        """W [rad/s] and W_dot [rad/s^2] in {E} of rates and accelerations of the actuators."""
-        x, y, z, ax, ay, az = self._star(*q, *gamma_dot, *gamma_ddot)
-        return (x, y, z), (ax, ay, az)
 
     def follow(
         self, known: Quaternion, here: Vector3, gamma: Vector3, sigma: float | None = None

@@ -200,8 +200,7 @@ class ControlLaw(NamedTuple):
 
     settings: ControllerSettings
     torque: Callable[[Any, Any, Any], Triple]  # of the model, by quaternion, W and W_dot [N m]
-    # W and W_dot of the model, by quaternion, gamma_dot and gamma_ddot
-    accelerate: Callable[[Any, Any, Any], tuple[Triple, Triple]]
+    accelerate: Callable[..., Any]  # W and W_dot of the model, see `ActuatorSpaceMap.star_motion`
     kp: Triple  # gains of accelerations [1/s^2]
     kd: Triple  # [1/s]
     inertia: Triple  # M_kk at the start of the motion [kg m^2]
@@ -232,7 +231,8 @@ class ControlLaw(NamedTuple):
             feedforward = self.torque(observed, ZERO, ZERO)
         if mode == "computed_torque":
             asked = add(desired.gamma_ddot, self._correct(integral, error, rates))
-            body_rate, acceleration = self.accelerate(observed, gamma_dot, asked)
+            moving = self.accelerate(*observed, *gamma_dot, *asked)
+            body_rate, acceleration = moving[:3], moving[3:]
             summed = error
             if self.settings.space == "so3":
                 summed, acceleration = self._correct_on_so3(desired, observed, body_rate, integral)

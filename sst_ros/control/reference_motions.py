@@ -214,8 +214,8 @@ def move_actuators(
         gamma, gamma_dot, gamma_ddot = path(time)
         index = max(bisect_right(times, time) - 1, 0)
         q = space.follow(known[index], gammas[index], gamma, sigma[index])
-        star = space.star_motion(q, gamma_dot, gamma_ddot)
-        return Reference(q, *star, gamma, gamma_dot, gamma_ddot)
+        star: Any = space.star_motion(*q, *gamma_dot, *gamma_ddot)
+        return Reference(q, star[:3], star[3:], gamma, gamma_dot, gamma_ddot)
 
     return ReferenceMotion(inside, pieces)
 

@@ -204,10 +204,6 @@ class ControlledBatch:
         def torque(*at: Any) -> Any:
             return kernel.actuator_torque(kernel.model_of(self._scene), *at)[0]
 
-        def accelerate(q: Any, gamma_dot: Any, gamma_ddot: Any) -> tuple[Any, Any]:
-            found = space.star_accelerations(*q, *gamma_dot, *gamma_ddot)
-            return found[:3], found[3:]
-
         def command(
             joints: Any, given: Any, memory: Any, gains: Any, noise: Sequence[Any]
         ) -> tuple[Any, ...]:
@@ -223,6 +219,7 @@ class ControlledBatch:
             desired = Reference(**{name: given[name] for name in _DESIRED})
             limit = gains["limit"][0] if self._limited else None
             numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
+            accelerate = space.star_accelerations
             scheme = law.ControlLaw(control, torque, accelerate, *numbers, control.period)
             ahead = given["feedforward"], given["held"]
             found = scheme.answer(desired, ahead, gamma, gamma_dot, observed, memory["integral"])
