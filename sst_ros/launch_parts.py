@@ -27,7 +27,7 @@ from launch.launch_description import LaunchDescription
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from sst_ros.description.robot import urdf, urdf_with_ros2_control
+from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.host import processes
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics
@@ -169,12 +169,11 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
     """
     hardware = "joint_state_topic_hardware_interface"
     require("robot_state_publisher", "controller_manager", "joint_state_broadcaster", hardware)
-    topics_used = "/sst_simulator/commands_stamped", "/joint_states"
-    names = (_in_namespace(given, topic) for topic in topics_used)
+    names = [_in_namespace(given, topic) for topic in TOPICS]
     path = controllers or str(share_directory() / "config" / "controllers.yaml")
     spawned = ["joint_state_broadcaster", controller, "--param-file", path]
     return [
-        _state_publisher(given, urdf_with_ros2_control(load(given["scene"]), *names)),
+        _state_publisher(given, urdf(load(given["scene"]), names)),
         _node(given, "controller_manager", "ros2_control_node", parameters=[path]),
         _node(given, "controller_manager", "spawner", ends=False, arguments=spawned),
     ]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from sst_ros.description.robot import urdf, urdf_with_ros2_control
+from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.scene.scene import Scene, load, names
 from sst_ros.scene.yaml_document import json_schema
 
@@ -24,5 +24,4 @@ def print_schema(_: argparse.Namespace) -> None:
 
 def describe(options: argparse.Namespace) -> None:
     """Print a scene as URDF."""
-    write = urdf_with_ros2_control if options.ros2_control else urdf
-    print(write(load(options.scene)), end="")
+    print(urdf(load(options.scene), TOPICS if options.ros2_control else ()), end="")

@@ -24,7 +24,7 @@ the joints of its tag only: passive joints, which have no command, must not be i
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
@@ -55,6 +55,8 @@ LEG_COLOURS: tuple[Colour, ...] = ((0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00
 STEP = np.radians(6.0)  # arcs are drawn as chords of this length or less: 0.14 % of the radius off
 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
+TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
+"""Of commands and states, by which ros2_control drives a simulator."""
 EVERY_CYCLE = "-1"
 """Threshold of the change of a command below which the plug-in sends none: the simulator drops a
 command that is not repeated within command_timeout."""
@@ -195,29 +197,27 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
     return found
 
 
-def urdf(scene: Scene) -> str:
-    """Write a scene as a URDF document."""
-    return _text(_robot(scene))
+def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
+    """Write a scene as a URDF document.
 
-
-def urdf_with_ros2_control(
-    scene: Scene, commands: str = "/sst_simulator/commands_stamped", states: str = "/joint_states"
-) -> str:
-    """Write a scene as URDF with the ros2_control tag of its actuators.
-
-    The simulator takes commands by name on the one topic, and has its joint states on the other.
-    Until the first of them arrive, the hardware has the initial state of the scene: without it
-    joint_trajectory_controller, activated before, holds nan, and no command starts the run.
+    With topics of commands by name and of joint states it has the ros2_control tag of the
+    actuators. Until the first of them arrive, the hardware has the initial state of the scene:
+    without it joint_trajectory_controller, activated before, holds nan, and no command starts the
+    run.
     """
     root = _robot(scene)
+    if topics:
+        _add_ros2_control(root, scene, topics)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _add_ros2_control(root: ET.Element, scene: Scene, topics: Sequence[str]) -> None:
     tag = ET.SubElement(root, "ros2_control", name="sst_ros", type="system")
     hardware = ET.SubElement(tag, "hardware")
     ET.SubElement(hardware, "plugin").text = PLUGIN
-    for name, value in (
-        ("joint_commands_topic", commands),
-        ("joint_states_topic", states),
-        ("trigger_joint_command_threshold", EVERY_CYCLE),
-    ):
+    names = "joint_commands_topic", "joint_states_topic", "trigger_joint_command_threshold"
+    for name, value in zip(names, (*topics, EVERY_CYCLE), strict=True):
         ET.SubElement(hardware, "param", name=name).text = value
     starts = zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)
     for name, gamma, gamma_dot in starts:
@@ -226,12 +226,6 @@ def urdf_with_ros2_control(
         for state, start in (("position", gamma), ("velocity", gamma_dot), ("effort", 0.0)):
             interface = ET.SubElement(joint, "state_interface", name=state)
             ET.SubElement(interface, "param", name="initial_value").text = repr(start)
-    return _text(root)
-
-
-def _text(root: ET.Element) -> str:
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
 def _robot(scene: Scene) -> ET.Element:

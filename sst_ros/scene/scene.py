@@ -153,17 +153,15 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
     """
     if initial is None:
         return scene
-    if not isinstance(initial, (loads.Initial, Mapping)):
+    if isinstance(initial, Mapping):
+        initial = {key: x for key, x in initial.items() if x is not None}  # as in `Initial`
+    elif not isinstance(initial, loads.Initial):
         try:
             gamma, gamma_dot = initial
         except (TypeError, ValueError):
             allowed = "must be (gamma, gamma_dot), a mapping or Initial"
             raise InputError("initial", [Problem("initial", initial, allowed)]) from None
         initial = {"gamma": gamma, "gamma_dot": gamma_dot}
-    if isinstance(initial, Mapping):
-        # As in `Initial`, None is no orientation.
-        given = {key: x for key, x in initial.items() if key != "orientation" or x is not None}
-        initial = schema.build(loads.Initial, given, "initial")
     return replace(scene, initial=initial)
 
 

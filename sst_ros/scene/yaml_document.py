@@ -221,15 +221,12 @@ def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
 
 
 def _object_schema(cls: type[Section]) -> dict[str, Any]:
-    described: dict[str, Any] = {"type": "object", "additionalProperties": False}
-    if cls.__doc__:
-        described["description"] = cls.__doc__.partition("\n")[0]
-    if cls.ONE_OF:
-        described["oneOf"] = [{"required": [name]} for name in cls.ONE_OF]
-    known = cls.SPECS
-    properties = {name: _property_schema(spec) for name, spec in known.items()}
-    required = [name for name, spec in known.items() if spec.default is REQUIRED]
-    return {**described, "properties": properties, "required": required}
+    described = {"description": (cls.__doc__ or "").partition("\n")[0]}
+    one_of = {"oneOf": [{"required": [name]} for name in cls.ONE_OF]} if cls.ONE_OF else {}
+    properties = {name: _property_schema(spec) for name, spec in cls.SPECS.items()}
+    required = [name for name, spec in cls.SPECS.items() if spec.default is REQUIRED]
+    given = {"properties": properties, "required": required}
+    return {"type": "object", "additionalProperties": False, **described, **one_of, **given}
 
 
 def _property_schema(spec: Spec) -> dict[str, Any]:

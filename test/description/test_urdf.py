@@ -29,7 +29,6 @@ from sst_ros.description.robot import (
     roll_pitch_yaw,
     shapes,
     urdf,
-    urdf_with_ros2_control,
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism import rates, virtual_work
@@ -282,7 +281,7 @@ def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name)
 def test_the_tag_has_the_actuators_the_topics_and_the_states_before_the_first_message():
     """Without those a controller that is activated first holds nan, and no run starts."""
     scene = load("swing")
-    text = urdf_with_ros2_control(scene, "/a/commands", "/a/states")
+    text = urdf(scene, ("/a/commands", "/a/states"))
     (tag,) = ET.fromstring(text).findall("ros2_control")
     assert tag.attrib == {"name": "sst_ros", "type": "system"}
     hardware = tag.find("hardware")
