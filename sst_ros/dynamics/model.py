@@ -14,7 +14,6 @@ from sst_ros.mechanism.generic_math import Symmetric, Triple, cross3, multiply, 
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
-from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
 
@@ -68,8 +67,8 @@ class Model(NamedTuple):
     time_constant: float | None = None  # lag of the actuators [s]
 
 
-def model_of(scene: Scene, geometry: Geometry | None = None) -> Model:
-    """Collect the constants of a scene; its geometry may be given where it is known.
+def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
+    """Collect the constants of a `Scene`; its geometry may be given where it is known.
 
     The numbers of the scene and its geometry may be columns, of many scenes at once.
     """
@@ -189,8 +188,8 @@ def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
     return [(joint, low, high) for joint, (low, high) in found.items()]
 
 
-def limits_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
-    """Yield serial singularities, and the ends at which the scene stops.
+def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
+    """Yield serial singularities, and the ends at which the `Scene` stops.
 
     Of many geometries the ends are columns, which no text names.
     """
