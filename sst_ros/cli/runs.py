@@ -122,10 +122,8 @@ def map_workspace(options: argparse.Namespace) -> None:
 def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
     out, picture, count = options.out, None, options.samples
-    ends, allowed = (
-        f"must end in {' or '.join(SUFFIXES)}",
-        f"must be a whole number from 1 to {MOST}",
-    )
+    ends = f"must end in {' or '.join(SUFFIXES)}"
+    allowed = f"must be a whole number from 1 to {MOST}"
     refuse_unless(
         "simulate",
         ("--out", str(out), out is None or out.suffix in SUFFIXES, ends),

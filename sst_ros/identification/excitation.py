@@ -39,6 +39,7 @@ SHARE = 0.9  # of each range that the motion may use: the manipulator is not qui
 LEAST_SINE = 0.15  # of mu_k, and det J2: torques and rates grow with their inverse
 _FIRST = 0.05  # amplitude of the first guess [rad]
 _PENALTY = 100.0
+_POINT = ("time", "gamma", "gamma_dot", "gamma_ddot")  # of a quintic between waypoints
 _HOMOTOPY = 8  # steps from the centre to all samples
 
 
@@ -102,8 +103,14 @@ def design(
     free = np.random.default_rng(seed).normal(size=trial.size)
     free *= _FIRST / np.abs(trial.series(free)[0] - trial.centre).max()
     found = minimize(trial.cost, free, method="L-BFGS-B", options={"maxiter": iterations}).x
+    origin = "designed to identify parameters: Fourier series"
+    changes = {"initial.gamma_dot": 0.0, "torque": None, "provenance.motion": origin}
     for _ in range(40):
-        designed = _write_scene(scene, trial.times, trial.series(found))
+        rows = zip(trial.times, *trial.series(found), strict=True)
+        points = [dict(zip(_POINT, row, strict=True)) for row in rows]
+        points[-1] |= dict.fromkeys(_POINT[2:], (0.0, 0.0, 0.0))
+        motion = {"motion": {"waypoints": points}, "duration": trial.times[-1]}
+        designed = scene.with_values(changes | motion)
         plan = examine_motion(reference_motion(designed), designed)
         columns, excess = trial.evaluate(found)
         if not plan.problems and excess.max() <= 0.0:
@@ -117,14 +124,10 @@ def design(
 
 
 class _Trial:
-    """Motions of a scene as Fourier series of free numbers, and what they determine of parameters.
+    """Fourier series of free numbers about `centre`, at `times`, and how far they determine `base`.
 
-    Attributes:
-        centre: angles at both ends [rad], shape (3,).
-        size: number of the free numbers.
-        times: samples [s], POINTS in a period of the highest harmonic, shape (n,).
-        base: the parameters that some motion determines.
-
+    `base` are the parameters that some motion of the scene determines; samples are POINTS in a
+    period of the highest harmonic, n of them.
     """
 
     def __init__(
@@ -196,13 +199,3 @@ def _condition(columns: Array) -> float:
     """Condition number with columns of length one, 1e15 at most."""
     lengths = np.linalg.norm(columns, axis=0)
     return min(float(np.linalg.cond(columns / np.maximum(lengths, 1e-300))), 1e15)
-
-
-def _write_scene(scene: Scene, times: Array, angles: tuple[Array, Array, Array]) -> Scene:
-    """Return the scene with the motion as waypoints, quintic between them."""
-    names = ("time", "gamma", "gamma_dot", "gamma_ddot")
-    points = [dict(zip(names, row, strict=True)) for row in zip(times, *angles, strict=True)]
-    points[-1] |= dict.fromkeys(names[2:], (0.0, 0.0, 0.0))
-    origin = "designed to identify parameters: Fourier series"
-    changes = {"initial.gamma_dot": 0.0, "torque": None, "motion": {"waypoints": points}}
-    return scene.with_values(changes | {"duration": times[-1], "provenance.motion": origin})
