@@ -93,14 +93,10 @@ class Bar:
     def draw(self, share: float, text: str = "") -> None:
         """Show that this share is done, from 0 to 1, and a text."""
         percent = int(100.0 * share)
-        if not self._drawn or percent == self._percent:
-            return
-        self._percent = percent
-        bar = "#" * (40 * percent // 100)
-        end = "\n" if percent == 100 else ""
-        more = f" {text:60.60}" if text else ""
-        line = f"\r{self._label} [{bar:40}] {percent:3d} %{more}"
-        print(line, end=end, file=sys.stderr, flush=True)
+        if self._drawn and percent != self._percent:
+            self._percent, bar = percent, "#" * (40 * percent // 100)
+            line = f"\r{self._label} [{bar:40}] {percent:3d} %" + (f" {text:60.60}" if text else "")
+            print(line, end="\n" if percent == 100 else "", file=sys.stderr, flush=True)
 
 
 def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:

@@ -171,7 +171,10 @@ class SimulationInterfaces:
         quaternion, rate = now.quaternion, _turn(now.quaternion, now.body_rate)
         try:
             if getattr(request, "set_pose", True):  # the flags are new in 2.1
-                quaternion = _unit(_numbers(pose.orientation, "xyzw"))
+                given = _numbers(pose.orientation, "xyzw")
+                if not abs((length := float(np.linalg.norm(given))) - 1.0) < _UNIT:
+                    raise ValueError(f"orientation has length {length:.6g}, must be 1")
+                quaternion = tuple(part / length for part in given)
                 if any(_numbers(pose.position, "xyz")):
                     raise ValueError("position must be zero: the star turns about the origin")
             if getattr(request, "set_twist", True):
@@ -266,11 +269,3 @@ def _numbers(message: Any, names: str) -> Any:
     if not all(map(math.isfinite, numbers)):
         raise ValueError(f"{type(message).__name__} must be finite numbers")
     return numbers
-
-
-def _unit(quaternion: Quaternion) -> Quaternion:
-    length = float(np.linalg.norm(quaternion))
-    if not abs(length - 1.0) < _UNIT:
-        raise ValueError(f"orientation has length {length:.6g}, must be 1")
-    x, y, z, w = (part / length for part in quaternion)
-    return x, y, z, w

@@ -129,8 +129,19 @@ class RunDiagnostics:
             **self.gauges,
             "fault": self._loop.fault,
         }
-        if ticks:
-            self._keep_row(values["simulated_time_s"], values["real_time_factor"])
+        if not ticks:
+            return values
+        # Of the table the newest row is kept and at most 16 before it, evenly over the run.
+        keys = ("error_estimate", "energy_residual_J", "closure_residual")
+        errors, seconds = [self.gauges.get(key) for key in keys], values["simulated_time_s"]
+        if self._last is not None and self._last[0] != seconds:
+            self._count += 1
+            if self._count % self._stride == 0:
+                self._rows.append(self._last)
+            if len(self._rows) >= _ROWS:
+                self._rows = self._rows[1::2]
+                self._stride *= 2
+        self._last = seconds, errors, values["real_time_factor"], self._pacer.missed
         return values
 
     def status(self, values: dict[str, Any], warnings: list[str]) -> tuple[int, str, list[str]]:
@@ -178,19 +189,6 @@ class RunDiagnostics:
             cells = (f"{value:.2e}" if isinstance(value, float) else "-" for value in errors)
             yield columns.format(f"{seconds:.3f}", *cells, f"{factor:.3f}", missed)
 
-    def _keep_row(self, simulated_s: float, factor: float) -> None:
-        """Keep the newest row and at most 16 before it, evenly over the run."""
-        keys = ("error_estimate", "energy_residual_J", "closure_residual")
-        errors = [self.gauges.get(key) for key in keys]
-        if self._last is not None and self._last[0] != simulated_s:
-            self._count += 1
-            if self._count % self._stride == 0:
-                self._rows.append(self._last)
-            if len(self._rows) >= _ROWS:
-                self._rows = self._rows[1::2]
-                self._stride *= 2
-        self._last = simulated_s, errors, factor, self._pacer.missed
-
 
 def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
     """Read the gauges in the thread of the run; those without a finite value are left out."""
@@ -200,7 +198,7 @@ def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
     margins: dict[str, list[float]] = {"gamma": [], "mu": [], "beta": []}
     for limit in limits_of(simulation.scene, simulation.geometry):
         margins[JOINTS[limit.joint].partition("_")[0]].append(limit.distance(angles))
-    values: dict[str, object] = {
+    values: dict[str, Any] = {
         "error_estimate": simulation.error_estimate,
         "rate_error_estimate": simulation.rate_error_estimate,
         "hold_error_start": None if hold is None else hold[0],
@@ -216,8 +214,5 @@ def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
         "step_evaluations": simulation.evaluations / max(simulation.accepted_steps, 1),
         "step_budget": simulation.step_budget,
     }
-    return {
-        key: value
-        for key, value in values.items()
-        if value is not None and not (isinstance(value, float) and not math.isfinite(value))
-    }
+    known = {key: value for key, value in values.items() if value is not None}
+    return {key: x for key, x in known.items() if isinstance(x, str) or math.isfinite(x)}
