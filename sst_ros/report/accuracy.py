@@ -422,7 +422,8 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
         axes.plot(*place, "o", color=INK, zorder=5, label=label, **ring)
     axes.yaxis.set_major_locator(LogLocator(numticks=12))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    figure.legend(fontsize=8, frameon=False, loc="outside right center")
+    if axes.get_legend_handles_labels()[0]:  # none where every setting failed
+        figure.legend(fontsize=8, frameon=False, loc="outside right center")
     figure.suptitle(f"{study.scene}: error against wall time\n{name_fastest(study)}", fontsize=12)
     note(figure, f"Reference: {study.reference.how}. {provenance()}", 145)
     return figure

@@ -132,12 +132,9 @@ def pair_commands(recording: Recording) -> DataFrame:
     command, tick = (found[name].to_numpy(dtype=int) for name in ("command", "tick"))
     stamps, begins = commands.stamp_ns[command], ticks.start_ns[tick]
     age = (begins + recording.start_ns - stamps) / 1e3
-    columns = {
-        "time_s": begins / NANOSECONDS,
-        "received_us": (step_ns[tick] - commands.received_ns[command]) / 1e3,
-        "stamped_us": np.where(stamps > 0, age, np.nan),
-        "tick": tick,
-    }
+    received = (step_ns[tick] - commands.received_ns[command]) / 1e3
+    stamped, seconds = np.where(stamps > 0, age, np.nan), begins / NANOSECONDS
+    columns = {"time_s": seconds, "received_us": received, "stamped_us": stamped, "tick": tick}
     return pd.DataFrame(columns)
 
 
