@@ -160,6 +160,10 @@ SINGULAR_MU = 1e-6
 """Distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning."""
 
 
+CONTACT_BAND = 1e-9
+"""Farther beyond than this [rad], an actuator has not just reached the contact."""
+
+
 class Limit(NamedTuple):
     """One end: sign * (angle of a joint - end) >= 0."""
 
@@ -209,3 +213,18 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
             most = geometry.beta_max
             yield Limit(f"{beta} < 0", WorkspaceLeft, k + 6, 1.0, 0.0)
             yield Limit(above(beta, most), WorkspaceLeft, k + 6, -1.0, most)
+
+
+def contact_events_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
+    """Yield begin and end of contact at the elastic stops of a scene, one limit each."""
+    if scene.stroke.at_end == "elastic":
+        for k in range(3):
+            for end in (0.0, float(geometry.arc[k])):
+                for sign in (1.0, -1.0):
+                    yield Limit(f"gamma_{k + 1} = {end:.6f} rad", None, k, sign, end)
+
+
+def free_range(events: Sequence[Limit]) -> list[Limit]:
+    """Return limits of the range in which no elastic stop can be in contact."""
+    inner = [event for event in events if (event.end == 0.0) == (event.sign > 0.0)]
+    return [event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign) for event in inner]

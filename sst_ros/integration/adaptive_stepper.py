@@ -4,18 +4,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import ODE, Function
 from sst_ros.integration import step_loops
-from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.compiled_method import (
     JACOBIAN_COST,
     CompiledMethod,
     JointRanges,
+    Linearisation,
     Periods,
     Vector,
     methods_of,
@@ -94,6 +94,15 @@ _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3
 
 
+class TorqueLaw(NamedTuple):
+    """A derivative in plain Python, under torques that are a function, in place of the ODE's."""
+
+    derivative: Function
+    linearise: Linearisation | None  # None where it is not known, and no method is implicit
+    jump: Callable[[float, float, Vector], tuple[float, float] | None]
+    """(begin, end, state): times just before and after a jump in between, if there is one."""
+
+
 class Step(NamedTuple):
     """An accepted step, or the part of it before an event."""
 
@@ -117,7 +126,7 @@ class AdaptiveStepper:
         method: name of a method in `methods.METHODS`, or auto.
         tolerance: largest local error estimate of a step: of the quaternion, and of the rate
             relative to its length.
-        law: torques in plain Python, whose derivatives take the place of those of the ODE.
+        law: derivatives that take the place of those of the ODE.
         ranges: see `CompiledMethod`.
         joints: nine angles and nine rates of a state's first seven numbers, for the ends of steps.
         budget: counts evaluations, and ends a period that takes too many.
@@ -136,7 +145,7 @@ class AdaptiveStepper:
         budget: EvaluationBudget,
         max_step: float,
         ranges: JointRanges = (),
-        law: AppliedTorque | None = None,
+        law: TorqueLaw | None = None,
     ) -> None:
         self.tolerance, self.budget = tolerance, budget
         self._ode, self._law, self._max_step = ode, law, max_step
@@ -144,7 +153,7 @@ class AdaptiveStepper:
         self._chooses = len(self._methods) > 1
         self._most_attempts = _CHOOSE_EVERY - 1 if self._chooses else math.inf
         self._derivative = law.derivative if law else None
-        self._linearise = law.linearise if law and law.is_traced else None
+        self._linearise = law.linearise if law else None
         self._ranges, self._joints = ranges, joints
         self._machines: dict[str, CompiledMethod] = {}
 
@@ -247,7 +256,7 @@ class AdaptiveStepper:
         """
         at = at._replace(attempts=at.attempts + 1)
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(at.method, Rosenbrock)
-        if not self._chooses or (self._law is not None and not self._law.is_traced):
+        if not self._chooses or (self._law and not self._linearise):
             return at
         if at.attempts < _CHOOSE_EVERY and not early:
             return at
@@ -266,7 +275,7 @@ class AdaptiveStepper:
 
     def _jump_in(self, t: float, h: float, y: Vector, origin: float) -> list[float]:
         """Return times just before and after a jump of the derivative in a step, if any."""
-        found = self._law.jump(t, t + h, y) if self._law is not None else None
+        found = self._law.jump(t, t + h, y) if self._law else None
         if found is None or h < 1e-13 * max(abs(origin + t), h):
             return []
         margin = 4e-16 * max(abs(origin + found[1]), h)

@@ -6,11 +6,9 @@ The force of an elastic stop has a kink where contact begins and ends, so steps 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
-from sst_ros.dynamics.model import Limit
-from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Scene
+from sst_ros.dynamics.model import CONTACT_BAND, Limit
 
 Signal = Callable[[float], float]
 
@@ -19,18 +17,6 @@ TIME_TOLERANCE = 1e-15
 
 GRAZING = 1e-12
 """A distance below this [rad] counts as zero: closure and rounding reach 1e-15."""
-
-CONTACT_BAND = 1e-9
-"""Farther beyond than this [rad], an actuator has not just reached the contact."""
-
-
-def contact_events_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
-    """Yield begin and end of contact at the elastic stops of a scene, one limit each."""
-    if scene.stroke.at_end == "elastic":
-        for k in range(3):
-            for end in (0.0, float(geometry.arc[k])):
-                for sign in (1.0, -1.0):
-                    yield Limit(f"gamma_{k + 1} = {end:.6f} rad", None, k, sign, end)
 
 
 def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:
@@ -50,12 +36,6 @@ def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> boo
 def just_beyond(event: Limit, x: float, joints: Sequence[float], h: float) -> float:
     """Time just after an event at x, where the Jacobian is that of the side beyond the kink."""
     return min(x + min(1e-14 / max(abs(event.slope(joints)), 1e-200), 1e-3 * h), h)
-
-
-def free_range(events: Sequence[Limit]) -> list[Limit]:
-    """Return limits of the range in which no elastic stop can be in contact."""
-    inner = [event for event in events if (event.end == 0.0) == (event.sign > 0.0)]
-    return [event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign) for event in inner]
 
 
 def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
