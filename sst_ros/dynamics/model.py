@@ -215,8 +215,8 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
             yield Limit(above(beta, most), WorkspaceLeft, k + 6, -1.0, most)
 
 
-def contact_events_of(scene: Scene, geometry: Geometry) -> Iterator[Limit]:
-    """Yield begin and end of contact at the elastic stops of a scene, one limit each."""
+def contact_events_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
+    """Yield begin and end of contact at the elastic stops of a `Scene`, one limit each."""
     if scene.stroke.at_end == "elastic":
         for k in range(3):
             for end in (0.0, float(geometry.arc[k])):
