@@ -12,7 +12,6 @@ import stat
 import sys
 import tempfile
 import warnings
-from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -51,15 +50,6 @@ def configured_folder() -> Path | None:
         return Path.home() / ".cache" / "sst_ros"
     except RuntimeError:
         return None
-
-
-def store(files: Mapping[str, bytes]) -> None:
-    """Write files of compiled code, by their names in the cache folder, where they are missing."""
-    folder = cache_folder()
-    (folder / "__pycache__").mkdir(exist_ok=True, mode=0o700)
-    for name, data in files.items():
-        if not (folder / name).exists():
-            _write(folder / name, data)
 
 
 def import_text(name: str, text: str) -> ModuleType | None:

@@ -56,7 +56,8 @@ class PreparedSweep:
         profile = study.model_scene.torque is not None
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
         self.controlled = None if study.control is None else ControlledBatch(self.batch, study)
-        self.modules = [one.module for one in (self.batch, self.controlled) if one is not None]
+        for one in (self.batch, self.controlled):
+            _ = one and one.module  # compiled here, before several threads want it
         self._quantities = [name for name in study.outputs if name != "extremes"]  # of a state
         self.pilot_error = math.nan
         self.steps = steps or study.steps or self._choose_steps()

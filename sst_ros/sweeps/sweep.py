@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from sst_ros.errors import refuse_unless, require
 from sst_ros.host.output import TEMPORARY, Bar, require_free, write_into
 from sst_ros.scene.scene import scene_of
-from sst_ros.sweeps.engine import ChunkOutcome, run_chunk, run_local, run_on_cluster, send_code
+from sst_ros.sweeps.engine import ChunkOutcome, run_chunk, run_local, run_on_cluster
 from sst_ros.sweeps.prepared import prepare
 from sst_ros.sweeps.results import find_complete, read_sweep, to_frame
 from sst_ros.sweeps.sweep_study import SweepStudy
@@ -141,8 +141,7 @@ def run_study(
     if client is None:
         run_local(compute, missing, done, workers or len(os.sched_getaffinity(0)))
     else:
-        send_code(client, ready.modules)
-        run_on_cluster(client, compute, out, missing, done)
+        run_on_cluster(client, compute, missing, done)
 
     def read(kind: int) -> pd.DataFrame:
         if out is not None:

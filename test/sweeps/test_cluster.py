@@ -129,15 +129,10 @@ def until(condition):
 
 
 def test_a_cluster_gives_the_bits_of_threads(processes, expected, tmp_path):
-    processes.environment |= {"SST_ROS_CACHE": str(tmp_path / "empty")}
     processes.add_worker()
     processes.add_worker()
     with processes.client(2) as client:
         same(run_study(STUDY, tmp_path / "out", client=client), expected)
-    # Code was sent, not compiled: no file of a worker is younger than the epoch.
-    sent = list((tmp_path / "empty").rglob("sst_*.nbc"))
-    assert sent
-    assert all(path.stat().st_mtime == 0 for path in sent)
 
 
 def test_workers_killed_at_random_lose_nothing(processes, tmp_path):
@@ -216,12 +211,15 @@ def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, 
         run_study(STUDY, tmp_path / "out", client=client)
 
 
+@pytest.mark.parametrize(
+    ("allowed", "message"), [(0, "[^;]*died while running it[^;]*"), (9, "its workers died")]
+)
 def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
-    processes, expected, tmp_path, monkeypatch
+    processes, expected, tmp_path, monkeypatch, allowed, message
 ):
     monkeypatch.setattr(engine, "MOST_DEATHS", 2)
     processes.stop()
-    processes.environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    processes.environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(allowed)}
     processes.start_scheduler()
     live = threading.Event()
 
@@ -231,7 +229,7 @@ def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
             if all(one.poll() is not None for one in processes.workers):
                 processes.add_worker(POISONED)
 
-    died = pytest.raises(SweepFailed, match="chunk 3: its workers died 2 times")
+    died = pytest.raises(SweepFailed, match=f"^chunk 3: {message}$")
     with meanwhile(keep_one, live), processes.client(1) as client, died:
         run_study(STUDY, tmp_path / "out", client=client)
     assert len(list((tmp_path / "out").glob("part-*"))) == 11
