@@ -185,7 +185,7 @@ class _ClusterRun:
             if self._client.status == "closed" or time.monotonic() > end:
                 raise SweepFailed(NO_ANSWER)
             time.sleep(0.1)
-        # Not by `scheduler_info`: another thread of the client empties what it is about to return.
+        # Not by scheduler_info(): another thread of the client empties what it is about to return.
         threads: dict[str, int] = self._client.nthreads()
         if new := [*(threads.keys() - self._faults.keys())]:
             # A worker of another version may not be able to read a study: it is asked by text.
