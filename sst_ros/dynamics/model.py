@@ -88,19 +88,17 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
         xx, yy, zz, xy, xz, yz = entries_of(bodies[1].inertia)
         turning = zip(star, PLACES, strict=True)
         star = [part + xx * (float(i == j) - e[i] * e[j]) for part, (i, j) in turning]
-        leg = Leg(w, v, cross3(w, v), e[0], e[1], drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
-        springs = ([x for x in scene.springs if x.joint == f"{kind}_{k + 1}"] for kind in kinds)
-        leg = leg._replace(
-            friction=tuple(getattr(scene.friction, kind, None) for kind in kinds),
-            springs=tuple(map(_join, springs)),
-        )
+        drive = link = ZERO
         if scene.gravity is not None:
             drive, link = (multiply(body.mass, body.centre) for body in bodies)
-            leg = leg._replace(drive=drive, link=link)
+        stops = None
         if scene.stroke.stiffness is not None:
             stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
-            leg = leg._replace(stops=stops)
-        legs.append(leg)
+        friction = tuple(getattr(scene.friction, kind, None) for kind in kinds)
+        springs = ([x for x in scene.springs if x.joint == f"{kind}_{k + 1}"] for kind in kinds)
+        inertias = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
+        loads = (friction, tuple(map(_join, springs)), drive, link, stops)
+        legs.append(Leg(w, v, cross3(w, v), e[0], e[1], *inertias, *loads))
     return Model(
         star=tuple(star),
         legs=(legs[0], legs[1], legs[2]),
