@@ -18,7 +18,7 @@ import numpy as np
 from sst_ros.cli.commands import free_out, function, refuse_unknown
 from sst_ros.errors import InputError, Problem, SstError, refuse_unless, require
 from sst_ros.host import compiled_module, processes
-from sst_ros.host.cache_folder import cache_folder, configured_folder
+from sst_ros.host.compiled_module import cache_folder, configured_folder
 from sst_ros.host.output import SUFFIXES, require_free, results_folder
 from sst_ros.integration import compiled_method
 from sst_ros.mechanism import workspace

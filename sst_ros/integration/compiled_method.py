@@ -23,7 +23,7 @@ from sst_ros.dynamics.expression import Slots
 from sst_ros.dynamics.simd_source import linearise_by_columns
 from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, Function, ode_with_work
 from sst_ros.host import compiled_module
-from sst_ros.host.cache_folder import cache_folder
+from sst_ros.host.compiled_module import cache_folder
 from sst_ros.integration import step_loops
 from sst_ros.integration.methods import (
     DOP853,

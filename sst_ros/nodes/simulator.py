@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, SstError
 from sst_ros.host import compiled_module, processes
-from sst_ros.host.cache_folder import cache_folder
+from sst_ros.host.compiled_module import cache_folder
 from sst_ros.integration import compiled_method
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every

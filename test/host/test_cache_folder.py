@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 from programs import python
 
-from sst_ros.host import cache_folder as module
-from sst_ros.host.cache_folder import cache_folder
-from sst_ros.host.compiled_module import numba_version
+from sst_ros.host import compiled_module as module
+from sst_ros.host.compiled_module import cache_folder, numba_version
 
 OTHER_USER = 65534
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root to act as a second user")
