@@ -263,8 +263,12 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
     for name, spec in known.items():
         if spec.default is REQUIRED and name not in values:
             problems.append(Problem(name, None, "is missing; " + spec.describe()))
+    given = {name: x for name, x in values.items() if name in known}
+    for name, x in given.items():
+        if known[name].kind == "text" and isinstance(x, (int, float)):  # as in a YAML file
+            given[name] = str(x)
     try:
-        frozen = _freeze_all((name, known[name], x) for name, x in values.items() if name in known)
+        frozen = _freeze_all((name, known[name], x) for name, x in given.items())
         if not problems:
             return cls(**frozen)
     except InputError as error:
@@ -302,7 +306,7 @@ def accept(spec: Spec, value: Any) -> Any:
     if kind == "number":
         return _freeze_numbers(spec, value, spec.shape)
     if kind == "text":
-        return _freeze_text(str(value) if isinstance(value, (int, float)) else value)
+        return _freeze_text(value)
     if kind == "notes" and isinstance(value, (Mapping, tuple)):
         each = ((_freeze_text(name), _NOTE, x) for name, x in dict(value).items())
         return tuple(_freeze_all(each).items())
