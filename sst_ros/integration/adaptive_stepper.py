@@ -114,9 +114,17 @@ class Step(NamedTuple):
     machine: CompiledMethod  # what has taken it
     last: bool  # whether it ends with the period
 
-    def state(self, x: float) -> list[float]:
-        """Return the state x [s] after its begin, by one shorter step."""
-        return self.machine.step_fixed(self.t, x, 1, self.begin.y, self.drive)
+    def inside(self, x: float) -> Point:
+        """Return the solution x [s] after its begin, by one shorter step; not the second one.
+
+        Raises:
+            ArithmeticError: it is not finite.
+
+        """
+        at, size = self.machine.step_pair(self.t, x, self.begin, self.drive, parts=1)
+        if size == math.inf:
+            raise ArithmeticError("a state inside a step is not finite")
+        return at
 
 
 class AdaptiveStepper:

@@ -117,7 +117,7 @@ class CompiledMethod:
         # tenth of a step's call.
         size, drive = len(system.state), len(system.drive)
         self._place = [self._vector([0.0] * n) for n in (size, size, 18)]
-        self._run = self._vector([0.0] * 9)
+        self._run = self._vector([0.0] * 10)
         self._length: Any = self._vector([0.0])
         self._drive: Any = np.zeros((1, drive)) if compiled else [[0.0] * drive]
         self._no_start: Any = np.empty((0, size)) if compiled else []
@@ -133,8 +133,12 @@ class CompiledMethod:
         y = [0.0, 0.0, 0.0, 1.0, *(0.0,) * (size - 4)]
         self.step_pair(0.0, 1e-3, Point(y, y, (0.0,) * 18, self.method), drive)
 
-    def step_pair(self, t: float, h: float, at: Point, d: Vector) -> tuple[Point, float]:
+    def step_pair(
+        self, t: float, h: float, at: Point, d: Vector, *, parts: int = 3
+    ) -> tuple[Point, float]:
         """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
+
+        With one part in place of three the second one has no meaning.
 
         Returns:
             Where they end, and the local error estimate in units of the tolerance; infinite where
@@ -142,8 +146,8 @@ class CompiledMethod:
 
         """
         one, begin = self.hold(h, d), at._replace(h=math.inf)
-        done, end = self.step_many(0, 1, one, begin, ranges=self._no_ranges, t=t)
-        return end, float(self._run[8]) if done else math.inf
+        done, end = self.step_many(0, 1, one, begin, ranges=self._no_ranges, t=t, parts=parts)
+        return end, float(self._run[9]) if done else math.inf
 
     def slope(self, t: float, y: Vector, d: Vector) -> tuple[float, ...]:
         """Return the derivative of the state."""
@@ -167,6 +171,7 @@ class CompiledMethod:
         *,
         ranges: Any = None,
         t: float = 0.0,
+        parts: int = 3,
     ) -> tuple[int, Point]:
         """Advance from period `first` to `end`; stop before one that needs more than steps.
 
@@ -180,6 +185,7 @@ class CompiledMethod:
             reached: takes both solutions at the ends, shape (n, 2, size).
             ranges: in place of those of the method.
             t: time at which periods begin, as the system takes it [s].
+            parts: see `step_pair`.
 
         Returns:
             The first period that was not done, and where it begins.
@@ -190,7 +196,7 @@ class CompiledMethod:
         y[:], z[:], joints[:] = at[:3]
         run[0], run[1], run[2], run[3] = at.h, at.attempts, at.steps, first
         run[4], run[5], run[6] = most
-        run[7] = t
+        run[7], run[8] = t, parts
         try:
             done = self._module.step_many(
                 first, end, *periods, self._numbers, tolerance, y, z,
@@ -218,10 +224,10 @@ class CompiledMethod:
         return self._listed(new)
 
 
-def has_step_code(system: ODE, method: Method, functions: Sequence[str] = ("step_many",)) -> bool:
+def has_step_code(system: ODE, method: Method) -> bool:
     """Return whether machine code of what a run calls is there, to be loaded quickly."""
     texts, constants, base, _ = _source(system, method, by_structure=True)
-    return compiled_module.has_code(texts, constants, functions, base=base)
+    return compiled_module.has_code(texts, constants, ("step_many",), base=base)
 
 
 def compile_derivative(system: ODE) -> Function:

@@ -200,7 +200,7 @@ class Propagator:
             if x in (0.0, step.h):
                 return step.end.joints if x else step.begin.joints
             self.budget.charge(step.machine.cost)
-            return self.dynamics.joints(*step.state(x)[:7])
+            return step.inside(x).joints
 
         ends = step.begin.joints, step.end.joints
         near = [event for event in self._events if may_occur(event, *ends)]

@@ -19,14 +19,15 @@ GROW, SHRINK, SAFETY = 5.0, 0.2, 0.9
 """Largest and least factor by which a step changes; share of the step that the error allows."""
 
 
-def step_pair(t, h, y, z, d, p, new_y, new_z, error):
+def step_pair(parts, t, h, y, z, d, p, new_y, new_z, error):
     """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
 
-    Returns the size of the local error estimate of y, relative to a tolerance of 1.
+    The second one needs three parts; of one part there is only the first. Returns the size of the
+    local error estimate of y, relative to a tolerance of 1.
     """
     middle = vector(SIZE)
     other = vector(SIZE)
-    for part in range(3):  # one call: the compiler puts the step here once
+    for part in range(parts):  # one call: the compiler puts the step here once
         begin, length = t, 0.5 * h
         if part == 0:
             length, old, near, new, local = h, y, y, new_y, error
@@ -35,12 +36,14 @@ def step_pair(t, h, y, z, d, p, new_y, new_z, error):
         else:
             begin, old, near, new, local = t + 0.5 * h, middle, middle, new_z, other
         attempt(begin, length, old, near, d, p, new, local)
-    if DOUBLING:  # the method has no estimate of its own
+    if DOUBLING and parts == 3:  # the method has no estimate of its own
         for i in range(SIZE):
             error[i] = (new_z[i] - z[i]) - (new_y[i] - y[i])
     size = size_of(error, y, new_y, h)
-    second = size_of(other, middle, new_z, h)
     normalise(new_y)
+    if parts == 1:
+        return size
+    second = size_of(other, middle, new_z, h)
     normalise(new_z)
     return size if second < INFINITE else INFINITE
 
@@ -98,7 +101,7 @@ def step_many(
     begin of the period that is returned, and reached[k] the solutions at the end of period k. `run`
     has the longest next step [s], attempts and steps until now, and the next period; then
     what is allowed: longest step [s], attempts until the method is looked at, and steps; then the
-    time at which periods begin [s], and the local error estimate of the last step.
+    time at which periods begin [s], the parts of a step, and the local error estimate of the last.
     """
     now_y, now_z, new_y, new_z = vector(SIZE), vector(SIZE), vector(SIZE), vector(SIZE)
     error, now_joints, new_joints = vector(SIZE), vector(18), vector(18)
@@ -121,8 +124,9 @@ def step_many(
             counted = 1.0 if IMPLICIT or not last else 0.0
             if attempts + counted > run[5] or steps >= run[6]:
                 return k
-            size = step_pair(run[7] + t, length, now_y, now_z, d, p, new_y, new_z, error)
-            run[8] = size
+            begin, parts = run[7] + t, int(run[8])
+            size = step_pair(parts, begin, length, now_y, now_z, d, p, new_y, new_z, error)
+            run[9] = size
             if not size <= tolerance:
                 return k
             joints_of(new_y, p, new_joints)

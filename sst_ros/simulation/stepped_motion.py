@@ -178,9 +178,7 @@ class SteppedMotion:
 
         Under a function only the derivative is compiled, which takes a second.
         """
-        there = callable(self._torque) or has_step_code(
-            machine.system, machine.method, ("step_many", "step_fixed")
-        )
+        there = callable(self._torque) or has_step_code(machine.system, machine.method)
         if there or self._spent + self.budget.spent > _WORTH_COMPILING:
             self.propagator.compile()
             self._compile_after = math.inf
@@ -195,7 +193,7 @@ class SteppedMotion:
         from scipy.interpolate import KroghInterpolator  # many runs have few samples
 
         times = [0.25 * k * step.h for k in range(5)]
-        states = [step.begin.y, *map(step.state, times[1:-1]), step.end.y]
+        states = [step.begin.y, *(step.inside(x).y for x in times[1:-1]), step.end.y]
         slopes = [
             step.machine.slope(step.t + x, y, step.drive)
             for x, y in zip(times, states, strict=True)
@@ -203,7 +201,7 @@ class SteppedMotion:
         data = [row for pair in zip(states, slopes, strict=True) for row in pair]
         polynomial = KroghInterpolator(np.repeat(times, 2), data)
         worst = _WORST * step.h
-        found, exact = polynomial(worst).tolist(), step.state(worst)
+        found, exact = polynomial(worst).tolist(), step.inside(worst).y
         self.budget.charge(4 * step.machine.cost + len(times))
         return polynomial if state_distance(found, exact) <= self._task.tolerance else None
 
@@ -218,7 +216,7 @@ class SteppedMotion:
         if y is None:
             x = time - self._last_begin
             self.budget.charge(self._last.machine.cost)
-            y = self._last.state(x) if x > 0.0 else self._last.begin.y
+            y = (self._last.inside(x) if x > 0.0 else self._last.begin).y
         at = self.propagator.begin(list(y))
         acting = self.propagator.acting(self._torque, time, at)
         self.rows.append((time, *at.y[:7], *acting, *at.joints))
