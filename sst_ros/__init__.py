@@ -51,30 +51,42 @@ if TYPE_CHECKING:
 
 __version__ = VERSION
 
-_RENAMED = {
-    "direct_kinematics": ("sst_ros.mechanism.kinematics", "direct"),
-    "inverse_kinematics": ("sst_ros.mechanism.kinematics", "inverse"),
-    "load_scene": ("sst_ros.scene.scene", "load"),
-    "read_bag": ("sst_ros.recording.recording", "read"),
+# Names of each module; one that has another name there is followed by it.
+_MODULES = {
+    "control.actuator_space": "ReferenceMotion",
+    "control.controller": "Controller InverseDynamics",
+    "control.law": "ControllerSettings",
+    "control.reference_motions": "reference_motion",
+    "errors": "AssemblyError InputError RunStopped SingularConfiguration SstError",
+    "identification.identify": "identify",
+    "identification.parameters": "Identification",
+    "integration.batch": "Batch",
+    "mechanism.geometry": "Geometry",
+    "mechanism.kinematics": "direct_kinematics:direct inverse_kinematics:inverse",
+    "mechanism.workspace": "workspace",
+    "plot.workspace": "plot_workspace",
+    "recording.recording": "Recording read_bag:read",
+    "scene.bodies": "arc_inertia",
+    "scene.scene": "Scene load_scene:load",
+    "scene.torque_profile": "PolynomialTorque SineTorque TorqueTable",
+    "simulation.simulate": "prepare simulate",
+    "simulation.simulation": "Simulation",
+    "simulation.trajectory": "Trajectory",
+    "state": "State",
+    "sweeps.sweep": "sweep",
 }
 
 if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all others
-
-    def _read_exports() -> dict[str, tuple[str, str]]:
-        """Read modules and names of the exports from the imports above, which are their list."""
-        lines = __spec__.loader.get_data(__file__).decode().splitlines()
-        words = [line.split() for line in lines if line.startswith("    from sst_ros.")]
-        own = {shown: (module, name) for _, module, _, name, _, shown in words if name == shown}
-        return own | _RENAMED
-
-    _EXPORTS = _read_exports()
+    _WORDS = [(module, word) for module, words in _MODULES.items() for word in words.split()]
+    _EXPORTS = {word.partition(":")[0]: (module, word) for module, word in _WORDS}
     __all__ = ["__version__", *sorted(_EXPORTS)]
 
     def __getattr__(name: str) -> object:
         if name not in _EXPORTS:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        module, attribute = _EXPORTS[name]
-        value: object = getattr(importlib.import_module(module), attribute)
+        module, word = _EXPORTS[name]
+        found = importlib.import_module(f"sst_ros.{module}")
+        value: object = getattr(found, word.rpartition(":")[2])
         globals()[name] = value
         return value
 
