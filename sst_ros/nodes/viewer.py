@@ -78,19 +78,21 @@ class Viewer(Worker[ViewerParameters]):
         """Return the phase and the latest diagnostics."""
         return replace(self._status, phase=self._phase)
 
-    def pause(self, paused: bool) -> tuple[bool, str]:
-        """Pause or resume the run."""
-        return self._call("pause", SetBool.Request(data=paused))
-
-    def step(self) -> tuple[bool, str]:
-        """Advance a paused run by one sample."""
-        return self._call("step", Trigger.Request())
-
-    def reset(self) -> tuple[bool, str]:
-        """Return to the initial state."""
-        reply = self._call("reset", Trigger.Request())
-        self._start_ns = 0 if reply[0] else self._start_ns  # time counts from the next sample
-        return reply
+    def ask(self, request: str) -> tuple[bool, str]:
+        """Ask for pause, resume, step or reset; the node's thread takes the reply."""
+        paused = {"pause": True, "resume": False}.get(request)
+        client = self._clients[request if paused is None else "pause"]
+        if not client.service_is_ready():
+            return False, f"no service {client.srv_name}: is the simulator running?"
+        given: Any = Trigger.Request() if paused is None else SetBool.Request(data=paused)
+        future, answered = client.call_async(given), threading.Event()
+        future.add_done_callback(lambda _: answered.set())
+        if not answered.wait(_REPLY_S):
+            return False, f"no reply within {_REPLY_S:g} s"
+        reply: Any = future.result()
+        if request == "reset" and reply.success:
+            self._start_ns = 0  # time counts from the next sample
+        return bool(reply.success), str(reply.message)
 
     def apply(self, torque: Vector3) -> None:
         """Hold torques from now on; the timer publishes them."""
@@ -149,15 +151,3 @@ class Viewer(Worker[ViewerParameters]):
                 simulator = self.parameters.simulator
                 self._commands = topics.VIEWER["commands"].publisher(self.node, simulator=simulator)
             self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
-
-    def _call(self, service: str, request: Any) -> tuple[bool, str]:
-        """Call a service from a thread of the page; the node's thread takes the reply."""
-        client, answered = self._clients[service], threading.Event()
-        if not client.service_is_ready():
-            return False, f"no service {client.srv_name}: is the simulator running?"
-        future = client.call_async(request)
-        future.add_done_callback(lambda _: answered.set())
-        if not answered.wait(_REPLY_S):
-            return False, f"no reply within {_REPLY_S:g} s"
-        reply: Any = future.result()
-        return bool(reply.success), str(reply.message)

@@ -14,14 +14,15 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from viser import GuiButtonHandle, GuiSliderHandle, GuiUplotHandle, Icon, ViserServer, uplot
+from viser import GuiButtonHandle, GuiSliderHandle, GuiUplotHandle, Icon, uplot
 
 from sst_ros.description.robot import LEG_COLOURS
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.view.scene_drawing import SceneDrawing
+from sst_ros.state import ZERO
+from sst_ros.view.scene_drawing import ROOT, SceneDrawing
 from sst_ros.view.server import LOCAL, PORT, PageServer
-from sst_ros.view.source import Replay, RunControl, RunStatus, ViewState
+from sst_ros.view.source import Replay, RunControl, ViewState
 
 PERIOD_S = 1.0 / 30.0
 _SHOW_EVERY, _DRAW_EVERY = 3, 6  # frames between two updates of the numbers, and of the plots
@@ -55,9 +56,8 @@ class Page:
         self._source = source
         self._server = PageServer(host, port)
         self.url = self._server.url
-        _arrange(self._server)
+        self._clear()
         self._server.gui.add_markdown("Waiting for a simulator ...")
-        self._parts: tuple[SceneDrawing, _Panel, _RunControls | _ReplayControls] | None = None
         self._scene: Scene | None = None
         self._state: ViewState | None = None
         self._stop = threading.Event()
@@ -79,46 +79,53 @@ class Page:
     def _live(self) -> None:
         due = time.monotonic()
         for count in itertools.count():
-            self._update(count)
+            scene = self._source.scene
+            if scene is not None and scene != self._scene:
+                self._build(scene)
+            if self._scene is not None:
+                with self._server.atomic():
+                    self._update(count)
             due = max(due + PERIOD_S, time.monotonic())  # late frames are dropped
             if self._stop.wait(max(0.0, due - time.monotonic())):
                 return
 
-    def _update(self, count: int) -> None:
-        scene = self._source.scene
-        if scene is not None and scene != self._scene:
-            self._build(scene)
-        if self._parts is None:
-            return
-        drawing, panel, controls = self._parts
-        with self._server.atomic():
-            for state in self._source.states():
-                drawing.add(state.time, state.angles)
-                panel.add(state)
-                self._state = state
-            if self._state is not None:
-                drawing.show(self._state.angles, self._state.torque)
-            if count % _SHOW_EVERY == 0:
-                status = self._source.status()
-                panel.show(self._state, status)
-                controls.show(self._state, status)
-            if count % _DRAW_EVERY == 0:
-                panel.draw()
+    def _clear(self) -> None:
+        """Empty the page; set the theme, the panel's place and the light."""
+        gui, scene = self._server.gui, self._server.scene
+        gui.reset()
+        gui.configure_theme(
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(0, 114, 178),
+            control_width="large",
+        )
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(_PANEL_WIDTH)
+        scene.remove_by_name(ROOT)
+        scene.configure_default_lights(cast_shadow=False)
+        scene.configure_environment_map(None)
+        scene.set_up_direction("+z")
 
     def _build(self, scene: Scene) -> None:
-        """Show another scene in place of the last."""
-        server, source = self._server, self._source
-        if self._parts is not None:
-            self._parts[0].remove()
-        server.gui.reset()
-        _arrange(server)
+        """Show another scene in place of the last: picture, numbers, plots and controls."""
+        self._clear()
+        server, gui, source = self._server, self._server.gui, self._source
         self._scene, self._state = scene, None
-        controls = (
-            _ReplayControls(server, source)
+        self._show_controls = (
+            _add_replay_controls(server, source)
             if isinstance(source, Replay)
-            else _RunControls(server, scene, source)
+            else _add_run_controls(server, scene, source)
         )
-        self._parts = SceneDrawing(server, scene), _Panel(server, scene), controls
+        self._drawing = SceneDrawing(server, scene)
+        self._head = gui.add_html("", order=0.0)
+        self._joints = gui.add_html("", order=2.0)
+        with gui.add_folder("actuator angles γ, last 10 s", order=3.0):
+            gamma = _plot(server, "γ [deg]", (0.0, 90.0))
+        with gui.add_folder("torques τ, last 10 s", order=4.0):
+            self._plots = gamma, _plot(server, "τ [N m]", (-1.0, 1.0))
+        with gui.add_folder("status of the run", order=6.0):
+            self._status = gui.add_html("")
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=_POINTS)
         middle = Geometry.of(scene).v.sum(axis=0)
         middle /= np.linalg.norm(middle)
         size = max(scene.base.radius, scene.star.radius)
@@ -127,36 +134,23 @@ class Page:
             camera.position = size * (3.9 * middle + np.array([0.35, -0.55, 0.5]))
             camera.look_at, camera.fov = 0.28 * size * middle, np.radians(35.0)
 
+    def _update(self, count: int) -> None:
+        """Take what is new, and show it where it is due."""
+        for state in self._source.states():
+            self._drawing.add(state.time, state.angles)
+            self._add_to_plots(state)
+            self._state = state
+        if self._state is not None:
+            self._drawing.show(self._state.angles, self._state.torque)
+        if count % _SHOW_EVERY == 0:
+            self._show_numbers()
+        if count % _DRAW_EVERY == 0 and len(self._rows) >= 2:
+            rows = np.array(self._rows)
+            rows = rows[rows[:, 0] > rows[-1, 0] - _WINDOW_S]
+            for plot, columns in zip(self._plots, (rows[:, 1:4], rows[:, 4:7]), strict=True):
+                plot.data = (rows[:, 0], *columns.T.copy())
 
-def _arrange(server: PageServer) -> None:
-    """Set the theme, the panel's place and the light."""
-    server.gui.configure_theme(
-        show_logo=False, show_share_button=False, brand_color=(0, 114, 178), control_width="large"
-    )
-    server.gui.main_panel.dock_right()
-    server.gui.main_panel.set_width(_PANEL_WIDTH)
-    server.scene.configure_default_lights(cast_shadow=False)
-    server.scene.configure_environment_map(None)
-    server.scene.set_up_direction("+z")
-
-
-class _Panel:
-    """The numbers beside the picture: state, joints, status, and plots of gamma and torque."""
-
-    def __init__(self, server: ViserServer, scene: Scene) -> None:
-        gui = server.gui
-        self._scene = scene
-        self._head = gui.add_html("", order=0.0)
-        self._joints = gui.add_html("", order=2.0)
-        with gui.add_folder("actuator angles γ, last 10 s", order=3.0):
-            self._gamma = _plot(server, "γ [deg]", (0.0, 90.0))
-        with gui.add_folder("torques τ, last 10 s", order=4.0):
-            self._torque = _plot(server, "τ [N m]", (-1.0, 1.0))
-        with gui.add_folder("status of the run", order=6.0):
-            self._status = gui.add_html("")
-        self._rows: deque[tuple[float, ...]] = deque(maxlen=_POINTS)
-
-    def add(self, state: ViewState) -> None:
+    def _add_to_plots(self, state: ViewState) -> None:
         """Add a state to the plots; a time that goes back begins new ones."""
         if state.time is None:
             return
@@ -165,29 +159,21 @@ class _Panel:
         if not self._rows or state.time - self._rows[-1][0] >= _WINDOW_S / _POINTS:
             self._rows.append((state.time, *np.degrees(state.gamma), *state.torque))
 
-    def show(self, state: ViewState | None, status: RunStatus) -> None:
-        """Show name, phase and time, and the numbers of a state."""
-        phase = status.phase or "no simulator"
+    def _show_numbers(self) -> None:
+        """Show name, phase and time, the numbers of the state, and what is possible now."""
+        state, status = self._state, self._source.status()
+        phase, at = status.phase or "no simulator", None if state is None else state.time
         colour = _LEVELS[2 if phase.startswith("fault") else status.level]
-        time = "–" if state is None or state.time is None else f"{state.time:.2f} s"
-        self._head.content = str(_PANEL.head(self._scene, phase, colour, time))
-        if state is None:
-            return
-        self._joints.content = str(_PANEL.joints(_COLOURS, state))
-        shown = _PANEL.status(_LEVELS[status.level], status.message, status.values)
-        self._status.content = str(shown)
-
-    def draw(self) -> None:
-        """Draw the plots."""
-        if len(self._rows) < 2:
-            return
-        rows = np.array(self._rows)
-        rows = rows[rows[:, 0] > rows[-1, 0] - _WINDOW_S]
-        for plot, columns in ((self._gamma, rows[:, 1:4]), (self._torque, rows[:, 4:7])):
-            plot.data = (rows[:, 0], *columns.T.copy())
+        shown = "–" if at is None else f"{at:.2f} s"
+        self._head.content = str(_PANEL.head(self._scene, phase, colour, shown))
+        if state is not None:
+            self._joints.content = str(_PANEL.joints(_COLOURS, state))
+            found = _PANEL.status(_LEVELS[status.level], status.message, status.values)
+            self._status.content = str(found)
+        self._show_controls(phase, at)
 
 
-def _plot(server: ViserServer, label: str, range_: tuple[float, float]) -> GuiUplotHandle:
+def _plot(server: PageServer, label: str, range_: tuple[float, float]) -> GuiUplotHandle:
     """Add a plot of three legs whose axis shows a range at least."""
     lines: list[uplot.Series] = [{"label": "t [s]"}]
     for k, colour in zip("₁₂₃", _COLOURS, strict=True):
@@ -203,81 +189,85 @@ def _plot(server: ViserServer, label: str, range_: tuple[float, float]) -> GuiUp
     )
 
 
-class _RunControls:
-    """Pause, step, reset, and manual torques while no controller commands the run."""
+def _add_run_controls(
+    server: PageServer, scene: Scene, run: RunControl
+) -> Callable[[str, float | None], None]:
+    """Add pause, step, reset, and manual torques while no controller commands the run.
 
-    def __init__(self, server: ViserServer, scene: Scene, run: RunControl) -> None:
-        self._run, self._paused = run, False
-        gui = server.gui
-        most = scene.torque_limit or _LARGEST_TORQUE
-        with gui.add_folder("run", order=1.0):
-            self._pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
-            self._step = gui.add_button("Step", icon=Icon.PLAYER_SKIP_FORWARD, disabled=True)
-            reset = gui.add_button("Reset", icon=Icon.REFRESH)
-        with gui.add_folder("manual torques [N m]", order=5.0):
-            self._note = gui.add_html("")
-            self._sliders = [gui.add_slider(f"τ{k}", -most, most, most / 100.0, 0.0) for k in "₁₂₃"]
-            self._zero = gui.add_button("Zero", icon=Icon.CIRCLE_OFF)
-        _ask(self._pause, "pause", lambda: run.pause(not self._paused))
-        _ask(self._step, "step", run.step)
-        _ask(reset, "reset", self._reset)
-        self._zero.on_click(lambda _: self._release())
-        for slider in self._sliders:
-            slider.on_update(lambda event: self._apply() if event.client is not None else None)
+    The function returned enables what is possible in a phase.
+    """
+    gui, most = server.gui, scene.torque_limit or _LARGEST_TORQUE
+    with gui.add_folder("run", order=1.0):
+        pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
+        step = gui.add_button("Step", icon=Icon.PLAYER_SKIP_FORWARD, disabled=True)
+        reset = gui.add_button("Reset", icon=Icon.REFRESH)
+    with gui.add_folder("manual torques [N m]", order=5.0):
+        note = gui.add_html("")
+        sliders = [gui.add_slider(f"τ{k}", -most, most, most / 100.0, 0.0) for k in "₁₂₃"]
+        zero = gui.add_button("Zero", icon=Icon.CIRCLE_OFF)
 
-    def show(self, state: ViewState | None, status: RunStatus) -> None:
-        """Enable what is possible now."""
-        paused = status.phase == "paused"
-        if paused != self._paused:
-            self._paused = paused
-            _name(self._pause, "Resume" if paused else "Pause")
-            self._step.disabled = not paused
-        controller = self._run.controller()
-        note = str(_PANEL.commanded(controller)) if controller else ""
-        if note != self._note.content:
-            self._note.content = note
-            for handle in (*self._sliders, self._zero):
+    def ask(event: Any) -> None:
+        """Ask for what a button says, and notify the client of a refusal."""
+        if event.target is reset and any(slider.value for slider in sliders):
+            release(event)
+        name = event.target.label.lower()
+        done, message = run.ask(name)
+        if not done and event.client is not None:
+            given: Any = {"auto_close_seconds": _REFUSAL_S, "color": "red"}
+            event.client.add_notification(f"{name} refused", message, **given)
+
+    def apply(event: Any) -> None:
+        if event.client is not None:
+            first, second, third = (float(slider.value) for slider in sliders)
+            run.apply((first, second, third))
+
+    def release(_: Any) -> None:
+        for slider in sliders:
+            _move(slider, 0.0)
+        run.apply(ZERO)
+
+    def show(phase: str, _: float | None) -> None:
+        if (phase == "paused") != (pause.label == "Resume"):
+            _name(pause, "Resume" if phase == "paused" else "Pause")
+            step.disabled = phase != "paused"
+        controller = run.controller()
+        text = str(_PANEL.commanded(controller)) if controller else ""
+        if text != note.content:
+            note.content = text
+            for handle in (*sliders, zero):
                 handle.disabled = bool(controller)
 
-    def _apply(self) -> None:
-        first, second, third = (float(slider.value) for slider in self._sliders)
-        self._run.apply((first, second, third))
-
-    def _release(self) -> None:
-        for slider in self._sliders:
-            _move(slider, 0.0)
-        self._run.apply((0.0, 0.0, 0.0))
-
-    def _reset(self) -> tuple[bool, str]:
-        if any(slider.value for slider in self._sliders):
-            self._release()
-        return self._run.reset()
+    for button in (pause, step, reset):
+        button.on_click(ask)
+    for slider in sliders:
+        slider.on_update(apply)
+    zero.on_click(release)
+    return show
 
 
-class _ReplayControls:
-    """Play, a time slider, and the speed of a recording."""
+def _add_replay_controls(server: PageServer, replay: Replay) -> Callable[[str, float | None], None]:
+    """Add play, a time slider, and the speed of a recording; the function returned moves them."""
+    gui = server.gui
+    with gui.add_folder("recording", order=1.0):
+        play = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
+        slider = gui.add_slider("t [s]", 0.0, replay.length, replay.length / 1000.0, 0.0)
+        speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1 ×")
 
-    def __init__(self, server: ViserServer, replay: Replay) -> None:
-        self._replay, self._playing = replay, True
-        gui = server.gui
-        with gui.add_folder("recording", order=1.0):
-            self._play = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
-            self._time = gui.add_slider("t [s]", 0.0, replay.length, replay.length / 1000.0, 0.0)
-            speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1 ×")
-        self._play.on_click(lambda _: replay.play(not replay.playing))
-        self._time.on_update(
-            lambda event: replay.seek(float(self._time.value)) if event.client is not None else None
-        )
-        speed.on_update(lambda _: replay.set_speed(float(speed.value.split()[0])))
+    def seek(event: Any) -> None:
+        if event.client is not None:
+            replay.seek(float(slider.value))
 
-    def show(self, state: ViewState | None, status: RunStatus) -> None:
-        """Update button and slider."""
-        before, playing = self._playing, self._replay.playing
+    def show(_: str, at: float | None) -> None:
+        before, playing = play.label == "Pause", replay.playing
         if playing != before:
-            self._playing = playing
-            _name(self._play, "Pause" if playing else "Play")
-        if (playing or before) and state is not None and state.time is not None:
-            _move(self._time, round(min(state.time, self._replay.length), 6))
+            _name(play, "Pause" if playing else "Play")
+        if (playing or before) and at is not None:
+            _move(slider, round(min(at, replay.length), 6))
+
+    play.on_click(lambda _: replay.play(not replay.playing))
+    slider.on_update(seek)
+    speed.on_update(lambda _: replay.set_speed(float(speed.value.split()[0])))
+    return show
 
 
 def _name(button: GuiButtonHandle, label: str) -> None:
@@ -287,15 +277,3 @@ def _name(button: GuiButtonHandle, label: str) -> None:
 
 def _move(slider: GuiSliderHandle[float], value: float) -> None:
     slider.value = value  # type: ignore[misc]  # its setter does not follow its getter at once
-
-
-def _ask(button: Any, name: str, act: Callable[[], tuple[bool, str]]) -> None:
-    """Have a button act, and notify the client of a refusal."""
-
-    def on_click(event: Any) -> None:
-        done, message = act()
-        if not done and event.client is not None:
-            given: Any = {"auto_close_seconds": _REFUSAL_S, "color": "red"}
-            event.client.add_notification(f"{name} refused", message, **given)
-
-    button.on_click(on_click)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -22,21 +23,21 @@ _PATH_S = 4.0
 _LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
 """The path lies a little outside the star, which would hide it; newer parts above older ones."""
 _OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
-_ROOT = "/manipulator"
+ROOT = "/manipulator"
 _SIDES = 20  # corners of an arc's cross-section
 
 
 class SceneDrawing:
-    """One scene as drawn; `remove` takes it off the page."""
+    """One scene as drawn, in nodes below ROOT."""
 
     def __init__(self, server: ViserServer, scene: Scene) -> None:
         self._server, self._scene, self._geometry = server, scene, Geometry.of(scene)
         self._joints = robot.joints_of(self._geometry)
         self._frames = {}
         for link, drawn in robot.shapes(scene).items():
-            self._frames[link] = server.scene.add_frame(f"{_ROOT}/{link}", show_axes=False)
+            self._frames[link] = server.scene.add_frame(f"{ROOT}/{link}", show_axes=False)
             for index, shape in enumerate(drawn):
-                add_shape(server, f"{_ROOT}/{link}/{index}", shape)
+                add_shape(server, f"{ROOT}/{link}/{index}", shape)
         self._size = size = max(scene.base.radius, scene.star.radius)
         self._add_labels()
         self._points: deque[tuple[float, Array]] = deque(maxlen=PATH_POINTS)
@@ -44,7 +45,7 @@ class SceneDrawing:
         fade = np.linspace(0.0, 1.0, PATH_POINTS)[:, None]
         colours = (1.0 - fade) * _OLD + fade * _NEW
         self._path = server.scene.add_line_segments(
-            f"{_ROOT}/path",
+            f"{ROOT}/path",
             np.zeros((PATH_POINTS - 1, 2, 3)),
             np.stack([colours[:-1], colours[1:]], axis=1),
             thickness=0.016 * size,
@@ -58,10 +59,6 @@ class SceneDrawing:
         for arrow in self._torques:
             arrow.visible = False
         self._largest_torque = 1.0
-
-    def remove(self) -> None:
-        """Take it off the page."""
-        self._server.scene.remove_by_name(_ROOT)
 
     def add(self, time: float | None, angles: Mapping[str, float]) -> None:
         """Add E at a time [s] and joint angles [rad] to the path.
@@ -88,20 +85,16 @@ class SceneDrawing:
         points = np.concatenate([np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points])
         points *= _LIFT
         self._path.points = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
-        self._show_torques(np.array(torque))
-
-    def _show_torques(self, torques: Array) -> None:
-        """Draw tau_k along w_k, outwards where positive; the largest yet has full length."""
-        self._largest_torque = max(self._largest_torque, float(np.abs(torques).max()))
-        for arrow, torque, w in zip(self._torques, torques, self._geometry.w, strict=True):
-            length = 0.45 * self._size * abs(float(torque)) / self._largest_torque
+        # tau_k along w_k, outwards where positive; the largest yet has full length
+        self._largest_torque = max(self._largest_torque, *map(abs, torque))
+        for arrow, tau, w in zip(self._torques, torque, self._geometry.w, strict=True):
+            length = 0.45 * self._size * abs(tau) / self._largest_torque
             visible = length > 0.01 * self._size
             if visible:
                 foot = 1.17 * self._scene.base.radius
                 ends = np.array([foot * w, (foot + length) * w])
-                arrow.points = (ends if torque > 0.0 else ends[::-1]).astype(np.float32)[None]
-            if visible != arrow.visible:
-                arrow.visible = visible
+                arrow.points = (ends if tau > 0.0 else ends[::-1]).astype(np.float32)[None]
+            arrow.visible = visible
 
     def _add_arrow(
         self, name: str, ends: Array, colour: ArrayLike, sizes: tuple[float, float, float]
@@ -111,14 +104,9 @@ class SceneDrawing:
         viser takes linear colours for arrows, and sRGB for all else.
         """
         shaft, head, length = (self._size * size for size in sizes)
-        return self._server.scene.add_arrows(
-            f"{_ROOT}/{name}",
-            ends[None],
-            np.asarray(colour, dtype=float) ** 2.2,
-            shaft_radius=shaft,
-            head_radius=head,
-            head_length=length,
-        )
+        linear = np.asarray(colour, dtype=float) ** 2.2
+        given: Any = {"shaft_radius": shaft, "head_radius": head, "head_length": length}
+        return self._server.scene.add_arrows(f"{ROOT}/{name}", ends[None], linear, **given)
 
     def _add_labels(self) -> None:
         """Name the vertices P_k of the base triangle, on its outer side, and E."""
@@ -126,13 +114,11 @@ class SceneDrawing:
         outwards = v - v.mean(axis=0)
         outwards /= np.linalg.norm(outwards, axis=1)[:, None]
         points = self._scene.base.radius * (v + 0.13 * outwards)
+        end = self._scene.star.radius * np.array([0.0, 0.0, 1.36])
         places = [(f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at) for k, at in enumerate(points, 1)]
-        places.append(
-            (f"{robot.STAR}/E", "E", self._scene.star.radius * np.array([0.0, 0.0, 1.36]))
-        )
-        for name, text, at in places:
+        for name, text, at in (*places, (f"{robot.STAR}/E", "E", end)):
             self._server.scene.add_label(
-                f"{_ROOT}/{name}", text, position=at, anchor="center-center", font_screen_scale=2.0
+                f"{ROOT}/{name}", text, position=at, anchor="center-center", font_screen_scale=2.0
             )
 
 

@@ -33,7 +33,7 @@ from sst_ros.errors import InputError, Problem, SstError
 
 LOCAL = "127.0.0.1"
 PORT = 8080
-TITLE = "sst_ros"
+TITLE, COOKIE = "sst_ros", "sst_view_{}"
 _PORTS = (1024, 65535)
 _TRIED = 100  # ports, from the given one on
 
@@ -78,9 +78,8 @@ class AccessCheck:
         cookies = http.cookies.SimpleCookie()
         with contextlib.suppress(http.cookies.CookieError):
             cookies.load("; ".join(request.headers.get_all("Cookie")))
-        query = parse_qs(urlsplit(request.path).query)
-        given = query.get("token", [])
-        if (morsel := cookies.get(_cookie(local[1]))) is not None:
+        given = parse_qs(urlsplit(request.path).query).get("token", [])
+        if (morsel := cookies.get(COOKIE.format(local[1]))) is not None:
             given.append(morsel.value)
         if not any(secrets.compare_digest(one.encode(), self.token.encode()) for one in given):
             return "Open the address that `view` has printed: it contains the access token."
@@ -88,13 +87,13 @@ class AccessCheck:
 
     def _complete(self, response: Response, port: int) -> None:
         """Set the cookie, and the title of the browser's tab; forbid frames and referrers."""
-        response.body = response.body.replace(
-            b"<title>Viser</title>", f"<title>{TITLE}</title>".encode(), 1
-        )
-        del response.headers["Content-Length"]
-        headers = response.headers
+        headers, title = response.headers, f"<title>{TITLE}</title>".encode()
+        response.body = response.body.replace(b"<title>Viser</title>", title, 1)
+        del headers["Content-Length"]
         headers["Content-Length"] = str(len(response.body))
-        headers["Set-Cookie"] = f"{_cookie(port)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        headers["Set-Cookie"] = (
+            f"{COOKIE.format(port)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        )
         headers["X-Frame-Options"], headers["Referrer-Policy"] = "DENY", "no-referrer"
 
 
@@ -108,7 +107,7 @@ class PageServer(ViserServer):
 
     def __init__(self, host: str = LOCAL, port: int = PORT) -> None:
         check = AccessCheck(host)
-        with _silence(), _swap_serve(check):
+        with contextlib.redirect_stdout(io.StringIO()), _swap_serve(check):  # viser's messages
             super().__init__(host, _free_port(host, port), label=TITLE, verbose=False)
         if not check.installed:
             self.stop()
@@ -118,7 +117,7 @@ class PageServer(ViserServer):
 
     def stop(self) -> None:
         """Stop serving."""
-        with _silence():
+        with contextlib.redirect_stdout(io.StringIO()):
             super().stop()
 
     def request_share_url(self, verbose: bool = True) -> str | None:
@@ -185,14 +184,3 @@ def _loopback(address: str) -> bool:
         return ipaddress.ip_address(address).is_loopback
     except ValueError:
         return address.lower() == "localhost"
-
-
-def _cookie(port: int) -> str:
-    return f"sst_view_{port}"
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep viser's messages from the terminal."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

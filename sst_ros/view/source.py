@@ -49,10 +49,7 @@ class RunStatus:
 
 
 class RunControl(Protocol):
-    """A run that is shown, paused and driven; called from the page's thread.
-
-    Requests return success and a message.
-    """
+    """A run that is shown, paused and driven; called from the page's thread."""
 
     @property
     def scene(self) -> Scene | None:
@@ -64,14 +61,8 @@ class RunControl(Protocol):
     def status(self) -> RunStatus:
         """Return the latest status of the run."""
 
-    def pause(self, paused: bool) -> tuple[bool, str]:
-        """Pause or resume the run."""
-
-    def step(self) -> tuple[bool, str]:
-        """Advance a paused run by one sample."""
-
-    def reset(self) -> tuple[bool, str]:
-        """Return to the initial state."""
+    def ask(self, request: str) -> tuple[bool, str]:
+        """Ask to pause, resume, step (a paused run by one sample) or reset; success and message."""
 
     def apply(self, torque: Vector3) -> None:
         """Hold torques [N m] from now on."""

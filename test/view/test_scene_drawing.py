@@ -12,7 +12,7 @@ from sst_ros.description.robot import BASE, STAR, Arc, Ball, Box, Rod, shapes
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.view.scene_drawing import SceneDrawing, add_shape
+from sst_ros.view.scene_drawing import ROOT, SceneDrawing, add_shape
 from sst_ros.view.source import ViewState
 
 RED = (1.0, 0.0, 0.0)
@@ -73,15 +73,15 @@ def test_links_are_where_the_simulation_has_them(server, name):
     for link, drawn in shapes(scene).items():
         for index in range(len(drawn)):
             assert node(server, f"/manipulator/{link}/{index}") is not None
-    drawing.remove()
+    server.scene.remove_by_name(ROOT)
 
 
 def test_labels_are_beside_their_vertices(server):
     scene = load("example2")
-    drawing = SceneDrawing(server, scene)
+    SceneDrawing(server, scene)
     vertices = scene.base.radius * Geometry.of(scene).v
     for k in range(3):
         label = node(server, f"/manipulator/{BASE}/P{k + 1}")
         distances = np.linalg.norm(label.position - vertices, axis=1)
         assert distances[k] < 0.15 * scene.base.radius and distances.argmin() == k
-    drawing.remove()
+    server.scene.remove_by_name(ROOT)
