@@ -28,35 +28,41 @@ _READY_S = 60.0  # a first start compiles, on a busy machine for half a minute
 _END_S = 30.0
 
 
-def record(name: str, bag: Path) -> None:
+def record(name: str, folder: Path) -> Path:
     """Play a scene's torques to its simulator, in processes of their own, and record the run.
 
-    It goes by the clock, and in lockstep: to the same bits however busy the machine is. An SstError
-    names a node that failed or did not end in time.
+    It goes by the clock, and in lockstep: to the same bits however busy the machine is. The bag in
+    `folder` takes the place of an earlier one. An SstError names a node that failed or did not end
+    in time.
     """
     seconds = load(name).duration or 1.0
     run = {"scene": name, "duration": seconds}
-    _record(bag, run, "torque_player", {"scene": name}, seconds + _END_S)
+    return _record(folder, run, "torque_player", {"scene": name}, seconds + _END_S)
 
 
-def follow(name: str, bag: Path, mode: str, *, model: str | None = None) -> None:
+def follow(name: str, folder: Path, mode: str, *, model: str | None = None) -> Path:
     """Have the controller node follow a scene's motion in lockstep, and record the run.
 
-    The controller's model and motion are those of the scene `model`, by default the plant's own. An
-    SstError names a node that failed or did not end in time.
+    The controller's model and motion are those of the scene `model`, by default the plant's own.
+    Bag and errors are as with `record`; a scene without a motion is refused before the folder is
+    touched.
     """
     motion = reference_motion(load(model or name))
     seconds = math.ceil((motion.duration + _HOLD_S) * _RATE) / _RATE
     run = {"scene": name, "duration": seconds, "publish_rate": _RATE, "real_time_factor": 0.0}
     followed = {"scene": model or name, "mode": mode, "hold": _HOLD_S, "rate": _RATE}
     followed |= {"feedforward_at": "middle", "wait_for_recorder": True}
-    _record(bag, run, "inverse_dynamics", followed, 20.0 * seconds + _END_S)
+    return _record(folder, run, "inverse_dynamics", followed, 20.0 * seconds + _END_S)
 
 
 def _record(
-    bag: Path, run: dict[str, object], command: str, given: dict[str, object], most_s: float
-) -> None:
+    folder: Path, run: dict[str, object], command: str, given: dict[str, object], most_s: float
+) -> Path:
     """Record a run of the simulator under the commands of a node; all end by themselves."""
+    bag = folder / "bag"
+    if bag.exists():
+        shutil.rmtree(bag)
+    folder.mkdir(parents=True, exist_ok=True)
     with _node("recorder", _END_S, output=str(bag), timeout=_READY_S) as recorder:
         with _node("simulator", _END_S, sync="lockstep", **run):
             # One line when it receives all topics, none where it gives up, or is stuck.
@@ -67,6 +73,7 @@ def _record(
             with _node(command, most_s, stamped=True, min_subscribers=2, **given):
                 pass
         recorder.send_signal(signal.SIGINT)
+    return bag
 
 
 @contextmanager
@@ -80,12 +87,3 @@ def _node(command: str, end_s: float, **given: object) -> Iterator[subprocess.Po
             raise SstError(f"{command} did not end within {end_s:g} s") from None
         if status != 0:
             raise SstError(f"{command} failed with status {status}")
-
-
-def empty_bag(folder: Path) -> Path:
-    """Return the folder of a bag, without that of an earlier demo."""
-    bag = folder / "bag"
-    if bag.exists():
-        shutil.rmtree(bag)
-    folder.mkdir(parents=True, exist_ok=True)
-    return bag

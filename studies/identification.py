@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_ros.demo import FOLLOWED, empty_bag, follow
+from sst_ros.demo import FOLLOWED, follow
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.plot.style import BLUE, VERMILION, hide_zeros, legend, save_figure, stack, styled
@@ -109,8 +109,7 @@ def compare(out: Path, identified: str) -> str:
 def _follow(out: Path, model: str) -> None:
     """Follow the motion of a model's scene on the plant, and record it in a folder of its name."""
     print(f"following {model}", flush=True)
-    bag, path = empty_bag(out / model), out / f"{model}.yaml"
-    follow(str(out / "plant.yaml"), bag, MODE, model=str(path))
+    follow(str(out / "plant.yaml"), out / model, MODE, model=str(out / f"{model}.yaml"))
 
 
 def main(words: Sequence[str] | None = None) -> int:

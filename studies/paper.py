@@ -79,9 +79,7 @@ def paper(out: Path) -> list[LargestDifference]:
         for name in demo.EXAMPLES:
             scene = load(name)
             print(f"{name}: {scene.description}", flush=True)
-            bag = demo.empty_bag(out / name)
-            demo.record(name, bag)
-            solutions, differences, note = _solutions(scene, bag)
+            solutions, differences, note = _solutions(scene, demo.record(name, out / name))
             found += differences
             notes += note
             paths += _draw(scene, solutions, out)

@@ -103,6 +103,7 @@ def error_of(words, capsys):
         (["demo", "--force", "--out", "/etc/passwd"], "Not a directory"),
         (["demo", "--scene", "swing"], "demo feedforward"),
         (["demo", "feedforward", "--mode", "pdd"], "did you mean 'pd'"),
+        (["demo", "feedforward", "--scene", "example2"], "has no desired motion"),
         (["workspace", "example2", "--out", "picture"], "must end in .png or .pdf or .svg"),
         (["simulate", "example2", "--out", "table.txt"], "must end in .parquet or .csv"),
         (["simulate", "example2", "--samples", "0"], "--samples = 0: must be a whole number"),
@@ -118,6 +119,7 @@ def test_an_error_is_one_line(words, said, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").touch()
     (tmp_path / "latin.yaml").write_bytes("name: é".encode("latin-1"))
     assert said in error_of([word.format(here=tmp_path) for word in words], capsys)
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "latin.yaml"}
 
 
 BUG = "internal error, please report it with the output of --debug: "

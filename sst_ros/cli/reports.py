@@ -74,14 +74,12 @@ def run_demo(options: argparse.Namespace) -> None:
         name = options.scene or demo.FOLLOWED
         for mode in modes:
             print(f"{name}, {mode}: {load(name).description}", flush=True)
-            bag = demo.empty_bag(out / mode)
-            demo.follow(name, bag, mode)
+            bag = demo.follow(name, out / mode, mode)
             print(function("report.tracking:write_tracking_report")(bag, out / mode), flush=True)
         return
     for name in demo.EXAMPLES:
         folder = out if name == "example2" else out / name  # the main job
         print(f"{name}: {load(name).description}", flush=True)
-        bag = demo.empty_bag(folder)
-        demo.record(name, bag)
+        bag = demo.record(name, folder)
         summary = function("report.run:write_run_report")(bag, folder)
         print(function("report.run:summary_text")(summary, str(folder)), flush=True)

@@ -49,8 +49,7 @@ def twice(tmp_path_factory, forked_demos):
     path, first, second = str(written(folder)), folder / "feedforward", folder / "second"
     words = ["--scene", path, "--mode", "feedforward", "--out", str(folder), "--force"]
     assert main(["demo", "feedforward", *words]) == 0
-    second.mkdir()
-    demo.follow(path, second / "bag", "feedforward")
+    demo.follow(path, second, "feedforward")
     return first, second
 
 
