@@ -91,7 +91,7 @@ def _study(rows: int) -> dict[str, float]:
 
 def _arrays(study: SweepStudy, steps: int) -> tuple[Any, list[Any]]:
     """Sample and check all rows; return their batch, states, inputs and codes."""
-    values = study.sampler.rows(0, study.rows)
+    values = study.draw(0, study.rows)
     ready = prepare(study, steps)
     scenarios, _, _ = ready.scenarios(values)
     batch = ready.batch.with_parameters(scenarios)

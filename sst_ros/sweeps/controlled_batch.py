@@ -8,7 +8,7 @@ of tracking errors. It is traced, without branches: what the settings do not use
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from functools import cached_property
 from itertools import islice
@@ -184,59 +184,51 @@ class ControlledBatch:
             "rest": drive - 3 + len(self._batch.model.names),
             "gains": sum(GAINS.values()),
         }
-        command = self._trace_command()
 
         def answer(*inputs: Expression) -> tuple[Any, ...]:
             of = divide(sizes, inputs)
             plant = self._batch.model.constants(of["rest"][drive - 3 :]).model
-            given, gains = divide(REFERENCES, of["references"]), divide(GAINS, of["gains"])
-            memory = divide(self._memory_sizes, of["memory"])
-            return command(kernel.joints(plant, of["y"]), given, memory, gains, of["noise"])
+            return self._command(kernel.joints(plant, of["y"]), of)
 
         program = trace(answer, [f"i{j}" for j in range(sum(sizes.values()))])
         texts = [*NOISE, control_source(program, sizes)]
         return compiled_module.load(texts, {}, numba=True, nogil=True)
 
-    def _trace_command(self) -> Callable[..., tuple[Any, ...]]:
-        """Return the law and its channel: three torques and the new memory, see `module`."""
+    def _command(self, joints: Any, of: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Return what the law and its channel send, three torques, and the new memory."""
         control, space = self._control, ActuatorSpaceMap(Geometry.of(self._scene))
+        given, gains = divide(REFERENCES, of["references"]), divide(GAINS, of["gains"])
+        memory = divide(self._memory_sizes, of["memory"])
+        new = dict(memory)
+        angle, rate = gains["noise"]
+        scaled = [n * by for n, by in zip(of["noise"], (angle,) * 3 + (rate,) * 3, strict=False)]
+        exact = joints.gamma, joints.gamma_dot
+        gamma, gamma_dot, new["before"] = control.measure(*exact, memory["before"], scaled)
+        if observed := memory["observed"]:  # in the last assembly mode
+            carriages = space.carriages(gamma)
+            for _ in range(NEWTON_STEPS):
+                observed = space.newton_step(*observed, *carriages)[:4]
+        desired = Reference(**{name: given[name] for name in _DESIRED})
+        limit = gains["limit"][0] if self._limited else None
+        numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
 
         def torque(*at: Any) -> Any:
             return kernel.actuator_torque(kernel.model_of(self._scene), *at)[0]
 
-        def command(
-            joints: Any, given: Any, memory: Any, gains: Any, noise: Sequence[Any]
-        ) -> tuple[Any, ...]:
-            new = dict(memory)
-            angle, rate = gains["noise"]
-            scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
-            exact = joints.gamma, joints.gamma_dot
-            gamma, gamma_dot, new["before"] = control.measure(*exact, memory["before"], scaled)
-            if observed := memory["observed"]:  # in the last assembly mode
-                carriages = space.carriages(gamma)
-                for _ in range(NEWTON_STEPS):
-                    observed = space.newton_step(*observed, *carriages)[:4]
-            desired = Reference(**{name: given[name] for name in _DESIRED})
-            limit = gains["limit"][0] if self._limited else None
-            numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
-            accelerate = space.star_accelerations
-            scheme = law.ControlLaw(control, torque, accelerate, *numbers, control.period)
-            ahead = given["feedforward"], given["held"]
-            found = scheme.answer(desired, ahead, gamma, gamma_dot, observed, memory["integral"])
-            first, queue = given["first"][0], memory["queue"]
-            sent, new["queue"] = control.transmit(found.torque, queue, first)
-            if self._limited:
-                cut = axpy(1.0, found.total, -1.0, found.torque)
-                new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
-                sent = law.bound(sent, gains["plant_limit"][0])
-            off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
-            sums, most = (zip(memory[name], off, strict=True) for name in ("squares", "largest"))
-            new |= {"observed": observed, "integral": found.integral}
-            new["squares"] = tuple(s + e * e for s, e in sums)
-            new["largest"] = tuple(s + positive(positive(e) + positive(-e) - s) for s, e in most)
-            return (*sent, *(number for name in self._memory_sizes for number in new[name]))
-
-        return command
+        scheme = law.ControlLaw(control, torque, space.star_accelerations, *numbers, control.period)
+        ahead = given["feedforward"], given["held"]
+        found = scheme.answer(desired, ahead, gamma, gamma_dot, observed, memory["integral"])
+        sent, new["queue"] = control.transmit(found.torque, memory["queue"], given["first"][0])
+        if self._limited:
+            cut = axpy(1.0, found.total, -1.0, found.torque)
+            new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
+            sent = law.bound(sent, gains["plant_limit"][0])
+        off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
+        sums, most = (zip(memory[name], off, strict=True) for name in ("squares", "largest"))
+        new |= {"observed": observed, "integral": found.integral}
+        new["squares"] = tuple(s + e * e for s, e in sums)
+        new["largest"] = tuple(s + positive(positive(e) + positive(-e) - s) for s, e in most)
+        return (*sent, *(number for name in self._memory_sizes for number in new[name]))
 
     def run(
         self,
@@ -280,21 +272,16 @@ class ControlledBatch:
 
         step = self.samples * control.period / steps
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
-        return result, self._judge_tracking(result, divide(self._memory_sizes, memory))
-
-    def _judge_tracking(self, result: BatchResult, memory: dict[str, Any]) -> dict[str, Array]:
-        """Root of the mean square and largest error of gamma [rad] at the samples of a run."""
-        desired = divide(REFERENCES, self._references[-1])
-        final = np.array(desired["gamma"]) - result.gamma
+        # Root of the mean square and largest error of gamma [rad] at the samples of a run.
+        final = np.array(divide(REFERENCES, self._references[-1])["gamma"]) - result.gamma
         complete = result.success[:, None]
-        squares = np.stack(memory["squares"], axis=1) + np.where(complete, final**2, 0.0)
-        largest = np.stack(memory["largest"], axis=1)
+        squares = np.stack(blocks["squares"], axis=1) + np.where(complete, final**2, 0.0)
+        largest = np.stack(blocks["largest"], axis=1)
         largest = np.where(complete, np.maximum(largest, np.abs(final)), largest)
-        samples = np.floor(result.t / self._control.period + 1e-9) + 1
-        rms = np.sqrt(squares / samples[:, None])
-        columns = {f"error_rms_{k + 1}": rms[:, k] for k in range(3)}
-        columns |= {f"error_max_{k + 1}": largest[:, k] for k in range(3)}
-        return columns | {"limited_samples": memory["limited"][0]}
+        samples = np.floor(result.t / control.period + 1e-9) + 1
+        errors = {"rms": np.sqrt(squares / samples[:, None]), "max": largest}
+        columns = {f"error_{name}_{k + 1}": x[:, k] for name, x in errors.items() for k in range(3)}
+        return result, columns | {"limited_samples": blocks["limited"][0]}
 
     @cached_property
     def _references(self) -> Array:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from collections.abc import Mapping
@@ -19,7 +20,6 @@ from sst_ros.scene.scene import Scenarios
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints, columns_of
 from sst_ros.sweeps.controlled_batch import ControlledBatch
 from sst_ros.sweeps.sweep_study import SweepStudy
-from sst_ros.sweeps.variations import Sampler
 from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
@@ -33,8 +33,7 @@ PILOT = 256
 
 MOST_STEPS = 1_000_000
 
-_STATE_KEYS = ("initial.gamma", "initial.gamma_dot")
-_ENDS = ("min", "max")
+EXTREMES = tuple(itertools.product(Joints._fields, ("min", "max")))
 
 Columns = dict[str, NDArray[Any]]
 
@@ -68,9 +67,15 @@ class PreparedSweep:
         The error of c steps is the difference from 2c steps; it falls with the eighth power of c.
         It is nan where no run reaches the end.
         """
-        values, tolerance = draw_pilot_rows(self.study), self.study.tolerance
+        study, tolerance = self.study, self.study.tolerance
+        if study.table is None:
+            rows = np.arange(PILOT)
+            values = study.draw(0, PILOT, "random")
+        else:
+            chosen = np.linspace(0, study.rows - 1, min(PILOT, study.rows)).astype(int)
+            rows = np.arange(len(chosen))
+            values = {key: x[chosen] for key, x in study.draw(0, study.rows).items()}
         scenarios, starts, _ = self.scenarios(values)
-        rows = np.arange(len(next(iter(values.values()))))
         unit = 1 if self.controlled is None else self.controlled.samples
         count = max(unit, 16)
         for _ in range(12):
@@ -98,7 +103,7 @@ class PreparedSweep:
         """Metadata of the files: study, its digest, version, units."""
         units = UNITS | {"fault_time": "s", "local_error": "1"}
         for k in DIMENSIONS["leg"]:
-            joints = {f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in _extremes()}
+            joints = {f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES}
             units |= joints | {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
         for one in self.study.variations:
             units |= dict.fromkeys(one.columns, "1" if one.factor else one.targets[0].spec.unit)
@@ -116,7 +121,7 @@ class PreparedSweep:
         """Table of the rows of a chunk, and of their trajectories if the study asks for some."""
         pyarrow, study = require("pyarrow"), self.study
         rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
-        values = study.sampler.rows(int(rows[0]), len(rows))
+        values = study.draw(int(rows[0]), len(rows))
         scenarios, starts, faults = self.scenarios(values)
         result, more = self.run(scenarios, starts, rows, self.steps)
         columns: Columns = {
@@ -195,7 +200,10 @@ class PreparedSweep:
             step = self.study.length / steps
             result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
         if result.kept is not None and not kept:
-            more |= extremes_of(result.kept)
+            with np.errstate(all="ignore"):
+                for (name, end), k in itertools.product(EXTREMES, range(3)):
+                    angles = getattr(result.kept, name)[..., k]
+                    more[f"{name}_{end}_{k + 1}"] = getattr(angles, end)(axis=0)
             result.kept = None
         return result, more
 
@@ -205,8 +213,7 @@ class PreparedSweep:
         outside: dict[str, Array] = {}
         for one in self.study.variations:
             for key, array in one.parameters(values[one.key]).items():
-                given = key in _STATE_KEYS or key.startswith("control.")
-                (outside if given else inside)[key] = array
+                (outside if key.startswith(("initial.", "control.")) else inside)[key] = array
         return inside, outside
 
 
@@ -238,26 +245,3 @@ def find_range_ends(study: SweepStudy) -> dict[str, Array]:
         if one.kind != "table":
             rows += [rows[0] | {one.key: end} for end in one.ends()]
     return {key: np.stack([row[key] for row in rows]) for key in middle}
-
-
-def draw_pilot_rows(study: SweepStudy) -> dict[str, Array]:
-    """Return the values of what varies in the pilot rows."""
-    if study.table is None:
-        return Sampler(study.variations, PILOT, study.seed, "random").rows(0, PILOT)
-    chosen = np.linspace(0, study.rows - 1, min(PILOT, study.rows)).astype(int)
-    whole = study.sampler.rows(0, study.rows)
-    return {key: values[chosen] for key, values in whole.items()}
-
-
-def _extremes() -> list[tuple[str, str]]:
-    return [(name, end) for name in Joints._fields for end in _ENDS]
-
-
-def extremes_of(kept: BatchResult) -> Columns:
-    """Least and largest angles and rates of joints at the ends of steps."""
-    with np.errstate(all="ignore"):
-        return {
-            f"{name}_{end}_{k + 1}": getattr(getattr(kept, name)[..., k], end)(axis=0)
-            for name, end in _extremes()
-            for k in range(3)
-        }

@@ -72,14 +72,9 @@ def sweep(
     """
     rows = {"table": vary} if hasattr(vary, "columns") else {"vary": dict(vary)}
     given = {"torque": torque, "duration": duration, "n": n, "seed": seed, **options, **rows}
-    return run_study(
-        SweepStudy.from_values({"scene": scene_of(scene), **given}),
-        None if out is None else Path(out),
-        client=client,
-        workers=workers,
-        resume=resume,
-        progress=progress,
-    )
+    study = SweepStudy.from_values({"scene": scene_of(scene), **given})
+    path, run = None if out is None else Path(out), {"resume": resume, "progress": progress}
+    return run_study(study, path, client=client, workers=workers, **run)
 
 
 def run_study(
@@ -110,7 +105,7 @@ def run_study(
             require_free(out, "sweep")
     ready = prepare(study, steps)
     if study.table is not None:  # refuse rows that make no scene, before anything runs
-        ready.check(study.sampler.rows(0, study.rows))
+        ready.check(study.draw(0, study.rows))
     complete: set[int] = set()
     if out is not None:
         with write_into(out, "sweep"):

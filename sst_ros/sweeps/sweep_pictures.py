@@ -68,8 +68,7 @@ def draw_distributions(outputs: pd.DataFrame, units: Mapping[str, str]) -> Figur
     for i, (name, values) in enumerate(outputs.items()):
         axes = figure.add_subplot(rows, COLUMNS, i + 1)
         axes.hist(values[np.isfinite(values)], 60, color=BLUE)
-        axes.set_title(f"{name} [{units.get(str(name), '1')}]")
-        axes.set_yticks([])
+        axes.set(title=f"{name} [{units.get(str(name), '1')}]", yticks=[])
     return figure
 
 
@@ -79,12 +78,10 @@ def draw_early_ends(correlations: pd.Series, counts: pd.Series) -> Figure:
     figure = Figure(figsize=(11.0, 1.2 + 0.3 * max(len(correlations), len(counts), 4)))
     left, right = figure.subplots(1, 2)
     left.barh(correlations.index[::-1], correlations[::-1], color=VERMILION)
-    left.set_xlim(-1.0, 1.0)
-    left.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
-    left.set_title("Rank correlation of inputs with an early end")
+    ticks, title = [-1.0, -0.5, 0.0, 0.5, 1.0], "Rank correlation of inputs with an early end"
+    left.set(xlim=(-1.0, 1.0), xticks=ticks, title=title)
     right.barh(counts.index[::-1], counts[::-1], color=GREY)
-    right.set_title("Runs by how they ended")
-    right.set_xscale("symlog")
+    right.set(title="Runs by how they ended", xscale="symlog")
     return figure
 
 

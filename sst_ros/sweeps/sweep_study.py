@@ -8,17 +8,20 @@ import hashlib
 import json
 import math
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem
+from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.schema import Section, anything, build, entry, positive
 from sst_ros.scene.torque_profile import SineTorque
@@ -27,9 +30,10 @@ from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
     LARGEST_HYPERCUBE,
     SAMPLINGS,
-    Sampler,
+    TINY,
     Target,
     Variation,
+    philox,
     read_table,
     read_variation,
     tabulate,
@@ -112,10 +116,10 @@ class SweepStudy(Section):
         constant = not isinstance(torque, (Mapping, SineTorque, type(None)))
         if constant and finite_vector(torque) is None:
             yield Problem("torque", torque, "must be three finite numbers [N m] or a mapping")
-        good = isinstance(kept, Mapping) and kept.keys() == {"rows", "samples"}
-        if kept is not None and not (
-            good and all(type(x) is int and 1 <= x <= 100_000 for x in kept.values())
-        ):
+        whole = isinstance(kept, Mapping) and all(
+            type(x) is int and 1 <= x <= 100_000 for x in kept.values()
+        )
+        if kept is not None and not (whole and kept.keys() == {"rows", "samples"}):
             allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
             yield Problem("trajectory", kept, allowed)
 
@@ -223,10 +227,50 @@ class SweepStudy(Section):
             raise InputError("sweep", [Problem(key, given[key], allowed)])
         return rows
 
+    def draw(self, first: int, count: int, sampling: str = "") -> dict[str, Array]:
+        """Draw rows `first` to `first + count`: arrays (count, components) by varied key."""
+        quantiles, used = self._quantiles(first, count, sampling or self.sampling), 0
+        found, index = {}, np.arange(first, first + count)
+        for one in self.variations:
+            if one.drawn:
+                found[one.key] = one.values(quantiles[:, used : used + len(one.columns)])
+                used += len(one.columns)
+            else:
+                found[one.key] = one.numbers[first : first + count]
+        for one in reversed(self.variations):  # the last key of a grid varies fastest
+            if one.kind == "grid":
+                found[one.key] = one.numbers[index % len(one.numbers)]
+                index = index // len(one.numbers)
+        return found
+
     @cached_property
-    def sampler(self) -> Sampler:
-        """Rows of what varies."""
-        return Sampler(self.variations, self.rows, self.seed, self.sampling)
+    def _width(self) -> int:
+        """Numbers that are drawn for a row."""
+        return sum(len(one.columns) for one in self.variations if one.drawn)
+
+    def _quantiles(self, first: int, count: int, sampling: str) -> Array:
+        """Numbers in (0, 1), shape (count, width)."""
+        if sampling == "random" or not self._width:
+            return philox(self.seed, first, count, self._width)
+        if sampling == "latin_hypercube":
+            points = self._hypercube[first : first + count]
+        else:
+            from scipy.stats import qmc
+
+            engine = qmc.Sobol(self._width, seed=np.random.default_rng(self.seed))
+            if first:
+                engine.fast_forward(first)
+            with warnings.catch_warnings():  # that a chunk of rows is no power of two
+                warnings.simplefilter("ignore", UserWarning)
+                points = engine.random(count)
+        return np.clip(points, TINY, 1.0 - TINY)
+
+    @cached_property
+    def _hypercube(self) -> Array:
+        from scipy.stats import qmc
+
+        engine = qmc.LatinHypercube(self._width, seed=np.random.default_rng(self.seed))
+        return np.asarray(engine.random(self.rows))
 
     @property
     def chunks(self) -> int:

@@ -14,7 +14,6 @@ row; Sobol points from their index; a Latin hypercube from all n rows at once.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,7 +36,7 @@ SAMPLINGS = ("random", "sobol", "latin_hypercube")
 LARGEST_HYPERCUBE = 10_000_000
 """Rows of a Latin hypercube: each process holds all of them, 80 bytes for ten columns."""
 
-_TINY = 2.0**-53
+TINY = 2.0**-53
 
 
 class Target(NamedTuple):
@@ -164,12 +163,13 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
     expected = EXPECTED.get(kind, "")
     if expected and len(numbers) != expected.count(",") + 1:
         raise ValueError(f"{kind} takes {expected}")
-    values = np.array(numbers, dtype=float) if kind == "grid" else _broadcast(numbers, nominal)
+    if kind != "grid":
+        numbers = [np.broadcast_to(np.array(x, dtype=float), nominal.shape) for x in numbers]
+    values = np.array(numbers, dtype=float)
     if kind == "grid" and (values.shape[1:] != nominal.shape or not len(values)):
         raise ValueError(f"must be a list of values of shape {nominal.shape}")
-    if np.any(np.isnan(values)) or not np.all(
-        np.isfinite(values if kind == "grid" else values[:2])
-    ):
+    bounded = values if kind == "grid" else values[:2]
+    if np.isnan(values).any() or not np.isfinite(bounded).all():
         raise ValueError("must be finite numbers")
     if kind != "grid" and not np.all(values[-2] < values[-1]):
         raise ValueError("the lower end must be less than the upper one")
@@ -186,16 +186,12 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
     return Variation(key, kind, values.reshape(len(values), -1), targets, factor)
 
 
-def _broadcast(numbers: Any, nominal: Array) -> Array:
-    return np.array([np.broadcast_to(np.array(x, dtype=float), nominal.shape) for x in numbers])
-
-
 def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) -> Variation:
     """Return the variation of a key whose values are columns of a table, which must be complete."""
     if len(set(map(len, columns.values()))) > 1:
         raise ValueError("must have columns of equal length")
-    numbers = np.stack(list(columns.values()), axis=1)
-    found = Variation(key, "table", numbers, targets, _scales_tensor(key, targets))
+    values, factor = np.stack(list(columns.values()), axis=1), _scales_tensor(key, targets)
+    found = Variation(key, "table", values, targets, factor)
     if tuple(columns) != found.columns:
         raise ValueError(f"needs the columns {', '.join(found.columns)}")
     return found
@@ -205,66 +201,15 @@ def read_table(given: Any) -> dict[str, Array]:
     """Read columns of numbers from a DataFrame, a mapping, or a CSV or Parquet file."""
     try:
         if isinstance(given, Path):
-            pandas = require("pandas")
-            read = pandas.read_parquet if given.suffix == ".parquet" else pandas.read_csv
-            given = read(given)
+            kind = "parquet" if given.suffix == ".parquet" else "csv"
+            given = getattr(require("pandas"), f"read_{kind}")(given)
         columns = {str(name): np.array(given[name], dtype=float) for name in given}
-        if any(column.ndim != 1 for column in columns.values()):
-            raise ValueError("a column has one number for each row")
-        return columns
+        if all(column.ndim == 1 for column in columns.values()):
+            return columns
+        raise ValueError("a column has one number for each row")
     except (OSError, ValueError, TypeError, LookupError) as error:
         allowed = f"must be columns of numbers, or a .csv or .parquet file of them ({error})"
         raise InputError("sweep", [Problem("table", str(given), allowed)]) from None
-
-
-class Sampler:
-    """Values of all varied numbers by row, of n rows, by one of SAMPLINGS."""
-
-    def __init__(self, variations: Sequence[Variation], n: int, seed: int, sampling: str) -> None:
-        self._variations, self._n, self._seed, self._sampling = variations, n, seed, sampling
-        self._width = sum(len(one.columns) for one in variations if one.drawn)
-
-    def rows(self, first: int, count: int) -> dict[str, Array]:
-        """Values of rows `first` to `first + count`, shape (count, components), by key."""
-        quantiles, used = self._quantiles(first, count), 0
-        found, index = {}, np.arange(first, first + count)
-        for one in self._variations:
-            if one.drawn:
-                found[one.key] = one.values(quantiles[:, used : used + len(one.columns)])
-                used += len(one.columns)
-            else:
-                found[one.key] = one.numbers[first : first + count]
-        for one in reversed(self._variations):  # the last key of a grid varies fastest
-            if one.kind == "grid":
-                found[one.key] = one.numbers[index % len(one.numbers)]
-                index = index // len(one.numbers)
-        return found
-
-    def _quantiles(self, first: int, count: int) -> Array:
-        """Numbers in (0, 1), shape (count, width)."""
-        if not self._width:
-            return np.empty((count, 0))
-        if self._sampling == "random":
-            return philox(self._seed, first, count, self._width)
-        if self._sampling == "latin_hypercube":
-            points = self._hypercube[first : first + count]
-        else:
-            from scipy.stats import qmc
-
-            engine = qmc.Sobol(self._width, seed=np.random.default_rng(self._seed))
-            if first:
-                engine.fast_forward(first)
-            with warnings.catch_warnings():  # that a chunk of rows is no power of two
-                warnings.simplefilter("ignore", UserWarning)
-                points = engine.random(count)
-        return np.clip(points, _TINY, 1.0 - _TINY)
-
-    @cached_property
-    def _hypercube(self) -> Array:
-        from scipy.stats import qmc
-
-        engine = qmc.LatinHypercube(self._width, seed=np.random.default_rng(self._seed))
-        return np.asarray(engine.random(self._n))
 
 
 def philox(seed: int, first: int, count: int, width: int) -> Array:
@@ -273,4 +218,4 @@ def philox(seed: int, first: int, count: int, width: int) -> Array:
     generator = np.random.Philox(key=seed)
     generator.advance(first * blocks)
     raw = generator.random_raw(count * 4 * blocks).reshape(count, 4 * blocks)[:, :width]
-    return np.asarray(((raw >> np.uint64(11)) + 0.5) * _TINY)
+    return np.asarray(((raw >> np.uint64(11)) + 0.5) * TINY)

@@ -66,7 +66,7 @@ def test_each_torque_is_that_of_the_python_controller(request, case, by):
 
     ready.controlled.__dict__["module"] = SimpleNamespace(control=one_period)
     rows = np.arange(5, 8)
-    scenarios, starts, _ = ready.scenarios(study.sampler.rows(0, 3))
+    scenarios, starts, _ = ready.scenarios(study.draw(0, 3))
     start = study.motion.at(0.0)
     # Off the reference, for feedback to act.
     off = np.array([0.01, -0.02, 0.005])

@@ -15,7 +15,7 @@ KEY = "star.inertia.zz"
 
 def rows(vary, n=1000, first=0, count=None, **options):
     study = SweepStudy(SCENE, vary, n=n, **options)
-    return study.sampler.rows(first, count or n)
+    return study.draw(first, count or n)
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
@@ -65,7 +65,7 @@ def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
     vary = {KEY: [0.2, 0.3], "initial.gamma": [[0.7] * 3, [0.8] * 3, [0.9] * 3]}
     study = SweepStudy(SCENE, vary)
     assert study.rows == 6
-    found = study.sampler.rows(0, 6)
+    found = study.draw(0, 6)
     assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
     assert found["initial.gamma"][:, 1].tolist() == [0.7, 0.8, 0.9] * 2
 
@@ -73,7 +73,7 @@ def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
 def test_one_factor_scales_a_whole_tensor():
     study = SweepStudy(SCENE, {"actuated_links.inertia": ("uniform", 0.5, 2.0, "relative")}, n=9)
     (one,) = study.variations
-    factor = study.sampler.rows(0, 9)[one.key]
+    factor = study.draw(0, 9)[one.key]
     assert one.columns == ("actuated_links.inertia",)
     found = one.parameters(factor)
     assert len(found) == 3 * 4
