@@ -136,6 +136,8 @@ def test_arcs_define_the_directions_of_the_base():
         ({"star.inertia.zz": "much"}, "must be a finite number"),
         ({"springs[0].rest": 1.0}, r"springs\[0\].rest = 1.0: names nothing"),
         ({"name.first": 1.0}, "names nothing"),
+        ({"initial.gamma[-1]": None}, "names nothing"),
+        ({"star.": None}, "names nothing"),
         ({"star.inertia.zz": {1, 2}}, "star.inertia.zz"),
         ({"star.inertia.zz": object()}, "star.inertia.zz = .*: must be a finite number"),
     ],

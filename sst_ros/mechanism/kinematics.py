@@ -111,6 +111,8 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     isolated, AssemblyError is raised.
     """
     angles = np.array(gamma, dtype=float)
+    if angles.shape != (3,) or not np.all(np.isfinite(angles)):
+        raise AssemblyError("gamma must be three finite numbers", angles)
     found = direct_many(geometry, angles[None])
     if not found.isolated[0]:
         raise AssemblyError("the assemblies are not isolated", angles)

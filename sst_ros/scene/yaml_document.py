@@ -151,7 +151,7 @@ def replace_values(document: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in values.items():
         try:
             _set(changed, *_split(str(key)), value=value)
-        except (AttributeError, LookupError, TypeError):
+        except (AttributeError, LookupError, TypeError, ValueError):
             raise KeyError(key) from None
     return changed
 
@@ -171,7 +171,9 @@ def _set(tree: Any, name: str | int, *rest: str | int, value: Any) -> None:
 
 
 def _split(key: str) -> Place:
-    """Return a key as a place."""
+    """Return a key as a place; ValueError says that it is none."""
+    if not re.fullmatch(r"\w+(\[\d+\])*(\.\w+(\[\d+\])*)*", key, re.A):
+        raise ValueError(NO_NUMBER)
     words = re.sub(r"\[(\d+)\]", r".\1", key).split(".")
     return tuple(int(word) if word.isdecimal() else word for word in words)
 
