@@ -100,6 +100,7 @@ class SweepStudy(Section):
     chunk: int = _count("rows of a task and of a file", default=CHUNK)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "scene", scene_of(self.scene))
         if self.table is not None:
             object.__setattr__(self, "table", read_table(self.table))
         super().__post_init__()
@@ -148,7 +149,9 @@ class SweepStudy(Section):
             given["scene"] = folder / given["scene"]
         if isinstance(given.get("table"), str):
             given["table"] = folder / given["table"]
-        return build(cls, given | {"scene": scene_of(given["scene"])}, "sweep")
+        if given.keys() <= cls.SPECS.keys():  # else the unknown ones say more than no scene
+            given["scene"] = scene_of(given["scene"])
+        return build(cls, given, "sweep")
 
     @cached_property
     def model_scene(self) -> Scene:

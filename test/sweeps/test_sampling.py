@@ -110,6 +110,7 @@ REFUSED = [
     ({"steps": 2.5}, "steps = 2.5: must be a whole number"),
     ({"control": {"mode": "lqr"}}, "mode = 'lqr': must be one of feedforward"),
     ({"control": {"gain": 3.0}}, "control.gain = 3.0: unknown key; allowed are mode"),
+    ({"scene": None, "scen": SCENE}, "scen = .*: unknown key; .*did you mean 'scene'"),
     ({"chunks": 5}, "chunks = 5: unknown key; .*did you mean 'chunk'"),
 ]
 
@@ -119,6 +120,11 @@ def test_bad_studies_are_refused_by_key(given, message):
     values = {"scene": SCENE, "vary": {KEY: ("uniform", 0.2, 0.3)}, "n": 4} | given
     with pytest.raises(InputError, match=f"(?s){message}"):
         SweepStudy.from_values(values)
+
+
+def test_a_study_refuses_what_is_no_scene():
+    with pytest.raises(InputError, match="scene = 3: must be a Scene"):
+        SweepStudy(3, {KEY: [0.2]})
 
 
 def test_a_study_keeps_its_table_when_the_one_given_changes():
