@@ -153,7 +153,6 @@ class ControlledBatch:
             allowed = f"must be a multiple of {self.samples}, the control periods of a run"
             raise InputError("sweep", [Problem("steps", study.steps, allowed)])
         self._controller = Controller(self._scene, self._motion, control, period)
-        self._inertia = np.array(self._controller.inertia)[:, None]
         varied = {one.key for one in study.variations}
 
         def has(*names: str) -> bool:
@@ -302,10 +301,11 @@ class ControlledBatch:
             found = given.get(f"control.{name}", np.array(nominal))
             return found.T if np.ndim(nominal) == 1 and found.ndim == 2 else found
 
+        inertia = np.array(self._controller.inertia)[:, None]
         varies = {"control.stiffness", "control.damping"} & given.keys()
         rows = (
-            *law.feedback_gains(self._inertia, value, self._control.direct or bool(varies)),
-            self._inertia,
+            *law.feedback_gains(inertia, value, self._control.direct or bool(varies)),
+            inertia,
             value("integral_rate"),
             law.command_limit(value("torque_limit"), self._scene),
             batch.columns.torque_limit,

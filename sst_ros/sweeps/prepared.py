@@ -68,14 +68,11 @@ class PreparedSweep:
         It is nan where no run reaches the end.
         """
         study, tolerance = self.study, self.study.tolerance
-        if study.table is None:
-            rows = np.arange(PILOT)
-            values = study.draw(0, PILOT, "random")
-        else:
-            chosen = np.linspace(0, study.rows - 1, min(PILOT, study.rows)).astype(int)
-            rows = np.arange(len(chosen))
-            values = {key: x[chosen] for key, x in study.draw(0, study.rows).items()}
+        whole, kind = (PILOT, "random") if study.table is None else (study.rows, study.sampling)
+        chosen = np.linspace(0, whole - 1, min(PILOT, whole)).astype(int)
+        values = {key: x[chosen] for key, x in study.draw(0, whole, kind).items()}
         scenarios, starts, _ = self.scenarios(values)
+        rows = np.arange(len(chosen))
         unit = 1 if self.controlled is None else self.controlled.samples
         count = max(unit, 16)
         for _ in range(12):

@@ -33,6 +33,7 @@ _REFUSAL_S = 4.0
 _WINDOW_S = 10.0
 _POINTS = 500
 _COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in LEG_COLOURS)
+_BRAND = (0, 114, 178)
 _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
 
 _templates = jinja2.Environment(
@@ -94,10 +95,7 @@ class Page:
         gui, scene = self._server.gui, self._server.scene
         gui.reset()
         gui.configure_theme(
-            show_logo=False,
-            show_share_button=False,
-            brand_color=(0, 114, 178),
-            control_width="large",
+            brand_color=_BRAND, control_width="large", show_logo=False, show_share_button=False
         )
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_WIDTH)
