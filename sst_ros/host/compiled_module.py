@@ -81,7 +81,7 @@ _INNER = (
 )
 
 # A call hands on each array as seven words on the stack and counts its readers by two atomic
-# operations: a step by calls takes 5 to 20 % longer. Each has one caller, so its text stays one.
+# operations: a step by calls takes 5 to 20 % longer. In what a run calls each has one caller.
 _INLINE = ("attempt", "step_pair")
 
 _FREE_ROUNDING = ', fastmath={"arcp", "contract"}'
