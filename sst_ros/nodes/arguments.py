@@ -202,7 +202,7 @@ def _advice(word: str, known: dict[str, Spec]) -> str:
 
 def _as_yaml(spec: Spec, word: str) -> str:
     """Return a value as rcl reads it, or raise ValueError."""
-    value: Any = Switch(word) if spec.kind == "flag" else word
+    value: Any = Switch(word) if spec.kind == "flag" else word.strip()
     if spec.shape or spec.kind == "texts":
         value = [part.strip() for part in word.strip("[]").split(",")]
     text = json.dumps(accept(spec, value), ensure_ascii=False)

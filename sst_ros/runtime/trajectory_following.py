@@ -219,17 +219,14 @@ class TrajectoryFollower:
         manipulator is, at rest. A reference that moves is replaced in lockstep only. Where an error
         is raised, nothing has changed.
         """
-        given, last = self._settings, self._last
+        origin, given, last = "joint_trajectory", self._settings, self._last
+        allowed = "must be topic, for trajectories to be taken"
+        refuse_unless(origin, ("motion", given.motion, given.motion == "topic", allowed))
         begin = last.desired if last else self._reference_at_rest(seen)
         moving = any((*begin.gamma_dot, *begin.gamma_ddot))
-        from_topic = "must be topic, for trajectories to be taken"
         # The check takes longer than a control period; in lockstep the plant waits.
-        free = "must come when the motion has ended, outside lockstep"
-        refuse_unless(
-            "joint_trajectory",
-            ("motion", given.motion, given.motion == "topic", from_topic),
-            ("points", "", given.stamped or not moving, free),
-        )
+        allowed = "must come when the motion has ended, outside lockstep"
+        refuse_unless(origin, ("points", "", given.stamped or not moving, allowed))
         motion = motion_of(message, self._geometry, begin)
         check_motion(motion, self._model)
         if last is None:

@@ -23,7 +23,7 @@ def values(command, *words):
     [
         ("simulator", ["--scene", "friction"], {"scene": "friction"}),
         ("simulator", ["--scene=3"], {"scene": "3"}),
-        ("simulator", ["--publish-rate", "100", "--duration=2"],
+        ("simulator", ["--publish-rate", " 100", "--duration=2 "],
          {"publish_rate": 100, "duration": 2.0}),
         ("simulator", ["--wait-for-command"], {"wait_for_command": True}),
         ("simulator", ["--publish_clock", "true", "--compiled", "false", "--use-sim-time"],

@@ -131,6 +131,11 @@ def test_what_cannot_be_followed_is_refused_at_the_start(model, settings, reason
         )
 
 
+def test_a_trajectory_beside_the_motion_of_the_scene_is_refused_for_that():
+    with pytest.raises(InputError, match="must be topic"):
+        follow().take(None, None)
+
+
 def test_it_begins_only_near_the_start_of_the_motion():
     gamma = tuple(np.add(MODEL.initial.gamma, (0.0, 0.06, 0.0)))
     off = seen(Simulation(dataclasses.replace(MODEL, initial=Initial(gamma=gamma))).state)
