@@ -47,6 +47,7 @@ over it: torques, and a moment on the star in {B} where the scene takes one [N m
 LONGEST_TICK_NS = 1_000_000  # longer ticks are divided [ns]
 TICK_TOLERANCE = 1e-13  # largest local error estimate of a step
 TICK_BUDGET = 3600  # evaluations that a tick may take on average: a hundred steps
+UNRESOLVED = 100  # so many ticks may take more: then the scene is too stiff, and tries take long
 COMPILED_FROM = 10_000  # from this number of ticks on compilation costs less than it saves
 PLAIN_TICKS = 60_000  # so many are compared in plain Python, a minute's work
 CHUNK = 25_000  # so many ticks at a time, which bounds the memory
@@ -69,13 +70,14 @@ class TickPropagator(Propagator):
             budget=EvaluationBudget(TICK_BUDGET), limits=False,
         )  # fmt: skip
 
-    def follow(self, ticks: Held, starts: Array) -> Array:
+    def follow(self, ticks: Held, starts: Array, again: Array | None = None) -> Array:
         """Propagate through m ticks.
 
         They begin at the states `starts` (quaternion, body rate, lagged torques), shape
-        (m, 7 or 10); NaN where a tick goes on from the one before, and before the first. Returns
+        (m, 7 or 10); NaN where a tick goes on from the one before, and before the first. After one
+        that no step resolves, the next of `starts` or of the states `again` is begun at. Returns
         solution and second solution at the end of each tick, with the work since the start [J],
-        shape (m, 2, 8 or 11); NaN from a tick that no step resolves to the next start.
+        shape (m, 2, 8 or 11); NaN from a tick that is not resolved to the next state.
         """
         start_ns, end_ns, drives = ticks
         parts = np.maximum(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
@@ -83,8 +85,11 @@ class TickPropagator(Propagator):
         length = np.repeat((end_ns - start_ns) / NANOSECONDS / parts, parts)
         begin = np.repeat(start_ns / NANOSECONDS, parts)
         begin += length * (np.arange(len(length)) - np.repeat(first, parts))
-        begins = np.full((len(length), len(self.ode.state)), np.nan)
+        begins, known = np.full((2, len(length), len(self.ode.state)), np.nan)
         begins[first] = np.hstack([starts, 0.0 * starts[:, :1]])
+        if again is not None:
+            known[first] = np.hstack([again, 0.0 * again[:, :1]])
+        known = np.where(np.isfinite(begins), begins, known)
         if self._sine is not None:  # phases of sines, or torques within the limit
             held = np.fmod(np.outer(begin, self._sine.frequency) + self._sine.phase, 2.0 * np.pi)
         else:
@@ -96,9 +101,9 @@ class TickPropagator(Propagator):
         if not self.compiled:
             reached, given = reached.tolist(), tuple(array.tolist() for array in given)
         stepper, _ = self._begin_period(self._sine or (0.0, 0.0, 0.0), 0.0, ())
-        known = np.append(np.flatnonzero(np.isfinite(begins[:, 0])), len(length))
-        k = int(known[0])
-        at = stepper.begin(begins[min(k, len(length) - 1), :-1].tolist())
+        left = iter([*np.flatnonzero(np.isfinite(known[:, 0])).tolist(), len(length)])
+        k, failed = next(left), 0
+        at = stepper.begin(known[k % len(length), :-1].tolist())
         while k < len(length):
             k, at = stepper.step_through(k, len(length), given, at, len(length) - k, reached)
             if k == len(length):
@@ -110,7 +115,9 @@ class TickPropagator(Propagator):
                 reached[k][0][:], reached[k][1][:] = at.y, at.z
                 k += 1
             except (LimitReached, CannotStep, ArithmeticError, ValueError):
-                k = int(known[np.searchsorted(known, k, side="right")])
+                failed += 1
+                k = next(n for n in left if n > k) if failed < UNRESOLVED else len(length)
+                at = stepper.begin(known[k % len(length), :-1].tolist())
         return np.asarray(np.asarray(reached)[first + parts - 1])
 
 
@@ -291,23 +298,27 @@ def _compare(
         note(np.array([0]), np.stack([state, state])[None])
     known = known and start_ns[0] == 0
     # Where ticks are lost, those up to the next sample are left out.
-    at = places(recording.time_ns, start_ns)
-    usable = np.flatnonzero((at >= 0) & np.isfinite(recording.quaternion[at, 0]))
+    sample = places(recording.time_ns, start_ns)
+    sample[~np.isfinite(recording.quaternion[sample, 0])] = -1  # as where there is none
+    if torque is not None:
+        sample[:] = -1  # no sample is on the motion under continuous torques
+    usable = np.flatnonzero(sample >= 0)
     gaps = np.flatnonzero(np.append(not known, start_ns[1:] != end_ns[:-1])[:count])
-    again = np.append(usable, count)[np.searchsorted(usable, gaps)].clip(max=count)
+    after = np.append(usable, count)[np.searchsorted(usable, gaps)].clip(max=count)
     kept = np.ones(count, dtype=bool)
-    for gap, end in zip(gaps, again, strict=True):
+    for gap, end in zip(gaps, after, strict=True):
         kept[gap:end] = False
-    restarts = np.unique(again[again < count])
-    begun_ns, states = start_ns[restarts], of_samples(recording, at[restarts])
+    begun_ns = start_ns[np.unique(after[after < count])]
     start_ns, end_ns, drives = start_ns[:count][kept], end_ns[:count][kept], drives[:count][kept]
+    sample = sample[:count][kept]
     state = state if known else unknown
     for part in slices(len(start_ns), CHUNK, "reference", len(start_ns) > CHUNK):
-        starts = np.full((len(start_ns[part]), len(state)), np.nan)
-        starts[0] = state
-        place = places(start_ns[part], begun_ns)
-        starts[place[place >= 0]] = states[place >= 0]
-        reached = motion.follow((start_ns[part], end_ns[part], drives[part]), starts)[..., :-1]
+        again = of_samples(recording, sample[part])
+        again[sample[part] < 0] = np.nan
+        starts, begun = np.full_like(again, np.nan), np.isin(start_ns[part], begun_ns)
+        starts[0], starts[begun] = state, again[begun]
+        ticks = start_ns[part], end_ns[part], drives[part]
+        reached = motion.follow(ticks, starts, again)[..., :-1]
         rows = places(recording.time_ns, end_ns[part])
         found = (rows >= 0) & np.isfinite(reached[:, 0, 0])  # nan where no step resolves a tick
         note(rows[found], reached[found])

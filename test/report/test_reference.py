@@ -88,6 +88,14 @@ def test_what_is_lost_is_not_compared_and_no_error(
     assert missing == (set() if topic == "JOINTS" else lost)
 
 
+def test_after_a_tick_that_no_step_resolves_the_next_sample_is_begun_at(run):
+    torque = run.ticks.torque.copy()
+    torque[40] = 1e13
+    found = reference.integration(altered(run, ticks=replace(run.ticks, torque=torque)))
+    assert np.flatnonzero(np.isnan(found.error.gamma)).tolist() == [21]
+    assert (found.compared, found.restarts_ns) == (150, ()) and np.nanmax(found.error.gamma) < 1e-11
+
+
 def test_a_lost_start_is_not_taken_for_an_error(read, example2):
     run = read([e for e in example2 if not 0 <= e.sample < 10])
     assert not reference.begins(run) and reference.ideal(run) is None
