@@ -205,6 +205,7 @@ def fit_torques(
     refuse_unless(
         "identify",
         ("gamma", reached, reached >= STILL or scene.gravity is not None, allowed),
+        ("parameters", requested, bool(names), "must name one or more"),
         ("noise", noise, three, "must be three finite standard deviations > 0 [N m]"),
     )
     regressor = Regressor(scene, names)

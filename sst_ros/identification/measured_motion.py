@@ -28,6 +28,7 @@ Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any] | str | Path"
 
 FEWEST = 20  # samples to identify anything: filters and splines have transients at both ends
 NEEDED, OPTIONAL = ("t", "gamma", "torque"), ("gamma_dot", "quaternion", "held")
+_HELD = (torques.TorqueTable, torques.ConstantTorque)
 OBSERVABLES = ("gamma_1", "gamma_2", "gamma_3", "theta", "phi", "psi", "x", "y", "z")
 """Actuator angles and ZYZ angles [rad], position of E in {B} [m]."""
 
@@ -90,7 +91,11 @@ def read_motion(data: Measured, delay: float = 0.0) -> MeasuredMotion:
     if problems:
         raise InputError("identify", problems)
     t, n = arrays["t"], arrays["t"].size
-    refuse_unless("identify", ("t", t, torques.ascend(t), "must be rising times [s], shape (n,)"))
+    refuse_unless(
+        "identify",
+        ("t", t, torques.ascend(t), "must be rising times [s], shape (n,)"),
+        ("delay", delay, bool(np.isfinite(delay)), "must be a finite time [s]"),
+    )
     if held and arrays["torque"].shape == (n, 3):
         arrays["torque"] = arrays["torque"][:-1]
     shapes = {"t": (n,), "torque": (n - held, 3), "quaternion": (4,)}
@@ -113,7 +118,9 @@ def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
     """Take a simulated motion, or a recorded run while it has torques."""
     law: Any
     if isinstance(data, Trajectory):
-        motion, law, rows = data, data.law, np.full(len(data.t), True)
+        motion, rows = data, np.full(len(data.t), True)
+        # With a lag the torques at the joints are behind those of the law, as in a recording.
+        law = "sampled" if data.scene.lags else data.law
     elif hasattr(data, "ticks"):
         motion, ticks = data.trajectory, data.ticks
         begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
@@ -124,7 +131,7 @@ def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
         allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
         raise InputError("identify", [Problem("data", data, allowed)])
     t, torque = motion.t[rows], motion.torque[rows]
-    held = law is None or isinstance(law, (torques.TorqueTable, torques.ConstantTorque))
+    held = law is None or isinstance(law, _HELD)
     if held:  # without a law to their sample, see `Trajectory`
         torque = torque[1:] if law is None else _average(law, t)
     return {
@@ -164,17 +171,21 @@ def take_readings(data: Measured, scene: Scene) -> tuple[torques.TorqueProfile, 
         return _take_figure(data, scene)
     measured = read_motion(data)
     t = measured.t - measured.t[0]
-    torque: torques.TorqueProfile
+    values = np.pad(measured.gamma, ((0, 0), (0, 6)), constant_values=np.nan)
     if hasattr(data, "ticks"):  # a recording: torques before the lag, which the model has
         begins = np.round(data.ticks.start_ns / 1e9 - measured.t[0], 9)
-        torque = torques.TorqueTable(begins, data.ticks.torque)
-    elif measured.held:
-        torque = torques.TorqueTable(t[:-1], measured.torque)
-    else:
-        spline = CubicSpline(t, measured.torque)
-        torque = torques.PolynomialTorque(spline.c, spline.x)
-    values = np.pad(measured.gamma, ((0, 0), (0, 6)), constant_values=np.nan)
-    return torque, (t, values, None)
+        return torques.TorqueTable(begins, data.ticks.torque), (t, values, None)
+    # A simulated motion as well, while its torques are known.
+    if isinstance(data, Trajectory) and data.law and data.scene.lags and scene.lags:
+        held = isinstance(data.law, _HELD)
+        torque = _average(data.law, data.t) if held else data.law.values(data.t)
+        if np.isfinite(torque).all():  # not of the state, and not lost
+            limit = data.scene.torque_limit or np.inf
+            measured = measured._replace(torque=np.clip(torque, -limit, limit), held=held)
+    if measured.held:
+        return torques.TorqueTable(t[:-1], measured.torque), (t, values, None)
+    spline = CubicSpline(t, measured.torque)
+    return torques.PolynomialTorque(spline.c, spline.x), (t, values, None)
 
 
 def _take_figure(data: Mapping[str, Any], scene: Scene) -> tuple[torques.TorqueProfile, Readings]:

@@ -81,20 +81,21 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
 
 def values(scene: Scene, names: Sequence[str]) -> Array:
     """Values of parameters in a scene, zero for what it does not have, shape (len(names),)."""
-    return np.array([value_of(scene, name) or 0.0 for name in names])
+    found = []
+    for name in names:
+        body, moment, _ = name.partition(".moment.")
+        mass = (value_of(scene, f"{body}.mass") or 0.0) if moment else 1.0
+        found.append(mass * (value_of(scene, _of_centre(name)) or 0.0))
+    return np.array(found)
 
 
 def value_of(scene: Scene, name: str) -> float | None:
     """Return a number of a scene by its key, the first of a list; None where there is none."""
     try:
-        _, value, spec = next(find_fields(scene, _of_centre(name), components=True))
+        _, value, spec = next(find_fields(scene, name, components=True))
     except ValueError:
         return None
-    if spec.kind != "number" or value is None:
-        return None
-    body, moment, _ = name.partition(".moment.")
-    factor = value_of(scene, f"{body}.mass") if moment else 1.0
-    return float(np.ravel(value)[0]) * (factor or 0.0)
+    return None if spec.kind != "number" or value is None else float(np.ravel(value)[0])
 
 
 def _of_centre(name: str) -> str:

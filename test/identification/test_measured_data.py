@@ -11,6 +11,7 @@ from sst_ros import load_scene, reference_motion
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import filter_angles, find_bandwidth, identify
+from sst_ros.identification.measured_motion import read_motion
 
 COUNT = 2.0 * np.pi / 65536
 NOISE = 0.01
@@ -113,6 +114,13 @@ def test_a_known_delay_of_the_torques_is_taken_out():
         errors.append(np.linalg.norm(found.estimate - true) / np.linalg.norm(true))
     assert errors[0] < 1e-3 and errors[2] < 1e-3
     assert errors[1] > 5.0 * errors[2]
+
+
+def test_the_last_of_held_torques_acts_on():
+    t, steps = 0.01 * np.arange(30), np.outer(np.arange(1.0, 30.0), [1.0, 2.0, 3.0])
+    given = {"t": t, "gamma": np.zeros((30, 3)), "torque": steps, "held": True}
+    found = read_motion(given, delay=0.02).torque
+    assert found == pytest.approx(np.vstack([steps[2:], steps[-1:], steps[-1:]]))
 
 
 def test_the_filter_has_no_phase_and_leaves_the_motion():

@@ -119,6 +119,20 @@ def test_smoothing_and_lag_which_no_torque_is_linear_in_are_found():
     assert found.scene.actuators.time_constant == pytest.approx(0.02, rel=1e-6)
 
 
+@pytest.mark.parametrize("torque", [(0.3, -0.2, 0.1), None])
+def test_the_torques_of_a_trajectory_lag_once(torque):
+    name, drop = "friction.gamma.viscous", {} if torque is None else {"torque": None}
+    lag = {"actuators.time_constant": 0.02, name: 0.1}
+    plant = load_scene("example2_heavy").with_values(lag | drop)
+    times = np.linspace(0.0, 0.3, 151)
+    motion = simulate(plant, torque, t_eval=times, duration=0.3, tolerance=1e-11)
+    by_torques = identify(motion, plant, [name, "star.inertia"])
+    assert by_torques.values[by_torques.names.index(name)] == pytest.approx(0.1, rel=1e-6)
+    guess = plant.with_values({name: 0.12})
+    found = identify(motion, guess, [name], method="simulation")
+    assert found.values == pytest.approx([0.1], rel=1e-6)
+
+
 @pytest.mark.slow
 def test_the_standard_deviations_cover_the_errors_of_noisy_readings():
     plant = load_scene("example2_heavy")
@@ -179,6 +193,7 @@ def test_bodies_that_cannot_exist_give_way_to_the_nearest():
         ((), {}, "must be keys of numbers"),
         (("base.radius",), {}, "is geometry"),
         (("friction.gamma.smoothing",), {}, "must be the key of a number that the scene has"),
+        (("star.moment.x",), {}, "must be the key of a number that the scene has"),
         (("star.inertia.zz",), {"t": [0.2, 0.1]}, "must be ascending times"),
         (("star.inertia.zz",), {"speed": [1.0, 1.0]}, "must be t, deviation or one of"),
         (("star.inertia.zz",), {"psi": [1.0]}, r"psi = \(1,\): must have the shape \(2,\)"),
