@@ -32,7 +32,7 @@ NO_WORKER, NO_SCHEDULER = 60.0, 15.0
 """Longest wait for a worker that takes chunks, and for a scheduler that does not answer [s]."""
 
 GATHER = 60.0
-"""Longest wait for a worker's versions, or the outcome of a chunk [s]: a busy one answers late."""
+"""Longest wait for the outcome of a chunk that is done [s]: a busy worker answers late."""
 
 NO_ANSWER = "the scheduler does not answer; continue with --resume"
 
@@ -187,16 +187,11 @@ class _ClusterRun:
             time.sleep(0.1)
         # Not by scheduler_info(): another thread of the client empties what it is about to return.
         threads: dict[str, int] = self._client.nthreads()
-        new = [*(threads.keys() - self._faults.keys())]
-        # A worker of another version may not be able to read a study: it is asked by text.
-        text = f"__import__({__name__!r}).sweeps.engine.describe_versions()"
-        here, given = describe_versions(), {"on_error": "return", "callback_timeout": GATHER}
-        for asked in (new, *([one] for one in new)):  # each alone where all give no answer in time
-            if {*asked} <= self._faults.keys():
-                continue
-            answers = dict.fromkeys(asked, "no answer") if len(asked) == 1 else {}
-            with contextlib.suppress(*self.interrupted):
-                answers = self._client.run(eval, text, workers=asked, **given)
+        if new := [*(threads.keys() - self._faults.keys())]:
+            # A worker of another version may not be able to read a study: it is asked by text.
+            text = f"__import__({__name__!r}).sweeps.engine.describe_versions()"
+            here = describe_versions()
+            answers = self._client.run(eval, text, workers=new, on_error="return")
             for worker, there in answers.items():
                 self._note(worker, "" if there == here else f"it has {there} in place of {here}")
         return {worker: n for worker, n in threads.items() if self._faults.get(worker) == ""}
