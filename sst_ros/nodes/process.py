@@ -135,7 +135,7 @@ def _declare(
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")
         elif not name.startswith(arguments.FOREIGN):
-            problems.append(arguments.unknown_parameter(name, [*values]))
+            problems.append(arguments.unknown_name(name, values))
     try:
         if problems:
             raise InputError("", problems)
@@ -237,22 +237,25 @@ def run(words: Sequence[str]) -> int:
     signals.handle()
     command, *given = words
     if {"-h", "--help"} & set(given):
-        print(arguments.help_text(command))
+        arguments.make_parser(command).print_help()
         return 0
     configure_middleware()
     try:
         ros = arguments.ros_arguments(command, given)
-        for line in arguments.params_file_warnings(command, ros):
-            print(f"{command}: {line}", file=sys.stderr)
         rclpy.init(args=[command, *ros], signal_handler_options=SignalHandlerOptions.NO)
-    except (InputError, RuntimeError, ValueError) as error:  # the latter from rcl
-        text = str(error) if isinstance(error, InputError) else str(error).splitlines()[0]
-        print(text if text.startswith(command) else f"{command}: {text}", file=sys.stderr)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except (RuntimeError, ValueError) as error:  # of rcl; some have nothing but the words
+        print(f"{command}: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
     try:
         if not signals.came:
             module = importlib.import_module(f"sst_ros.nodes.{command}")
-            spin(getattr(module, arguments.COMMANDS[command][0])())
+            worker = getattr(module, arguments.COMMANDS[command][0])()
+            for line in arguments.unused_files(ros, worker.node.get_fully_qualified_name()):
+                worker.node.get_logger().warning(line)
+            spin(worker)
     except (SstError, ParameterException) as error:
         print(f"{command}: {error}", file=sys.stderr)
         return 1

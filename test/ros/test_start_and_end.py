@@ -28,8 +28,10 @@ def test_help_starts_nothing(run_here, command):
 @pytest.mark.parametrize(
     ("words", "refused", "said"),
     [
-        ("--scen friction", 2, "did you mean --scene?"),
-        ("--ros-args --params-file {path}", 1, "did you mean scene?"),
+        ("--scen friction", 2, "did you mean '--scene'?"),
+        ("--ros-args --params-file {path}", 1, "did you mean 'scene'?"),
+        ("--ros-args --params-file nowhere.yaml", 2, "nowhere.yaml"),
+        ("--ros-args --bogus", 2, "--bogus"),
     ],
 )
 def test_unknown_arguments_are_refused(run_here, tmp_path, words, refused, said):
