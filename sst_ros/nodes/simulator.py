@@ -39,7 +39,6 @@ from sst_ros.state import NANOSECONDS
 
 _DELAY_S = 5.0
 """Delay of the compiler: the first seconds of a real-time run have the processor alone."""
-_WATCH_S = 0.1
 _END_S = 0.5
 """Wait for the thread of the run, where a step does not end."""
 FOLLOWED_STEP_NS = 200_000_000
@@ -85,7 +84,6 @@ class Simulator(Worker[SimulatorParameters]):
         self._loop.post(processes.quiet)  # once the code of all methods is loaded
         self._thread = threading.Thread(target=self._live, name="run", daemon=True)
         self._thread.start()
-        threading.Thread(target=self._watch, name="watch", daemon=True).start()
 
     def close(self) -> None:
         """End the run, publish the last diagnostics; raise the reason where the run has failed."""
@@ -107,13 +105,6 @@ class Simulator(Worker[SimulatorParameters]):
             self._loop.run()
         finally:
             self.done.set()
-
-    def _watch(self) -> None:
-        """Look after the run, in a thread of its own: a timer would go through the executor."""
-        while not self.done.wait(_WATCH_S):
-            self._loop.watch()
-            if self._loop.failed:
-                self.done.set()
 
     def change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""

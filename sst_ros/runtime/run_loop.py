@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-import threading
 import time
 import traceback
 from collections import deque
@@ -29,8 +28,6 @@ from sst_ros.state import Vector3
 IDLE_PERIOD_S = 0.1
 _POLL_S = 0.001
 _REPLY_S = 30.0
-_STUCK_S = 0.4
-"""Processor time after which a step in progress is a fault; a step's budget ends it before."""
 
 
 class Phase(str, Enum):
@@ -70,26 +67,20 @@ class RunLoop(TickLoop):
         self._build, self._original = build, build(scene)
         super().__init__(self._original, run, torque_input, pacer, output)
         self._requests: deque[tuple[Callable[[], Reply | None], Future[Reply]]] = deque()
-        self._changing = threading.RLock()
-        self._thread: threading.Thread | None = None
-        self._watched = (0.0, 0.0)
         self._missing_since: float | None = time.monotonic()
 
     def ask(self, request: Callable[[], Reply]) -> Reply:
         """Have a request (`pause`, `reset`, ...) served by the thread of the run; wait for it.
 
-        The wait ends early where the run has stopped or a step does not end.
+        The wait ends early where the run has stopped.
         """
         pending = self.post(request)
         deadline = time.monotonic() + _REPLY_S
         while not wait([pending], _POLL_S).done:
-            since = self.step_since
-            stuck = since and time.perf_counter() - since > _STUCK_S
-            ends = stuck or self.stopped.is_set() or time.monotonic() > deadline
+            ends = self.stopped.is_set() or time.monotonic() > deadline
             if ends and not pending.done():  # it may have been served just before
                 pending.cancel()
-                reason = self.fault or ("a step does not end" if stuck else "the node is ending")
-                return Reply(False, f"not done: {reason}")
+                return Reply(False, f"not done: {self.fault or 'the node is ending'}")
         return pending.result()
 
     def post(self, request: Callable[[], Reply | None]) -> Future[Reply]:
@@ -104,20 +95,9 @@ class RunLoop(TickLoop):
         self.stopped.set()
         self.requested.set()
 
-    def watch(self) -> None:
-        """Latch a fault, from another thread, where the step in progress does not end."""
-        since, used = self.step_since, self._processor_s()
-        if since == 0.0 or since != self._watched[0]:
-            self._watched = since, used
-        elif used - self._watched[1] > _STUCK_S and self.phase is not Phase.FAULT:
-            took = time.perf_counter() - since
-            with self._changing:
-                self.fault = self.fault or f"a step has not ended after {took:.1f} s"
-                self._to(Phase.FAULT)
-
     def run(self) -> None:
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
-        self._thread, self._missing_since = threading.current_thread(), time.monotonic()
+        self._missing_since = time.monotonic()
         self._output.publish_phase(self._status)
         warm, shown = False, -math.inf
         while not (self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
@@ -133,10 +113,7 @@ class RunLoop(TickLoop):
                         self.show(fault=False)
                     time.sleep(_POLL_S)
                 elif self.phase is Phase.RUNNING:
-                    done = self.to_next_sample(paced=True)
-                    if self.fault:  # latched by `watch`: the step has ended after all
-                        self.publish_rest()
-                    elif done and self.complete:
+                    if self.to_next_sample(paced=True) and self.complete:
                         self._rest(Phase.FINISHED)
                 elif self.phase in (Phase.PAUSED, Phase.FAULT):
                     self.show(fault=bool(self.fault))
@@ -185,7 +162,6 @@ class RunLoop(TickLoop):
                 return Reply(False, f"not done, no controller answers: {none}")
             except RunStopped as stopped:
                 self._fail(str(stopped))
-            if self.fault:
                 return Reply(False, self._status)
             if self.complete:
                 self._rest(Phase.FINISHED)
@@ -254,28 +230,17 @@ class RunLoop(TickLoop):
     def _fail(self, reason: str) -> None:
         """Latch a fault; the last valid state is published, then held."""
         self.fault = self.fault or reason
+        self.failed = self.failed or self._run.last_tick < sys.maxsize
         if self.phase is not Phase.FAULT:
             self.publish_rest()
         self._to(Phase.FAULT)
 
     def _to(self, phase: Phase) -> None:
-        with self._changing:
-            if phase is not Phase.RUNNING:
-                self.counters.hold()
-            if self.fault:
-                phase = Phase.FAULT
-                self.failed = self.failed or self._run.last_tick < sys.maxsize
-            if phase is not self.phase:
-                self.phase = phase
-                self._output.publish_phase(self._status)
-
-    def _processor_s(self) -> float:
-        """Processor time of the thread of the run [s], where the system has it."""
-        if self._thread is None or self._thread.ident is None or not self._thread.is_alive():
-            return 0.0
-        if not hasattr(time, "pthread_getcpuclockid"):
-            return time.monotonic()
-        return time.clock_gettime(time.pthread_getcpuclockid(self._thread.ident))
+        if phase is not Phase.RUNNING:
+            self.counters.hold()
+        if phase is not self.phase:
+            self.phase = phase
+            self._output.publish_phase(self._status)
 
     @property
     def _status(self) -> str:

@@ -254,7 +254,6 @@ class TickLoop:
         self.counters, self.held = Counters(), HeldTorques()
         # Set by others to interrupt a wait, or to end.
         self.requested, self.stopped = threading.Event(), threading.Event()
-        self.step_since = 0.0  # perf_counter at which the step in progress began, 0 between steps
         self._run, self._input, self._pacer, self._output = run, torque_input, pacer, output
         self._lockstep, self._last_tick = run.lockstep, run.last_tick
         self._period_ns, self._ticks_per_sample = run.period_ns, run.ticks_per_sample
@@ -268,10 +267,8 @@ class TickLoop:
         Later steps take no longer, also where they change the method.
         """
         self.simulation.load_code()  # may take a second, and is no step
-        self.step_since = time.perf_counter()
         with contextlib.suppress(RunStopped):
             self.simulation.step(ZERO, self._period_ns)
-        self.step_since = 0.0
         self.simulation.reset()
 
     def restart(self, simulation: Simulation) -> None:
@@ -388,12 +385,11 @@ class TickLoop:
     def _advance(self, torque: Vector3, ticks: int) -> None:
         simulation, moment = self.simulation, self._input.moment
         before = simulation.time_ns
-        self.step_since = began = time.perf_counter()
+        began = time.perf_counter()
         try:
             simulation.advance(torque, self._period_ns, ticks, moment)
         finally:
             took = time.perf_counter() - began
-            self.step_since = 0.0
             done = (simulation.time_ns - before) // self._period_ns
             if done:
                 self.counters.count(took, self._pacer.late_ns, done)

@@ -126,20 +126,6 @@ def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):
     assert begun and not any(begun)
 
 
-def test_code_that_takes_long_to_load_is_no_fault(start):
-    class Slow(Simulation):
-        def load_code(self):
-            end = time.thread_time() + 0.6
-            while time.thread_time() < end:
-                pass
-
-    bench = start(build=Slow, duration=0.01)
-    while bench.thread.is_alive():
-        bench.loop.watch()
-        time.sleep(0.05)
-    assert bench.loop.phase is Phase.FINISHED and not bench.loop.fault
-
-
 def test_pause_is_idempotent_and_a_step_is_one_sample(start, at_once):
     bench = start()
     output = bench.output
@@ -341,39 +327,6 @@ def test_requests_of_four_callers_at_once_are_all_answered(start):
     refused = [reply.message for reply in replies if not reply.success]
     assert all("only a paused run can be stepped" in words for words in refused)
     assert bench.ask("reset").success and not bench.loop.fault
-
-
-def test_a_step_that_does_not_end_is_a_fault_and_everything_is_answered(start):
-    class Stuck(Simulation):
-        stuck = threading.Event()
-        released = threading.Event()
-
-        def advance(self, *args):
-            while self.stuck.is_set() and not self.released.is_set():
-                pass
-            super().advance(*args)
-
-    bench = start(build=Stuck)
-    loop, output = bench.loop, bench.output
-    bench.until(lambda: len(output.samples) > 2)
-    loop.simulation.stuck.set()
-    began = time.process_time()  # its own: on a busy machine 0.4 s of it take any time
-
-    def watched():
-        loop.watch()
-        time.sleep(0.02)
-        return loop.phase is Phase.FAULT
-
-    bench.until(watched)
-    assert output.phases[-1].startswith("fault: a step has not ended after")
-    asked = time.process_time()
-    assert bench.ask("reset") == (False, f"not done: {loop.fault}")
-    assert time.process_time() - asked < 0.5
-    assert 0.4 < asked - began < 1.0
-    loop.simulation.released.set()
-    bench.until(lambda: output.idles and output.idles[-1][1])
-    assert bench.ask("reset").success  # what could not be done has been forgotten
-    bench.to(Phase.RUNNING)
 
 
 def test_it_waits_for_subscribers_and_no_longer_than_allowed(start):
