@@ -14,7 +14,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
-from operator import add, mul, sub, truediv
 from typing import Any
 
 import numpy as np
@@ -38,9 +37,8 @@ _TEMPLATES = {
     "step": "(1.0 if {} > 0.0 else 0.0)",
 }
 _ON_FLOATS: dict[str, Callable[..., float]] = {
-    **{"add": add, "sub": sub, "mul": mul, "div": truediv},
-    **FUNCTIONS,
-    "positive": lambda x: max(x, 0.0),
+    op: eval(f"lambda x, y=0.0: {text.format('x', 'y')}", {**FUNCTIONS})
+    for op, text in _TEMPLATES.items()
 }
 _SLOPES: dict[str, Callable[..., Value]] = {
     "add": lambda here, x, y, dx, dy: dx + dy,
@@ -69,9 +67,7 @@ class Graph:
 
     def node(self, op: str, *args: Value) -> Expression:
         """Return the expression op(args), an old one where there is one."""
-        keys = tuple(
-            ("n", a.index) if isinstance(a, Expression) else ("c", _origin(a)) for a in args
-        )
+        keys = [("n", a.index) if isinstance(a, Expression) else ("c", _origin(a)) for a in args]
         key = (op, *(sorted(keys) if op in ("add", "mul") else keys))
         if key not in self._known:
             self._known[key] = Expression(self, len(self.nodes))
@@ -349,16 +345,13 @@ def trace(
         slopes: list[Value] = []
         for index, (op, args) in enumerate(nodes):
             d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
+            here = Expression(graph, index)
             if op == "input":
                 slopes.append(direction.get(args[0], 0.0))
-            elif len(args) == 1 and _is(d[0], 0.0):
-                slopes.append(0.0)
+            elif len(args) > 1:
+                slopes.append(_SLOPES[op](here, *args, *d))
             else:
-                slope = _SLOPES[op]
-                here = Expression(graph, index)
-                slopes.append(
-                    slope(here, *args) * d[0] if len(args) == 1 else slope(here, *args, *d)
-                )
+                slopes.append(0.0 if _is(d[0], 0.0) else _SLOPES[op](here, *args) * d[0])
         results += [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
 
     def operand(value: Value) -> float | int:

@@ -116,7 +116,7 @@ def balance(
     rows = rotation_rows(q)
     inertia: tuple[Scalar, ...] = model.star
     force = cross3(triple(dot3(row, rate) for row in symmetric_rows(model.star)), rate)
-    field = field_of(model, rows)
+    field = ZERO if model.gravity is None else rotate_back(rows, model.gravity)
     if model.gravity is not None:
         force = add(force, cross3(model.weight, field))
     for external in (model.moment, moment):
@@ -130,8 +130,7 @@ def balance(
         a_rest, gamma_rest = rest_accelerations(at, rate)
         # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
         a_inertia, a_slope = leg.a0 + leg.a2 * (a * a), 2.0 * leg.a2 * a
-        c_inertia: Scalar = 0.0
-        c_slope: Scalar = 0.0
+        c_inertia, c_slope = 0.0, 0.0
         if leg.ixy or leg.ixz or leg.iyz:
             root = sqrt(u)
             c_inertia, c_slope = leg.ixz * a / root - leg.ixy, leg.ixz / (u * root)
@@ -140,8 +139,7 @@ def balance(
         force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
         force_gamma = a_inertia * gamma_rest + c_inertia * a_rest - drive
         force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
-        toward_a = multiply(c_inertia, g)
-        toward_gamma = axpy(a_inertia, g, c_inertia, p)
+        toward_a, toward_gamma = multiply(c_inertia, g), axpy(a_inertia, g, c_inertia, p)
         at_gamma, at_mu, at_beta = joint_torques(at, field)
         force_gamma = force_gamma - at_gamma
         if not (type(at_mu) is float and at_mu == 0.0):
@@ -177,11 +175,7 @@ def leg_motions(model: Model, state: Sequence[Scalar]) -> Iterator[LegMotion]:
 def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
     """Vectors and rates of a leg; `rows` are the rows of R, `rate` is W."""
     e0, e1 = leg.e0, leg.e1
-    w0, w1, w2 = leg.w
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rows
-    x = w0 * r00 + w1 * r10 + w2 * r20
-    y = w0 * r01 + w1 * r11 + w2 * r21
-    z = w0 * r02 + w1 * r12 + w2 * r22
+    x, y, z = rotate_back(rows, leg.w)
     a, across = e0 * x + e1 * y, e0 * y - e1 * x
     p = (e1 * z, -(e0 * z), across)
     u = across * across + z * z
@@ -197,11 +191,6 @@ def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
     along = dot3(at.along, rate)
     a_rest = dot3(at.axis, rate) * along - at.a * dot3(rate, rate)
     return a_rest, at.a_dot * (2.0 * at.a * at.gamma_dot - along) / at.u
-
-
-def field_of(model: Model, rows: Rows) -> Triple:
-    """Gravity in {E}."""
-    return ZERO if model.gravity is None else rotate_back(rows, model.gravity)
 
 
 def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
@@ -224,7 +213,8 @@ def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
 def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     """Potential energy [J]: weight, springs and elastic stops."""
     x, y, z, w = state[:4]
-    field = field_of(model, rotation_rows((x, y, z, w)))
+    rows = rotation_rows((x, y, z, w))
+    field = ZERO if model.gravity is None else rotate_back(rows, model.gravity)
     total: Scalar = 0.0 if model.gravity is None else -dot3(model.weight, field)
     for at in leg_motions(model, state):
         leg, own = at.leg, 0.0
@@ -288,8 +278,7 @@ def joint_torques(at: LegMotion, field: Triple) -> Triple:
         0.0 if spring is None else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
         for kind, spring in enumerate(leg.springs)
     )
-    at_gamma: Scalar = 0.0
-    at_mu: Scalar = 0.0
+    at_gamma, at_mu = 0.0, 0.0
     if any(leg.drive) or any(leg.link):  # weight: moments about w_k and -r_k
         of_drive, of_link = _directions(at)
         on_link = cross3(_combine(leg.link, *of_link), field)

@@ -16,6 +16,12 @@ from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
 from sst_ros.state import ZERO
 
+SINGULAR_MU = 1e-6
+"""Distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning."""
+
+CONTACT_BAND = 1e-9
+"""Farther beyond than this [rad], an actuator has not just reached the contact."""
+
 
 class JointSpring(NamedTuple):
     """All springs of one joint as one: torque -stiffness (angle - rest)."""
@@ -154,14 +160,6 @@ def _join(springs: list[Any]) -> JointSpring | None:
     return JointSpring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
 
 
-SINGULAR_MU = 1e-6
-"""Distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning."""
-
-
-CONTACT_BAND = 1e-9
-"""Farther beyond than this [rad], an actuator has not just reached the contact."""
-
-
 class Limit(NamedTuple):
     """One end: sign * (angle of a joint - end) >= 0."""
 
@@ -171,10 +169,9 @@ class Limit(NamedTuple):
     sign: float  # +1 for a lower end, -1 for an upper one
     end: Any  # angle [rad]
 
-    def distance(self, joints: Sequence[float]) -> float:
+    def distance(self, joints: Sequence[float]) -> Any:
         """Distance to the end [rad], negative beyond it; nine angles, then nine rates."""
-        distance: float = self.sign * (joints[self.joint] - self.end)
-        return distance
+        return self.sign * (joints[self.joint] - self.end)
 
     def slope(self, joints: Sequence[float]) -> float:
         """Rate of the distance [rad/s]."""

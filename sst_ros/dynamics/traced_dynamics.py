@@ -39,6 +39,7 @@ Function = Callable[..., tuple[float, ...]]
 
 QUATERNION = ("x", "y", "z", "w")
 RATE = ("wx", "wy", "wz")
+MOTION = (*QUATERNION, *RATE)
 LAG = ("l1", "l2", "l3")
 TORQUE = ("t1", "t2", "t3")
 MOMENT = ("n1", "n2", "n3")
@@ -57,7 +58,7 @@ class Dynamics:
 
     def __init__(self, model: kernel.Model, *, has_moment_topic: bool = False) -> None:
         self.model, self.has_moment_topic = model, has_moment_topic
-        self.state = (*QUATERNION, *RATE, *(LAG if model.time_constant is not None else ()))
+        self.state = (*MOTION, *(LAG if model.time_constant is not None else ()))
         self.drive = (*TORQUE, *(MOMENT if has_moment_topic else ()))
 
     @staticmethod
@@ -79,9 +80,7 @@ class Dynamics:
     @cached_property
     def joints_program(self) -> Program:
         """The program of `joints`."""
-        return trace(
-            lambda *state: [*chain(*kernel.joints(self.numbers, state))], (*QUATERNION, *RATE)
-        )
+        return trace(lambda *state: [*chain(*kernel.joints(self.numbers, state))], MOTION)
 
     @cached_property
     def inverse(self) -> Function:
@@ -96,7 +95,7 @@ class Dynamics:
             return (*found[0], found[1], *(at.u for at in kernel.leg_motions(self.model, inputs)))
 
         more = MOMENT if self.has_moment_topic else ()
-        return compile_program(trace(torques, (*QUATERNION, *RATE, *BODY_ACCELERATION, *more)))
+        return compile_program(trace(torques, (*MOTION, *BODY_ACCELERATION, *more)))
 
     @cached_property
     def energies(self) -> Function:
@@ -123,14 +122,12 @@ recent = lru_cache(maxsize=32)(Dynamics)
 
 
 class ODE:
-    """Derivative of a scene's state, as programs with the inputs t, state, drive.
+    """Derivative of a scene's state, as programs with the inputs t, `state` and `drive`.
 
-    `torque` over time, clamped to `limit` [N m], replaces the torques of the drive; with `phases`
-    the drive keeps three numbers for them, the phases [rad]. `work` appends to the state the work
-    [J] that actuators and moments have put in, less what friction has taken out.
-
-    `state` has the names of the state's numbers: quaternion, body rate, lagged torques, work;
-    `drive` of what acts from outside and is constant over a step.
+    These are those of `dynamics`, but for: `torque` over time, clamped to `limit` [N m], replaces
+    the torques of the drive; with `phases` the drive keeps three numbers for them, the phases
+    [rad]. `work` appends to the state the work [J] that actuators and moments have put in, less
+    what friction has taken out.
     """
 
     def __init__(
@@ -142,7 +139,7 @@ class ODE:
         work: bool = False,
         phases: bool = False,
     ) -> None:
-        self._dynamics, self._torque, self._limit = dynamics, torque, limit
+        self.dynamics, self._torque, self._limit = dynamics, torque, limit
         self._work, self._phases = work, phases
         self.state = (*dynamics.state, *(("work",) if work else ()))
         self.drive = dynamics.drive if torque is None or phases else dynamics.drive[3:]
@@ -189,21 +186,16 @@ class ODE:
         by = ("t", *self.state, *TORQUE)
         return compile_program(trace(self.derivative, self._inputs, by))
 
-    @property
-    def joints(self) -> Program:
-        """Nine angles and nine rates, of quaternion and body rate."""
-        return self._dynamics.joints_program
-
     def derivative(self, time: Any, *inputs: Any, numbered: bool = False) -> tuple[Any, ...]:
         """Return the derivative at the time, the state and the drive given, of any kind.
 
         If `numbered` it is that of constants that may be others in another scene.
         """
-        model, sine, limit = self._dynamics.model, self._torque, self._limit
+        model, sine, limit = self.dynamics.model, self._torque, self._limit
         if numbered:
-            model, sine = self._dynamics.numbers, number_constants(sine, ("torque",))
+            model, sine = self.dynamics.numbers, number_constants(sine, ("torque",))
             limit = number_constants(limit, ("limit",))
-        state, drive = inputs[: len(self._dynamics.state)], inputs[len(self.state) :]
+        state, drive = inputs[: len(self.dynamics.state)], inputs[len(self.state) :]
         torque, moment = drive[:3], drive[3:]
         if sine is not None:
             phase = torque if self._phases else sine.phase
@@ -218,16 +210,8 @@ class ODE:
         return (*slope, *work)
 
 
-@lru_cache(maxsize=32)
-def ode_with_work(dynamics: Dynamics) -> ODE:
-    """Give the system that counts work: traced once for all runs of the same dynamics."""
-    return ODE(dynamics, work=True)
-
-
-@lru_cache(maxsize=32)
-def ode_under(dynamics: Dynamics, torque: SineTorque, limit: float | None) -> ODE:
-    """Give the system under a sine whose phases are its drive, which counts work."""
-    return ODE(dynamics, torque, limit=limit, work=True, phases=True)
+recent_ode = lru_cache(maxsize=64)(ODE)
+"""Traced once for all runs of the same dynamics."""
 
 
 def limit_distances(
@@ -275,28 +259,25 @@ class ParameterColumns(NamedTuple):
 
 
 class ParametricModel:
-    """The programs of a scene, with the numbers that differ between scenarios as inputs.
+    """The programs of a scene, with the numbers that differ between scenarios, `names`, as inputs.
 
-    With `profile` the scene's own torques act. `ode` has the names of the state and the drive,
-    `names` those of the varied numbers.
+    With `profile` the scene's own torques act. `ode` has the names of the state and the drive.
     """
 
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
         self.scene, self._profile = scenarios.document, profile
         self._tree = self._constants_of(scenarios)[0]
         numbers = leaves(self._tree)
-        varied = [place for place, x in numbers.items() if np.max(x) != np.min(x)]
-        self._varied = {place: f"p{i}" for i, place in enumerate(varied)}
-        self.names = tuple(self._varied.values())
+        self._varied = [place for place, x in numbers.items() if np.max(x) != np.min(x)]
+        self.names = tuple(f"p{i}" for i in range(len(self._varied)))
         rest = (place for place in numbers if place not in self._varied)
         self._fixed = {place: float(np.ravel(numbers[place])[0]) for place in rest}
         self.ode = ODE(Dynamics.of(self.scene), self.scene.torque if profile else None)
 
     def columns(self, scenarios: Scenarios) -> ParameterColumns:
-        """Return the numbers of scenarios.
+        """Return the numbers of scenarios, of which none may differ that is fixed in this model.
 
-        Refused are actuators that cannot give the torques of the profile, and numbers that differ
-        but do not in the scenarios that this model was made from.
+        Refused are actuators that cannot give the torques of the profile, too.
         """
         tree, geometries, which = self._constants_of(scenarios)
         numbers = leaves(tree)
@@ -309,31 +290,21 @@ class ParametricModel:
                 row[:] = np.where(row == 0.0, numbers[level], row)
             elif place[-1] == "rest":
                 np.nan_to_num(row, copy=False)  # of a spring without stiffness any will do
-        actuators = scenarios.columns().actuators
-        given = None if actuators is None else actuators.torque_limit
+        given = getattr(scenarios.columns().actuators, "torque_limit", None)
         limit = np.full(len(which), np.inf if given is None else given)
         limit[limit == 0.0] = np.inf  # of actuators that are left out
         lagging, lags = tree.model.time_constant, "must be > 0 [s] in every scenario, or in none"
-        fixed = "must be {} in all scenarios of this model"
-        checks = [
-            (str(place), numbers[place], bool(np.all(numbers[place] == x)), fixed.format(x))
-            for place, x in self._fixed.items()
-        ]
-        checks.append(("actuators.time_constant", 0.0, not np.any(lagging == 0.0), lags))
+        checks = [("actuators.time_constant", 0.0, not np.any(lagging == 0.0), lags)]
+        for place, x in self._fixed.items():
+            allowed = f"must be {x} in all scenarios of this model"
+            checks.append((str(place), numbers[place], bool(np.all(numbers[place] == x)), allowed))
         if tree.torque is not None:  # a fixed step does not resolve the kinks of a clamped torque
             amplitudes = np.array(np.broadcast_arrays(*tree.torque.amplitude, limit)[:3])
             largest = np.abs(amplitudes).max(axis=0)
             n = int(np.argmax(largest > limit))
-            where = f"scenario {n}: " if scenarios.count else ""
+            key = f"scenario {n}: " * bool(scenarios.count) + "actuators.torque_limit"
             allowed = f"must not be less than the amplitude {largest[n]} of the profile"
-            checks.append(
-                (
-                    f"{where}actuators.torque_limit",
-                    float(limit[n]),
-                    bool(largest[n] <= limit[n]),
-                    allowed,
-                )
-            )
+            checks.append((key, float(limit[n]), bool(largest[n] <= limit[n]), allowed))
         refuse_unless(self.scene.name, *checks)
         return ParameterColumns(inputs, geometries, which, limit)
 
@@ -359,7 +330,7 @@ class ParametricModel:
             at = self.constants(inputs[7:])
             return limit_distances(limits, at.ends, at.model, inputs[:7])
 
-        return trace(values, (*QUATERNION, *RATE, *self.names))
+        return trace(values, (*MOTION, *self.names))
 
     @cached_property
     def outputs(self) -> dict[str, Callable[..., tuple[Any, ...]]]:
@@ -374,7 +345,7 @@ class ParametricModel:
             kinetic = kernel.kinetic_energy(model, state)
             return (*joints, kinetic + kernel.potential_energy(model, state))
 
-        whole = trace(values, (*QUATERNION, *RATE, *self.names))
+        whole = trace(values, (*MOTION, *self.names))
         parts = (whole.prune(whole.outputs[i : i + 3]) for i in range(0, 19, 3))
         return dict(zip(OUTPUTS, map(compile_for_arrays, parts), strict=True))
 

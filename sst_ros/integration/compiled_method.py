@@ -21,7 +21,7 @@ import numpy as np
 
 from sst_ros.dynamics.expression import Slots
 from sst_ros.dynamics.simd_source import linearise_by_columns
-from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, Function, ode_with_work
+from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, Function, recent_ode
 from sst_ros.host import compiled_module
 from sst_ros.host.compiled_module import cache_folder
 from sst_ros.integration import step_loops
@@ -270,7 +270,7 @@ def _source(
     )
     shared = [
         system.program.source("rhs", slots),
-        system.joints.source("angles_and_rates", slots),
+        system.dynamics.joints_program.source("angles_and_rates", slots),
         f"def joints_of(y, p, joints):\n{joints}",
         *(inspect.getsource(function) for function in _SHARED),
     ]
@@ -326,10 +326,10 @@ def make_code(scene: Scene, integrator: str) -> None:
 
 
 def _missing(scene: Scene, integrator: str) -> list[Method]:
-    system = ode_with_work(Dynamics.of(scene))
+    system = recent_ode(Dynamics.of(scene), work=True)
     return [method for method in methods_of(integrator) if not has_step_code(system, method)]
 
 
 def _make(scene: Scene, method: str) -> None:
-    system = ode_with_work(Dynamics.of(scene))
+    system = recent_ode(Dynamics.of(scene), work=True)
     CompiledMethod(system, METHODS[method], compiled=True).load()

@@ -13,7 +13,7 @@ import numpy as np
 
 from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.model import Limit, contact_events_of, free_range, limits_of, ranges_of
-from sst_ros.dynamics.traced_dynamics import Dynamics, Function, ode_under, ode_with_work
+from sst_ros.dynamics.traced_dynamics import Dynamics, Function, recent_ode
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper, EvaluationBudget, Step, TorqueLaw
 from sst_ros.integration.compiled_method import compile_derivative
@@ -78,7 +78,7 @@ class Propagator:
     ) -> None:
         geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
-        self.ode = ode_with_work(self.dynamics)
+        self.ode = recent_ode(self.dynamics, work=True)
         self.budget = budget
         ends = tuple(limits_of(scene, geometry)) if limits else ()
         contacts = tuple(contact_events_of(scene, geometry))
@@ -134,7 +134,9 @@ class Propagator:
             if sine is None:
                 new = self._new_stepper(self.ode, compiled=False, ranges=(), law=self._law)
             else:
-                new = self._new_stepper(ode_under(self.dynamics, sine, self.torque.limit_of(sine)))
+                limit = self.torque.limit_of(sine)
+                ode = recent_ode(self.dynamics, sine, limit=limit, work=True, phases=True)
+                new = self._new_stepper(ode)
             self._others[sine] = new
         return self._others[sine], (*self.torque.begin(torque, start), *moment)
 
@@ -228,7 +230,7 @@ class AppliedTorque:
     def __init__(
         self, dynamics: Dynamics, limit: float | None, derivative: Function | None
     ) -> None:
-        self._dynamics, self._ode, self.limit = dynamics, ode_with_work(dynamics), limit
+        self._dynamics, self._ode, self.limit = dynamics, recent_ode(dynamics, work=True), limit
         self.is_traced = derivative is None
         if derivative is not None:
             self.rhs = derivative

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.initial_state import derive_by_paper, start_of
-from sst_ros.dynamics.traced_dynamics import Dynamics, ode_with_work
+from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.errors import Diverged, StepBudgetExceeded, refuse_unless
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import BudgetSpent, CannotStep, EvaluationBudget
@@ -48,7 +48,7 @@ def default_budget(dynamics: Dynamics, equations: str, *, compiled: bool) -> int
         return _VIRTUAL_WORK_BUDGET
     if compiled:
         return _COMPILED_BUDGET
-    return _PLAIN_BUDGET // (len(ode_with_work(dynamics).program.steps) + _STAGE_OPERATIONS)
+    return _PLAIN_BUDGET // (len(recent_ode(dynamics, work=True).program.steps) + _STAGE_OPERATIONS)
 
 
 def _whole(value: Any) -> int:

@@ -19,7 +19,7 @@ from models import seeded_samples
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Slots, number_constants, trace
 from sst_ros.dynamics.kernel import derivative
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, ode_with_work
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, recent_ode
 from sst_ros.host import compiled_module
 from sst_ros.integration import gauss
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -293,7 +293,7 @@ def test_scenes_take_turns_and_threads_and_keep_their_own_numbers(start):
 @pytest.mark.parametrize("name", SCENES)
 def test_a_text_that_serves_all_scenes_has_hardly_more_operations(name):
     """Against the trace that merges and folds whatever is equal in this scene."""
-    ode = ode_with_work(Dynamics.of(load(name)))
+    ode = recent_ode(Dynamics.of(load(name)), work=True)
     own = trace(ode.derivative, ode.program.inputs)
     assert own.operations.total() <= ode.program.operations.total()
     assert ode.program.operations.total() <= own.operations.total() + 5
