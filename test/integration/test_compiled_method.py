@@ -172,7 +172,7 @@ def ode_of(scene, torque=None, **options):
 def text_of(ode, *, implicit=False):
     """What is compiled, and the numbers that it takes."""
     slots = Slots()
-    programs = {"rhs": ode.program, "joints": ode.joints}
+    programs = {"rhs": ode.program, "joints": ode.dynamics.joints_program}
     if implicit:
         programs["directional"] = ode.directional
     return "".join(one.source(name, slots) for name, one in programs.items()), slots.values
