@@ -19,7 +19,8 @@ def list_all(_: argparse.Namespace) -> None:
 
 def print_schema(_: argparse.Namespace) -> None:
     """Print the JSON schema of scenes."""
-    print(json.dumps(json_schema(Scene, "sst_ros scene"), indent=2))
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "sst_ros scene"}
+    print(json.dumps(head | json_schema(Scene), indent=2))
 
 
 def describe(options: argparse.Namespace) -> None:

@@ -19,7 +19,7 @@ import yaml
 
 from sst_ros.errors import InputError, Problem, suggestion
 from sst_ros.runtime import settings
-from sst_ros.scene.schema import Section, Spec, Switch, accept
+from sst_ros.scene.schema import Section, Spec, accept
 
 USE_SIM_TIME = "use_sim_time"
 FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
@@ -133,7 +133,7 @@ def _option(name: str) -> str:
 
 def _as_yaml(spec: Spec, word: str) -> str:
     """Return a value as rcl reads it, or raise ValueError."""
-    value: Any = Switch(word) if spec.kind == "flag" else word.strip()
+    value: Any = word.strip()
     if spec.shape or spec.kind == "texts":
         value = [part.strip() for part in word.strip("[]").split(",")]
     text = json.dumps(accept(spec, value), ensure_ascii=False)

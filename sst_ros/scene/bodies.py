@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,14 +56,10 @@ class Inertia(Section):
         largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
         definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
         fits = _is_positive([-part for part in tensor], largest)
-
-        def moments() -> Any:
-            return np.linalg.eigvalsh(self.matrix).tolist()
-
         least = f"> 0 (positive definite), at least {SMALLEST_MOMENT:g} kg m^2"
-        yield ~definite, "", moments, f"principal moments of inertia must be {least}"
+        yield ~definite, "", tensor, f"principal moments of inertia must be {least}"
         allowed = "no principal moment may exceed the sum of the other two"
-        yield definite & ~fits, "", moments, allowed
+        yield definite & ~fits, "", tensor, allowed
 
 
 class Base(Section):
@@ -105,18 +100,12 @@ class Base(Section):
             return
         v = np.moveaxis(np.asarray(self.v), (0, 1), (-2, -1))
         lengths = np.linalg.norm(v, axis=-1)
-        unit = v / lengths[..., None]
-        volume = np.linalg.det(unit)
-        side = np.linalg.norm(unit - np.roll(unit, 1, axis=-2), axis=-1).max(axis=-1)
-        zero = lengths.min(axis=-1) < 1e-6
-        flat, small = ~zero & (abs(volume) < RELATIVE_ROUNDING), side < SMALLEST_SIDE
-        yield zero, "v", self.v, "no direction may be zero (shorter than 1e-6)"
-        apart = f"P1, P2, P3 must lie {SMALLEST_SIDE:g} rad apart or more: triangle too small"
-        yield flat & small, "v", self.v, apart
-        circle = "P1, P2, P3 must not lie on one great circle (degenerate)"
-        yield flat & ~small, "v", self.v, circle
+        volume = np.linalg.det(v / lengths[..., None])
+        flat = (lengths.min(axis=-1) < 1e-6) | ~(abs(volume) >= RELATIVE_ROUNDING)
+        allowed = f"must lie {SMALLEST_SIDE:g} rad apart or more, and not on one great circle"
+        yield flat, "v", self.v, f"P1, P2, P3 {allowed}; no direction may be zero (degenerate)"
         handed = "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points"
-        yield ~zero & ~flat & (volume < 0.0), "v", self.v, handed
+        yield ~flat & (volume < 0.0), "v", self.v, handed
 
 
 def _directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3, Vector3]:
@@ -141,7 +130,6 @@ class Link(Section):
         "m",
         default=(0.0, 0.0, 0.0),
         acts_on=("mass",),
-        needs="needs mass > 0 [kg]",
     )
     inertia_about: str = entry(
         "point of the inertia; the scene that is read has it about O",
@@ -171,17 +159,11 @@ class Link(Section):
             scale = np.maximum(scale, abs(part))
         # Moments about the centre of mass: none exceeds half their sum, but for rounding.
         fits = _is_positive([-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale)
-
-        def allowed() -> str:
-            left = _matrix_of(own)
-            finite = bool(np.isfinite(left).all())  # the square of a centre may overflow
-            moments = np.linalg.eigvalsh(left) if finite else np.diag(left)
-            return (
-                f"must fit the inertia about O, which leaves {moments} about this centre "
-                f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
-            )
-
         given = np.greater(mass, 0.0) & np.greater(scale, 0.0)
+        allowed = (
+            "must fit the inertia about O, which leaves moments about this centre that no body has "
+            f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
+        )
         yield given & ~fits, "centre", self.centre, allowed
 
 
@@ -196,8 +178,7 @@ class Star(Link):
         """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
         total = sum(self.alpha_deg)
         open_ = np.greater(abs(total - 360.0), 360.0 * RELATIVE_ROUNDING)
-        allowed = partial("must sum to 360 deg; the sum is {:g}".format, total)
-        yield open_, "alpha_deg", self.alpha_deg, allowed
+        yield open_, "alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total}"
         yield from super().rules()
 
 
@@ -250,17 +231,16 @@ class Stroke(Section):
     def rules(self) -> Rules:
         """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
         elastic, damped = self.at_end == "elastic", np.not_equal(self.damping, 0.0)
-        bounces, has_rate = self.restitution is not None, self.impact_rate is not None
-        only = "is given with at_end: elastic, and only there"
-        for name, broken, allowed in (
-            ("stiffness", (self.stiffness is not None) != elastic, only),
-            ("restitution", bounces and not elastic, only),
-            ("impact_rate", has_rate and not elastic, only),
-            ("impact_rate", bounces != has_rate, "is given with restitution, both or none"),
-            ("damping", damped & (not elastic), only),
-            ("damping", damped & bounces, "give either damping or restitution"),
-        ):
-            yield broken, name, getattr(self, name), allowed
+        bounces, only = (
+            self.restitution is not None,
+            "is given with at_end: elastic, and only there",
+        )
+        yield (self.stiffness is not None) != elastic, "stiffness", self.stiffness, only
+        yield bounces and not elastic, "restitution", self.restitution, only
+        both = bounces == (self.impact_rate is not None)
+        yield not both, "impact_rate", self.impact_rate, "is given with restitution, both or none"
+        yield damped & (not elastic), "damping", self.damping, only
+        yield damped & bounces, "damping", self.damping, "give either damping or restitution"
 
 
 class Workspace(Section):
@@ -280,9 +260,7 @@ PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 def entries_of(inertia: Inertia | None) -> list[Any]:
     """Return xx, yy, zz, xy, xz and yz, zero without inertia; they may be columns or symbols."""
-    if inertia is None:
-        return [0.0] * 6
-    return [inertia.xx, inertia.yy, inertia.zz, inertia.xy, inertia.xz, inertia.yz]
+    return [0.0] * 6 if inertia is None else [*vars(inertia).values()]
 
 
 def point_inertia(mass: Any, centre: Any) -> list[Any]:
@@ -323,9 +301,9 @@ def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) ->
     positive, or the directions span no arc.
     """
     first, last = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
-    fits = first.shape == last.shape == (3,) and bool(np.all(np.isfinite([first, last])))
-    normal = np.linalg.norm(np.cross(first, last)) if fits else 0.0
-    spans = fits and bool(normal > 1e-9 * np.linalg.norm(first) * np.linalg.norm(last))
+    fits = first.shape == last.shape == (3,)
+    normal = float(np.linalg.norm(np.cross(first, last))) if fits else math.nan
+    spans = normal > 1e-9 * float(np.linalg.norm(first) * np.linalg.norm(last))
     directions = "must be two directions, shape (3,), neither parallel nor opposite"
     refuse_unless(
         "arc_inertia",

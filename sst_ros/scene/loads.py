@@ -29,7 +29,6 @@ class Gravity(Section):
     """A uniform field."""
 
     EFFECTS = ("acceleration",)
-    IDLE = "acceleration", "must not be zero: leave gravity out"
 
     acceleration: Vector3 = entry("acceleration of free fall in {B}", "m/s^2")
 
@@ -37,13 +36,10 @@ class Gravity(Section):
 class Moment(Section):
     """An external moment on the star: constant, or received on the topic ~/external_moment."""
 
+    ONE_OF = "value", "topic"
+
     value: Vector3 | None = entry("constant moment in {B}", "N m")
     topic: bool = entry("take it from the topic ~/external_moment", default=False)
-
-    def rules(self) -> Rules:
-        """Refuse both and neither."""
-        both_or_none = self.topic == (self.value is not None)
-        yield both_or_none, "", self.value, "give either value or topic: true"
 
 
 class Friction(Section):
@@ -53,7 +49,6 @@ class Friction(Section):
     """
 
     EFFECTS = "viscous", "coulomb", "static"
-    IDLE = "viscous", "friction without a coefficient: leave it out"
 
     viscous: float = coefficient("viscous coefficient", "N m s/rad")
     coulomb: float = coefficient("Coulomb torque", "N m")
@@ -71,14 +66,13 @@ class Friction(Section):
     def rules(self) -> Rules:
         """Refuse a breakaway torque below the Coulomb torque."""
         below = np.not_equal(self.static, 0.0) & np.less(self.static, self.coulomb)
-        yield below, "static", self.static, lambda: f"must be >= coulomb = {self.coulomb:g} N m"
+        yield below, "static", self.static, f"must be >= coulomb = {self.coulomb} N m"
 
 
 class JointFriction(Section):
     """Friction by kind of joint, the same in all legs."""
 
     EFFECTS = "gamma", "mu", "beta"
-    IDLE = "", "names no joint: give gamma, mu or beta, or leave it out"
 
     gamma: Friction | None = entry("actuated revolute joints")
     mu: Friction | None = entry("passive revolute joints")
@@ -106,7 +100,6 @@ class Actuators(Section):
         "rotor_inertia", "torque_limit", "time_constant", "idle_damping", "velocity_limit",
         "acceleration_limit",
     )  # fmt: skip
-    IDLE = "", "changes nothing: leave it out"
 
     rotor_inertia: float = coefficient("inertia of the motor's rotor", "kg m^2")
     gear_ratio: float = positive(
@@ -114,7 +107,6 @@ class Actuators(Section):
         "1",
         default=1.0,
         acts_on=("rotor_inertia",),
-        needs="acts on rotor_inertia only (torques are those at the joint): give it",
     )
     torque_limit: float | None = positive("largest torque", "N m")
     time_constant: float | None = positive("time constant of a first-order lag of the torque", "s")
@@ -187,7 +179,7 @@ class Sweep(Section):
     def rules(self) -> Rules:
         """Refuse to fade for longer than there is time."""
         most = 0.5 * self.duration
-        allowed = partial("must not exceed half the duration, {:g} s".format, most)
+        allowed = f"must not exceed half the duration, {most} s"
         yield np.greater(self.fade, most), "fade", self.fade, allowed
 
 
@@ -241,6 +233,5 @@ class DesiredMotion(Section):
         """Refuse points whose times do not rise."""
         for index, (before, here) in enumerate(pairwise(self.waypoints), start=1):
             early = np.less(here.time, before.time + NANOSECOND)
-            allowed = "must be > {:g} s, that of the point before, by 1e-9 s"
-            text = partial(allowed.format, before.time)
-            yield early, f"waypoints[{index}].time", here.time, text
+            allowed = f"must be > {before.time} s, that of the point before, by 1e-9 s"
+            yield early, f"waypoints[{index}].time", here.time, allowed

@@ -110,7 +110,7 @@ class Scene(Section):
             mass = mass + body.mass
             x, y, z = body.centre
             far = np.sqrt(x * x + y * y + z * z) > reach
-            yield far, f"{name}.centre", body.centre, lambda: f"must lie within {reach:g} m of O"
+            yield far, f"{name}.centre", body.centre, f"must lie within {reach} m of O"
         if self.gravity is not None:
             allowed = "acts on nothing: no body has a mass"
             yield np.equal(mass, 0.0), "gravity", self.gravity.acceleration, allowed

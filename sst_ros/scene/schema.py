@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
 from types import UnionType
@@ -45,15 +45,11 @@ Place = tuple[str | int, ...]
 """Names and indices of a part of a tree from the root on."""
 
 
-class Switch(str):
-    """A word of YAML 1.1 for true or false, of which YAML 1.2 has those two."""
-
-
 @dataclass(frozen=True)
 class Spec:
     """What a field may hold. `shape` () is a scalar, (3,) a vector, (3, 3) a list of rows.
 
-    Without any of the fields `acts_on` it has no effect; `needs` says so.
+    Without any of the fields `acts_on` it has no effect.
     """
 
     kind: str
@@ -67,7 +63,6 @@ class Spec:
     section: type[Section] | None = None
     lengths: tuple[int, ...] = ()
     acts_on: tuple[str, ...] = ()
-    needs: str = ""
     default: Any = None
 
     def allows(self, x: Any) -> Any:
@@ -76,9 +71,7 @@ class Spec:
 
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
-        keys = "" if self.section is None else f" with the keys {', '.join(self.section.SPECS)}"
-        hint = keys if self.kind == "section" else ": in rad?" if self.most == TURN else ""
-        return self.describe() + hint
+        return self.describe() + ": in rad?" * (self.most == TURN)
 
     def describe(self) -> str:
         """Describe the values that are allowed."""
@@ -88,6 +81,7 @@ class Spec:
         ends = (">", self.above), (">=", self.least), ("<=", self.most)
         bounds = "".join(f" {sign} {end:g}" for sign, end in ends if math.isfinite(end))
         counts = " or ".join(map(str, self.lengths)) + " " if self.lengths else ""
+        keys = ", ".join(self.section.SPECS) if self.section else ""
         return {
             "number": f"must be {what}{bounds}{unit}",
             "integer": f"must be a whole number from {self.least} to {self.most}{unit}",
@@ -95,7 +89,7 @@ class Spec:
             "text": "must be text without control characters",
             "texts": "must be a list of text",
             "choice": "must be one of " + ", ".join(self.choices),
-            "section": "must be a mapping",
+            "section": f"must be a mapping with the keys {keys}",
             "sections": f"must be a list of {counts}mappings",
             "notes": "must be a mapping from keys to text",
             "anything": "",
@@ -124,10 +118,8 @@ def anything(doc: str, **default: Any) -> Any:
     return field(metadata={"spec": Spec("anything", doc)}, **default)
 
 
-Rules: TypeAlias = "Iterator[tuple[Any, str, Any, str | Callable[[], str]]]"
-"""Whether each rule is broken; key and value that are at fault, and what is allowed.
-
-The last two may be functions, which are called where the rule is broken."""
+Rules: TypeAlias = "Iterator[tuple[Any, str, Any, str]]"
+"""Whether each rule is broken; key and value that are at fault, and what is allowed."""
 
 
 @dataclass_transform(frozen_default=True)
@@ -141,10 +133,7 @@ class Section:
     """What messages are headed by; by default the name of the class."""
 
     EFFECTS: ClassVar[tuple[str, ...]] = ()
-    """A section has no effect where all of these are zero or not given."""
-
-    IDLE: ClassVar[tuple[str, str]] = "", ""
-    """Key and text that refuse a section without effect; no text where its fields refuse it."""
+    """A section has no effect, and is refused, where all of these are zero or not given."""
 
     ONE_OF: ClassVar[tuple[str, ...]] = ()
     """Fields of which a document gives exactly one."""
@@ -184,23 +173,19 @@ class Section:
         """Yield what has no effect, and what is not one of several."""
 
         def has_any(names: tuple[str, ...]) -> bool:
-            return has_effect([getattr(self, name) for name in names])
+            return not names or has_effect([getattr(self, name) for name in names])
 
-        acts = True
+        if not has_any(self.EFFECTS):
+            names = " or ".join(self.EFFECTS)
+            yield Problem("", None, f"has no effect without {names}: leave it out")
+            return
         for name, spec in self.SPECS.items():
             value = getattr(self, name)
-            if spec.acts_on and value != spec.default and not has_any(spec.acts_on):
-                given = "it" if len(spec.acts_on) == 1 else "one"
-                text = spec.needs or f"acts on {' or '.join(spec.acts_on)}: give {given}"
-                yield Problem(name, value, text)
-                acts = False
-        if self.ONE_OF:
-            chosen = [name for name in self.ONE_OF if getattr(self, name)]
-            if len(chosen) != 1:
-                yield Problem("", chosen or None, "give one of " + ", ".join(self.ONE_OF))
-        key, text = self.IDLE
-        if text and acts and not has_any(self.EFFECTS):
-            yield Problem(key, getattr(self, key, None), text)
+            if not has_any(spec.acts_on) and value != spec.default:
+                yield Problem(name, value, f"acts on {' or '.join(spec.acts_on)}: give it")
+        chosen = [name for name in self.ONE_OF if getattr(self, name)]
+        if self.ONE_OF and len(chosen) != 1:
+            yield Problem("", chosen or None, "give one of " + ", ".join(self.ONE_OF))
 
     def settle(self) -> Iterator[Problem]:
         """Put what may be given in several forms into one; yield what forbids that."""
@@ -209,9 +194,7 @@ class Section:
     def check(self) -> Iterator[Problem]:
         """Yield the faults that no single field shows; override where rules are not enough."""
         with np.errstate(all="ignore"):
-            for broken, key, *found in self.rules():
-                if broken:
-                    yield Problem(key, *(one() if callable(one) else one for one in found))
+            yield from (Problem(*found) for broken, *found in self.rules() if broken)
 
     def rules(self) -> Rules:
         """Yield the rules that numbers of several fields must keep.
@@ -253,24 +236,21 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
 
     Messages are headed by `origin`; InputError lists every fault.
     """
-    known, problems = cls.SPECS, []
+    known = cls.SPECS
     if not isinstance(values, Mapping):
-        raise InputError(origin, [Problem("", values, Spec("section", "", section=cls).refuse())])
-    for name, value in values.items():
-        if name not in known:
-            allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(str(name), known)}"
-            problems.append(Problem(str(name), value, allowed))
+        allowed = Spec("section", "", section=cls).describe()
+        raise InputError(origin, [Problem("", values, allowed)])
+    problems = []
+    for name in [name for name in values if name not in known]:
+        allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(str(name), known)}"
+        problems.append(Problem(str(name), values[name], allowed))
     for name, spec in known.items():
         if spec.default is REQUIRED and name not in values:
             problems.append(Problem(name, None, "is missing; " + spec.describe()))
-    given = {name: x for name, x in values.items() if name in known}
-    for name, x in given.items():
-        if known[name].kind == "text" and isinstance(x, (int, float)):  # as in a YAML file
-            given[name] = str(x)
     try:
-        frozen = _freeze_all((name, known[name], x) for name, x in given.items())
+        given = _freeze_all((name, known[name], values[name]) for name in values if name in known)
         if not problems:
-            return cls(**frozen)
+            return cls(**given)
     except InputError as error:
         problems += error.problems
     raise InputError(origin, problems)
@@ -308,7 +288,8 @@ def accept(spec: Spec, value: Any) -> Any:
     if kind == "text":
         return _freeze_text(value)
     if kind == "notes" and isinstance(value, (Mapping, tuple)):
-        each = ((_freeze_text(name), _NOTE, x) for name, x in dict(value).items())
+        note = Spec("text", "")
+        each = ((_freeze_text(name), note, x) for name, x in dict(value).items())
         return tuple(_freeze_all(each).items())
     if kind == "section" and isinstance(value, Mapping):
         return build(section, value)
@@ -320,7 +301,7 @@ def accept(spec: Spec, value: Any) -> Any:
             parts = _freeze_all((f"[{i}]", entry, x) for i, x in enumerate(value))
             times = max(spec.lengths) if spec.lengths and len(value) == 1 else 1
             return (*parts.values(),) * times
-    if kind == "flag" and isinstance(value, Switch):
+    if kind == "flag" and isinstance(value, str):
         value = {"true": True, "false": False}.get(value.lower())
     elif kind == "integer" and isinstance(value, str) and re.fullmatch("[-+]?[0-9]+", value):
         value = int(value)
@@ -334,9 +315,6 @@ def accept(spec: Spec, value: Any) -> Any:
     if not fits.get(kind):
         raise ValueError
     return value
-
-
-_NOTE = Spec("text", "a note")
 
 
 def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
@@ -353,10 +331,11 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _freeze_text(value: Any) -> str:
-    """Return text without its outer blanks, or raise ValueError."""
-    if not isinstance(value, str) or not value.strip() or _UNPRINTABLE.search(value):
+    """Return text, or a number as text, without outer blanks, or raise ValueError."""
+    text = str(value).strip()
+    if not isinstance(value, (str, int, float)) or not text or _UNPRINTABLE.search(text):
         raise ValueError
-    return value.strip()
+    return text
 
 
 def has_effect(value: Any) -> bool:
@@ -364,19 +343,17 @@ def has_effect(value: Any) -> bool:
     return any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
 
 
-def drop_idle(cls: type[Section], values: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return a document without what has no effect in it; None if nothing has.
+def drop_idle(cls: type[Section] | None, value: Any) -> Any:
+    """Return a document of a section without what has no effect in it; None if nothing has.
 
     A document that says such things is refused, as a friction whose coefficients are zero.
     """
-    known, given = cls.SPECS, dict(values)
-    for name, value in values.items():
-        inner = known[name].section
-        if inner and isinstance(value, list):
-            parts = [drop_idle(inner, part) for part in value]
-            given[name] = [part for part in parts if part is not None]
-        elif inner:
-            given[name] = drop_idle(inner, value)
+    if isinstance(value, list):
+        return [part for part in (drop_idle(cls, entry) for entry in value) if part is not None]
+    if cls is None:
+        return value
+    known = cls.SPECS
+    given = {name: drop_idle(known[name].section, x) for name, x in value.items()}
 
     def acts(names: tuple[str, ...]) -> bool:
         return not names or has_effect([given.get(name) for name in names])
@@ -388,22 +365,20 @@ def drop_idle(cls: type[Section], values: Mapping[str, Any]) -> dict[str, Any] |
 # The tree: sections and tuples, whose leaves are numbers or columns, words and None.
 
 
-def build_unchecked(cls: type[Section], values: Mapping[str, Any]) -> Any:
+def build_unchecked(cls: type[Section] | None, value: Any) -> Any:
     """Build a section from nested dicts and lists of any values, which are not checked.
 
     They may be columns or symbols. A number that a section must have and these values have not is
     zero.
     """
-
-    def make(inner: type[Section] | None, value: Any) -> Any:
-        if isinstance(value, list):
-            return tuple(make(inner, entry) for entry in value)
-        return build_unchecked(inner, value) if inner and isinstance(value, dict) else value
-
+    if isinstance(value, list):
+        return tuple(build_unchecked(cls, entry) for entry in value)
+    if cls is None or not isinstance(value, dict):
+        return value
     found = object.__new__(cls)
     for name, spec in cls.SPECS.items():
         default = 0.0 if spec.default is REQUIRED else spec.default
-        vars(found)[name] = make(spec.section, values.get(name, default))
+        vars(found)[name] = build_unchecked(spec.section, value.get(name, default))
     return found
 
 

@@ -239,25 +239,23 @@ class TorqueTable(TorqueProfile):
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             problem = Problem("csv", origin, f"must be readable ({error})")
             raise InputError(origin, [problem]) from None
-        if names != header:
-            allowed = "must be " + ", ".join(header)
-            raise InputError(origin, [Problem("header", names or None, allowed, 1)])
-        times: list[float] = []
-        torques: list[Vector3] = []
         problems = [] if lines else [Problem("rows", 0, "must be one or more")]
+        if names != header:
+            problems = [Problem("header", names or None, "must be " + ", ".join(header), 1)]
+        last, rows = -math.inf, []
         for line, row in lines:
-            time, torque = finite_vector([*row[:1], 0, 0]), finite_vector(row[1:])
-            if time is None or torque is None:
+            begin, torque = finite_vector(row[:3]), finite_vector(row[1:])
+            if begin is None or torque is None:
                 problems.append(Problem("row", row, "must be four finite numbers", line))
-            elif times and time[0] <= times[-1]:
-                allowed = f"must be > {times[-1]:g} s, the last"
-                problems.append(Problem("time", time[0], allowed, line))
+            elif begin[0] <= last:
+                problems.append(Problem("time", begin[0], f"must be > {last:g} s, the last", line))
             else:
-                times.append(time[0])
-                torques.append(torque)
+                last = begin[0]
+                rows.append((last, *torque))
         if problems:
             raise InputError(origin, problems)
-        return cls(times, torques)
+        table = np.array(rows)
+        return cls(table[:, 0], table[:, 1:])
 
     __call__ = _at
 

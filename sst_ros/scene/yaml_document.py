@@ -20,13 +20,17 @@ import numpy as np
 import yaml
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.scene.schema import REQUIRED, Place, S, Section, Spec, Switch, build
+from sst_ros.scene.schema import REQUIRED, Place, S, Section, Spec, build
 
 NO_NUMBER = "must name a number, as star.mass does"
 
 LONGEST, MOST_NODES, DEEPEST = 1_000_000, 20_000, 20
-"""Characters, values and levels of nesting of a document: PyYAML reads 20,000 values in 0.5 s,
-and its time grows with the square of the levels."""
+LIMITS = (
+    f"no more than {LONGEST} characters, {MOST_NODES} values and {DEEPEST} levels are allowed, and "
+    "no aliases"
+)
+"""Of a document: PyYAML reads 20,000 values in 0.5 s, and its time grows with the square of the
+levels."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -39,15 +43,9 @@ class _Loader(yaml.SafeLoader):
         self.depth += isinstance(event, yaml.CollectionStartEvent)
         self.depth -= isinstance(event, yaml.CollectionEndEvent)
         self.nodes += isinstance(event, yaml.NodeEvent)
-        fault = None
-        if isinstance(event, yaml.AliasEvent):
-            fault = f"*{event.anchor}", "aliases are not allowed; write the value out"
-        elif self.depth > DEEPEST:
-            fault = "nested", f"no more than {DEEPEST} levels are allowed"
-        elif self.nodes > MOST_NODES:
-            fault = "long", f"no more than {MOST_NODES} values are allowed"
-        if fault:
-            raise InputError("", [Problem("", *fault, _line(event))])
+        alias = f"*{event.anchor}" if isinstance(event, yaml.AliasEvent) else ""
+        if alias or self.depth > DEEPEST or self.nodes > MOST_NODES:
+            raise InputError("", [Problem("", alias or "more", LIMITS, _line(event))])
         return event
 
 
@@ -57,8 +55,7 @@ def read(cls: type[S], source: str, origin: str) -> S:
     problems: list[Problem] = []
     try:
         if len(source) > LONGEST:
-            allowed = f"no more than {LONGEST} characters are allowed"
-            raise InputError("", [Problem("", f"{len(source)} characters", allowed)])
+            raise InputError("", [Problem("", "more", LIMITS)])
         values = _values(yaml.compose(source, Loader=_Loader), "", lines, problems)
         result = build(cls, values, origin)
     except InputError as refused:
@@ -94,8 +91,8 @@ def _values(
     """
     if node is not None:
         lines.setdefault(path, _line(node))
-    if isinstance(node, yaml.ScalarNode) and not node.tag.endswith(":null"):
-        return Switch(node.value) if node.tag.endswith(":bool") else node.value
+    if isinstance(node, yaml.ScalarNode):
+        return None if node.tag.endswith(":null") else node.value
     if isinstance(node, yaml.SequenceNode):
         entries = enumerate(node.value)
         return [_values(entry, f"{path}[{i}]", lines, problems) for i, entry in entries]
@@ -216,19 +213,14 @@ def _below(
         raise ValueError(NO_NUMBER)
 
 
-def json_schema(cls: type[Section], title: str) -> dict[str, Any]:
-    """Describe the documents that `read(cls, ...)` accepts."""
-    draft = "https://json-schema.org/draft/2020-12/schema"
-    return {"$schema": draft, "title": title, **_object_schema(cls)}
-
-
-def _object_schema(cls: type[Section]) -> dict[str, Any]:
+def json_schema(cls: type[Section]) -> dict[str, Any]:
+    """Describe the documents that `read(cls, ...)` accepts, by draft 2020-12."""
     described = {"description": (cls.__doc__ or "").partition("\n")[0]}
-    one_of = {"oneOf": [{"required": [name]} for name in cls.ONE_OF]} if cls.ONE_OF else {}
+    any_of = {"anyOf": [{"required": [name]} for name in cls.ONE_OF]} if cls.ONE_OF else {}
     properties = {name: _property_schema(spec) for name, spec in cls.SPECS.items()}
     required = [name for name, spec in cls.SPECS.items() if spec.default is REQUIRED]
-    given = {"properties": properties, "required": required}
-    return {"type": "object", "additionalProperties": False, **described, **one_of, **given}
+    given = {"additionalProperties": False, "properties": properties, "required": required}
+    return {"type": "object", **described, **any_of, **given}
 
 
 def _property_schema(spec: Spec) -> dict[str, Any]:
@@ -238,14 +230,15 @@ def _property_schema(spec: Spec) -> dict[str, Any]:
     bounds = {"exclusiveMinimum": spec.above, "minimum": spec.least, "maximum": spec.most}
     text = {"type": "string", "pattern": "\\S"}
     known: dict[str, dict[str, Any]] = {
-        "number": {"type": "number"} | {name: x for name, x in bounds.items() if math.isfinite(x)},
-        "integer": {"type": "integer", "minimum": spec.least, "maximum": spec.most},
+        "number": {"type": "number"},
+        "integer": {"type": "integer"},
         "choice": {"enum": list(spec.choices)},
         "notes": {"type": "object", "additionalProperties": text},
         "texts": {"type": "array", "items": text},
         "flag": {"type": "boolean"},
     }
-    own = _object_schema(spec.section) if spec.section else known.get(spec.kind, text)
+    own = json_schema(spec.section) if spec.section else known.get(spec.kind, text)
+    own = own | {name: bound for name, bound in bounds.items() if math.isfinite(bound)}
     for size in reversed(spec.shape):
         own = {"type": "array", "items": own, "minItems": size, "maxItems": size}
     if spec.kind == "sections":

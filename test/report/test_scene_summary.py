@@ -126,7 +126,7 @@ def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
     bad = tmp_path / "bad.yaml"
     bad.write_text("name: 3\nfriction: {}\n", encoding="utf-8")
     assert cli.main(["scene", "check", str(bad)]) == 1
-    assert "bad.yaml: line 2: friction = None: names no joint" in capsys.readouterr().out
+    assert "bad.yaml: line 2: friction = None: has no effect" in capsys.readouterr().out
 
 
 SHIPPED = ("example2", "stiff", "friction", "elastic_stops", "gravity_payload", "fast_spin")
