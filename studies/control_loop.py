@@ -210,9 +210,8 @@ def run_loop(loop: ControlLoop) -> tuple[Track, NDArray[np.bool_], str]:
         command = controller.command(now, channel.measure(joints.gamma, joints.gamma_dot))
         acting, desired = channel.transmit(command.torque), command.desired
         error = axpy(1.0, desired.gamma, -1.0, joints.gamma)
-        error_rate = axpy(1.0, desired.gamma_dot, -1.0, joints.gamma_dot)
         torques = *command.feedforward, *command.feedback, *acting
-        rows.append((now, *desired.gamma, *desired.gamma_dot, *error, *error_rate, *torques))
+        rows.append((now, *desired.gamma, *desired.gamma_dot, *error, *torques))
         limited.append(command.saturated)
         if math.dist(desired.gamma, joints.gamma) > loop.lost:
             raise ControlStopped(f"off by more than {loop.lost:g} rad", now)

@@ -29,13 +29,14 @@ from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.simulation.trajectory import Trajectory
 
 SAMPLES = 16  # parts of a piece of the motion; even, for Simpson's rule
 SINGULAR_J2 = 1e-6  # det J2 within which a motion counts as singular
 SLOWEST, FASTEST = 1e-4, 1e8  # factors of speed between which ends are looked for
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 """Of what a motion demands of an actuator; power is negative where the actuator brakes."""
-_GRID, _BEYOND = 360, 27  # factors to try; infeasible ones, three doublings, that end it
+_GRID = 360  # factors to try
 _ROUNDING = 1e-13
 
 
@@ -74,10 +75,7 @@ class MotionPlan:
     """A reference motion of a scene with the result of its check."""
 
     motion: ReferenceMotion
-    scene: Scene
-    times: Array  # where it was sampled [s], shape (n,)
-    references: tuple[Reference, ...]  # the motion there
-    torques: Array  # actuator torques there [N m], shape (n, 3)
+    trajectory: Trajectory  # the motion where it was sampled, with the torques that it demands
     peaks: dict[str, list[Peak]]  # by quantity of UNITS and leg, the largest, with their signs
     limits: dict[str, float]  # those that the actuators have, by quantity of UNITS
     torque_rms: list[float]  # root of the mean square over the duration, by leg [N m]
@@ -115,18 +113,29 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
         power = (x * rate for x, rate in zip(torque, at.gamma_dot, strict=True))
         return (*torque, *power, *at.gamma_dot, *at.gamma_ddot)
 
+    def states(times: Array) -> Array:
+        """Quaternions, body rates and torques of the motion, shape (n, 10)."""
+        found = map(motion.at, times.tolist())
+        rows = [(*at.quaternion, *at.body_rate, *inverse.reference_torque(at)) for at in found]
+        return np.array(rows)
+
     samples = np.array(list(map(measure, desired)))
+    star = np.array([(*at.quaternion, *at.body_rate) for at in desired])
+    t, rows = np.unique(times, return_index=True)  # ends of pieces may be equal up to rounding
+    trajectory = Trajectory(
+        scene, t, star[rows, :4], star[rows, 4:], samples[rows, :3], message="planned",
+        law=lambda time: inverse.reference_torque(motion.at(time)), dense=states,
+    )  # fmt: skip
     extremes = _extremes(motion, measure, times, samples)
     largest = [max(high, low, key=lambda peak: abs(peak.value)) for low, high in extremes]
     peaks = {name: largest[3 * k : 3 * k + 3] for k, name in enumerate(UNITS)}
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
-    torques = samples[:, :3]
-    squares = simpson(torques[pieces] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
+    squares = simpson(samples[pieces, :3] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
     rms = np.sqrt(squares / times[-1]).tolist()
     given = {name: getattr(scene.actuators, f"{name}_limit", None) for name in UNITS}
     limits = {name: limit for name, limit in given.items() if limit is not None}
     faults = tuple(_faults(distances, peaks, limits))
-    return MotionPlan(motion, scene, times, desired, torques, peaks, limits, rms, distances, faults)
+    return MotionPlan(motion, trajectory, peaks, limits, rms, distances, faults)
 
 
 def _extremes(
@@ -137,15 +146,14 @@ def _extremes(
 ) -> Iterator[tuple[Peak, Peak]]:
     """Yield the lowest and the highest of each number that is measured at a reference."""
 
-    def find(sign: float, index: int) -> Peak:
-        def sample(time: float) -> float:
-            return sign * measure(motion.at(time))[index]
+    def sample(sign: float, index: int, time: float) -> float:
+        return sign * measure(motion.at(time))[index]
 
-        return maximum(sample, times, sign * samples[:, index])
-
-    for index in range(samples.shape[1]):
-        low = find(-1.0, index)
-        yield Peak(-low.value, low.time), find(1.0, index)
+    for index, values in enumerate(samples.T):
+        low, high = (
+            maximum(partial(sample, sign, index), times, sign * values) for sign in (-1.0, 1.0)
+        )
+        yield Peak(-low.value, low.time), high
 
 
 def maximum(
@@ -251,7 +259,7 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     The factors that torques allow are found on a grid first, then to rounding; a feasible range
     narrower than the grid, between others that are not, may be overlooked.
     """
-    known, torque_limit = plan.limits, plan.scene.torque_limit
+    known, torque_limit = plan.limits, plan.trajectory.scene.torque_limit
     caps = {"": math.inf}
     for name, power in (("velocity", 1.0), ("acceleration", 0.5)):
         largest = max(abs(peak.value) for peak in plan.peaks[name])
@@ -263,11 +271,8 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     excess = _excess(plan, torque_limit)
     find_end = partial(brentq, excess, xtol=1e-300, rtol=4.0 * np.finfo(float).eps)
     ends = SLOWEST * min(highest, 1.0), min(highest, FASTEST)
-    grid, fits = np.geomspace(*ends, _GRID).tolist(), list[bool]()
-    for factor in grid:
-        fits.append(excess(factor) <= 0.0)
-        if any(fits) and not any(fits[-_BEYOND:]):
-            break
+    grid = np.geomspace(*ends, _GRID).tolist()
+    fits = [excess(factor) <= 0.0 for factor in grid]
     if not any(fits):
         return TimeScaling(None, 0.0, "torque")
     last = int(np.flatnonzero(fits)[-1])
@@ -281,9 +286,10 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
 
 def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
     """Return by how much a torque exceeds the limit [N m] at a factor of speed; <= 0 for none."""
-    model, inverse = kernel.model_of(plan.scene), InverseDynamics(plan.scene)
-    star = [(at.quaternion, at.body_rate, at.body_acceleration) for at in plan.references]
-    quaternion, rate, acceleration = (np.array(part).T for part in zip(*star, strict=True))
+    scene, times = plan.trajectory.scene, plan.trajectory.t
+    model, inverse = kernel.model_of(scene), InverseDynamics(scene)
+    quaternion, rate = plan.trajectory.quaternion.T, plan.trajectory.body_rate.T
+    acceleration = np.array([plan.motion.at(time).body_acceleration for time in times.tolist()]).T
 
     def torque(factor: float, leg: int, sign: float, time: float) -> float:
         at = plan.motion.at(time)
@@ -298,7 +304,7 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
         for leg, sign in product(range(3), (1.0, -1.0)):
             if largest <= limit:  # not above it yet
                 at = partial(torque, factor, leg, sign)
-                peak = maximum(at, plan.times, sign * sampled[leg], limit)
+                peak = maximum(at, times, sign * sampled[leg], limit)
                 largest = max(largest, peak.value)
         return largest - limit
 
@@ -310,7 +316,7 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     highest = fastest.highest
     any_speed = highest is not None and math.isinf(highest)
     found = {
-        "scene": plan.scene.name,
+        "scene": plan.trajectory.scene.name,
         "duration": plan.motion.duration,
         "feasible": not plan.problems,
         "problems": [str(problem) for problem in plan.problems],
@@ -334,7 +340,7 @@ def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
 
     The last row holds the manipulator where the motion ends.
     """
-    inverse, motion = InverseDynamics(plan.scene), plan.motion
+    inverse, motion = InverseDynamics(plan.trajectory.scene), plan.motion
     count = math.ceil(motion.duration / period - 1e-9)
     lines = ["time,tau_1,tau_2,tau_3"]
     for k in range(count + 1):

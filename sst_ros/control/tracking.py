@@ -11,51 +11,42 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.mechanism.geometry import Array
 
 BAND = 0.02  # settling band: share of the largest range of a joint
-ROWS = 10
-_KEPT = 4096  # rows of the history of a record in parts: above it every other row goes
 
-_PARTS = ("gamma", "gamma_dot", "error", "error_rate", "feedforward", "feedback", "torque")
+_PARTS = ("gamma", "gamma_dot", "error", "feedforward", "feedback", "torque")
 TRACK = np.dtype([("time", float), *((name, float, 3) for name in _PARTS)])
-"""A sample of a tracking record, 22 numbers: the time since the start of the motion or of the run
-[s], gamma and gamma_dot as desired [rad], [rad/s], desired - measured of both, the two parts of the
-controller's command [N m], and the torque that was commanded or applied [N m]."""
+"""A sample of a tracking record, 19 numbers: the time since the start of the motion or of the run
+[s], gamma and gamma_dot as desired [rad], [rad/s], desired - measured gamma [rad], the two parts of
+the controller's command [N m], and the torque that was commanded or applied [N m]."""
 
 Track: TypeAlias = "np.recarray[Any, Any]"
 
 
 def track_of(rows: ArrayLike) -> Track:
-    """Return a tracking record, shape (n,) of TRACK, of numbers in its order, (n, 22) or flat."""
+    """Return a tracking record, shape (n,) of TRACK, of numbers in its order, (n, 19) or flat."""
     return np.array(rows, dtype=float).reshape(-1).view(TRACK).view(np.recarray)
 
 
 class TrackingMetrics:
     """Metrics of a tracking record, which may come part by part. Those of joints have shape (3,).
 
-    Beside the properties: the number of `samples`, the `seconds` from the first to the last, the
-    `largest` and the `last` error [rad], `torque_largest` [N m], and `limited`, the samples in
-    which a torque was limited, None where that is not known.
+    Beside the properties: the number of `samples`, the `largest` and the `last` error [rad],
+    `torque_largest` [N m], and `limited`, the samples in which a torque was limited, None where
+    that is not known.
     """
 
     def __init__(self, track: Track | None = None, limited: int | None = None) -> None:
-        self.samples, self.seconds, self.limited = 0, 0.0, limited
+        self.samples, self.limited = 0, limited
         self.largest, self.torque_largest, self.last = np.zeros((3, 3))
         self._sums = np.zeros((4, 3))  # of error^2, torque^2, feedforward x torque, feedback x it
         self._lowest, self._highest = np.full(3, np.inf), np.full(3, -np.inf)
-        self._begin = 0.0
         self._rested: float | None = None  # when the motion ended
         self._settled: float | None = None  # since when the error has been inside the band
-        self._history, self._newest, self._stride = np.empty((0, 4)), np.empty(4), 1
         if track is not None:
             self.add(track)
 
     def add(self, track: Track) -> None:
         """Add the next part of the record, of one sample or more."""
-        error, torque, time = np.abs(track.error), track.torque, track.time
-        count = self.samples + np.arange(1, len(error) + 1)
-        square = self._sums[0].mean() + np.cumsum(np.mean(error**2, axis=1))
-        largest = error.max(axis=1)
-        so_far = np.maximum(np.maximum.accumulate(largest), self.largest.max())
-        rows = np.stack([count - 1, time, np.sqrt(square / count), so_far], axis=1)
+        error, torque = np.abs(track.error), track.torque
         parts = error**2, torque**2, track.feedforward * torque, track.feedback * torque
         self._sums += [np.sum(part, axis=0) for part in parts]
         self.largest = np.maximum(self.largest, error.max(axis=0))
@@ -63,14 +54,10 @@ class TrackingMetrics:
         self._lowest = np.minimum(self._lowest, track.gamma.min(axis=0))
         self._highest = np.maximum(self._highest, track.gamma.max(axis=0))
         moving = np.any(track.gamma_dot != 0.0, axis=1)
-        self._rested = _since(self._rested, moving, time)
-        self._settled = _since(self._settled, moving | (largest > self.band), time)
-        self._begin = self._begin if self.samples else float(time[0])
-        self.seconds, self.last = float(time[-1]) - self._begin, error[-1]
-        while len(self._history) > _KEPT:
-            self._history, self._stride = self._history[::2], 2 * self._stride
-        self._history = np.vstack([self._history, rows[rows[:, 0] % self._stride == 0.0]])
-        self._newest, self.samples = rows[-1], int(count[-1])
+        self._rested = _since(self._rested, moving, track.time)
+        away = moving | (error.max(axis=1) > self.band)
+        self._settled = _since(self._settled, away, track.time)
+        self.last, self.samples = error[-1], self.samples + len(error)
 
     @property
     def rms(self) -> Array:
@@ -107,13 +94,6 @@ class TrackingMetrics:
             return None
         return self._settled - self._rested
 
-    @property
-    def history(self) -> Array:
-        """Rows of time [s], RMS and largest error of all joints up to then [rad], (m, 3)."""
-        rows = np.vstack([self._history, self._newest])
-        shown = np.linspace(0, self.samples - 1, ROWS + 1).round()
-        return np.asarray(rows[np.unique(np.searchsorted(rows[:, 0], shown)), 1:])
-
 
 def _since(known: float | None, wrong: NDArray[np.bool_], time: Array) -> float | None:
     """Return since when nothing has been wrong, behind the next part; None where its end is."""
@@ -140,11 +120,6 @@ def tracking_table(found: TrackingMetrics) -> str:
     lines += [f"{label:24}" + "".join(f"{one:>12}" for one in row) for label, row in cells.items()]
     settled = "-" if found.settling is None else f"{found.settling:.4f}"
     limited = "-" if found.limited is None else found.limited
-    lines += [
-        f"{'settling time [s]':24}{settled:>12}  (to {found.band:.2e} rad)",
-        f"{'samples at a limit':24}{limited:>12}  (of {found.samples})",
-        "",
-        f"{'run time [s]':>16}{'RMS to then [rad]':>20}{'largest to then [rad]':>24}",
-        *(f"{time:16.4f}{rms:20.3e}{most:24.3e}" for time, rms, most in found.history),
-    ]
+    lines += [f"{'settling time [s]':24}{settled:>12}  (to {found.band:.2e} rad)"]
+    lines += [f"{'samples at a limit':24}{limited:>12}  (of {found.samples})"]
     return "\n".join(lines) + "\n"

@@ -102,7 +102,7 @@ def of(run: Recording) -> TrackedRun | None:
     torque = np.where((tick >= 0)[:, None], run.ticks.torque[tick], feedforward + feedback)
     torque[times >= run.ticks.end_ns[-1]] = 0.0
     seconds = times[:, None] / NANOSECONDS
-    columns = seconds, reference[:, :6], error[:, :6], feedforward, feedback, torque
+    columns = seconds, reference[:, :6], error[:, :3], feedforward, feedback, torque
     return TrackedRun(run, track_of(np.hstack(columns)), rows)
 
 

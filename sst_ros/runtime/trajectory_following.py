@@ -37,8 +37,8 @@ from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
 NO_TOLERANCE = -1.0
 """Of a message: the default does not hold either."""
-_NUMBERS = 256 * 22
-"""Numbers of samples, 22 each, that are added to the tracking metrics at once."""
+_NUMBERS = 256 * 19
+"""Numbers of samples, 19 each, that are added to the tracking metrics at once."""
 
 
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
@@ -281,9 +281,9 @@ class TrajectoryFollower:
             self.stage = Stage.ENDED
             command = dataclasses.replace(command, torque=ZERO)
         if passed_ns <= end_ns:
-            desired, errors = command.desired, (*command.error, *command.error_rate)
+            angles = *command.desired.gamma, *command.desired.gamma_dot, *command.error
             torques = *command.feedforward, *command.feedback, *command.torque
-            self._rows.extend((time, *desired.gamma, *desired.gamma_dot, *errors, *torques))
+            self._rows.extend((time, *angles, *torques))
             if len(self._rows) >= _NUMBERS:
                 self._add_rows()
         self.samples += 1

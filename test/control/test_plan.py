@@ -85,6 +85,9 @@ def test_demands_of_the_one_degree_of_freedom_are_its_closed_form():
     square = quad(lambda time: swing_torque(time)[0] ** 2, 0.0, TIME, epsabs=1e-14)[0]
     root = 0.5 - math.sqrt(3.0) / 6.0
     plan = planned(swing())
+    between = plan.trajectory.at(0.123)
+    assert between.gamma[0] == pytest.approx(plan.motion.at(0.123).gamma, abs=1e-14)
+    assert between.torque[0] == pytest.approx(swing_torque(0.123)[0], rel=1e-12)
     for leg in range(3):
         peaks = {name: found[leg] for name, found in plan.peaks.items()}
         for found, function in (

@@ -214,10 +214,10 @@ def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(exam
         assert at.quaternion == pytest.approx(run.quaternion[row], abs=1e-12)
     torque = held.torque.at
     # What is held since the last millisecond lags behind the sine by half of one.
-    expected = np.array([torque(time - 0.0005) for time in plan.times.tolist()])
-    inside = (plan.times > 0.02) & (plan.times < plan.motion.duration - 0.02)
+    expected = np.array([torque(time - 0.0005) for time in plan.trajectory.t.tolist()])
+    inside = (plan.trajectory.t > 0.02) & (plan.trajectory.t < plan.motion.duration - 0.02)
     half_a_step = 0.0005 * np.max(np.multiply(held.torque.amplitude, held.torque.frequency))
-    assert np.abs(plan.torques - expected)[inside].max() < half_a_step
+    assert np.abs(plan.trajectory.torque - expected)[inside].max() < half_a_step
     assert np.abs(expected).max() > 100.0 * half_a_step
 
 

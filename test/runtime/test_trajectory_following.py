@@ -80,8 +80,7 @@ def test_samples_that_come_twice_or_late_are_told_apart():
     assert (follower.samples, follower.irregular) == (3, 1)
 
 
-def test_a_long_motion_keeps_no_more_than_a_short_one(monkeypatch):
-    monkeypatch.setattr(tracking, "_KEPT", 100)
+def test_a_long_motion_keeps_no_more_than_a_short_one():
     follower = follow(hold=1e6)
     answers(follower, range(600))
     tracemalloc.start()
@@ -89,7 +88,7 @@ def test_a_long_motion_keeps_no_more_than_a_short_one(monkeypatch):
         answers(follower, [k])
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert kept < 70_000  # 600 rows of a record are 106 000
+    assert kept < 70_000  # 600 rows of a record are 91 000
     assert follower.tracking().samples == 1200
 
 
