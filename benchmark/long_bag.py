@@ -24,11 +24,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmark.measure import describe_machine, join_line, read_options
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.host.output import slices
-from sst_ros.mechanism.geometry import Array
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.nodes.publications import TorqueLog, stamp, state_messages
 from sst_ros.recording.bag_writer import BagWriter
-from sst_ros.report.reference import TickPropagator, initial, joint_columns
+from sst_ros.report.reference import TickPropagator
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import Friction, JointFriction, Spring
@@ -105,7 +107,7 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array
     torque = scene.torque
     assert torque is not None
     motion = TickPropagator(scene, None, compiled=True)
-    y = np.array(initial(scene))
+    y = np.array(initial_state(scene, Geometry.of(scene)))
     for rows in slices(samples + 1, _CHUNK, "writing a run", shown):
         # Each sample is answered by a torque, which is held until the next one.
         answered = np.maximum(np.arange(rows.start, rows.stop) - 1, 0)[:, None] * SAMPLE_NS / 1e9
@@ -114,14 +116,13 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array
         run = ticks >= 0
         start = ticks[run] * TICK_NS
         drives = np.repeat(held, TICKS_A_SAMPLE, axis=0)[run]
-        starts = np.full((len(start), len(y)), np.nan)
-        starts[:1] = y
-        reached = motion.follow((start, start + TICK_NS, drives), starts)[:, 0, :-1]
+        reached = motion.follow((start, start + TICK_NS, drives), y)[:, 0, :-1]
         state = reached[TICKS_A_SAMPLE - 1 :: TICKS_A_SAMPLE]
         if not rows.start:
             state = np.vstack([y, state])
         y = state[-1]
-        yield rows, state[:, :4], joint_columns(motion.dynamics.model, state), held
+        joints = kernel.joints(motion.dynamics.model, tuple(state.T))
+        yield rows, state[:, :4], np.vstack([*joints]).T, held
 
 
 def main(arguments: list[str] | None = None) -> int:

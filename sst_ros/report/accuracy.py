@@ -10,7 +10,6 @@ studies on the terminal, in files, and as one page.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import timeit
 from collections.abc import Callable, Iterator, Sequence
@@ -27,9 +26,7 @@ from sst_ros.errors import SstError
 from sst_ros.host.output import slices
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RK4, Method
-from sst_ros.mechanism.geometry import Array
 from sst_ros.plot.style import INK, MARKERS, Looks, note, styled
-from sst_ros.report.reference import compare_with_paper
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
     ReferenceSolution,
@@ -37,7 +34,7 @@ from sst_ros.report.reference_solution import (
     solve_reference,
 )
 from sst_ros.report.results import data_frame, markdown, provenance, publish, records, render
-from sst_ros.report.scene_summary import StepAdvice, cost_table, step_advice
+from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import PreparedRun, prepare, simulate
@@ -59,7 +56,6 @@ LONGEST_RUN_S = 0.4  # no finer settings are tried after a run that took longer 
 LEAST_SETTINGS = 3
 """So many settings of each method are tried even where they take longer: a busy machine slows one
 run, but must not empty the grid."""
-SAME_EQUATIONS = 1e-10  # kernel and the paper's equations must agree to this part
 
 ERROR = "largest_orientation_rad"
 ERRORS = [
@@ -87,10 +83,6 @@ class WorkPrecision:
     advice: StepAdvice  # as `scene show` prints it
     measured: float | None
     """Error of `simulate` with that advice [rad]; None where a limit stops it."""
-    formulation: float | None
-    """Largest difference of W_dot from the paper's equations along the reference, relative to the
-    largest W_dot; None where it cannot be compared."""
-    warnings: tuple[str, ...]  # contradictions
 
     @property
     def floor(self) -> float:
@@ -139,16 +131,8 @@ def study_scene(
     problem = InitialValueProblem(scene)
     grid, truth = list_settings(problem), solve_reference(problem)
     rows: list[dict[str, Any]] = []
-    best: dict[str, tuple[float, Array]] = {}  # by method: least error, and the last state
     for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
-        for row, end in _refine(grid[part.start], problem, truth, longest_s):
-            rows.append({"scene": scene.name, **row})
-            found = row.get("final_orientation_rad", math.inf), end
-            best[row["method"]] = min(best.get(row["method"], found), found, key=lambda x: x[0])
-    zero = np.zeros((len(problem.times), 3))
-    torques = zero if scene.torque is None else scene.torque.values(problem.times)
-    along = zip(truth.states.astype(float), torques.tolist(), strict=True)
-    difference, _ = compare_with_paper(scene, along)
+        rows += _refine(grid[part.start], problem, truth, longest_s)
     motion, measured = simulate(scene, duration=problem.seconds, t_eval=problem.times), None
     if len(motion) > problem.count:  # else a limit stops it before
         states = np.hstack([motion.quaternion, motion.body_rate])
@@ -158,33 +142,10 @@ def study_scene(
         seconds=problem.seconds,
         ends=problem.ends,
         reference=truth,
-        rows=data_frame(rows, COLUMNS),
+        rows=data_frame(({"scene": scene.name, **row} for row in rows), COLUMNS),
         advice=step_advice(scene),
         measured=measured,
-        formulation=difference,
-        warnings=tuple(_warnings(problem, truth, best, difference)),
     )
-
-
-def _warnings(
-    problem: InitialValueProblem,
-    truth: ReferenceSolution,
-    best: dict[str, tuple[float, Array]],
-    difference: float | None,
-) -> Iterator[str]:
-    if difference is not None and difference > SAME_EQUATIONS:
-        yield f"the kernel differs from the paper's equations by {difference:.1e}"
-    if problem.clamped:
-        yield "the torques are clamped to the actuators' limit: no fixed steps are tried"
-    for (one, (error, end)), (two, (other, other_end)) in itertools.combinations(best.items(), 2):
-        apart = problem.errors(end[None], other_end[None].astype(np.longdouble))[0].orientation
-        least = min(error, other)
-        if math.inf > least > 100.0 * max(apart, 10.0 * truth.own.orientation, 1e-13):
-            yield (
-                f"{one} and {two} agree to {apart:.1e} rad, but are {least:.1e} "
-                "rad off the reference: they do not solve what the reference solves"
-            )
-            return
 
 
 class SolverSetting(NamedTuple):
@@ -259,12 +220,12 @@ def _refine(
     problem: InitialValueProblem,
     truth: ReferenceSolution,
     longest_s: float,
-) -> Iterator[tuple[dict[str, Any], Array]]:
+) -> Iterator[dict[str, Any]]:
     """Go from coarse to fine until a run takes long or two errors lie below the floor."""
     below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
     for number, setting in enumerate(settings, start=1):
-        row, end = _measure(setting, problem, truth)
-        yield row, end
+        row = _measure(setting, problem, truth)
+        yield row
         below += row.get(ERROR, math.inf) < max(floor, ROUNDING)
         if (row["wall_min_s"] > longest_s and number >= LEAST_SETTINGS) or below > 1:
             return
@@ -272,11 +233,10 @@ def _refine(
 
 def _measure(
     setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
-) -> tuple[dict[str, Any], Array]:
-    """Run one setting: its row of the grid, and its last state, nan for a failure."""
+) -> dict[str, Any]:
+    """Run one setting: its row of the grid."""
     row: dict[str, Any] = dict(zip(("method", "kind", "setting"), setting[:3], strict=True))
     row |= {"evaluations": None, "wall_min_s": 0.0, "failure": ""}
-    states: Array = np.full((1, 7), np.nan)
     with np.errstate(all="ignore"):
         try:
             states, row["evaluations"] = setting.solve()
@@ -293,7 +253,7 @@ def _measure(
             row |= dict(zip(ERRORS, (*final, *largest), strict=True))
         except (SstError, ArithmeticError, ValueError) as error:
             row["failure"] = str(error).splitlines()[0] if str(error) else "not finite"
-    return row, states[-1]
+    return row
 
 
 def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision]:
@@ -306,19 +266,17 @@ def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision
 
     """
     studies: list[WorkPrecision] = []
-    terms: list[dict[str, Any]] = []
     for each in [scenes.load(name) for name in names]:
         study = study_scene(each, shown=True)
         studies.append(study)
-        terms += cost_table(each)
         print(accuracy_text(study), flush=True)
         rows = [row for one in studies for row in records(one.rows)]
         publish(
             out,
             "accuracy",
             csv=data_frame(rows),
-            document={"rows": rows, "terms": terms},
-            page=accuracy_page(studies, terms),
+            document={"rows": rows},
+            page=accuracy_page(studies),
             figures={} if study.rests else {f"accuracy_{each.name}": draw_accuracy(study)},
         )
     return studies
@@ -372,20 +330,18 @@ def accuracy_text(study: WorkPrecision) -> str:
     return render("accuracy.txt", study=study, grid=grid, below=sum(below), **given)
 
 
-def accuracy_page(studies: Sequence[WorkPrecision], terms: Sequence[dict[str, Any]] = ()) -> str:
-    """Write studies, and the rows of `cost_table` of their scenes, as one Markdown page."""
+def accuracy_page(studies: Sequence[WorkPrecision]) -> str:
+    """Write studies as one Markdown page."""
     rows = []
     for each in studies:
         words = {target: f"{_setting(x)}: {_time(x)}" for target, x in each.fastest.items()}
         cells = {f"{target:.0e} rad": words.get(target) for target in TARGETS}
         run = "at rest" if each.rests else f"{each.seconds:g} s"
         rows.append({"scene": each.scene, "run": run, **cells})
-    costs = data_frame({**row, "ns": f"{row['ns']:.0f}"} for row in terms)
     return render(
         "accuracy.md",
         studies=studies,
         summary=markdown(data_frame(rows)),
-        terms=markdown(costs) if terms else "",
         fastest=name_fastest,
         provenance=provenance(),
     )

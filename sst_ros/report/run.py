@@ -3,6 +3,17 @@
 
 The numbers are one flat mapping, units in the names, nothing that is not finite; what a recording
 does not contain is None, never a guess.
+
+Periods are between the receptions of consecutive samples by the recorder, so that they hold the
+jitter of simulator, transport and recorder together. A command is paired with the first tick that
+applies its values. Two delays are measured:
+
+- By the recorder's clock, from the reception of the command to the step. The simulator begins the
+  step of a tick when the tick ends, with the newest command that it has; when that was is read from
+  the receptions of the samples, at the tick's end between two of them. This holds at any pace and
+  with any clock in the stamps, and includes the transport of the samples to the recorder.
+- By stamps, from that of a command, which is that of the sample it answers, to the beginning of the
+  tick: simulated time between what was measured and what was done about it.
 """
 
 from __future__ import annotations
@@ -17,20 +28,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from sst_ros.host.output import write_into
 from sst_ros.plot import pictures, style
 from sst_ros.plot.style import BLUE, GREY, LINES, VERMILION, hide_zeros
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import reference, timing, tracking
+from sst_ros.report import reference, tracking
 from sst_ros.report.reference import QUANTITIES, Comparison
 from sst_ros.report.results import made_on, provenance, render
-from sst_ros.report.timing import Timing
 from sst_ros.state import NANOSECONDS, Array
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 """Pictures of `plot` that the report has, too."""
@@ -38,42 +49,58 @@ DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 PAGE, HTML = "page.png", "page.html"
 
 ERROR_LIMIT_RAD = 1e-9  # of the integration, where the tolerance of the run was not recorded
-ANSWERED_PERCENT = 90.0  # share of samples that a controller at the sample rate answers
-FORMULATION_LIMIT = 1e-9
+
+REPORTED = (
+    *("ticks_missed", "ticks", "step_mean_us"),
+    *("error_estimate", "hold_error_start", "hold_error_middle"),
+)
+"""Numbers of the diagnostics that are shown over the run."""
+
+STATISTICS = {"min": "min", "mean": "mean", "99%": "p99", "99.9%": "p99_9", "max": "max"}
+"""What is shown of periods and delays, as pandas and as the summary name it."""
+
+
+class Timing(NamedTuple):
+    """Timing of a recording by its clocks."""
+
+    period_us: Array  # between receptions of samples that follow each other [us], shape (p,)
+    lost_s: Array  # times of lost samples [s], shape (l,)
+    gaps_s: Array  # times at which a tick does not begin where the one before ended [s]
+    pace: Series[float]  # simulated time per time on the recorder's clock, over time [s]
+    reported: DataFrame
+    """A row for each of the simulator's reports: time_s of the run, and the numbers of REPORTED,
+    nan where one was not reported."""
+    commands: DataFrame
+    """A row for each command that was followed: time_s, when the tick begins that applied it;
+    received_us, from its reception to the step; stamped_us, from its stamp to the beginning of the
+    tick, nan where it has none; tick, its number."""
+    numbers: dict[str, Any]  # all in all: flat, units in the names, None for what is not known
+    missing: list[str]  # what is not known, and why
 
 
 class RunEvaluation(NamedTuple):
-    """A run in numbers: timing, energy residual [J] by sample, two comparisons, and the summary."""
+    """A run in numbers: its timing, two comparisons, and the summary."""
 
     timing: Timing
-    energy: Array
     integration: Comparison
     ideal: Comparison | None
     summary: dict[str, Any]
 
 
 def evaluate_run(run: Recording) -> RunEvaluation:
-    """Evaluate a recorded run; raises as `write_run_report` does."""
-    measured = timing.measure(run)
-    energy, missing = reference.energy_residual(run)
+    """Evaluate a recorded run."""
+    measured = measure_timing(run)
     # Compiled loops release the interpreter lock: the two comparisons run in parallel.
     with ThreadPoolExecutor(1) as pool:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
-    numbers = {
-        **_count(run, measured),
-        **summarise(run, integration, ideal),
-        **measured.numbers,
-        "energy_residual_max_J": largest(np.abs(energy)),
-        "unknown": [*measured.missing, *filter(None, [missing])],
-    }
+    numbers = _count(run, measured) | summarise(run, integration, ideal) | measured.numbers
     given = {"run": run, "integration": integration, "ideal": ideal, "s": numbers}
-    given |= {"answered_percent": ANSWERED_PERCENT, "formulation": FORMULATION_LIMIT}
-    said = render("run_findings.txt", begins=reference.begins(run), **given).splitlines()
+    said = render("run.txt", part="findings", begins=reference.begins(run), **given).splitlines()
     notes = [line.removeprefix("Note: ") for line in said if line.startswith("Note: ")]
     wrong = [line for line in said if not line.startswith("Note: ")]  # in order of weight
     summary = {"verdict": "WARNING" if wrong else "OK", "reasons": wrong, "notes": notes} | numbers
-    return RunEvaluation(measured, energy, integration, ideal, summary)
+    return RunEvaluation(measured, integration, ideal, summary)
 
 
 def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
@@ -84,7 +111,6 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
 
     Raises:
         InputError: the bag is no whole recording of a run, or `out` cannot be written.
-        AssemblyError: the scene's initial gamma has no unique admissible assembly.
 
     """
     run = recording.read(bag, damaged=damaged)
@@ -115,42 +141,41 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
 
 def summary_text(summary: dict[str, Any], folder: str) -> str:
     """Format verdict, figures that matter and the place of the files."""
-    return render("run.txt", s=summary, folder=folder)
+    return render("run.txt", part="text", s=summary, folder=folder)
 
 
 def summary_table(summary: dict[str, Any]) -> str:
     """Format a whole summary as an aligned table; what is unknown is a dash."""
-    return render("run_table.txt", s=summary, made=provenance(summary["report"]))
+    return render("run.txt", part="table", s=summary, made=provenance(summary["report"]))
 
 
 def summarise(run: Recording, integration: Comparison, ideal: Comparison | None) -> dict[str, Any]:
-    """Collect the figures of what was computed anew: errors, tracking, the equations, efforts."""
-    tracked, formulation = tracking.of(run), reference.check_with_paper(run)
-    found = tracked and tracked.metrics
-    ideals: dict[str, Any] = {}
+    """Collect the figures of what was computed anew: errors, energy, tracking, efforts."""
+    tracked = tracking.of(run)
+    found, off = tracked and tracked.metrics, largest(run.effort_difference)
+    compared = {
+        "integration_error": integration.error,
+        "integration_reference_error": integration.own,
+    }
     if ideal:
-        ideals = {
-            **_largest("ideal_difference", ideal.error),
-            **_largest("ideal_reference_error", ideal.own),
-            "hold_order": hold_order(run),
-        }
-    off = largest(run.effort_difference)
-    at = float(run.seconds[np.nanargmax(run.effort_difference)]) if off else None
+        compared |= {"ideal_difference": ideal.error, "ideal_reference_error": ideal.own}
     return {
         "torque_peak_N_m": np.abs(run.ticks.torque).max(axis=0).tolist(),
         "tracking_error_rms_rad": found and found.rms.tolist(),
         "tracking_error_max_rad": found and found.largest.tolist(),
         "settling_time_s": found and found.settling,
-        **_largest("integration_error", integration.error),
-        **_largest("integration_reference_error", integration.own),
+        **{
+            f"{name}_{key}_{unit}": largest(table[key])
+            for name, table in compared.items()
+            for key, unit in QUANTITIES.items()
+        },
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,
         "restarts_at_s": [time / NANOSECONDS for time in integration.restarts_ns],
-        **ideals,
-        "formulation_difference_relative": formulation[0],
-        "formulation_states": formulation[1],
+        "energy_residual_max_J": largest(np.abs(integration.energy)),
         "effort_difference_max_N_m": off,
-        "effort_difference_largest_at_s": at,
+        "effort_difference_largest_at_s": off
+        and float(run.seconds[np.nanargmax(run.effort_difference)]),
     }
 
 
@@ -189,6 +214,7 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "actuators_lag": run.scene.lags,
         "topics_missing": list(run.missing),
         "damage": list(run.signals.bag.damage),
+        "unknown": measured.missing,
         "report": made_on(),
     }
 
@@ -198,25 +224,110 @@ def largest(values: Array) -> float | None:
     return float(np.nanmax(values)) if np.isfinite(values).any() else None
 
 
-def _largest(name: str, table: DataFrame) -> dict[str, float | None]:
-    """Largest value of each column; None where nothing is known."""
-    return {f"{name}_{key}_{unit}": largest(table[key]) for key, unit in QUANTITIES.items()}
+def measure_timing(recording: Recording) -> Timing:
+    """Measure how regular a recorded run was."""
+    time, received_ns, ticks = recording.time_ns, recording.received_ns, recording.ticks
+    spacing, period, missing = np.diff(time), recording.period_ns, list[str]()
+    period_us = np.diff(received_ns)[spacing == period] / 1e3
+    if np.any(period_us < 0.0):
+        missing.append("receptions are not in the order of the samples: periods are as recorded")
+    lost_ns = [
+        time[row] + period * np.arange(1, round(spacing[row] / period))
+        for row in np.flatnonzero(spacing > period).tolist()
+    ]
+    # Simulated time per received time, over pieces of the run.
+    rows = np.unique(np.linspace(0, len(time) - 1, min(61, len(time))).round().astype(int))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pace = np.diff(time[rows]) / np.diff(received_ns[rows])
+    middle = 0.5 * (time[rows][1:] + time[rows][:-1]) / NANOSECONDS
+    good = np.isfinite(pace) & (pace > 0.0)
+    if not recording.diagnostics:
+        missing.append("no diagnostics: missed ticks and samples published are not known")
+    commands = pair_commands(recording)
+    if not len(recording.commands.torque):
+        missing.append("no commands are recorded: their latency is not known")
+    elif commands.empty:
+        missing.append("no recorded command is found among the applied torques")
+    first = int(received_ns[0])
+    reports = [values for _, values in recording.reports]
+    reported = pd.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
+    at, since = [when_ns - first for when_ns, _ in recording.reports], received_ns - first
+    reported.insert(0, "time_s", np.interp(at, since.astype(float), recording.seconds))
+    delays = {
+        "period": pd.Series(period_us, dtype=float),
+        "command_latency": commands.received_us,
+        "command_stamp_to_tick": commands.stamped_us,
+    }
+    numbers = {"commands_followed": len(commands), **_measure_answers(recording, commands)}
+    for name, values in delays.items():
+        described = values.describe([0.99, 0.999]).dropna()
+        numbers |= {f"{name}_{word}_us": described.get(key) for key, word in STATISTICS.items()}
+    return Timing(
+        period_us=period_us,
+        lost_s=np.concatenate([np.empty(0), *lost_ns]) / NANOSECONDS,
+        gaps_s=ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]] / NANOSECONDS,
+        pace=pd.Series(pace[good], middle[good]),
+        reported=reported,
+        commands=commands,
+        numbers=numbers,
+        missing=missing,
+    )
 
 
-def hold_order(run: Recording) -> int | None:
-    """Order in the control period of the sample-and-hold error, by the torques that were held.
+def pair_commands(recording: Recording) -> DataFrame:
+    """Pair commands with ticks, by their values: `Timing.commands`.
 
-    Two where most of them are the scene's profile at the middle of a hold, one where they are that
-    of another instant; None where the scene has no profile or nothing was held.
+    Each has the first tick of its values from its reception on, or from a tick before it: the
+    recorder may have received it a little later than the simulator.
     """
-    profile, ticks = run.scene.torque, run.ticks
-    if profile is None or not len(ticks.start_ns):
-        return None
-    changes = 1 + np.flatnonzero(np.any(ticks.torque[1:] != ticks.torque[:-1], axis=1))
-    first, last = np.append(0, changes), np.append(changes, len(ticks.start_ns)) - 1
-    middle = (ticks.start_ns[first] + ticks.end_ns[last]) / 2 / NANOSECONDS
-    off = np.abs(ticks.torque[first] - profile.values(middle)).max(axis=1)
-    return 2 if np.median(off) <= 1e-9 * np.abs(profile.amplitude).max() else 1
+    legs, commands, ticks = ["1", "2", "3"], recording.commands, recording.ticks
+    limit = recording.scene.torque_limit
+    most = np.inf if limit is None else limit
+    asked, applied = (np.clip(each.torque, -most, most) + 0.0 for each in (commands, ticks))
+    new, changed = _changes(asked), _changes(applied)
+    # When the steps of ticks began, interpolated between the receptions of samples.
+    first = recording.received_ns[0]
+    since = (recording.received_ns - first).astype(float)
+    step_ns = first + np.interp(ticks.end_ns, recording.time_ns, since).astype(np.int64)
+    left = pd.DataFrame(asked[new], columns=legs)
+    left = left.assign(command=new, ns=commands.received_ns[new] - ticks.period_ns)
+    right = pd.DataFrame(applied[changed], columns=legs)
+    right = right.assign(tick=changed, ns=step_ns[changed])
+    left, right = (table.sort_values("ns", kind="stable") for table in (left, right))
+    found = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
+    # Commands are in order of reception: the last of those that share a tick is the one it took.
+    found = found.dropna(subset="tick").sort_values("command").drop_duplicates("tick", keep="last")
+    command, tick = (found[name].to_numpy(dtype=int) for name in ("command", "tick"))
+    stamps, begins = commands.stamp_ns[command], ticks.start_ns[tick]
+    age = (begins + recording.start_ns - stamps) / 1e3
+    received = (step_ns[tick] - commands.received_ns[command]) / 1e3
+    stamped, seconds = np.where(stamps > 0, age, np.nan), begins / NANOSECONDS
+    columns = {"time_s": seconds, "received_us": received, "stamped_us": stamped, "tick": tick}
+    return pd.DataFrame(columns)
+
+
+def _changes(torque: Array) -> NDArray[np.intp]:
+    """Rows that are not the same as the row before, and the first."""
+    return np.flatnonzero((np.diff(torque, axis=0, prepend=np.nan) != 0.0).any(axis=1))
+
+
+def _measure_answers(recording: Recording, paired: DataFrame) -> dict[str, float | None]:
+    """Share of samples that a command answered, and the mean age [s] of the command of a tick."""
+    commands, start_ns = recording.commands, recording.ticks.start_ns
+    share = age = None
+    if len(paired) > 1:  # a torque that is commanded once and for all answers no samples
+        if commands.stamp_ns.any():
+            answered = np.isin(recording.time_ns + recording.start_ns, commands.stamp_ns)
+        else:
+            counts = np.searchsorted(commands.received_ns, recording.received_ns, side="left")
+            answered = np.append(np.diff(counts), 0) > 0
+        # The last sample is the end of the run, which nothing answers.
+        share = 100.0 * float(np.mean(answered[:-1]))
+        begins = np.sort(start_ns[paired.tick])
+        tick = np.searchsorted(begins, start_ns, side="right") - 1
+        held = start_ns[tick >= 0] - begins[tick[tick >= 0]]
+        age = float(held.mean() / NANOSECONDS) if len(held) else 0.0
+    return {"samples_answered_percent": share, "command_age_mean_s": age}
 
 
 @style.styled
@@ -267,9 +378,9 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     errors = found.integration.error
     axes = panel("Integration error, against the same torques", errors)
     _draw_comparison(axes, seconds, found.integration)
-    axes = panel("Energy residual", found.energy)
+    axes = panel("Energy residual", found.integration.energy)
     axes.set_ylabel("energy residual [J]")
-    axes.plot(seconds, found.energy, color=BLUE, linewidth=1.4)
+    axes.plot(seconds, found.integration.energy, color=BLUE, linewidth=1.4)
     axes = panel("Real-time factor (recorder clock)", measured.pace)
     axes.set_ylabel("real-time factor")
     axes.plot(measured.pace.index, measured.pace, color=BLUE, marker=".")

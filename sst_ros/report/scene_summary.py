@@ -14,9 +14,8 @@ from __future__ import annotations
 import contextlib
 import math
 import textwrap
-from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
-from timeit import timeit
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,8 +25,7 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of, limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError, SstError
-from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.methods import DORMAND_PRINCE, RK4, Method, Rosenbrock
+from sst_ros.integration.methods import DORMAND_PRINCE, Method, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.results import WHOLE_RUN_S, render
 from sst_ros.scene.scene import Scene
@@ -116,31 +114,6 @@ def costs(scene: Scene) -> list[Cost]:
     total = operations(scene)
     bare = {term: operations(without(scene, term)) for term in TERMS if has(scene, term)}
     return [Cost(term, total - count, count) for term, count in bare.items()]
-
-
-TIMED_STEPS, ROUNDS = 2000, 200
-"""Steps of a measurement of the time of an evaluation, and how many: a scene and what it is without
-each term take turns, and each has the time of its fastest turn, which no other process has met."""
-
-
-def cost_table(scene: Scene) -> list[dict[str, Any]]:
-    """Return operations and times [ns] of an evaluation: the whole, then each term present."""
-    found, turns = costs(scene), list[Callable[[], object]]()
-    for one in (scene, *(without(scene, cost.name) for cost in found)):
-        method = CompiledMethod(ODE(Dynamics.of(one)), RK4, compiled=True)
-        count, rounds = (TIMED_STEPS, ROUNDS) if method.compiled else (TIMED_STEPS // 100, 3)
-        y = initial_state(one, Geometry.of(one))
-        y, d = (*y, *(0.0,) * (len(method.system.state) - 7)), (0.0,) * len(method.system.drive)
-        method.step_fixed(0.0, 1e-7, 1, y, d)  # compiles
-        turns.append(partial(method.step_fixed, 0.0, 1e-7, count, y, d))
-    times = np.min([[timeit(turn, number=1) for turn in turns] for _ in range(rounds)], axis=0)
-    whole, *bare = (1e9 * times / (len(RK4.b) * count)).tolist()
-    rows = [{"scene": scene.name, "term": "all", "operations": operations(scene), "ns": whole}]
-    for cost, ns in zip(found, bare, strict=True):
-        # A term that folds into constants leaves the same number of operations, and its time.
-        row = {"term": cost.name, "operations": cost.adds, "ns": whole - ns if cost.adds else 0.0}
-        rows.append({"scene": scene.name, **row})
-    return rows
 
 
 LONGEST_S = 10.0  # the advice is for a run of the scene's duration, but not of more [s]

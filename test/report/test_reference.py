@@ -13,7 +13,8 @@ from loaded_scenes import loaded
 from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics import kernel
-from sst_ros.mechanism.geometry import angle_between
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.mechanism.geometry import Geometry, angle_between
 from sst_ros.recording import recording
 from sst_ros.report import reference
 from sst_ros.report.run import evaluate_run
@@ -35,6 +36,10 @@ def solve(derivative, span, start):
     return solve_ivp(derivative, span, start, "DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
 
 
+def start_of(some):
+    return initial_state(some, Geometry.of(some))
+
+
 def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_its_own(integration):
     for deviation in (integration.error, integration.own):
         for name in ("gamma", "gamma_dot", "orientation"):
@@ -47,7 +52,7 @@ def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_it
 
 def test_the_reference_agrees_with_scipy(run):
     """The recorded torques, tick by tick, through an integrator that is not ours."""
-    model, y = kernel.model_of(run.scene), reference.initial(run.scene)
+    model, y = kernel.model_of(run.scene), start_of(run.scene)
     for start, torque in zip(run.ticks.start_ns[:100], run.ticks.torque[:100], strict=True):
         torques, span = tuple(torque.tolist()), (start / 1e9, start / 1e9 + 1e-3)
         y = solve(
@@ -106,7 +111,7 @@ def test_a_lost_start_is_not_taken_for_an_error(read, example2):
 def test_the_ideal_is_the_motion_under_continuous_torques(run):
     found = reference.ideal(run)
     model, profile = kernel.model_of(run.scene), run.scene.torque.at
-    start = reference.initial(run.scene)
+    start = start_of(run.scene)
     end = solve(lambda t, y: kernel.derivative(model, tuple(y), profile(t)), (0.0, 0.3), start)
     expected = angle_between(end[:4], run.quaternion[-1])
     assert abs(found.error.orientation.iloc[-1] - expected) < 1e-11
@@ -124,11 +129,8 @@ def test_long_ticks_are_cut_into_short_steps(run):
     assert found.steps >= 10 and found.own.gamma[np.isfinite(found.own.gamma)].max() < 1e-12
 
 
-def test_a_wrong_kernel_is_seen_by_the_papers_equations_and_by_the_integration(run, wrong_kernel):
-    difference, count = reference.check_with_paper(run)
-    assert count == 20 and difference < 1e-12
+def test_a_wrong_kernel_is_seen_by_the_integration(run, wrong_kernel):
     wrong_kernel(lambda right: [1.0000001 * x for x in right])
-    assert 5e-8 < reference.check_with_paper(run)[0] < 2e-7
     assert reference.integration(run).error.gamma.max() > 1e-9
 
 
@@ -136,12 +138,11 @@ def test_example_1_keeps_to_its_centre(read, bags):
     run = read(bags.simulated(scene.load("example1"), 0.1))
     found = reference.integration(run)
     assert np.max(found.error.orientation) < 1e-11
-    assert reference.check_with_paper(run)[0] < 1e-12
 
 
 def judged(run):
     """The comparisons and the notes of a report."""
-    _, _, integration, ideal, summary = evaluate_run(run)
+    _, integration, ideal, summary = evaluate_run(run)
     return integration, ideal, " ".join(summary["notes"])
 
 
@@ -169,8 +170,8 @@ LOADED = replace(loaded(), moment=Moment(value=(0.1, 0.2, 0.3)))
     ids=["loads", "steps in a tick", "loads and rotors", "limit", "lag and limit"],
 )
 def test_loads_and_actuators_are_compared_as_they_are(recorded, some):
-    integration, ideal, notes = judged(run := recorded(some))
-    assert np.abs(reference.energy_residual(run)[0]).max() < 1e-9
+    integration, ideal, notes = judged(recorded(some))
+    assert np.abs(integration.energy).max() < 1e-9
     assert integration.compared == 51
     assert integration.error.gamma.max() < 1e-9 and integration.error.gamma_dot.max() < 1e-8
     assert ideal.error.gamma.max() < 1e-2

@@ -35,7 +35,6 @@ from sst_ros.report.reference_solution import (
     solve_reference,
 )
 from sst_ros.report.results import data_frame
-from sst_ros.report.scene_summary import cost_table, operations
 from sst_ros.scene import scene
 from sst_ros.scene.bodies import Inertia
 from sst_ros.simulation.simulate import METHODS
@@ -101,12 +100,10 @@ def test_every_row_is_whole(short):
     assert (rows.wall_min_s > 0.0).all() and rows.evaluations.min() > 0
     assert (rows.final_orientation_rad <= rows[ERROR]).all()
     assert short.best(1e-9)[ERROR] <= 1e-9
-    assert not short.warnings and short.formulation < 1e-13
 
 
 def test_what_it_writes_can_be_read(short, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(accuracy, "study_scene", lambda scene, shown: short)
-    monkeypatch.setattr(accuracy, "cost_table", lambda scene: [])
     assert write_accuracy_report(["example2_heavy"], tmp_path) == [short]
     said, words = capsys.readouterr().out, name_fastest(short)
     assert words in said and words.startswith("1e-09 rad over 0.2 s: ")
@@ -122,12 +119,8 @@ def test_what_it_writes_can_be_read(short, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_the_summary_and_the_costs_of_terms_are_on_the_page(short):
+def test_every_target_has_a_fastest_setting(short):
     assert tuple(short.fastest) == TARGETS == (1e-3, 1e-6, 1e-9, 1e-12)
-    terms = cost_table(SHORT)
-    assert [row["operations"] for row in terms] == [operations(SHORT), 0, 51]
-    assert terms[0]["ns"] > terms[2]["ns"]
-    assert "| example2_heavy | intermediate links | 51 |" in accuracy_page([short], terms)
 
 
 @pytest.mark.slow
@@ -169,25 +162,14 @@ def test_a_setting_counts_only_if_every_finer_one_is_as_good(short, errors, chos
 
 
 def test_another_inertia_in_the_runs_is_seen(monkeypatch):
-    """A part in 1e7 of the star's inertia: no method gets near the reference, and it is said."""
+    """A part in 1e7 of the star's inertia: no method gets near the reference."""
     inertia = dataclasses.asdict(SHORT.star.inertia)
     inertia["zz"] *= 1.0 + 1e-7
     star = dataclasses.replace(SHORT.star, inertia=Inertia(**inertia))
     target = InitialValueProblem(dataclasses.replace(BRIEF, star=star))
     monkeypatch.setattr(accuracy, "solve_reference", lambda _: solve_reference(target))
     found = study_scene(BRIEF, longest_s=0.005)
-    least = found.rows[ERROR].min()
-    assert 1e-10 < least < 1e-6
-    assert any("do not solve what the reference solves" in words for words in found.warnings)
-    assert "WARNING" in accuracy_text(found)
-
-
-def test_a_kernel_that_is_wrong_everywhere_is_seen(wrong_kernel):
-    """Where reference and runs share the fault, the paper's equations do not."""
-    wrong_kernel(lambda right: (*right[:6], right[6] * (1.0 + 1e-7)))
-    found = study_scene(BRIEF, longest_s=0.001)
-    assert 1e-9 < found.formulation < 1e-6
-    assert any("paper's equations" in words for words in found.warnings)
+    assert 1e-10 < found.rows[ERROR].min() < 1e-6
 
 
 @pytest.mark.slow

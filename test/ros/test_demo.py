@@ -44,10 +44,8 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
     for quantity in ("gamma_rad", "gamma_dot_rad_per_s", "orientation_rad"):
         assert summary[f"integration_error_{quantity}"] <= 1e-9
         assert summary[f"integration_reference_error_{quantity}"] <= 1e-12
-    assert summary["formulation_difference_relative"] <= 1e-12
     # 500 Hz: held from the middle of the profile; from its start example2 has 1.58e-2 rad.
     assert 0.0 < summary["ideal_difference_gamma_rad"] <= 5e-5
-    assert summary["hold_order"] == 2
     assert are_drawn(out / part, [*PICTURES[part], "error"])
 
 
