@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 
@@ -24,7 +25,7 @@ from sst_ros.plot.pictures import (
     ASSUMPTION,
     NUMBERS,
     PICTURES,
-    Solution,
+    Solutions,
     caption,
     draw_angle,
     draw_path,
@@ -79,10 +80,10 @@ def paper(out: Path) -> list[LargestDifference]:
         for name in demo.EXAMPLES:
             scene = load(name)
             print(f"{name}: {scene.description}", flush=True)
-            solutions, differences, note = _solutions(scene, demo.record(name, out / name))
+            times, solutions, differences, note = _solve(scene, demo.record(name, out / name))
             found += differences
             notes += note
-            paths += _draw(scene, solutions, out)
+            paths += _draw(scene, times, solutions, out)
         path, difference = _inverse_dynamics(load("example1"), out)
         found.append(difference)
         paths.insert(2, path)
@@ -92,25 +93,22 @@ def paper(out: Path) -> list[LargestDifference]:
     return found
 
 
-def _solutions(
+def _solve(
     scene: Scene, bag: Path
-) -> tuple[list[Solution], list[LargestDifference], list[str]]:
-    """Return the solutions of an example at the samples of its run, and how far apart they are."""
+) -> tuple[Array, dict[str, Array], list[LargestDifference], list[str]]:
+    """Return the samples of a run, the solutions at them, how far apart they are, and notes."""
     run = recording.read(bag)
     times = run.seconds
     motion = simulate(scene, duration=float(times[-1]), t_eval=times, tolerance=1e-12)
-    solutions = [
-        Solution("continuous", times, motion.quaternion),
-        Solution("nodes, 500 Hz", times, run.quaternion, run.euler),
-    ]
+    solutions = {"continuous": motion.quaternion, "nodes, 500 Hz": run.quaternion}
     differences = [_difference(scene, "nodes", motion, run.quaternion, run.gamma, NODES_LIMIT)]
     try:
         quaternion, gamma = integrate_by_pinocchio(scene, times)
     except MissingDependency as error:
-        return solutions, differences, [f"no independent engine: {error}"]
-    solutions.append(Solution("Pinocchio", times, quaternion))
+        return times, solutions, differences, [f"no independent engine: {error}"]
+    solutions["Pinocchio"] = quaternion
     differences.append(_difference(scene, "Pinocchio", motion, quaternion, gamma, ENGINE_LIMIT))
-    return solutions, differences, []
+    return times, solutions, differences, []
 
 
 def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
@@ -159,20 +157,15 @@ def _difference(
     return LargestDifference(scene.name, what, max(apart, turned), limit, "rad")
 
 
-def _draw(scene: Scene, solutions: Sequence[Solution], out: Path) -> list[Path]:
+def _draw(scene: Scene, times: Array, solutions: Solutions, out: Path) -> list[Path]:
     """Draw the paper's figures of a scene."""
-    drawn = {
-        "path_of_E": partial(draw_path, scene, solutions),
-        "position_of_E": partial(draw_position, scene, solutions),
-        **{
-            name: partial(draw_angle, scene, solutions, i)
-            for i, name in enumerate(("theta", "phi", "psi"))
-        },
-    }
+    angles = {name: partial(draw_angle, which=i) for i, name in enumerate(("theta", "phi", "psi"))}
+    drawn: dict[str, Callable[..., Figure]] = {"path_of_E": draw_path, **angles}
+    drawn["position_of_E"] = draw_position
     paths: list[Path] = []
     for name in NUMBERS[scene.name]:
         stem, title = caption(name, PICTURES[name].title, scene.name)
-        paths += save(drawn[name](), title, out, stem, ["png"])
+        paths += save(drawn[name](scene, times, solutions), title, out, stem, ["png"])
     return paths
 
 

@@ -236,7 +236,6 @@ COMMANDS: dict[str, Subcommand | str] = {
         ),
         Arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
         _number("--cutoff", "of a zero-phase filter of measured angles [Hz]; default: no filter"),
-        _number("--delay", "by which measured torques come late [s]; default: 0"),
         _number("--duration", "of a designed motion [s]; default: 6"),
         Arg("--harmonics", "of a designed motion; default: 5", type=int),
         Arg("--seed", "of a designed motion; default: 0", type=int),

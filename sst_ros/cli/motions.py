@@ -75,7 +75,7 @@ def run_sweep(options: argparse.Namespace) -> None:
 def run_identification(options: argparse.Namespace) -> None:
     """Identify a scene from a recorded run, or design a motion that determines its parameters."""
     designing, later = options.bag == DESIGN, "must be given after design, and only there"
-    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "delay", "scene", "method")
+    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "scene", "method")
     chosen, foreign = (
         {name: value for name in names if (value := getattr(options, name)) is not None}
         for names in ((ours, others) if designing else (others, ours))

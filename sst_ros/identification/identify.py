@@ -136,7 +136,6 @@ def identify(
     method: str = "inverse_dynamics",
     *,
     cutoff: float | None = None,
-    delay: float = 0.0,
     noise: Iterable[float] | None = None,
 ) -> Identification:
     """Identify constants of a scene from a motion.
@@ -163,7 +162,6 @@ def identify(
         method: "inverse_dynamics" or "simulation".
         cutoff: of the zero-phase filter of the angles [Hz]; by default none where rates were
             measured, else ten times the bandwidth of the motion.
-        delay: time by which the measured torques come late [s].
         noise: standard deviations of the torques [N m], three; by default estimated.
 
     Returns:
@@ -181,9 +179,9 @@ def identify(
     refuse_unless("identify", ("scene", None, given is not None, "must be given with arrays"))
     given = scene_of(given)
     if method == "inverse_dynamics":
-        return fit_torques(data, given, parameters, cutoff, delay, noise)
-    plain = cutoff is None and not delay and noise is None
-    refuse_unless("identify", ("method", method, plain, "takes no cutoff, delay or noise"))
+        return fit_torques(data, given, parameters, cutoff, noise)
+    plain = cutoff is None and noise is None
+    refuse_unless("identify", ("method", method, plain, "takes no cutoff or noise"))
     return fit_simulation(data, given, parameters)
 
 
@@ -192,12 +190,11 @@ def fit_torques(
     scene: Scene,
     requested: Iterable[str] | None,
     cutoff: float | None,
-    delay: float,
     noise: Iterable[float] | None,
 ) -> TorqueFit:
     """Identify by torques; arguments as for `identify`."""
     names = parameters.select_names(scene, requested)
-    measured = read_motion(data, delay)
+    measured = read_motion(data)
     reached = float(np.ptp(measured.gamma, axis=0).max())
     allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
     weights = finite_vector(noise)
@@ -241,7 +238,6 @@ def fit_torques(
         scene=parameters.with_parameters(
             scene, names, values, f"identified from {samples} samples"
         ),
-        given=scene,
         names=names,
         values=values,
         labels=base.labels,

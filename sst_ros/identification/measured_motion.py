@@ -65,11 +65,10 @@ def open_data(data: Measured) -> Recording | Trajectory | Mapping[str, Any]:
     return read(data)
 
 
-def read_motion(data: Measured, delay: float = 0.0) -> MeasuredMotion:
+def read_motion(data: Measured) -> MeasuredMotion:
     """Read a motion from a recording, a trajectory, or arrays, see `identify`, or refuse it.
 
-    Held torques act from sample k to the next (n or n - 1 rows); measured ones come `delay` [s]
-    late.
+    Held torques act from sample k to the next (n or n - 1 rows).
     """
     data = open_data(data)
     given = dict(data) if isinstance(data, Mapping) else _take_samples(data)
@@ -91,11 +90,8 @@ def read_motion(data: Measured, delay: float = 0.0) -> MeasuredMotion:
     if problems:
         raise InputError("identify", problems)
     t, n = arrays["t"], arrays["t"].size
-    refuse_unless(
-        "identify",
-        ("t", t, torques.ascend(t), "must be rising times [s], shape (n,)"),
-        ("delay", delay, bool(np.isfinite(delay)), "must be a finite time [s]"),
-    )
+    good = torques.ascend(t)
+    refuse_unless("identify", ("t", t, good, "must be rising times [s], shape (n,)"))
     if held and arrays["torque"].shape == (n, 3):
         arrays["torque"] = arrays["torque"][:-1]
     shapes = {"t": (n,), "torque": (n - held, 3), "quaternion": (4,)}
@@ -106,11 +102,6 @@ def read_motion(data: Measured, delay: float = 0.0) -> MeasuredMotion:
             problems.append(Problem(name, array.shape, f"must have the shape {shape}"))
     if problems:
         raise InputError("identify", problems)
-    if delay and held:
-        arrays["torque"] = _average(torques.TorqueTable(t[:-1], arrays["torque"]), t + delay)
-    elif delay:  # the last torque is held
-        each = (np.interp(t + delay, t, column) for column in arrays["torque"].T)
-        arrays["torque"] = np.stack([*each], axis=1)
     return MeasuredMotion(**arrays, held=held)
 
 

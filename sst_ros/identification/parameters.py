@@ -160,7 +160,6 @@ class Identification(ABC):
 
     Attributes:
         scene: the scene with identified values, whose bodies can exist.
-        given: the scene as it was.
         names: of the parameters, length p.
         values: their values in `scene`, shape (p,).
         labels: quantities that are estimated: parameters or combinations of them, length b.
@@ -173,7 +172,6 @@ class Identification(ABC):
     """
 
     scene: Scene
-    given: Scene
     names: tuple[str, ...]
     values: Array
     labels: tuple[str, ...]

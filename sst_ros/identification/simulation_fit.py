@@ -20,6 +20,7 @@ figure, may fix fewer combinations than there are parameters.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -37,9 +38,8 @@ from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
 from sst_ros.errors import InputError, Problem
 from sst_ros.identification import parameters
-from sst_ros.identification.consistency import find_consistent_values, scales
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
-from sst_ros.identification.parameters import STANDARD, Identification, value_of
+from sst_ros.identification.parameters import Identification, value_of, with_parameters
 from sst_ros.mechanism.generic_math import atan2, quaternion_rate, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
@@ -49,6 +49,7 @@ from sst_ros.scene.yaml_document import plain, replace_values
 from sst_ros.state import ZERO
 
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
+POSITIVE = re.compile(r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$")
 TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size of a parameter
 AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivatives loses its order
 GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
@@ -97,7 +98,7 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
         lambda x: compare(*x)[0],
         given / size,
         lambda x: compare(*x)[1] * size,
-        bounds=(np.where([_is_positive(name) for name in names], 1e-3, -np.inf), np.inf),
+        bounds=(np.where([bool(POSITIVE.match(name)) for name in names], 1e-3, -np.inf), np.inf),
         xtol=1e-13,
         ftol=1e-13,
         gtol=None,
@@ -114,13 +115,21 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
     some = singular > 1e-12 * max(float(singular[0]), 1e-300)
     relative[: len(singular)][some] = 1.0 / singular[some]
     spread = (rows.T * np.minimum(relative, 1e9) ** 2) @ rows * np.outer(scale, scale)
-    adjusted, values, warnings = _make_possible_scene(scene, names, fitted)
     vague = rows[relative >= NOT_DETERMINED]
+    note, kept, warnings = "identified by simulation", names, tuple[str, ...]()
+    try:
+        adjusted = with_parameters(scene, names, fitted, note)
+    except InputError:
+        kept = tuple(name for name in names if ".inertia." not in name)
+        if kept == names:
+            raise
+        chosen = [name in kept for name in names]
+        adjusted = with_parameters(scene, kept, fitted[chosen], note)
+        warnings = ("no bodies have the inertias that fit best: the scene keeps the given ones",)
     return SimulationFit(
         scene=adjusted,
-        given=scene,
         names=names,
-        values=values,
+        values=parameters.values(adjusted, names),
         labels=names,
         before=given,
         estimate=fitted,
@@ -141,13 +150,6 @@ def describe_combination(row: Array, names: tuple[str, ...]) -> str:
         for name, value in zip(names, row, strict=True)
         if abs(value) > 0.05 * abs(largest)
     )
-
-
-def _is_positive(name: str) -> bool:
-    last = name.rpartition(".")[2]
-    if name.startswith(("friction", "actuators", "stroke", "springs")):
-        return last != "rest"
-    return last in ("mass", "xx", "yy", "zz")
 
 
 class Sensitivities:
@@ -296,43 +298,11 @@ class Sensitivities:
 def differentiate_damping(scene: Scene) -> float:
     """Return the derivative of the damping of elastic stops by the restitution [s/rad].
 
-    From s = d (1 + e), L(s/2) = (1 - e) / (1 + e) with Langevin's function L, see
-    `damping_of`: ds/de = -4 / ((1 + e)^2 L'(s/2)), L'(x) = 1/x^2 - 1/sinh(x)^2.
+    By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de =
+    d / (1 - e - e d), which is -3 where e = 1.
     """
     e, v = scene.stroke.restitution, scene.stroke.impact_rate
     assert e is not None and v is not None
-    d = damping_of(scene.stroke) * v
-    x = 0.5 * d * (1.0 + e)
-    if x < 0.05:  # the difference would cancel
-        slope = 1.0 / 3.0 - x * x / 15.0 + 2.0 * x**4 / 189.0 - x**6 / 675.0
-    else:
-        slope = 1.0 / x**2 - 1.0 / np.sinh(min(x, 300.0)) ** 2
-    return float((-4.0 / ((1.0 + e) ** 2 * slope) - d) / ((1.0 + e) * v))
-
-
-def _make_possible_scene(
-    scene: Scene, names: Sequence[str], numbers: Array
-) -> tuple[Scene, Array, tuple[str, ...]]:
-    """Scene with fitted numbers by key; where its bodies cannot exist, that with the nearest ones.
-
-    Returns it, the values in it, and a warning where they are others.
-    """
-    note = "identified by simulation"
-    fitted = [name for name in names if ".inertia." in name]
-    try:
-        return parameters.with_parameters(scene, names, numbers, note), numbers, ()
-    except InputError:
-        if not fitted:
-            raise
-    values = dict(zip(names, numbers, strict=True))
-    # All entries of the inertias to which those that were fitted belong.
-    bodies = dict.fromkeys(name.partition(".inertia")[0] for name in fitted)
-    entries = tuple(f"{body}.{part}" for body in bodies for part in STANDARD[4:])
-    chosen, given = [entries.index(name) for name in fitted], parameters.values(scene, entries)
-    root = np.diag(1e6 / scales(entries, given)[chosen])
-    kept, estimate = np.eye(len(entries))[chosen], np.array([values[name] for name in fitted])
-    nearest, _ = find_consistent_values(entries, given, kept, estimate, root, 1.0)
-    values |= zip(entries, nearest, strict=True)
-    found = parameters.with_parameters(scene, tuple(values), np.array([*values.values()]), note)
-    warning = "no bodies have the inertias that fit best: the scene has the nearest"
-    return found, parameters.values(found, names), (warning,)
+    d = float(damping_of(scene.stroke) * v)
+    change = d / (1.0 - e - e * d) if d else -3.0
+    return (change - d) / ((1.0 + e) * v)

@@ -96,8 +96,7 @@ def draw_comparison(
         drawn = [each for each in all_runs if not set(needs) & set(each[0].missing)]
         if left := [label for run, label, _ in all_runs if set(needs) & set(run.missing)]:
             missing[name] = f"without {', '.join(left)}: no {' or '.join(needs)} there"
-        paired = len(drawn) > 1 and drawn[0][0] is runs[0]
-        if paired or (drawn and name != "difference"):
+        if len(drawn) > 1 and drawn[0][0] is runs[0]:
             paths += pictures.save(make(drawn), title, out, f"compare_{name}")
         else:
             missing[name] = f"not drawn: {missing[name]}"

@@ -87,31 +87,13 @@ def draw_legs(label: str, series: Sequence[tuple[str, Array, Array, Mapping[str,
     return figure
 
 
-class Solution(NamedTuple):
-    """One solution of the motion: its name, times [s] (n,), quaternions (n, 4), ZYZ angles (n, 3).
+Solutions: TypeAlias = Mapping[str, Array]
+"""Solutions of one motion by name: quaternions (n, 4), all at the same times."""
 
-    Angles are in rad; where they are nan those of the quaternion are drawn.
-    """
 
-    name: str
-    seconds: Array
-    quaternion: Array
-    euler: Array | None = None
-
-    @property
-    def degrees(self) -> Array:
-        """ZYZ angles [deg] without jumps, over lost samples too, shape (n, 3)."""
-        angles = zyz_angles(rotation_matrix(self.quaternion))
-        if self.euler is not None:
-            angles = np.where(np.isfinite(self.euler), self.euler, angles)
-        for column in angles.T:
-            known = np.isfinite(column)
-            column[known] = np.unwrap(column[known])
-        return np.asarray(np.degrees(angles))
-
-    def position(self, scene: Scene) -> Array:
-        """Position of E in {B} [m], shape (n, 3)."""
-        return np.asarray(scene.star.radius * rotation_matrix(self.quaternion)[:, :, 2])
+def position_of_e(scene: Scene, quaternion: Array) -> Array:
+    """Position of E in {B} [m], shape (n, 3)."""
+    return scene.star.radius * rotation_matrix(quaternion)[:, :, 2]
 
 
 def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
@@ -126,38 +108,45 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
     return f"fig{number:02d}_{name}", f"{title}\nFig. {number} of the paper; {ASSUMPTION}"
 
 
-def draw_position(scene: Scene, solutions: Sequence[Solution]) -> Figure:
+def draw_position(scene: Scene, seconds: Array, solutions: Solutions) -> Figure:
     """Draw the coordinates of E over time."""
-    values = [each.position(scene) for each in solutions]
-    return _over_time(solutions, values, "xyz", "position of E in {B} [m]", LEAST_POSITION_M)
+    values = [position_of_e(scene, each) for each in solutions.values()]
+    label = "position of E in {B} [m]"
+    return _over_time(seconds, [*solutions], values, "xyz", label, LEAST_POSITION_M)
 
 
-def draw_angle(_: Scene | None, solutions: Sequence[Solution], which: int) -> Figure:
+def draw_angle(_: Scene | None, seconds: Array, solutions: Solutions, which: int) -> Figure:
     """Draw one of the ZYZ angles over time: 0 theta, 1 phi, 2 psi."""
-    letter = "θφψ"[which]
-    values = [each.degrees[:, which : which + 1] for each in solutions]
-    return _over_time(solutions, values, letter, f"{letter} [deg]", LEAST_ANGLE_DEG)
+    values, letter = [], "θφψ"[which]
+    for quaternion in solutions.values():
+        angle = zyz_angles(rotation_matrix(quaternion))[:, which : which + 1]
+        known = np.isfinite(angle)
+        angle[known] = np.unwrap(angle[known])  # over lost samples too
+        values.append(np.degrees(angle))
+    return _over_time(seconds, [*solutions], values, letter, f"{letter} [deg]", LEAST_ANGLE_DEG)
 
 
 def _over_time(
-    solutions: Sequence[Solution], values: Sequence[Array], letters: str, label: str, least: float
+    seconds: Array,
+    names: Sequence[str],
+    values: Sequence[Array],
+    letters: str,
+    label: str,
+    least: float,
 ) -> Figure:
-    """Draw columns over time; differences from the first solution below where there are several.
-
-    All solutions have the times of the first one.
-    """
-    seconds, unit = solutions[0].seconds, label.split("[")[1].rstrip("]")
-    if len(solutions) == 1:
+    """Draw columns over time; differences from the first solution below where there are several."""
+    if len(names) == 1:
         figure, (axes,) = stack([label], 3.2)
         lines(axes, seconds, values[0], list(letters), least_span=least)
         return figure
-    figure, (above, below) = stack([label, f"difference from\n{solutions[0].name} [{unit}]"], 2.7)
-    for solution, columns, looks in zip(solutions, values, LINES, strict=False):
-        above.plot(seconds, columns, **looks)[0].set_label(solution.name)
-        if solution is not solutions[0]:
+    unit = label.split("[")[1].rstrip("]")
+    figure, (above, below) = stack([label, f"difference from\n{names[0]} [{unit}]"], 2.7)
+    for name, columns, looks in zip(names, values, LINES, strict=False):
+        above.plot(seconds, columns, **looks)[0].set_label(name)
+        if columns is not values[0]:
             apart = np.abs(columns - values[0]).max(axis=1)
-            name = f"{solution.name}: {np.nanmax(apart):.1e} {unit}"
-            below.plot(seconds, style.hide_zeros(apart), label=name, **looks)
+            largest = f"{name}: {np.nanmax(apart):.1e} {unit}"
+            below.plot(seconds, style.hide_zeros(apart), label=largest, **looks)
     style.widen(above, values[0], least)
     if len(letters) > 1:  # each beside its last value
         beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
@@ -169,7 +158,7 @@ def _over_time(
     return figure
 
 
-def draw_path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
+def draw_path(scene: Scene, _: Array, solutions: Solutions) -> Figure:
     """Draw E over the base triangle, both at their own radius, and the triangle's image at E's."""
     figure = Figure(figsize=(6.4, 6.4))
     axes = figure.add_subplot(projection="3d")
@@ -182,11 +171,10 @@ def draw_path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
         axes.plot(*(star * outline).T, color=GREY, **image)
     for name, point in zip(leg_names("P"), 1.14 * max(base, star) * geometry.v, strict=True):
         axes.text(*point, name, ha="center", va="center")
-    several = len(solutions) > 1
-    for solution, looks in zip(solutions, LINES, strict=False):
-        name = solution.name if several else "path of E"
-        axes.plot(*solution.position(scene).T, label=name, **looks)
-    style.mark_ends(axes, *solutions[0].position(scene).T)
+    paths = [position_of_e(scene, each).T for each in solutions.values()]
+    for name, path, looks in zip(solutions, paths, LINES, strict=False):
+        axes.plot(*path, label=name, **looks)
+    style.mark_ends(axes, *paths[0])
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.set_box_aspect(np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1))
     x, y, z = geometry.v.sum(axis=0)
@@ -198,14 +186,9 @@ def draw_path(scene: Scene, solutions: Sequence[Solution]) -> Figure:
     return figure
 
 
-def _star(draw: Callable[[Scene, list[Solution]], Figure]) -> Callable[..., Figure]:
+def _star(draw: Callable[[Scene, Array, Solutions], Figure]) -> Callable[..., Figure]:
     """Return what draws the recorded motion of the star."""
-
-    def make(run: Signals, scene: Scene) -> Figure:
-        euler = run.take("theta", "phi", "psi") if "euler_zyz" not in run.missing else None
-        return draw(scene, [Solution("run", run.seconds(), run.take(*QUATERNION), euler)])
-
-    return make
+    return lambda run, scene: draw(scene, run.seconds(), {"path of E": run.take(*QUATERNION)})
 
 
 def _tracking(run: Signals, _: Scene) -> Figure:
@@ -305,18 +288,6 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     return figure
 
 
-def _phase(run: Signals, _: Scene) -> Figure:
-    """Draw each actuator's rate over its angle, from the circle to the square."""
-    figure = Figure(figsize=(10.5, 3.8))
-    angle, rate = DEGREES * run.legs("gamma"), run.legs("gamma_dot")
-    for k, axes, x, y in zip("₁₂₃", figure.subplots(1, 3), angle.T, rate.T, strict=True):
-        axes.plot(x, y, color=BLUE, linewidth=1.4)
-        style.mark_ends(axes, x, y)
-        axes.set(xlabel=f"γ{k} [deg]", ylabel=f"γ̇{k} [rad/s]")
-    figure.axes[-1].legend(loc="best", fontsize=8)
-    return figure
-
-
 def _margins(run: Signals, scene: Scene) -> Figure:
     """Draw the distance of each leg to the nearest limit of its joints."""
     geometry = Geometry.of(scene)
@@ -378,7 +349,6 @@ PICTURES = {
     "energy": Picture("Energy", (JOINTS, ORIENTATION, TICKS, S), _energy),
     "joint_angles": Picture("Joint angles", (JOINTS,), _ANGLES),
     "joint_rates": Picture("Joint rates", (JOINTS,), _RATES),
-    "phase": Picture("Phase portraits of the actuators", (JOINTS,), _phase),
     "margins": Picture("Distance to the limits", (JOINTS, S), _margins),
     "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), _sphere),
 }

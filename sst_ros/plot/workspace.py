@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap
-from sst_ros.plot.style import BLUE, GREY, INK, Looks, mark_ends, sides, styled
+from sst_ros.plot.style import BLUE, INK, Looks, mark_ends, sides, styled
 from sst_ros.scene.scene import Scene
 
 CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)  # levels of cond J; above all are the same
@@ -143,40 +143,22 @@ def project(geometry: Geometry, s: Array) -> tuple[Array, Array]:
     return scale * (s @ np.cross(up, out)), scale * (s @ up)
 
 
-LEVELS = (5, 10, 20, 30)
-
-
 @lru_cache(maxsize=4)
 def _map(scene: Scene) -> OrientationMap:
     return workspace.workspace(Geometry.of(scene), divisions=40, turns=72)
 
 
 def draw_paths(scene: Scene, paths: Sequence[tuple[str, Array, Looks]]) -> Figure:
-    """Draw paths of E, directions (n, 3) each, over the base triangle, and where E cannot be.
+    """Draw paths of E, directions (n, 3) each, over the map of the distance to the nearest limit.
 
-    Lines show how far the best turn of the star keeps from every limit; one path has its ends.
+    One path has its ends.
     """
-    geometry = Geometry.of(scene)
-    figure = Figure(figsize=(6.4, 5.6))
+    figure, chart = Figure(figsize=(7.2, 5.6)), _map(scene)
     axes = figure.subplots()
-    chart = _map(scene)
-    margin, faces = np.degrees(chart.best_margin), triangles(chart)
-    mesh = Triangulation(*project(geometry, chart.s), faces)
-    beyond = np.isnan(margin)
-    if beyond.any():
-        out = Triangulation(mesh.x, mesh.y, faces[beyond[faces].any(axis=1)])
-        axes.tripcolor(out, np.zeros(len(margin)), cmap="Greys", vmin=-0.5, vmax=2.0)
-        axes.plot([], [], "s", color="#cccccc", label="E cannot be there")
-    inside = Triangulation(mesh.x, mesh.y, faces, mask=beyond[faces].any(axis=1))
-    levels = [level for level in LEVELS if np.nanmin(margin) < level < np.nanmax(margin)]
-    if levels:
-        lines: Looks = {"levels": levels, "colors": GREY, "linewidths": 0.7, "alpha": 0.7}
-        drawn = axes.tricontour(inside, np.nan_to_num(margin), **lines)
-        axes.clabel(drawn, fontsize=7, fmt="%g°")
-        axes.plot([], [], color=GREY, linewidth=0.7, label="distance to the nearest limit")
-    draw_triangle(axes, geometry)
+    _panel(axes, chart, triangles(chart), np.degrees(chart.best_margin), condition=False)
     for name, s, looks in paths:
-        x, y = project(geometry, s)
+        x, y = project(chart.geometry, s)
+        axes.plot(x, y, color="white", linewidth=4.0, zorder=1.9)  # seen on each colour
         axes.plot(x, y, label=name, **looks)
         if len(paths) == 1:
             mark_ends(axes, x, y)

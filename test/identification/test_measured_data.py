@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification from encoder counts and noisy torques: coverage, bias, delay, filters."""
+"""Identification from encoder counts and noisy torques: coverage, bias, filters."""
 
 from functools import cache
 
@@ -11,7 +11,6 @@ from sst_ros import load_scene, reference_motion
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import filter_angles, find_bandwidth, identify
-from sst_ros.identification.measured_motion import read_motion
 
 COUNT = 2.0 * np.pi / 65536
 NOISE = 0.01
@@ -101,26 +100,6 @@ def test_noise_is_found_and_may_be_given():
     assert given.estimate == pytest.approx(found.estimate, rel=1e-9, abs=1e-12)
     assert found.consistent
     assert np.all(np.abs(np.diag(found.correlation) - 1.0) < 1e-12)
-
-
-def test_a_known_delay_of_the_torques_is_taken_out():
-    case = measured()
-    late, exact = 5, {"t": case.t, "gamma": case.gamma, "torque": case.torque}
-    delayed = np.vstack([np.repeat(case.torque[:1], late, axis=0), case.torque[:-late]])
-    errors = []
-    for torque, delay in ((case.torque, 0.0), (delayed, 0.0), (delayed, late * 1e-3)):
-        found = identify(exact | {"torque": torque}, case.model, cutoff=30.0, delay=delay)
-        true = found.base.transform @ parameters.values(case.plant, found.names)
-        errors.append(np.linalg.norm(found.estimate - true) / np.linalg.norm(true))
-    assert errors[0] < 1e-3 and errors[2] < 1e-3
-    assert errors[1] > 5.0 * errors[2]
-
-
-def test_the_last_of_held_torques_acts_on():
-    t, steps = 0.01 * np.arange(30), np.outer(np.arange(1.0, 30.0), [1.0, 2.0, 3.0])
-    given = {"t": t, "gamma": np.zeros((30, 3)), "torque": steps, "held": True}
-    found = read_motion(given, delay=0.02).torque
-    assert found == pytest.approx(np.vstack([steps[2:], steps[-1:], steps[-1:]]))
 
 
 def test_the_filter_has_no_phase_and_leaves_the_motion():
