@@ -58,7 +58,9 @@ class Page:
         self._server = PageServer(host, port)
         self.url = self._server.url
         self._clear()
-        self._server.gui.add_markdown("Waiting for a simulator ...")
+        # No markdown: viser sends its text as an update, which a slow browser complains of where
+        # it gets the removal at once with it.
+        self._server.gui.add_html("<small>&nbsp; Waiting for a simulator ...</small>")
         self._scene: Scene | None = None
         self._state: ViewState | None = None
         self._stop = threading.Event()
