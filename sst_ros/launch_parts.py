@@ -7,7 +7,6 @@ Only launch files import this module: it needs `launch` and `launch_ros` of a RO
 from __future__ import annotations
 
 import atexit
-import difflib
 import os
 import signal
 import sys
@@ -28,6 +27,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from sst_ros.description.robot import TOPICS, urdf
+from sst_ros.errors import suggestion
 from sst_ros.host import processes
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import default_topics
@@ -69,8 +69,7 @@ def description(
         for word in context.argv if ours else ():
             name, assigned, _ = word.partition(":=")
             if assigned and name not in every:
-                close = difflib.get_close_matches(name, every, 1) or sorted(every)
-                raise RuntimeError(f"{word}: no such argument; known: {', '.join(close)}")
+                raise RuntimeError(f"{word}: no such argument{suggestion(name, every)}")
         return actions({name: context.launch_configurations[name] for name in every})
 
     declared = [

@@ -13,12 +13,11 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sst_ros.errors import SstError, explanation, printable, refuse_unless, require, suggestion
+from sst_ros.errors import SstError, explanation, printable, require, suggestion
 from sst_ros.host.output import require_free
 from sst_ros.version import VERSION
 
@@ -55,14 +54,20 @@ def _out(what: str, default: str) -> tuple[Arg, Arg]:
     return _path("--out", f"{what}; default: {default}"), force
 
 
-def _whole(least: int, most: int, text: str) -> int:
-    if text.isdecimal() and least <= int(text) <= most:
-        return int(text)
-    allowed = f"must be a whole number from {least} to {most}, not {text!r}"
-    raise argparse.ArgumentTypeError(allowed)
+def _count(name: str, most: int, what: str, least: int = 1, **options: Any) -> Arg:
+    """Describe an option that is a whole number in a range."""
+
+    def whole(text: str) -> int:
+        if text.isdecimal() and least <= int(text) <= most:
+            return int(text)
+        allowed = f"must be a whole number from {least} to {most}, not {text!r}"
+        raise argparse.ArgumentTypeError(allowed)
+
+    return Arg(name, what, type=whole, metavar="N", **options)
 
 
-_port = partial(Arg, type=partial(_whole, 1024, 65535))
+_INTEGRATORS = ("auto", "rk4", "dopri5", "dop853", "rodas5p")
+_MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 _OF_SCENE = "name of a scene, or path of a .yaml file"
 SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")
@@ -74,7 +79,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _number("--duration", "length [s]; default: that of the scene"),
         Arg("--method", "integrator; default: auto", default="auto"),
         _number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
-        Arg("--samples", "even intervals in time; default: ends of steps", type=int, metavar="N"),
+        _count("--samples", 10_000_000, "even intervals in time; default: ends of steps"),
         _path("--out", "trajectory, .parquet, .csv or .npz", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
         _flag("--force", "overwrite earlier results"),
@@ -102,7 +107,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     "plan check": Subcommand(
         "check feasibility and the shortest duration; exit status 0 if feasible",
         "cli.motions:check_plan",
-        _scene("scene", "scene with a motion: name, or .yaml file", metavar="SCENE"),
+        SCENE,
         _flag("--json", "print JSON instead of a table"),
         _path("--csv", "write the torques to play", metavar="OUT"),
         _flag("--force", "overwrite the file of --csv"),
@@ -112,31 +117,23 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write a scene as URDF",
         "cli.scenes:describe",
         _scene("--scene", _OF_SCENE, default="example2", metavar="S"),
-        _flag(
-            "--ros2-control",
-            "with the tag by which ros2_control drives the actuators of a running simulator",
-        ),
+        _flag("--ros2-control", "with the tag by which ros2_control drives a running simulator"),
     ),
     "compile": Subcommand(
         "compile a scene before its first fast run",
         "cli.runs:compile_code",
         _scene("scene", _OF_SCENE, nargs="?", default="example2", metavar="SCENE"),
-        Arg("--integrator", "auto, or the name of an integrator; default: auto", default="auto"),
+        Arg("--integrator", "default: auto", choices=_INTEGRATORS, default="auto"),
     ),
     "demo": Subcommand(
         "run the paper's examples or a reference motion by the nodes",
         "cli.reports:run_demo",
-        Arg(
-            "kind",
-            "the paper's examples; or the node inverse_dynamics following a scene's motion",
-            nargs="?",
-            choices=("examples", "feedforward"),
-            default="examples",
-        ),
+        Arg("kind", "default: examples", nargs="?", choices=("examples", "feedforward")),
         *_out("folder of the results", "demo_out or demo_out/feedforward"),
         _scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
-        Arg("--mode", "with feedforward: control modes", nargs="+", metavar="MODE"),
+        Arg("--mode", "with feedforward: control modes", nargs="+", choices=_MODES),
         needs="rclpy rosbags matplotlib",
+        more="Run the paper's examples, or have the node inverse_dynamics follow a scene's motion.",
     ),
     "view": Subcommand(
         "show the manipulator in a browser, live or from a bag",
@@ -146,7 +143,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
         Arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
-        _port("--port", "port, or the next free one", default=8080),
+        _count("--port", 65535, "port, or the next free one", 1024, default=8080),
         _flag("--open", "open it, where there is a desktop"),
         needs="viser",
         more="Show a running simulator, one that is started for it (--scene), or a bag.",
@@ -163,9 +160,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     "report accuracy": Subcommand(
         "work-precision diagrams: error against cost of every method and step",
         "cli.reports:report_accuracy",
-        _scene(
-            "scenes", "names, or paths of .yaml files; default: all", nargs="*", metavar="SCENE"
-        ),
+        _scene("scenes", f"{_OF_SCENE}; default: all", nargs="*", metavar="SCENE"),
         *_out("folder of the results", "accuracy_out"),
     ),
     "report stability": Subcommand(
@@ -183,13 +178,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         *_out("folder of the pictures", "BAG_plots, beside the first bag"),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
         _flag("--list", "list the pictures, and draw none"),
-        _path(
-            "--compare",
-            "overlay runs and print their differences from the first",
-            nargs="+",
-            default=[],
-            metavar="BAG",
-        ),
+        _path("--compare", "show how runs differ", nargs="+", default=[], metavar="BAG"),
     ),
     "export": Subcommand(
         "write a recorded run as CSV or Parquet",
@@ -211,7 +200,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
         _path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
         Arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
-        Arg("--workers", "threads; default: one a core", type=partial(_whole, 1, 1024)),
+        _count("--workers", 1024, "threads; default: one a core"),
         _flag("--resume", "compute only the chunks that are missing in --out"),
         more="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
@@ -219,12 +208,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "identify inertias, friction and more from a recorded run; design excitation motions",
         "cli.motions:run_identification",
         Arg("bag", "folder of the bag, or the word design", metavar="BAG"),
-        _scene(
-            "designed",
-            "after design: the scene to make a motion for, about its initial pose",
-            nargs="?",
-            metavar="SCENE",
-        ),
+        _scene("designed", "after design: scene to make a motion for", nargs="?", metavar="SCENE"),
         _scene("--scene", "known numbers, and where to start; default: as recorded", metavar="S"),
         Arg(
             "--parameters",
@@ -317,14 +301,6 @@ def free_out(options: argparse.Namespace, default: str | Path) -> Path:
     """Return the path of `--out`, or the default; refuse to overwrite without `--force`."""
     out = options.out or Path(default)
     return require_free(out, options.command, force=getattr(options, "force", False))
-
-
-def refuse_unknown(
-    options: argparse.Namespace, option: str, word: str, known: Sequence[str]
-) -> None:
-    """Refuse a word that is none of those known, and name the nearest."""
-    allowed = f"must be one of {', '.join(known)}{suggestion(word, known)}"
-    refuse_unless(options.command, (option, word, word in known, allowed))
 
 
 def run_command(words: list[str]) -> int:

@@ -6,9 +6,7 @@ from __future__ import annotations
 import argparse
 
 from sst_ros import demo
-from sst_ros.cli.commands import free_out, function, refuse_unknown
-from sst_ros.control.law import MODES
-from sst_ros.errors import refuse_unless
+from sst_ros.cli.commands import free_out, function
 from sst_ros.host.output import results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
@@ -63,16 +61,13 @@ def draw_pictures(options: argparse.Namespace) -> int:
 
 def run_demo(options: argparse.Namespace) -> None:
     """Run the paper's examples by the nodes, or follow a motion; evaluate each run."""
-    following, given = options.kind == "feedforward", (options.scene, options.mode)
-    allowed = "are options of `demo feedforward`"
-    refuse_unless("demo", ("--scene, --mode", given, following or not any(given), allowed))
-    modes = options.mode or demo.MODES
-    for mode in modes:
-        refuse_unknown(options, "--mode", mode, MODES)
+    following = options.kind == "feedforward"
+    if not following and (options.scene or options.mode):
+        options.parser.error("--scene and --mode are options of `demo feedforward`")
     out = free_out(options, "demo_out/feedforward" if following else "demo_out")
     if following:
         name = options.scene or demo.FOLLOWED
-        for mode in modes:
+        for mode in options.mode or demo.MODES:
             print(f"{name}, {mode}: {load(name).description}", flush=True)
             bag = demo.follow(name, out / mode, mode)
             print(function("report.tracking:write_tracking_report")(bag, out / mode), flush=True)

@@ -10,19 +10,16 @@ form with a box as test function). Two Gauss points take it: there the second de
 Hermite spline is of third order, and the errors of the pair cancel, so that the mean is of fourth
 order in the period although the acceleration jumps at each sample.
 
-Noise in the angles is in the acceleration with a spectrum that rises as f^4. In the regressor it
-shrinks estimates, most those that the motion excites weakly (errors in variables); a lower cut-off
-of the angles would change the motion itself. So the regressor is made of angles filtered little,
-and then torques and columns alike are projected on the m sines of lowest frequency,
+Noise of the angles shrinks estimates (errors in variables), and a lower cut-off of the angles would
+change the motion itself. So the regressor is made of angles filtered little, and then torques and
+columns alike are projected on the m sines of lowest frequency,
 
     sqrt(2 / (n + 1)) sum over i of x_i sin(pi i k / (n + 1)), k = 1 to m.
 
-This is linear: what holds for samples holds for the components, without any distortion (parallel
-filtering and decimation: Gautier, Proc. IEEE ICRA 1997, 1922-1927). The sines are orthonormal:
-white noise of the torques stays white, of the same deviation. They vanish at both ends (modulating
-functions: Shinbrot, Trans. ASME 79 (1957) 547-552): integrated by parts, the acceleration leaves
-no noise of the rates there, as cosines, or sums of samples, would. docs/howto/identify.md has the
-bias with and without them, measured.
+What holds for samples holds for the components (Gautier, Proc. IEEE ICRA 1997, 1922-1927). The
+sines are orthonormal, so that white noise stays white, and vanish at both ends, where cosines or
+sums would leave noise of the rates (Shinbrot, Trans. ASME 79 (1957) 547-552).
+docs/howto/identify.md has the bias with and without them, measured.
 """
 
 from __future__ import annotations
@@ -75,7 +72,6 @@ class TorqueFit(Identification):
         vague: combinations whose standard deviation exceeds their size.
         samples: of the torques that were fitted.
         band: frequency below which they were [Hz]; None where angles were not filtered.
-        regressor: of the torques.
 
     """
 
@@ -86,27 +82,11 @@ class TorqueFit(Identification):
     vague: tuple[str, ...]
     samples: int
     band: float | None
-    regressor: Regressor
 
     @property
     def consistent(self) -> bool:
         """Whether bodies that can exist explain the estimates within their uncertainty."""
         return self.excess < SIGNIFICANT
-
-    def predict(self, data: Measured, cutoff: float | None = None) -> tuple[Array, Array]:
-        """Torques of another motion by the base parameters, and the measured ones.
-
-        Returns:
-            Predicted and measured torques [N m], each shape (m, 3): at the samples, or means over
-            the intervals where torques are held; without those at the ends that a filter needs.
-
-        Raises:
-            InputError: the data are not sound.
-
-        """
-        equations = form_equations(read_motion(data), self.regressor, cutoff)
-        known, columns, torque, _ = equations
-        return known + columns[..., self.base.chosen] @ self.estimate, torque
 
     def _notes(self) -> Iterator[str]:
         noise = ", ".join(f"{value:.3g}" for value in self.noise)
@@ -253,7 +233,6 @@ def fit_torques(
         vague=tuple(compress(base.labels, vague)),
         samples=samples,
         band=band,
-        regressor=regressor,
     )
 
 

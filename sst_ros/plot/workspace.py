@@ -40,7 +40,34 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
     names = titles or ["E on the base triangle"] * len(charts)
     for row, chart, title in zip(rows, charts, names, strict=True):
-        _row(row, chart, title)
+        poses, faces = workspace.parallel_singularities(chart), triangles(chart)
+        a, b, c = (chart.s[faces[:, i]] for i in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        reach = np.average((chart.turn > 0.0)[faces].mean(axis=1), weights=area)
+        share = f"E reaches {100 * reach:.0f} % of the triangle"
+        worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
+        least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
+        row.suptitle(f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK)
+        turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
+        margin = np.degrees(chart.best_margin)
+        left, axes, right = row.subplots(1, 3)
+        for panel, name, values in (
+            (left, "Free turn of the star about OE", turn),
+            (axes, "Best condition of J over that turn", chart.best_cond_j),
+            (right, "Distance to the nearest limit, best turn", margin),
+        ):
+            _panel(panel, chart, faces, values, condition=panel is axes)
+            panel.set_title(name, fontsize=10.5, color=INK, loc="center")
+        ends = workspace.serial_singularities(chart.geometry)
+        for found, marker, size, colour, label in (
+            (poses, ".", 2.2, _ALARM, "det J2 = 0 at some turn"),
+            (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
+        ):
+            if len(found):
+                x, y = project(chart.geometry, found.rotation[:, :, 2])
+                axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
+                axes.plot([], [], "o", markersize=4, color=colour, label=label)
+                axes.legend(loc="upper right", fontsize=8, frameon=False)
     return figure
 
 
@@ -48,37 +75,6 @@ def triangles(chart: OrientationMap) -> NDArray[np.intp]:
     """Triangles of the directions of a map, shape (n, 3)."""
     divisions = round((math.sqrt(8 * len(chart.s) + 1) - 3) / 2)
     return workspace.triangle_directions(chart.geometry, divisions)[1]
-
-
-def _row(figure: Any, chart: OrientationMap, title: str) -> None:
-    poses, faces = workspace.parallel_singularities(chart), triangles(chart)
-    a, b, c = (chart.s[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    reach = np.average((chart.turn > 0.0)[faces].mean(axis=1), weights=area)
-    share = f"E reaches {100 * reach:.0f} % of the triangle"
-    worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
-    least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
-    figure.suptitle(f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK)
-    turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
-    margin = np.degrees(chart.best_margin)
-    left, axes, right = figure.subplots(1, 3)
-    for panel, name, values in (
-        (left, "Free turn of the star about OE", turn),
-        (axes, "Best condition of J over that turn", chart.best_cond_j),
-        (right, "Distance to the nearest limit, best turn", margin),
-    ):
-        _panel(panel, chart, faces, values, condition=panel is axes)
-        panel.set_title(name, fontsize=10.5, color=INK, loc="center")
-    ends = workspace.serial_singularities(chart.geometry)
-    for found, marker, size, colour, label in (
-        (poses, ".", 2.2, _ALARM, "det J2 = 0 at some turn"),
-        (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
-    ):
-        if len(found):
-            x, y = project(chart.geometry, found.rotation[:, :, 2])
-            axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
-            axes.plot([], [], "o", markersize=4, color=colour, label=label)
-            axes.legend(loc="upper right", fontsize=8, frameon=False)
 
 
 def _panel(

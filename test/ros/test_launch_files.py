@@ -130,7 +130,7 @@ UNPLAYED = r"(?s)(?=.*must have torque and duration).*torque_player failed with 
         pytest.param("simulate", "rviz:=true", 1, f"{NEEDS}rviz2", marks=without("rviz2")),
         pytest.param("ros2_control", "", 1, f"{NEEDS}controller_manager",
                      marks=without("controller_manager")),
-        ("simulate", "scen:=swing", 1, "scen:=swing: no such argument; known: scene"),
+        ("simulate", "scen:=swing", 1, "scen:=swing: no such argument; did you mean 'scene'?"),
     ],
 )  # fmt: skip
 def test_how_a_launch_ends(launch, name, words, status, said):
