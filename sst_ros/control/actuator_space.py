@@ -24,18 +24,8 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_for_arrays, compile_program, trace
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import continuation
-from sst_ros.mechanism.generic_math import (
-    axpy,
-    cos,
-    cross3,
-    dot3,
-    multiply,
-    quaternion_product,
-    rotate_back,
-    rotation_rows,
-    sin,
-    sqrt,
-)
+from sst_ros.mechanism import generic_math as gm
+from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.state import ZERO, Quaternion, Vector3
 
@@ -60,30 +50,18 @@ class Reference:
 
 
 class ReferenceMotion:
-    """A desired motion; it rests before time 0 and after `duration`.
+    """A desired motion; it rests before time 0 and after `duration` [s].
 
-    Args:
-        inside: the reference at a time [s] from 0 to `duration`; an ArithmeticError of it is a
-            serial singularity.
-        pieces: times from 0 to `duration` [s], rising. From one to the next the motion is so smooth
-            that some ten samples resolve it.
-
-    Attributes:
-        duration: [s].
-        pieces: as given.
-
+    It is made of a function that gives the reference at a time from 0 to `duration`, in which an
+    ArithmeticError is a serial singularity, and of `pieces`, rising times from 0 to `duration`:
+    from one to the next the motion is so smooth that some ten samples resolve it.
     """
 
     def __init__(self, inside: Callable[[float], Reference], pieces: tuple[float, ...]) -> None:
         self._inside, self.pieces, self.duration = inside, pieces, pieces[-1]
 
     def at(self, time: float) -> Reference:
-        """Return the reference at a time [s]; at rest before 0 and after `duration`.
-
-        Raises:
-            SingularConfiguration: the motion meets a singularity there.
-
-        """
+        """Return the reference at a time [s]; raises SingularConfiguration in a singularity."""
         inside = min(max(time, 0.0), self.duration)
         try:
             found = self._inside(inside)
@@ -155,11 +133,8 @@ class ActuatorSpaceMap:
         It is found in the steps that `continuation` proves to stay in the mode. The proof needs
         sigma, the least singular value of J2. The rows of J2 are unit vectors, so its squared
         singular values sum to 3, the product of the larger two is at most 3/2, and
-        sigma >= 2/3 abs(det J2): enough for most steps, and cheap.
-
-        Raises:
-            BranchEnds: a parallel singularity lies between, or no assembly has these angles.
-
+        sigma >= 2/3 abs(det J2): enough for most steps, and cheap. Raises BranchEnds where a
+        parallel singularity lies between, or no assembly has these angles.
         """
         step = math.dist(gamma, here)
         with contextlib.suppress(ArithmeticError):
@@ -193,7 +168,7 @@ class ActuatorSpaceMap:
         """Return the unit vectors r_k of the carriages at angles of any kind, nine numbers."""
         found: list[Any] = []
         for angle, leg in zip(gamma, self._legs, strict=True):
-            c, s = cos(angle), sin(angle)
+            c, s = gm.cos(angle), gm.sin(angle)
             found += [c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)]
         return found
 
@@ -222,7 +197,7 @@ class ActuatorSpaceMap:
         return np.stack(q, axis=1)
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
-        rows, rate, acceleration = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
+        rows, rate, acceleration = gm.rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
         legs = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
         return (
             *(kernel.joint_angle(at, 0) for at in legs),
@@ -231,9 +206,9 @@ class ActuatorSpaceMap:
         )
 
     def _of_posture(self, *q: Any) -> tuple[Any, ...]:
-        rows = rotation_rows((q[0], q[1], q[2], q[3]))
+        rows = gm.rotation_rows((q[0], q[1], q[2], q[3]))
         legs = [kernel.leg_motion(leg, rows, ZERO) for leg in self._legs]
-        sines = [sqrt(at.u) for at in legs]
+        sines = [gm.sqrt(at.u) for at in legs]
         # Rows t_k x r_k of J2; p = r sin(mu).
         j2 = [multiply(1.0 / s, cross3(at.along, at.p)) for s, at in zip(sines, legs, strict=True)]
         beta = (kernel.joint_angle(at, 2) for at in legs)
@@ -241,7 +216,7 @@ class ActuatorSpaceMap:
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:
         """W [rad/s] and W_dot of quaternion, gamma_dot and gamma_ddot; numbers of any kind."""
-        rows, gamma_dot, gamma_ddot = rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
+        rows, gamma_dot, gamma_ddot = gm.rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
         reach = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
         rate = _solve(reach, gamma_dot)
         moving = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
@@ -251,15 +226,15 @@ class ActuatorSpaceMap:
 
     def newton_step(self, *inputs: Any) -> tuple[Any, ...]:
         """One step of Newton's method on r_k . R e_k = 0, and the residuals before it."""
-        rows = rotation_rows(inputs[:4])
+        rows = gm.rotation_rows(inputs[:4])
         arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
-        local = [rotate_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
+        local = [gm.rotate_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
         residual = [dot3(r, e) for r, e in zip(local, arcs, strict=True)]
         # R exp(turn): the residual changes by turn . (e x r).
         slope = [cross3(e, r) for r, e in zip(local, arcs, strict=True)]
         turn = multiply(-0.5, _solve(slope, residual))
-        moved = quaternion_product(inputs[:4], (*turn, 1.0))
-        length = sqrt(sum(part * part for part in moved))
+        moved = gm.quaternion_product(inputs[:4], (*turn, 1.0))
+        length = gm.sqrt(sum(part * part for part in moved))
         return (*(part / length for part in moved), *residual)
 
 

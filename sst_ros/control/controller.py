@@ -6,20 +6,16 @@ The control laws are in `law`: by the model, by feedback, or by both.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
-from sst_ros.control.law import (
-    Command,
-    ControlLaw,
-    ControllerSettings,
-    command_limit,
-    feedback_gains,
-)
+from sst_ros.control.law import Command, ControllerSettings
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import SingularConfiguration, SstError, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
@@ -37,10 +33,6 @@ class InverseDynamics:
     It is the model that the simulation integrates, solved for the torques: tau = M gamma_ddot + h
     (the paper's Eq. 90 with every term of the scene). What lies between a command and a torque
     (limit, lag) is no part of it.
-
-    Args:
-        scene: the manipulator.
-
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -55,32 +47,23 @@ class InverseDynamics:
         body_acceleration: Vector3,
         moment: Vector3 = ZERO,
     ) -> Vector3:
-        """Torques [N m] that give W_dot in a state.
+        """Torques [N m] that give W_dot in {E} [rad/s^2] in a state.
 
-        Args:
-            quaternion: of {E} in {B}, (x, y, z, w), of any length > 0.
-            body_rate: W in {E} [rad/s].
-            body_acceleration: W_dot in {E} [rad/s^2].
-            moment: external moment on the star in {B} [N m], used where a topic gives it.
-
-        Raises:
-            SingularConfiguration: serial (sin(mu_k) = 0) or parallel (det J2 = 0); no torques
-                control the star there.
-            InputError: an argument is not finite, or the quaternion has no direction.
-
+        The quaternion (x, y, z, w) of {E} in {B} has any length > 0, the body rate is W in {E}
+        [rad/s]; the moment on the star in {B} [N m] is used where a topic gives it. Raises
+        SingularConfiguration, serial (sin(mu_k) = 0) or parallel (det J2 = 0), where no torques
+        control the star; InputError for numbers that are no state.
         """
         acting = moment if self._has_moment_topic else ()
         given = (*quaternion, *body_rate, *body_acceleration, *acting)
-        try:
+        with contextlib.suppress(ArithmeticError, ValueError):
             first, second, third, determinant, *squares = self._program(*given)
             det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
-        except (ArithmeticError, ValueError):
-            raise self._refusal(quaternion, given) from None
-        # Comparisons with NaN are false: what is not finite is refused, too.
-        sound = math.isfinite(first + second + third) and det_j2 > SINGULAR
-        if not (sound and min(squares) > SINGULAR * SINGULAR):
-            raise self._refusal(quaternion, given)
-        return first, second, third
+            # Comparisons with NaN are false: what is not finite is refused, too.
+            sound = math.isfinite(first + second + third) and det_j2 > SINGULAR
+            if sound and min(squares) > SINGULAR * SINGULAR:
+                return first, second, third
+        raise self._refusal(quaternion, given)
 
     def reference_torque(self, reference: Reference) -> Vector3:
         """Torques [N m] of a reference: the feedforward; raises as `torque`."""
@@ -89,14 +72,9 @@ class InverseDynamics:
     def gravity_torque(self, at: State | Sequence[float]) -> Vector3:
         """Torques [N m] that hold the manipulator at rest against gravity, springs and the like.
 
-        Args:
-            at: a state of a simulation; or gamma [rad], shape (3,), for the admissible assembly;
-                or the quaternion (x, y, z, w) of {E} in {B}, shape (4,).
-
-        Raises:
-            SingularConfiguration, InputError: as `torque`.
-            AssemblyError: gamma has no unique admissible assembly.
-
+        It is in a state of a simulation; or in the admissible assembly at gamma [rad], shape (3,);
+        or at the quaternion (x, y, z, w) of {E} in {B}, shape (4,). Raises as `torque`, and
+        AssemblyError where gamma has no unique admissible assembly.
         """
         pose = at.quaternion if isinstance(at, State) else tuple(at)
         if len(pose) == 3:
@@ -124,19 +102,13 @@ class InverseDynamics:
         if (least := float(sines.min())) <= SINGULAR:
             return SingularConfiguration("serial singularity, sin(mu)", least)
         determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
-        if abs(determinant) <= 2.0 * SINGULAR:
-            return SingularConfiguration("parallel singularity, det J2", determinant)
-        said = "no finite torque gives this acceleration: det J2"
-        return SingularConfiguration(said, determinant)
+        parallel = abs(determinant) <= 2.0 * SINGULAR
+        said = "parallel singularity," if parallel else "no finite torque gives this acceleration:"
+        return SingularConfiguration(f"{said} det J2", determinant)
 
 
 class ControlStopped(SstError):
-    """No torque can be computed; every later call raises the same until a reset.
-
-    Attributes:
-        time: of the motion [s].
-
-    """
+    """No torque can be computed at a `time` of the motion [s]; so in every call until a reset."""
 
     def __init__(self, reason: str, time: float) -> None:
         self.time = time
@@ -153,19 +125,10 @@ class Measurement(NamedTuple):
 class Controller:
     """A controller that tracks one reference motion by one of the five schemes of the law.
 
-    Args:
-        model: the manipulator as the controller models it; the plant may differ.
-        motion: the reference motion.
-        settings: scheme (`mode`) and gains.
-        period_s: control period, over which a command is held [s].
-
-    Attributes:
-        inertia: M_kk at the start of the motion [kg m^2], by which gains are made.
-
-    Raises:
-        InputError: the integral action would be unstable.
-        SingularConfiguration: the motion begins in a singularity.
-
+    It has a model of the manipulator, which may differ from the plant, and holds a command over a
+    control period [s]. Its `inertia` is M_kk at the start of the motion [kg m^2], by which gains
+    are made. Raises InputError where the integral action would be unstable, SingularConfiguration
+    where the motion begins in a singularity.
     """
 
     def __init__(
@@ -181,15 +144,15 @@ class Controller:
         t1, _ = virtual_work.equation_of_motion(mechanism, posture, (0.0, 0.0, 0.0))
         self.inertia: Vector3 = triple((-np.diag(t1)).tolist())
         column, rate = np.array(self.inertia)[:, None], settings.integral_rate
-        gains = feedback_gains(column, lambda name: getattr(settings, name), settings.direct)
+        gains = law.feedback_gains(column, lambda name: getattr(settings, name), settings.direct)
         kp, kd = (triple(gain[:, 0].tolist()) for gain in gains)
         # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
         allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
         refuse_unless("control", ("integral_rate", rate, not rate or rate < min(kd), allowed))
-        limit = float(command_limit(settings.torque_limit, model))
+        limit = float(law.command_limit(settings.torque_limit, model))
         known = limit if math.isfinite(limit) else None
         functions, numbers = (self._inverse.torque, self._space.star_motion), (kp, kd, self.inertia)
-        self._law = ControlLaw(settings, *functions, *numbers, rate, known, period_s)
+        self._law = law.ControlLaw(settings, *functions, *numbers, rate, known, period_s)
         self.reset()
 
     def reset(self) -> None:
@@ -217,10 +180,8 @@ class Controller:
     def command(self, time: float, measured: Measurement) -> Command:
         """Return the command at a time of the motion [s], to be held for a period.
 
-        Raises:
-            ControlStopped: the measurement is not finite, the assembly mode ends, or the model is
-                singular there.
-
+        Raises ControlStopped where the measurement is not finite, the assembly mode ends, or the
+        model is singular.
         """
         if self._failure is not None:
             raise self._failure

@@ -35,21 +35,8 @@ import numpy as np
 
 from sst_ros.control.actuator_space import Reference
 from sst_ros.errors import Problem
-from sst_ros.mechanism import generic_math
-from sst_ros.mechanism.generic_math import (
-    Quadruple,
-    Scalar,
-    Triple,
-    add,
-    atan2,
-    axpy,
-    cross3,
-    dot3,
-    quaternion_product,
-    rotation_rows,
-    sqrt,
-    triple,
-)
+from sst_ros.mechanism import generic_math as gm
+from sst_ros.mechanism.generic_math import Quadruple, Scalar, Triple, add, axpy, triple
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, coefficient, entry, positive
 from sst_ros.state import ZERO, Array, Vector3, clamp
@@ -245,7 +232,7 @@ class ControlLaw(NamedTuple):
         weight: Scalar = 1.0
         if self.limit is not None:
             torque = bound(total, self.limit)
-            weight = 1.0 - is_above(dot3(axpy(1.0, total, -1.0, torque), error))
+            weight = 1.0 - is_above(gm.dot3(axpy(1.0, total, -1.0, torque), error))
         integral = integral and axpy(1.0, integral, weight * self.period, summed)
         return Command(torque, feedforward, feedback, desired, error, rates, integral, total)
 
@@ -254,11 +241,11 @@ class ControlLaw(NamedTuple):
     ) -> tuple[Triple, Triple]:
         """Error on SO(3) [rad], and W_dot [rad/s^2] that makes it vanish."""
         x, y, z, w = observed
-        between = quaternion_product((-x, -y, -z, w), desired.quaternion)
-        turn = rotation_rows(between)
-        rate = triple(dot3(row, desired.body_rate) for row in turn)
-        forward = triple(dot3(row, desired.body_acceleration) for row in turn)
-        moving = axpy(1.0, forward, -1.0, cross3(body_rate, rate))
+        between = gm.quaternion_product((-x, -y, -z, w), desired.quaternion)
+        turn = gm.rotation_rows(between)
+        rate = triple(gm.dot3(row, desired.body_rate) for row in turn)
+        forward = triple(gm.dot3(row, desired.body_acceleration) for row in turn)
+        moving = axpy(1.0, forward, -1.0, gm.cross3(body_rate, rate))
         error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
         return error, add(moving, self._correct(integral, error, rates))
 
@@ -297,8 +284,8 @@ def rotation_vector(quaternion: Quadruple) -> Triple:
     """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
     sign = 2.0 * is_above(quaternion[3]) - 1.0
     x, y, z, w = (sign * part for part in quaternion)
-    sine = sqrt(x * x + y * y + z * z + 1e-300)
-    factor = 2.0 * atan2(sine, w) / sine
+    sine = gm.sqrt(x * x + y * y + z * z + 1e-300)
+    factor = 2.0 * gm.atan2(sine, w) / sine
     return factor * x, factor * y, factor * z
 
 
@@ -307,8 +294,7 @@ def bound(values: Triple, limit: Scalar) -> Triple:
     if isinstance(limit, float):
         return clamp(values, limit)
     return triple(
-        value - generic_math.positive(value - limit) + generic_math.positive(-limit - value)
-        for value in values
+        value - gm.positive(value - limit) + gm.positive(-limit - value) for value in values
     )
 
 

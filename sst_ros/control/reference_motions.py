@@ -58,15 +58,10 @@ def reference_motion(
 ) -> ReferenceMotion:
     """Return the reference motion of a scene.
 
-    Args:
-        scene: has a `motion`.
-        read_motion: reads a bag as a `Trajectory`, as `recording.recording.read_run_motion` does.
-
-    Raises:
-        InputError: the scene has no motion, or one that cannot be made; see `through_points`.
-        AssemblyError: the initial gamma has no unique admissible assembly.
-        SingularConfiguration: the motion meets a parallel singularity.
-
+    `read_motion` reads a bag as a `Trajectory`, as `recording.recording.read_run_motion` does.
+    Raises InputError where the scene has no motion, or one that cannot be made (`through_points`);
+    AssemblyError where the initial gamma has no unique admissible assembly; SingularConfiguration
+    where the motion meets a parallel singularity.
     """
     motion, geometry = scene.motion, Geometry.of(scene)
     if motion is None:
@@ -189,13 +184,9 @@ def move_actuators(
 
     Orientations are computed once along the path, by `continuation` in steps that cannot leave the
     assembly mode; any other orientation is computed from the nearest of these. The motion therefore
-    does not depend on what was asked before. It starts from an orientation (x, y, z, w).
-
-    Raises:
-        SingularConfiguration: the path meets a parallel singularity; the message has the time.
-        InputError: a piece of the path is longer than LONGEST.
-        AssemblyError: start is not an orientation of the manipulator at the begin of the path.
-
+    does not depend on what was asked before. It starts from an orientation (x, y, z, w). Raises
+    SingularConfiguration, with the time, where the path meets a parallel singularity, InputError
+    where a piece is longer than LONGEST, AssemblyError where it does not begin at that orientation.
     """
     space, times = ActuatorSpaceMap(geometry), _space(path, pieces)
     gammas = [path(time)[0] for time in times]

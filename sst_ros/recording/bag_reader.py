@@ -78,10 +78,8 @@ class Bag:
     def messages(self) -> Iterator[tuple[str, int, Any]]:
         """Yield key of the topic, reception [ns] and content of the messages, as the file has them.
 
-        Raises:
-            InputError: the recording is damaged, which is known at the end at the latest; it is
-                empty; or two topics match one that is requested.
-
+        Raises InputError where the recording is damaged, which is known at the end at the latest,
+        where it is empty, and where two topics match one that is requested.
         """
         files, store, empty = self._mcap_files(), message_types(), True
         stored = self._read_mcap(files) if files else self._read_by_rosbags()
@@ -175,12 +173,11 @@ class Bag:
 
 @dataclass
 class Damage:
-    """A part of a file that cannot be used; numbers that are not known are 0."""
+    """A part of a file that cannot be used; times that are not known are 0."""
 
     offset: int  # first byte of the part
     reason: str  # what is wrong with it
-    messages: int = 0  # in it
-    begin_ns: int = 0  # first reception of them
+    begin_ns: int = 0  # first reception of its messages
     end_ns: int = 0  # last one
 
 
@@ -203,8 +200,7 @@ class McapFile:
             line = f"{self.path.name}, byte {one.offset}: {one.reason}"
             if one.end_ns:  # seconds after the first message
                 first, last = ((ns - self._origin_ns) / 1e9 for ns in (one.begin_ns, one.end_ns))
-                count = f"{one.messages} messages, " if one.messages else ""
-                line += f" ({count}{first:.3f} s to {last:.3f} s)"
+                line += f" ({first:.3f} s to {last:.3f} s)"
             lines.append(line)
         if self.cut:
             lines.append(f"{self.path.name}: the file ends before its index")
@@ -232,12 +228,12 @@ class McapFile:
                         yield *channel, record.log_time, record.data
                     else:
                         reason = f"channel {record.channel_id} is not described"
-                        self.damage.append(Damage(0, reason, 1))
+                        self.damage.append(Damage(0, reason))
             if index and not self.damage:
                 self._check_data(file, data_end)
         # Only an index whose checksum is right says how many there were.
         written = (one.message_count for one in index if isinstance(one, records.Statistics))
-        self.lost = max(sum(one.messages for one in self.damage), next(written, 0) - self.count)
+        self.lost = max(0, next(written, 0) - self.count)
 
     def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
         """Return the records of the index and where it begins; none where it is not intact."""
@@ -268,18 +264,15 @@ class McapFile:
     def _read_at(self, file: IO[bytes], chunks: Sequence[ChunkIndex]) -> Iterator[McapRecord]:
         """Yield the records in each chunk, where the index says that it begins."""
         for one in sorted(chunks, key=lambda one: one.chunk_start_offset):
-            # Each channel of the chunk has a message index: 15 bytes, and 16 for a message.
-            indexed = one.message_index_length - 15 * len(one.message_index_offsets)
-            times = one.message_start_time, one.message_end_time
             begin = file.seek(one.chunk_start_offset)
             stored = _records(file.read(one.chunk_length), chunks=True)
-            yield from self._open(stored, Damage(begin, "", indexed // 16, *times))
+            place = Damage(begin, "", one.message_start_time, one.message_end_time)
+            yield from self._open(stored, place)
 
     def _read_on(self, file: IO[bytes]) -> Iterator[McapRecord]:
         """Yield the records from the beginning to where they end, or to what is no record."""
         file.seek(len(MCAP0_MAGIC))
         stored = _records(file, chunks=True)
-        broken: Damage | None = None
         while True:
             offset = file.tell()
             try:
@@ -289,12 +282,8 @@ class McapFile:
             if isinstance(record, records.DataEnd):
                 return
             if isinstance(record, Chunk):
-                times = record.message_start_time, record.message_end_time
-                broken = Damage(offset, "", 0, *times)
-                yield from self._open(iter([record]), broken)
-            elif isinstance(record, records.MessageIndex):
-                if broken is not None and broken.reason:
-                    broken.messages += len(record.records)
+                place = Damage(offset, "", record.message_start_time, record.message_end_time)
+                yield from self._open(iter([record]), place)
             else:
                 yield record
         if self.cut:

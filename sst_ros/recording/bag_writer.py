@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mcap.writer import MCAP0_MAGIC, CompressionType
+from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Connection, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
@@ -31,7 +30,7 @@ class RecordingAborted(SstError):
 
 
 class _McapStorage:
-    """Storage of a rosbags writer: MCAP with checksums and numbered messages."""
+    """Storage of a rosbags writer: MCAP with checksums."""
 
     def __init__(self, path: Path, _: CompressionMode) -> None:
         self.path = path / f"{path.name}.mcap"
@@ -42,7 +41,6 @@ class _McapStorage:
         self._writer.start("ros2", "sst_ros")
         self._schemas: dict[str, int] = {}
         self._channels: dict[int, int] = {}
-        self._sequence: Counter[int] = Counter()
 
     def add_msgtype(self, connection: Connection) -> None:
         definition = connection.msgdef
@@ -56,9 +54,8 @@ class _McapStorage:
         self._channels[connection.id] = self._writer.register_channel(*named)
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        self._sequence[connection.id] += 1
-        channel, sequence = self._channels[connection.id], self._sequence[connection.id]
-        self._writer.add_message(channel, timestamp, bytes(data), timestamp, sequence)
+        channel = self._channels[connection.id]
+        self._writer.add_message(channel, timestamp, bytes(data), timestamp)
 
     def flush(self) -> None:
         self._writer.flush()
@@ -78,12 +75,9 @@ class BagWriter(Writer):
 
     A recording gets its index when it is closed. If that does not happen (kill -9, a full disk, a
     power cut) the messages that were flushed are in its .mcap file, and `recover` makes a
-    whole recording of them. Methods do nothing after `close` and after an abort.
-
-    Raises:
-        InputError: the folder exists, or cannot be made.
-        RecordingAborted: by any method, when the file cannot be written.
-
+    whole recording of them. After that, and after `close`, `write`, `save` and `close` do nothing.
+    Raises InputError where the folder exists or cannot be made, and from any method
+    RecordingAborted when the file cannot be written.
     """
 
     STORAGE_PLUGINS = {StoragePlugin.MCAP: _McapStorage}  # noqa: RUF012  # as in its base
@@ -155,34 +149,30 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     """Write the intact messages of a recording, a folder with one .mcap file or the file, anew.
 
     The new folder is `path` with _recovered behind by default. Raises InputError where there is no
-    such file, it is no MCAP or holds nothing, or where the new folder exists.
+    such file, it cannot be read or holds nothing, or where the new folder exists.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if len(files) != 1:
         raise refusal(path, "bag", len(files), "must hold one .mcap file")
-    try:
-        with files[0].open("rb") as opened:
-            begin = opened.read(len(MCAP0_MAGIC))
-    except OSError as problem:
-        raise refusal(path, "bag", str(files[0]), f"must be readable ({problem})") from None
-    if sum(one != right for one, right in zip(begin, MCAP0_MAGIC, strict=False)) > 1 or not begin:
-        raise refusal(path, "bag", files[0].name, "must be an MCAP file")
     file, target = McapFile(files[0]), out or path.with_name(f"{path.stem}_recovered")
     if target.exists():
         raise refusal(target, "bag", str(target), "must be a new folder")
     writer: BagWriter | None = None
     connections: dict[tuple[str, str], Connection] = {}
     unknown = 0
-    for topic, kind, received_ns, data in file.messages():
-        writer = writer or BagWriter(target)
-        if not writer.knows(kind):
-            unknown += 1
-            continue
-        if (topic, kind) not in connections:
-            connections[topic, kind] = writer.connect(topic, kind)
-        writer.write(connections[topic, kind], received_ns, data)
+    try:
+        for topic, kind, received_ns, data in file.messages():
+            writer = writer or BagWriter(target)
+            if not writer.knows(kind):
+                unknown += 1
+                continue
+            if (topic, kind) not in connections:
+                connections[topic, kind] = writer.connect(topic, kind)
+            writer.write(connections[topic, kind], received_ns, data)
+    except OSError as problem:
+        raise refusal(path, "bag", str(files[0]), f"must be readable ({problem})") from None
     if writer is None:
-        raise refusal(path, "bag", 0, "holds no message that was saved")
+        raise refusal(path, "bag", files[0].name, "holds no message, or is no MCAP file")
     try:
         writer.close()
     except WriterError as problem:

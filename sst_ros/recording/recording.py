@@ -13,10 +13,9 @@ from array import array
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, require
 from sst_ros.host.output import require_free, write_into, write_table
@@ -24,7 +23,7 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import topic_tables as topics
 from sst_ros.recording.bag_reader import Bag, refusal
-from sst_ros.recording.topic_tables import Column, Integers, Series, TopicTable, places
+from sst_ros.recording.topic_tables import Integers, Series, TopicTable, places
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
@@ -107,25 +106,21 @@ class Signals:
         """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
         return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
 
-    def columns(self, table: str) -> dict[Column, NDArray[Any]]:
-        """Columns of a table, times first, whole numbers where they are in ns; see `table`."""
-        if table not in self.tables:
-            allowed = "must be one of those in the bag: " + ", ".join(self.tables)
-            raise refusal(self.bag.path, "table", table, allowed)
-        series = self.tables[table]
-        times = (self.time_ns(table), series.stamp_ns, series.received_ns)
-        found: dict[Column, NDArray[Any]] = dict(zip(topics.TIMES, times, strict=True))
-        for column, values in zip(series.columns, series.values.T, strict=True):
-            found[column] = values.astype(np.int64) if column.unit == "ns" else values
-        return found
-
     def table(self, name: str = "samples") -> pd.DataFrame:
         """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
 
-        Raises InputError where the recording has no such table.
+        Columns in ns are whole numbers. Raises InputError where the recording has no such table.
         """
-        columns = self.columns(name)
-        numbers = {column.name: values for column, values in columns.items()}
+        if name not in self.tables:
+            allowed = "must be one of those in the bag: " + ", ".join(self.tables)
+            raise refusal(self.bag.path, "table", name, allowed)
+        series = self.tables[name]
+        columns = (*topics.TIMES, *series.columns)
+        times = (self.time_ns(name), series.stamp_ns, series.received_ns)
+        numbers = {
+            column.name: values.astype(np.int64) if column.unit == "ns" else values
+            for column, values in zip(columns, (*times, *series.values.T), strict=True)
+        }
         result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index("time_ns")
         result.attrs = {column.name: column.text for column in columns}
         return result
@@ -135,10 +130,7 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
     """Read a rosbag2 recording, MCAP or sqlite3, in one pass.
 
     With `damaged`, what is intact of a damaged recording; `Signals.bag.damage` names the rest.
-
-    Raises:
-        InputError: there is no recording, it is damaged, or it has nothing of a run.
-
+    Raises InputError where there is no recording, it is damaged, or it has nothing of a run.
     """
     path, tables = Path(path), {table.key: table for table in topics.TOPIC_TABLES}
     bag = Bag(path, [*tables.values(), topics.SCENE, topics.DIAGNOSTICS], damaged=damaged)
@@ -168,8 +160,8 @@ def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
         raise refusal(path, "topics", None, allowed)
     if len(scenes) > 1:
         raise refusal(path, topics.SCENE.key, len(scenes), "the recording must hold one scene")
-    stamped = [one.key for one in (*topics.TABLES["samples"], topics.TICKS)]
-    starts = [int(found[key].stamp_ns[0]) for key in stamped if len(found[key])]
+    stamped = [one for table in topics.STAMPED if len(one := found[table.key])]
+    starts = [int(one.stamp_ns[0]) for one in stamped]
     start_ns = min(starts or [int(one.received_ns[0]) for one in found.values() if len(one)])
     origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
     scene = yaml_document.read(Scene, scenes.pop(), origin) if scenes else None
@@ -198,10 +190,9 @@ class Ticks:
 
 
 class Recording:
-    """A run from its bag. Samples are in order of time; rows belong to samples.
+    """A run from all tables of its bag. Samples are in order of time; rows belong to samples.
 
-    Args:
-        found: all tables of the recording.
+    Raises InputError, which names the fault, where they are not those of a whole run.
 
     Attributes:
         path: where the bag is.
@@ -230,9 +221,6 @@ class Recording:
         signals: those given.
         table: `Signals.table`, a table as pandas by its name: samples (the default), ticks,
             commands, commands_stamped or external_moment.
-
-    Raises:
-        InputError: the signals are not those of a whole run; the error names the fault.
 
     """
 
@@ -356,15 +344,10 @@ def _usual(lengths_ns: Integers) -> int:
 
 
 def read(path: str | Path, *, damaged: bool = False) -> Recording:
-    """Read a rosbag2 recording of a run, MCAP or sqlite3.
+    """Read a rosbag2 recording of a run, MCAP or sqlite3, a folder or its file.
 
-    Args:
-        path: folder of the recording, or its file.
-        damaged: read what is intact of a damaged recording; `signals.bag.damage` names the rest.
-
-    Raises:
-        InputError: it is no recording of a run, or a damaged one; the error names the fault.
-
+    With `damaged`, what is intact of a damaged recording; `signals.bag.damage` names the rest.
+    Raises InputError, which names the fault, where it is no recording of a run, or a damaged one.
     """
     return Recording(read_signals(path, damaged=damaged))
 
@@ -380,19 +363,15 @@ def read_run_motion(bag: str | Path) -> Trajectory:
 def export(bag: Path, out: Path, form: str = "csv", *, force: bool = False) -> list[Path]:
     """Write each table of a recording, as csv or parquet, into a folder; return the paths.
 
-    The folder is made if it is not there; `force` replaces earlier files.
-
-    Raises:
-        InputError: the recording cannot be read, `out` cannot be written or is not empty.
-        MissingDependency: pandas or pyarrow is not installed.
-
+    The folder is made if it is not there; `force` replaces earlier files. Raises InputError where
+    the recording cannot be read, `out` cannot be written or is not empty, and MissingDependency.
     """
     require_free(out, "export", force=force)
     run = read_signals(bag)
     paths = [out / f"{name}.{form}" for name in run.tables]
     with write_into(out, "export"):
-        for name, path in zip(run.tables, paths, strict=True):
-            columns = run.columns(name)
+        for (name, series), path in zip(run.tables.items(), paths, strict=True):
+            table, columns = run.table(name).reset_index(), (*topics.TIMES, *series.columns)
             about = {one.name: {"unit": one.unit, "description": one.text} for one in columns}
-            write_table({one.name: values for one, values in columns.items()}, path, about)
+            write_table({key: table[key].to_numpy() for key in table}, path, about)
     return paths

@@ -52,12 +52,11 @@ class Column(NamedTuple):
 class TopicTable(Topic):
     """A topic, the columns of its rows, and the function that reads the rows of a message.
 
-    The function raises InvalidMessage. `stamped`: rows are ordered by stamps, one at each.
+    The function raises InvalidMessage.
     """
 
     columns: tuple[Column, ...]
     rows: Callable[[Any], Rows]
-    stamped: bool
 
 
 class InvalidMessage(ValueError):
@@ -111,7 +110,7 @@ def sort_rows(table: TopicTable, times: array[int], numbers: array[float], path:
     columns, at = table.columns, np.frombuffer(times, dtype=np.int64).reshape(-1, 2)
     values = np.frombuffer(numbers, dtype=float).reshape(len(at), len(columns))
     order = np.argsort(at[:, 1], kind="stable")
-    if table.stamped:
+    if table in STAMPED:
         stamps, order = np.unique(at[:, 0], return_index=True)
         again = np.delete(np.arange(len(at)), order)
         if table in (ORIENTATION, EULER):  # an idle state shows the last sample again
@@ -199,11 +198,10 @@ def _table(
     message_type: str,
     rows: Callable[[Any], Rows],
     *parts: tuple[Sequence[str], str, str],
-    stamped: bool = True,
 ) -> TopicTable:
     """Make the table of the topic that ends in its key; a part is columns, their unit and what."""
     columns = [Column(name, unit, what, key) for names, unit, what in parts for name in names]
-    return TopicTable(key, message_type, columns=tuple(columns), rows=rows, stamped=stamped)
+    return TopicTable(key, message_type, columns=tuple(columns), rows=rows)
 
 
 _JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -260,17 +258,13 @@ COMMANDS = _table(
     # Others are dropped by the simulator too.
     lambda message: [(0, message.data.tolist())] if len(message.data) == 3 else [],
     _COMMANDED,
-    stamped=False,
 )
-STAMPED_COMMANDS = _table(
-    "commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED, stamped=False
-)
+STAMPED_COMMANDS = _table("commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED)
 MOMENT = _table(
     "external_moment",
     "geometry_msgs/msg/WrenchStamped",
     _parts("wrench.torque", "xyz", stamped=False),
     (MOMENTS, "N m", _MOMENT),
-    stamped=False,
 )
 
 SCENE = Topic("scene", "std_msgs/msg/String")
@@ -284,6 +278,9 @@ TABLES: dict[str, tuple[TopicTable, ...]] = {
     "external_moment": (MOMENT,),
 }
 """The tables of a run, and the topics in each: samples have a row at each stamp of their topics."""
+
+STAMPED = (*TABLES["samples"], TICKS)
+"""Topics whose rows are ordered by stamps, one at each."""
 
 TOPIC_TABLES = tuple(table for tables in TABLES.values() for table in tables)
 

@@ -130,7 +130,7 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_pat
     bag = damaged_copy(tmp_path / "damaged", whole, bytes(content))
     with pytest.raises(InputError, match="wrong checksum"):
         export(bag, tmp_path / "out")
-    with pytest.raises(InputError, match=r"byte \d+: chunk with wrong checksum \(40 messages, 0\."):
+    with pytest.raises(InputError, match=r"byte \d+: chunk with wrong checksum \(0\."):
         recording.read(bag)
     run = recording.read(bag, damaged=True)
     assert 30 < len(run.time_ns) < 51
