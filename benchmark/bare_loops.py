@@ -29,7 +29,7 @@ from benchmark.measure import read_options
 from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.host import processes
 from sst_ros.nodes import process, topics
-from sst_ros.nodes.publications import LOG_NS, TorqueLog, finite, stamp, state_messages
+from sst_ros.nodes.publications import LOG_NS, TorqueLog, stamp, state_messages
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
 from sst_ros.runtime.tick_loop import Pacer, SteadyTime
@@ -63,7 +63,8 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     inputs = ("commands", "commands_stamped")[:read]
     readers = [Reader(node, topics.SIMULATOR[name]) for name in inputs]
     states, log = state_messages(), TorqueLog(TICK_NS)
-    numbers = finite(*Simulation("swing").sample)
+    y, joints, torque = Simulation("swing").sample
+    numbers = y[:4], joints, torque
     wait_for(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
 
     def publish(stamp_ns: int) -> None:

@@ -14,7 +14,6 @@ only add switches between threads.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import struct
 import time
@@ -28,7 +27,7 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from sst_ros.description.robot import urdf
-from sst_ros.errors import SstError, refuse_unless
+from sst_ros.errors import refuse_unless
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
@@ -45,8 +44,6 @@ of a wake."""
 _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
-_DISCOVERY_S = 5.0
-"""A participant of DDS whose first announcements were lost announces itself again within 3 s."""
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _STAMP = struct.Struct("<iI")
 _AT_REST = (0.0,) * len(JOINTS)
@@ -84,19 +81,6 @@ def _layout(*fields: str | int, align: int = 8) -> bytes:
             encoded = field.encode() + b"\x00"
             data += struct.pack("<I", len(encoded)) + encoded
     return bytes(data[_STAMP.size :]) + bytes(-len(data) % align)
-
-
-class NotFinite(SstError):
-    """A state has a number that is not finite; it is not published."""
-
-
-def finite(y: Sequence[float], joints: Sequence[float], torque: Sequence[float]) -> Numbers:
-    """Return the numbers of a state, or raise NotFinite; y begins with the quaternion."""
-    quaternion = y[:4]
-    # One number that is not finite makes the sum so.
-    if not math.isfinite(sum(joints) + sum(quaternion) + sum(torque)):
-        raise NotFinite(f"not finite, so not published: {quaternion}, {joints}, {torque}")
-    return quaternion, joints, torque
 
 
 def state_messages(frame_id: str = "") -> tuple[Message, Message, Message]:
@@ -143,11 +127,7 @@ def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
         theta, psi = total + difference, total - difference
     else:
         theta, psi = 0.0, 2.0 * (total - difference)
-    # In (-pi, pi], as atan2 gives it.
-    if not -math.pi < theta <= math.pi:
-        theta -= math.copysign(2.0 * math.pi, theta)
-    if not -math.pi < psi <= math.pi:
-        psi -= math.copysign(2.0 * math.pi, psi)
+    theta, psi = (math.remainder(angle, 2.0 * math.pi) for angle in (theta, psi))
     return theta, 2.0 * math.atan2(sine, cosine), psi
 
 
@@ -203,35 +183,12 @@ def follows_clock(node: Node) -> bool:
     return bool(node.get_parameter("use_sim_time").value)
 
 
-class PublishedClock:
-    """Publishes /clock; refused where it is published already, or the node itself follows it."""
-
-    def __init__(self, node: Node) -> None:
-        own, parameter = node.get_fully_qualified_name(), "publish_clock"
-        allowed = "a node with use_sim_time follows /clock and cannot be its source"
-        refuse_unless(own, (parameter, True, not follows_clock(node), allowed))
-        others: list[str] = []
-        deadline = time.monotonic() + _DISCOVERY_S  # until then, or one is found by its name
-        while time.monotonic() < deadline and (not others or topics.UNNAMED in others):
-            others = topics.publishers(node, "/clock")
-            time.sleep(0.02)
-        allowed = f"/clock is published already, by {', '.join(others)}"
-        refuse_unless(own, (parameter, True, not others, allowed))
-        self._publisher = topics.SIMULATOR["clock"].publisher(node)
-        self.now_ns = node.get_clock().now().nanoseconds
-
-    def publish(self, now_ns: int | None = None) -> None:
-        """Publish the time; without one the last again, for late subscribers."""
-        self.now_ns = self.now_ns if now_ns is None else now_ns
-        self._publisher.publish(clock_message(self.now_ns))
-
-
 class SimulatorTopics:
     """Publishers of the simulator: the `RunOutput` of its run."""
 
     def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:
         self._node, own = node, topics.SIMULATOR
-        self._clock = PublishedClock(node) if given.publish_clock else None
+        self._clock = own["clock"].publisher(node) if given.publish_clock else None
         history = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
         shown = ("joint_states", "orientation", "euler_zyz", "applied_torques")
@@ -248,11 +205,18 @@ class SimulatorTopics:
         names = [node.resolve_topic_name(name) for name in given.wait_for_subscribers if name]
         unknown = [name for name in names if name not in made]
         allowed = f"must be topics that the node publishes: {', '.join(sorted(made))}"
-        problem = "wait_for_subscribers", unknown, not unknown, allowed
-        refuse_unless(node.get_fully_qualified_name(), problem)
+        follows = self._clock is not None and follows_clock(node)
+        other = "a node with use_sim_time follows /clock and cannot be its source"
+        refuse_unless(
+            node.get_fully_qualified_name(),
+            ("wait_for_subscribers", unknown, not unknown, allowed),
+            ("publish_clock", True, not follows, other),
+        )
+        self._time_ns = 0  # of the clock that it publishes
+        if self._clock is not None:
+            self._time_ns = self.now_ns()
         self._awaited = [made[name] for name in names]
         self._samples, self._idles = state_messages(), state_messages(IDLE_FRAME_ID)
-        self._valid: Numbers = (0.0, 0.0, 0.0, 1.0), _AT_REST * 2, ZERO
         moments = scene.moment is not None and scene.moment.topic
         ticks, period_ns = given.run.ticks_per_sample, given.run.period_ns
         self._log_ticks = math.ceil(LOG_NS / (ticks * period_ns)) * ticks
@@ -261,9 +225,7 @@ class SimulatorTopics:
 
     def now_ns(self) -> int:
         """Return the ROS time [ns]; 0 as long as a followed clock has none."""
-        if self._clock is not None:
-            return self._clock.now_ns
-        return int(self._node.get_clock().now().nanoseconds)
+        return self._time_ns or int(self._node.get_clock().now().nanoseconds)
 
     def missing_subscribers(self) -> list[str]:
         """Return the topics of wait_for_subscribers that have no subscriber."""
@@ -280,15 +242,14 @@ class SimulatorTopics:
         self._log.append(torque, moment, count)
 
     def sample(self, simulation: Simulation, stamp_ns: int) -> None:
-        """Publish a sample of the run, and from time to time the torques logged up to it.
-
-        Where a number is not finite, NotFinite is raised and nothing is published.
-        """
+        """Publish a sample of the run, and from time to time the torques logged up to it."""
         logged = len(self._log)
         self._count_subscribers(COUNT_NS if logged else 0)  # the first of a run goes to all
-        numbers = finite(*simulation.sample)
+        y, joints, torque = simulation.sample
+        numbers = y[:4], joints, torque
         if self._clock is not None:
-            self._clock.publish(stamp_ns)
+            self._time_ns = stamp_ns
+            self._clock.publish(clock_message(stamp_ns))
         if logged >= self._log_ticks or not logged or self._torques not in self._read:
             self.flush()
             self._log_from_ns = stamp_ns
@@ -308,18 +269,16 @@ class SimulatorTopics:
         joint_states has this stamp and IDLE_FRAME_ID, the other topics the stamp zero.
         """
         if self._clock is not None:
-            self._clock.publish()
+            self._clock.publish(clock_message(self._time_ns))  # again, for late subscribers
         self.flush()
         self._torques.publish(self._log.take(0))
-        with contextlib.suppress(NotFinite):  # then the last valid one is shown
-            self._valid = finite(state.quaternion, sum(state.joints, ()), state.torque)
-        quaternion, joints, torque = self._valid
+        joints, torque = sum(state.joints, ()), state.torque
         if at_rest:
             joints, torque = (*joints[:9], *_AT_REST), ZERO
         self._count_subscribers(0)
         for publisher, message in self._messages(self._idles):
             at = stamp(stamp_ns if publisher is self._shown[0] else 0)
-            publisher.publish(message(at, (quaternion, joints, torque)))
+            publisher.publish(message(at, (state.quaternion, joints, torque)))
 
     def publish_phase(self, phase: str) -> None:
         """Publish and log the phase, with the reason of a fault."""
@@ -329,12 +288,6 @@ class SimulatorTopics:
             log.error(f"{phase}; the last valid state is held until ~/reset")
         else:
             log.info(phase)
-
-    def rivals(self) -> list[str]:
-        """Names of other nodes that publish /clock while this one does."""
-        own = self._node.get_fully_qualified_name()
-        names = [] if self._clock is None else topics.publishers(self._node, "/clock")
-        return [name for name in names if name != own]
 
     def _count_subscribers(self, age_ns: int) -> None:
         """Find the topics that are subscribed to, unless that was done so long ago [ns]."""

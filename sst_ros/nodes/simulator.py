@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import os
 import subprocess
@@ -146,8 +145,8 @@ class Simulator(Worker[SimulatorParameters]):
     def _report(self) -> None:
         """Publish the diagnostics, log what is new, request gauges for the next time."""
         self._schedule()  # the threads that have begun since: of callbacks and of DDS
-        own = self.node.get_fully_qualified_name()
-        commands = [topics.SIMULATOR[name].at(own) for name in ("commands", "commands_stamped")]
+        named = self.node.resolve_topic_name
+        commands = [named(topics.SIMULATOR[name].name) for name in ("commands", "commands_stamped")]
         values = self._diagnostics.values(sum(map(self.node.count_publishers, commands)))
         level, text, news = self._diagnostics.status(values, [*self._warnings(commands)])
         for line in news:
@@ -160,16 +159,17 @@ class Simulator(Worker[SimulatorParameters]):
 
     def _warnings(self, commands: Sequence[str]) -> Iterator[str]:
         """Conditions of the graph that keep a run from what its user expects."""
-        if rivals := self._topics.rivals():
+        own, clocks = self.node.get_fully_qualified_name(), topics.publishers(self.node, "/clock")
+        rivals = [name for name in clocks if name != own]
+        if rivals and self.parameters.publish_clock:
             yield f"/clock is also published by {', '.join(rivals)}"
         if follows_clock(self.node) and self._topics.now_ns() == 0:
             yield "use_sim_time is set and there is no /clock: the run waits for it"
         for topic in commands:
             for name in topics.publishers(self.node, topic, best_effort=True):
                 yield f"{topic} of {name} is best effort and not received: publish it reliably"
-        own = self.node.get_fully_qualified_name()
         # Not by the names of the graph: a node that has ended may stay there.
-        if self.node.count_publishers(topics.SIMULATOR["phase"].at(own)) > 1:
+        if self.node.count_publishers(f"{own}/phase") > 1:
             yield f"another node is named {own}, too"
 
 
@@ -236,18 +236,11 @@ class CodeCompiler:
             self._timer = every(node, _DELAY_S, self.start)
 
     def start(self) -> None:
-        """Start the compiler once, unless another process compiles; also at the end of the node."""
+        """Start the compiler once, also at the end of the node; it ends where another compiles."""
         if self._timer is None:
             return
         self._node.destroy_timer(self._timer)
         self._timer = None
-        try:  # the lock of `compiled_method.make_code`, not there before the first time
-            with (cache_folder() / "lock").open("r") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if isinstance(error, BlockingIOError):
-                self._node.get_logger().info("another process compiles: this one does not")
-                return
         given = self._given
         words = ["compile", given.scene, "--integrator", given.integrator]
         compiler = subprocess.Popen(
@@ -262,7 +255,7 @@ class CodeCompiler:
         self._node.get_logger().info(text)
 
 
-class FollowedClock:
+class FollowedClock(SteadyTime):
     """The ROS clock of a node with use_sim_time, as a time source of the pacer."""
 
     def __init__(self, node: Node) -> None:
@@ -277,7 +270,7 @@ class FollowedClock:
         """Return the time [ns]; 0 before the first /clock."""
         return int(self._clock.now().nanoseconds)
 
-    def sleep(self, seconds: float, /) -> None:
+    def sleep(self, seconds: float) -> None:
         """Wait for the next /clock."""
         self._moved.wait(_LONGEST_WAIT_S)
         self._moved.clear()

@@ -16,7 +16,7 @@ from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import Simulation
 
 OK, WARN, ERROR = range(3)
-_ROWS = 16
+_ROWS = 32
 
 GAUGES = {
     "error_estimate": "estimated error of the orientation [rad]",
@@ -37,7 +37,7 @@ GAUGES = {
 }
 """Keys of the values that the simulation itself reports."""
 
-KEYS = {
+_COUNTS = {
     "phase": "phase of the run",
     "ticks": "steps done",
     "ticks_missed": "steps dropped because the machine was late",
@@ -66,9 +66,9 @@ KEYS = {
     "states_set": "times that a state was set",
     "scheduling": "scheduling of the thread of the run",
     "cpu_dma_latency": "largest exit latency of idle states that the machine was asked to use",
-    **GAUGES,
-    "fault": "reason why the run stopped",
 }
+
+KEYS = {**_COUNTS, **GAUGES, "fault": "reason why the run stopped"}
 """Keys of /diagnostics, in order."""
 
 
@@ -84,64 +84,34 @@ class RunDiagnostics:
         self._before = (0, 0.0)
         self._noted: dict[str, Any] = {}
         self._warned: list[str] = []
-        self._rows: list[tuple[float, list[object], float, int]] = []
-        self._last: tuple[float, list[object], float, int] | None = None
-        self._count, self._stride = 0, 1
+        self._rows: dict[float, tuple[list[object], float, int]] = {}  # by simulated time [s]
 
     def values(self, publishers: int) -> dict[str, Any]:
         """Return the value of each key that has one."""
-        count, commands = self._loop.counters, self._input
-        ticks, wall, age = count.ticks, count.wall_s, commands.age
-        mean, deviation, largest = count.lateness_us
+        count, pacer, commands = self._loop.counters, self._pacer, self._input
+        period, ticks, wall, age = self._period_s, count.ticks, count.wall_s, commands.age
         new, passed = ticks - self._before[0], wall - self._before[1]
         self._before = (ticks, wall)
-        values: dict[str, Any] = {
-            "phase": self._loop.phase.value,
-            "ticks": ticks,
-            "ticks_missed": self._pacer.missed,
-            "overruns": self._pacer.overruns,
-            "clock_jumps": self._pacer.jumps,
-            "samples_published": count.published,
-            "step_mean_us": 1e6 * count.step_mean_s,
-            "step_max_us": 1e6 * count.step_max_s,
-            "tick_time_left": 1.0 - count.step_mean_s / self._period_s,
-            "tick_time_left_least": 1.0 - count.step_max_s / self._period_s,
-            "late_mean_us": mean,
-            "late_std_us": deviation,
-            "late_max_us": largest,
-            "real_time_factor": ticks * self._period_s / wall if wall else 0.0,
-            "real_time_factor_now": new * self._period_s / passed if passed > 0 else 0.0,
-            "wall_time_s": wall,
-            "simulated_time_s": ticks * self._period_s,
-            "commands_received": commands.received,
-            "commands_dropped": commands.dropped,
-            "commands_dropped_because": ", ".join(
-                f"{reason} {times}" for reason, times in dict(commands.reasons).items()
-            ),
-            "commands_clamped": commands.clamped,
-            "command_timeouts": commands.timeouts,
-            "command_age_s": "none" if age is None else age,
-            "command_publishers": publishers,
-            "resets": count.resets,
-            "states_set": count.states_set,
-            "scheduling": self.scheduling,
-            "cpu_dma_latency": self.cpu_dma_latency,
-            **self.gauges,
-            "fault": self._loop.fault,
-        }
-        if not ticks:
-            return values
-        # Of the table the newest row is kept and at most 16 before it, evenly over the run.
-        keys = ("error_estimate", "energy_residual_J", "closure_residual")
-        errors, seconds = [self.gauges.get(key) for key in keys], values["simulated_time_s"]
-        if self._last is not None and self._last[0] != seconds:
-            self._count += 1
-            if self._count % self._stride == 0:
-                self._rows.append(self._last)
-            if len(self._rows) >= _ROWS:
-                self._rows = self._rows[1::2]
-                self._stride *= 2
-        self._last = seconds, errors, values["real_time_factor"], self._pacer.missed
+        mean, most = count.step_mean_s, count.step_max_s
+        factor = ticks * period / wall if wall else 0.0
+        factor_now = new * period / passed if passed > 0 else 0.0
+        dropped = ", ".join(f"{reason} {times}" for reason, times in dict(commands.reasons).items())
+        row = (
+            *(self._loop.phase.value, ticks, pacer.missed, pacer.overruns, pacer.jumps),
+            *(count.published, 1e6 * mean, 1e6 * most, 1.0 - mean / period, 1.0 - most / period),
+            *(*count.lateness_us, factor, factor_now, wall, ticks * period),
+            *(commands.received, commands.dropped, dropped, commands.clamped, commands.timeouts),
+            *("none" if age is None else age, publishers, count.resets, count.states_set),
+            *(self.scheduling, self.cpu_dma_latency),
+        )
+        values: dict[str, Any] = dict(zip(_COUNTS, row, strict=True))
+        values |= {**self.gauges, "fault": self._loop.fault}
+        if ticks:
+            keys = ("error_estimate", "energy_residual_J", "closure_residual")
+            errors = [self.gauges.get(key) for key in keys]
+            self._rows[ticks * period] = errors, factor, pacer.missed
+        if len(self._rows) == _ROWS:  # half of those of a long run stay, and the newest
+            self._rows = dict([*self._rows.items()][1::2])
         return values
 
     def status(self, values: dict[str, Any], warnings: list[str]) -> tuple[int, str, list[str]]:
@@ -185,34 +155,27 @@ class RunDiagnostics:
         columns = "{:>12} {:>11} {:>11} {:>11} {:>10} {:>8}"
         yield columns.format("run time", "error", "energy", "closure", "real-time", "ticks")
         yield columns.format("[s]", "[rad]", "[J]", "[1]", "factor", "missed")
-        for seconds, errors, factor, missed in filter(None, (*self._rows, self._last)):
+        for seconds, (errors, factor, missed) in self._rows.items():
             cells = (f"{value:.2e}" if isinstance(value, float) else "-" for value in errors)
             yield columns.format(f"{seconds:.3f}", *cells, f"{factor:.3f}", missed)
 
 
 def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
     """Read the gauges in the thread of the run; those without a finite value are left out."""
-    state, hold = simulation.state, held.errors(simulation)
-    conditioning = simulation.conditioning
+    state, conditioning = simulation.state, simulation.conditioning
     angles = (*state.joints.gamma, *state.joints.mu, *state.joints.beta)
     margins: dict[str, list[float]] = {"gamma": [], "mu": [], "beta": []}
     for limit in limits_of(simulation.scene, simulation.geometry):
         margins[JOINTS[limit.joint].partition("_")[0]].append(limit.distance(angles))
-    values: dict[str, Any] = {
-        "error_estimate": simulation.error_estimate,
-        "rate_error_estimate": simulation.rate_error_estimate,
-        "hold_error_start": None if hold is None else hold[0],
-        "hold_error_middle": None if hold is None else hold[1],
-        "energy_residual_J": simulation.energy_residual,
-        "closure_residual": simulation.closure_residual,
-        "singularity_serial": conditioning["sin_mu"],
-        "singularity_parallel": conditioning["det_j2"],
-        "stroke_margin_rad": min(margins["gamma"], default=None),
-        "workspace_margin_rad": min(margins["beta"], default=None),
-        "integrator": simulation.method,
-        "integrator_changes": len(simulation.changes),
-        "step_evaluations": simulation.evaluations / max(simulation.accepted_steps, 1),
-        "step_budget": simulation.step_budget,
-    }
-    known = {key: value for key, value in values.items() if value is not None}
+    row: tuple[Any, ...] = (
+        *(simulation.error_estimate, simulation.rate_error_estimate),
+        *(held.errors(simulation) or (None, None)),
+        *(simulation.energy_residual, simulation.closure_residual),
+        *(conditioning["sin_mu"], conditioning["det_j2"]),
+        *(min(margins[joint], default=None) for joint in ("gamma", "beta")),
+        *(simulation.method, len(simulation.changes)),
+        simulation.evaluations / max(simulation.accepted_steps, 1),
+        simulation.step_budget,
+    )
+    known = {key: x for key, x in zip(GAUGES, row, strict=True) if x is not None}
     return {key: x for key, x in known.items() if isinstance(x, str) or math.isfinite(x)}

@@ -54,9 +54,7 @@ class SimulatorParameters(Section):
         default=1.0,
         most=1000.0,
     )
-    publish_clock: bool = entry(
-        "publish the simulated time on /clock; refused where there is a clock", default=False
-    )
+    publish_clock: bool = entry("publish the simulated time on /clock", default=False)
     publish_description: bool = entry(
         "publish the scene as URDF on robot_description", default=True
     )

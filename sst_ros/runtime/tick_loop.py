@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.mechanism.generic_math import add, axpy
@@ -35,21 +35,16 @@ RunOutput: TypeAlias = Any
 """Where a run publishes: what has the methods of `nodes.publications.SimulatorTopics`."""
 
 
-class TimeSource(Protocol):
-    """Clock that deadlines are measured by."""
+class SteadyTime:
+    """The clock that deadlines are measured by: the monotonic clock of the machine."""
 
     def now_ns(self) -> int:
         """Return the time [ns]."""
+        return time.monotonic_ns()
 
-    def sleep(self, seconds: float, /) -> None:
-        """Wait for about this time [s]; may return early."""
-
-
-class SteadyTime:
-    """The monotonic clock of the machine."""
-
-    now_ns = staticmethod(time.monotonic_ns)
-    sleep = staticmethod(time.sleep)
+    def sleep(self, seconds: float) -> None:
+        """Wait for about this time [s]; a clock that derives from this one may return early."""
+        time.sleep(seconds)
 
 
 class Pacer:
@@ -60,7 +55,7 @@ class Pacer:
     """
 
     def __init__(
-        self, period_ns: int, speed: float, source: TimeSource, tolerance_ns: int = 0
+        self, period_ns: int, speed: float, source: SteadyTime, tolerance_ns: int = 0
     ) -> None:
         self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
         self._anchor = self._count = self._seen = 0

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that compiles a scene for the next start: late, of low priority, one only."""
+"""The process that compiles a scene for the next start: late, of low priority."""
 
 import contextlib
-import fcntl
 import os
 import re
 from unittest.mock import Mock
@@ -49,12 +48,3 @@ def test_it_starts_late_once_and_of_the_lowest_priority(node, compiling, tmp_pat
     with contextlib.suppress(ChildProcessError):  # it has ended, and is waited for
         os.waitpid(int(pid), 0)
     assert (tmp_path / "started").read_text() == "19\n"
-
-
-def test_there_is_one_while_another_process_compiles(node, compiling, tmp_path):
-    with (tmp_path / "cache" / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        compiling.start()
-    assert "another process compiles: this one does not" in lines(node)
-    assert not (tmp_path / "started").exists()
-    node.destroy_timer.assert_called_once_with(node.create_timer.return_value)
