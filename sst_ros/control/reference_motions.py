@@ -278,12 +278,9 @@ def through_points(
     """
     count = len(times)
     problems = [] if count else [Problem("points", 0, "must be one or more")]
-    rows = [
-        _read_rows("times", [[time] for time in times], count, problems),
-        _read_rows("positions", positions, count, problems),
-        _read_rows("velocities", velocities, count, problems),
-        _read_rows("accelerations", accelerations, count, problems),
-    ]
+    names = "times", "positions", "velocities", "accelerations"
+    given = [[time] for time in times], positions, velocities, accelerations
+    rows = [_read_rows(*one, count, problems) for one in zip(names, given, strict=True)]
     if not problems:
         at, gamma, rates, seconds = map(np.array, rows)
         at = at.ravel()

@@ -21,8 +21,6 @@ from typing import IO, Any, TypeAlias
 
 import yaml
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
 from mcap.records import Chunk, ChunkIndex, McapRecord
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
@@ -32,8 +30,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, Problem
 
-_RECORD_HEAD = 9  # bytes of opcode and length before the content of an MCAP record
-_DATA_END_SIZE = _RECORD_HEAD + 4
+_DATA_END_SIZE = 9 + 4  # bytes of opcode and length, and of its content
 _PIECE = 1 << 20
 
 RawMessage: TypeAlias = tuple[str, str, int, bytes]
@@ -286,9 +283,7 @@ class McapFile:
                 yield from self._open(iter([record]), place)
             else:
                 yield record
-        if self.cut:
-            yield from self._read_cut_chunk(file, offset)
-        else:
+        if not self.cut:
             self.damage.append(Damage(offset, "unreadable bytes"))
 
     def _open(self, stored: Iterator[McapRecord], place: Damage) -> Sequence[McapRecord]:
@@ -306,16 +301,6 @@ class McapFile:
             return ()
         self.unverified += not chunk.uncompressed_crc
         return found
-
-    def _read_cut_chunk(self, file: IO[bytes], offset: int) -> Iterator[McapRecord]:
-        """Yield the whole records of an uncompressed chunk that the file ends in."""
-        file.seek(offset)
-        with contextlib.suppress(Exception):  # the file ends anywhere
-            if file.read(_RECORD_HEAD)[0] != Opcode.CHUNK:
-                return
-            chunk = Chunk.read(ReadDataStream(file))
-            if not chunk.compression and len(chunk.data) < chunk.uncompressed_size:
-                yield from _records(chunk.data)
 
     def _check_data(self, file: IO[bytes], end: int) -> None:
         """Check the data section, which ends at `end`: also what lies between its chunks."""
