@@ -7,15 +7,12 @@ y' = f(y, t, p), which obey the variational equation
     S' = (df/dy) S + df/dp,  S(0) = dy(0)/dp
 
 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14). Both
-derivatives are those of the traced equation of motion, exact to rounding, and are integrated with
-the motion, so that one error control holds for both. Where an elastic stop is met or left its
-torque is zero on both sides: f is continuous, and S as well. A jump (saltation) would follow from a
-jump of f alone (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems,
-Springer 2004, section 7.2).
+derivatives are those of the traced equation of motion, exact to rounding, and one error control
+holds for S and the motion. Where an elastic stop is met or left f is continuous, and so is S (Leine
+and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, Springer 2004, 7.2).
 
 In sizes of the parameters, the singular values of the sensitivities over the measuring errors show
-which combinations are known and how well: a motion, and even more a single number read off a
-figure, may fix fewer combinations than there are parameters.
+which combinations are known and how well: often fewer than there are parameters.
 """
 
 from __future__ import annotations
