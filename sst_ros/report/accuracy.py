@@ -306,32 +306,16 @@ def _time(row: Series[Any]) -> str:
     return f"{wall_ms:.2g} ms" if wall_ms < 99.5 else f"{wall_ms:.0f} ms"
 
 
-HEADS = {
-    "setting": "setting",
-    "evaluations": "evaluations",
-    "wall_min_s": "time [s]",
-    "final_orientation_rad": "end [rad]",
-    ERROR: "largest [rad]",
-    "largest_gamma_rad": "gamma [rad]",
-    "largest_gamma_dot_rad_per_s": "rate [rad/s]",
-}
-"""Columns of the grid that the terminal shows, and their heads there."""
-
-
 def accuracy_text(study: WorkPrecision) -> str:
-    """Format a study for the terminal."""
-    shown = study.rows.assign(setting=[_setting(row) for _, row in study.rows.iterrows()])
-    shown = shown[list(HEADS)].rename(columns=HEADS)
-    below = study.rows[ERROR].astype(float) < study.floor
-    shown[""] = below.map({True: "*", False: ""})
-    shown["failure"] = [f"FAILED: {why[:60]}" if why else "" for why in study.rows.failure]
+    """Format a study for the terminal: its part of the page, and the grid."""
+    shown = study.rows.drop(columns=["scene", "final_gamma_rad", "final_gamma_dot_rad_per_s"])
+    shown["failure"] = [f"FAILED: {why[:40]}" if why else "" for why in study.rows.failure]
     grid = shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
-    given = {"fastest": name_fastest(study), "provenance": provenance()}
-    return render("accuracy.txt", study=study, grid=grid, below=sum(below), **given)
+    return accuracy_page([study], whole=False) + f"\n{grid}\n"
 
 
-def accuracy_page(studies: Sequence[WorkPrecision]) -> str:
-    """Write studies as one Markdown page."""
+def accuracy_page(studies: Sequence[WorkPrecision], *, whole: bool = True) -> str:
+    """Write studies as one Markdown page, or without its introduction and summary."""
     rows = []
     for each in studies:
         words = {target: f"{_setting(x)}: {_time(x)}" for target, x in each.fastest.items()}
@@ -340,6 +324,7 @@ def accuracy_page(studies: Sequence[WorkPrecision]) -> str:
         rows.append({"scene": each.scene, "run": run, **cells})
     return render(
         "accuracy.md",
+        whole=whole,
         studies=studies,
         summary=markdown(data_frame(rows)),
         fastest=name_fastest,
