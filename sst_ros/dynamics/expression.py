@@ -126,13 +126,8 @@ class Expression:
     __rmul__ = __mul__
 
     def __truediv__(self, other: Value) -> Value:
-        if other is self:
-            return 1.0
-        if not isinstance(other, (Expression, Number)):
-            if abs(other) == 1.0:
-                return self * other
-            if math.frexp(other)[0] in (0.5, -0.5):  # a power of two: its inverse is exact
-                return self * (1.0 / other)
+        if _is(other, 1.0) or _is(other, -1.0):
+            return self * other
         mine = _drop_minus(self)
         return -(mine / other) if mine is not None else self.graph.node("div", self, other)
 
@@ -202,8 +197,7 @@ class Number(float):
     __truediv__, __rtruediv__ = _folds("div")
 
     def __neg__(self) -> Value:
-        op, *args = self.origin if isinstance(self.origin, tuple) else ("",)
-        return Number(-float(self), args[0] if op == "neg" else ("neg", self.origin))
+        return Number(-float(self), ("neg", self.origin))
 
 
 def _is(value: Value, number: float) -> bool:
@@ -275,18 +269,18 @@ class Program:
         return "\n".join([*lines, f"    return ({', '.join(results)},)\n"])
 
     def split(
-        self, late: Container[str], slots: Slots | None = None
+        self, late: Container[int], slots: Slots | None = None, names: Sequence[str] = ()
     ) -> tuple[list[str], list[str], list[str]]:
         """Lines v0 = .., v1 = .., a step each, that depend on no `late` input; the others; outputs.
 
-        With `slots` numbers have the names of their slots.
+        With `slots` numbers have the names of their slots; inputs may have other `names`.
         """
-        names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
-        is_late = [name in late for name in self.inputs]
+        words = [*(names or self.inputs), *(f"v{i}" for i in range(len(self.steps)))]
+        is_late = [number in late for number in range(len(self.inputs))]
 
         def word(operand: float | int) -> str:
             if isinstance(operand, int):
-                return names[operand]
+                return words[operand]
             if slots is not None and isinstance(operand, Number):
                 return slots.name(operand)
             return repr(operand) if operand >= 0.0 else f"({operand!r})"

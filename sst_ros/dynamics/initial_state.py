@@ -141,17 +141,15 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
         ("stroke.at_end", end, end != "elastic", refused),
     )
     mechanism = virtual_work.Mechanism.of(scene)
-    value = scene.moment.value if scene.moment is not None else None
-    constant = np.array(value or ZERO)
+    constant = np.array((scene.moment and scene.moment.value) or ZERO)
 
     def derivative(_: float, *inputs: float) -> tuple[float, ...]:
         (x, y, z, w, *rate), torque = inputs[:7], np.array(inputs[8:11])
         moment = constant + inputs[11:14] if len(inputs) > 11 else constant
         try:
-            found = accelerate_by_paper(mechanism, inputs[:7], torque, moment)
+            acceleration, gamma_dot = accelerate_by_paper(mechanism, inputs[:7], torque, moment)
         except SingularConfiguration as error:
             raise ArithmeticError(str(error)) from None
-        acceleration, gamma_dot = found
         turning = quaternion_rate((x, y, z, w), triple(rate))
         omega = rotation_matrix(inputs[:4]) @ rate
         return (*turning, *acceleration.tolist(), float(torque @ gamma_dot + moment @ omega))

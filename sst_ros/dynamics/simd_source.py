@@ -9,7 +9,6 @@ what, and leaves no scalar copy of a loop.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from itertools import accumulate
 
 from sst_ros.dynamics.expression import Program, Slots
@@ -41,19 +40,6 @@ class Layout:
         return [self.lane(group, row) for row in range(count)]
 
 
-def split(
-    program: Program, early: Sequence[bool], slots: Slots | None = None
-) -> tuple[list[str], list[str], list[str]]:
-    """Lines of a program that need early inputs only, the other lines, and the results.
-
-    Inputs are called u0, u1, ... here, and results of lines v0, v1, ...; `early` says of each input
-    whether it is known earlier than others.
-    """
-    names = tuple(f"u{i}" for i in range(len(program.inputs)))
-    late = [name for name, known in zip(names, early, strict=True) if not known]
-    return replace(program, inputs=names).split(late, slots)
-
-
 def evaluate_lanes(
     program: Program, given: Sequence[str], at: Layout, out: str, slots: Slots | None = None
 ) -> list[str]:
@@ -73,11 +59,12 @@ def evaluate_lanes(
             v8 = v7 * u1
             block[640 + i] = v257
     """
-    same = [not text.startswith("block[") for text in given]
-    before, after, results = split(program, same, slots)
-    loads = put([f"u{i}" for i in range(len(given))], given)
-    head = [line for line, early in zip(loads, same, strict=True) if early]
-    inside = [line for line, early in zip(loads, same, strict=True) if not early]
+    names = [f"u{i}" for i in range(len(given))]
+    late = [i for i, text in enumerate(given) if text.startswith("block[")]
+    before, after, results = program.split(late, slots, names)
+    loads = put(names, given)
+    head = [line for i, line in enumerate(loads) if i not in late]
+    inside = [loads[i] for i in late]
     stores = put(at.rows(out, len(results)), results)
     return [*head, *before, *loop(at, [*inside, *after, *stores])]
 
@@ -119,8 +106,9 @@ def linearise_by_columns(
                 for k in range(7):
                     matrix[i][k] = columns[8 * i + k]
     """
-    size, directions = len(state), program.inputs[1 + len(state) + len(drive) :]
-    before, along, results = program.split(directions, slots)
+    size, first = len(state), 1 + len(state) + len(drive)
+    directions = program.inputs[first:]
+    before, along, results = program.split(range(first, len(program.inputs)), slots)
     width = -(-len(directions) // _COLUMNS) * _COLUMNS
     by_time = "d_t" in directions
     states = len(directions) - by_time

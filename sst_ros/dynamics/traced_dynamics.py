@@ -215,10 +215,7 @@ recent_ode = lru_cache(maxsize=64)(ODE)
 
 
 def limit_distances(
-    limits: Sequence[Limit],
-    ends: Sequence[tuple[Scalar, Scalar]],
-    model: kernel.Model,
-    state: Sequence[Any],
+    limits: Sequence[Limit], ends: Sequence[Any], model: kernel.Model, state: Sequence[Any]
 ) -> tuple[Scalar, ...]:
     """Return a number for each limit, positive inside, then the rate of each.
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from sst_ros.dynamics.expression import Program, Slots
-from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, flat_sin, indent, loop, put, split
+from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, flat_sin, indent, loop, put
 from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.host import compiled_module
 from sst_ros.mechanism.geometry import Array
@@ -164,10 +164,11 @@ def source(ode: ODE, nodes: int, limits: Program | None) -> tuple[list[str], Lay
                         block[200 + i] = y4 + (block[104 + i] * g4_0 + block[112 + i] * g4_1)
     """
     size, inputs = len(ode.state), len(ode.program.inputs)
-    slots, of_time = Slots(), [True, *(False,) * size, *(True,) * (inputs - 1 - size)]
-    before, after, results = split(ode.program, of_time, slots)
-    held, moving, _ = split(ode.program, [False, *(True,) * (inputs - 1)], slots)
-    _, turn, turned = split(ode.program.prune(ode.program.outputs[:4]), of_time, slots)
+    slots, state = Slots(), range(1, 1 + size)
+    y, u = [f"y{j}" for j in range(size)], [f"u{i}" for i in range(inputs)]
+    before, after, results = ode.program.split(state, slots, u)
+    held, moving, _ = ode.program.split((0,), slots, u)
+    _, turn, turned = ode.program.prune(ode.program.outputs[:4]).split(state, slots, u)
     # What is known from time and drive alone, and is needed where the state is known, too.
     needed = set(re.findall(r"\bv\d+\b", "\n".join([*after, *results])))
     known = [name for line in before if (name := line.split(" = ")[0]) in needed]
@@ -181,7 +182,6 @@ def source(ode: ODE, nodes: int, limits: Program | None) -> tuple[list[str], Lay
     s, f, old = (at.rows(group, size) for group in ("s", "f", "old"))
     kept = at.rows("known", len(known))
     far, least = at.rows("far", limited), at.rows("least", limited)
-    y, u = [f"y{j}" for j in range(size)], [f"u{i}" for i in range(inputs)]
 
     def read(rows: range) -> list[str]:
         return [f"g{j}_{k} = {at.lane('f', j, k)}" for j in rows for k in range(nodes)]

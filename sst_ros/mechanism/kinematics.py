@@ -111,8 +111,6 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     isolated, AssemblyError is raised.
     """
     angles = np.array(gamma, dtype=float)
-    if angles.shape != (3,) or not np.all(np.isfinite(angles)):
-        raise AssemblyError("gamma must be three finite numbers", angles)
     found = direct_many(geometry, angles[None])
     if not found.isolated[0]:
         raise AssemblyError("the assemblies are not isolated", angles)
@@ -127,7 +125,7 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     """
     angles = np.asarray(gamma, dtype=float)
     if angles.ndim != 2 or angles.shape[1] != 3 or not np.all(np.isfinite(angles)):
-        raise AssemblyError("gamma must be rows of three finite numbers", angles)
+        raise AssemblyError("gamma must be three finite numbers, or rows of them", angles)
     r = carriage_directions(geometry, angles)
     configuration, rotation, isolated = _solve_closure(r, np.broadcast_to(geometry.e, r.shape))
     mu, beta, det_j2, admissible = describe_assemblies(

@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
-from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture
+from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture, Three
 from sst_ros.state import ZERO
 
 
@@ -61,7 +61,7 @@ def of_actuators(at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = ZERO
     rate, acceleration = np.array(gamma_dot, dtype=float), np.array(gamma_ddot, dtype=float)
     omega = at.j @ rate
     omega_dot = at.j @ acceleration + virtual_work.bias(at, rate).omega_dot
-    return _motion(at.r, at.t, at.w, omega, omega_dot, (rate, acceleration))
+    return _motion(at.r, at.t, at.w, omega, omega_dot, rate, acceleration)
 
 
 def of_star(
@@ -106,12 +106,7 @@ def body_rates(
 
 
 def _motion(
-    r: Array,
-    t: Array,
-    w: Array,
-    omega: Array,
-    omega_dot: Array,
-    actuators: tuple[Array, Array] | None = None,
+    r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, *actuators: Array
 ) -> BodyRates:
     """All joints and links; gamma_dot and gamma_ddot are those of `actuators` where given."""
     normal, wr, turning = cross(r, t), cross(w, r), cross(omega, t)
@@ -130,9 +125,7 @@ def _motion(
     gamma_dot, gamma_ddot = actuators or (gamma_dot, gamma_ddot)
     joints = gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot
     x, zero = np.array([1.0, 0.0, 0.0]), np.zeros(3)
-    omega_a, omega_a_dot = (
-        np.stack([zero, zero, about_w], axis=1) for about_w in (gamma_dot, gamma_ddot)
-    )
+    omega_a, omega_a_dot = (np.stack([zero, zero, x], axis=1) for x in (gamma_dot, gamma_ddot))
     # {2k} = [r, t x r, t]; w has no component along r.
     turn = np.stack([zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)], axis=1)
     omega_ipl = gamma_dot[:, None] * turn - mu_dot[:, None] * x
@@ -141,9 +134,8 @@ def _motion(
     omega_ipl_dot = (
         gamma_ddot[:, None] * turn - mu_ddot[:, None] * x - (gamma_dot * mu_dot)[:, None] * across
     )
-    return BodyRates(
-        *frozen(omega, omega_dot, *joints, omega_a, omega_a_dot, omega_ipl, omega_ipl_dot)
-    )
+    links = omega_a, omega_a_dot, omega_ipl, omega_ipl_dot
+    return BodyRates(*frozen(omega, omega_dot, *joints, *links))
 
 
 @dataclass(frozen=True)
@@ -164,26 +156,14 @@ class Reactions:
     torque: Array  #: actuator torques that belong to this motion [N m], shape (3,)
 
 
-def of_torque(
-    mechanism: Mechanism,
-    at: Posture,
-    gamma_dot: ArrayLike,
-    torque: ArrayLike,
-    moment: ArrayLike = ZERO,
-) -> Reactions:
-    """Constraint moments of the motion that torques [N m] and n_ext [N m] in {B} cause."""
-    gamma_ddot = virtual_work.direct_dynamics(mechanism, at, gamma_dot, torque, moment)
-    return of_motion(mechanism, at, gamma_dot, gamma_ddot, moment)
-
-
 def of_motion(
-    mechanism: Mechanism,
-    at: Posture,
-    gamma_dot: ArrayLike,
-    gamma_ddot: ArrayLike,
-    moment: ArrayLike = ZERO,
+    mechanism: Mechanism, at: Posture, gamma_dot: Three, gamma_ddot: Three, moment: Three = ZERO
 ) -> Reactions:
-    """Constraint moments, and torques, that a motion gamma_dot, gamma_ddot asks for."""
+    """Constraint moments, and torques, that a motion asks for: gamma_dot [rad/s], gamma_ddot.
+
+    The moment is n_ext [N m] in {B}. For the motion that torques cause see
+    `virtual_work.direct_dynamics`.
+    """
     torque = virtual_work.inverse_dynamics(mechanism, at, gamma_dot, gamma_ddot, moment)
     motion = of_actuators(at, gamma_dot, gamma_ddot)
     frames = virtual_work.link_frames(at)

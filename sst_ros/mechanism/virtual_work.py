@@ -10,6 +10,7 @@ otherwise. The simulation runs `kernel`, which the tests hold against this file.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,10 @@ from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, cross
 from sst_ros.scene.scene import Scene
+from sst_ros.state import ZERO
+
+Three: TypeAlias = ArrayLike
+"""Three numbers, one a leg or an axis."""
 
 SINGULAR = 1e-12
 """Smallest abs(det J2) and abs(c_k) for which the velocity analysis is done."""
@@ -137,7 +142,7 @@ def link_jacobians(at: Posture) -> tuple[Array, Array]:
 
 
 def equation_of_motion(
-    mechanism: Mechanism, at: Posture, gamma_dot: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0)
+    mechanism: Mechanism, at: Posture, gamma_dot: Three, moment: Three = ZERO
 ) -> tuple[Array, Array]:
     """T1 (3, 3) [kg m^2] and T2 (3,) [N m] of T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
 
@@ -169,11 +174,7 @@ def equation_of_motion(
 
 
 def direct_dynamics(
-    mechanism: Mechanism,
-    at: Posture,
-    gamma_dot: ArrayLike,
-    torque: ArrayLike,
-    moment: ArrayLike = (0.0, 0.0, 0.0),
+    mechanism: Mechanism, at: Posture, gamma_dot: Three, torque: Three, moment: Three = ZERO
 ) -> Array:
     """gamma_ddot [rad/s^2], shape (3,), of actuator torques [N m], Eq. 90."""
     t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)
@@ -181,11 +182,7 @@ def direct_dynamics(
 
 
 def inverse_dynamics(
-    mechanism: Mechanism,
-    at: Posture,
-    gamma_dot: ArrayLike,
-    gamma_ddot: ArrayLike,
-    moment: ArrayLike = (0.0, 0.0, 0.0),
+    mechanism: Mechanism, at: Posture, gamma_dot: Three, gamma_ddot: Three, moment: Three = ZERO
 ) -> Array:
     """Actuator torques [N m], shape (3,), that give gamma_ddot [rad/s^2], Eq. 90."""
     t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)

@@ -74,14 +74,14 @@ class OrientationMap:
     @property
     def best_cond_j(self) -> Array:
         """Least cond J over the admissible psi, shape (m,); NaN where there is none."""
-        least = np.where(self.measures.admissible, self.measures.cond_j, np.inf).min(axis=1)
-        return np.where(np.isfinite(least), least, np.nan)
+        values = np.where(self.measures.admissible, self.measures.cond_j, np.nan)
+        return np.asarray(np.fmin.reduce(values, axis=1))
 
     @property
     def best_margin(self) -> Array:
         """Largest distance to all limits over psi [rad], shape (m,); NaN where there is none."""
-        most = np.where(self.measures.admissible, self.measures.margin, -np.inf).max(axis=1)
-        return np.where(np.isfinite(most), most, np.nan)
+        values = np.where(self.measures.admissible, self.measures.margin, np.nan)
+        return np.asarray(np.fmax.reduce(values, axis=1))
 
 
 def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measures:
@@ -241,17 +241,13 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
 
 def report_singularities(geometry: Geometry, chart: OrientationMap) -> str:
     """Summarise the singular poses in a few lines."""
-    lines = []
-    for poses in (parallel_singularities(chart), serial_singularities(geometry)):
-        if not len(poses):
-            where = "inside" if poses.kind == "parallel" else "at the edge"
-            lines.append(f"{poses.kind}: none {where}")
-            continue
-        row = len(poses) // 2
-        gamma = ", ".join(f"{x:.4f}" for x in np.degrees(poses.gamma[row]))
-        s = ", ".join(f"{x:.4f}" for x in poses.rotation[row, :, 2])
-        leg = f", leg {poses.leg[row] + 1}" if poses.kind == "serial" else ""
-        lines.append(
-            f"{poses.kind}: {len(poses)} found; for example s = ({s}), gamma = ({gamma}) deg{leg}"
-        )
+    lines, found = [], (parallel_singularities(chart), serial_singularities(geometry))
+    for poses, where in zip(found, ("inside", "at the edge"), strict=True):
+        said, row = f"none {where}", len(poses) // 2
+        if len(poses):
+            gamma = ", ".join(f"{x:.4f}" for x in np.degrees(poses.gamma[row]))
+            s = ", ".join(f"{x:.4f}" for x in poses.rotation[row, :, 2])
+            said = f"{len(poses)} found; for example s = ({s}), gamma = ({gamma}) deg"
+            said += f", leg {poses.leg[row] + 1}" if poses.kind == "serial" else ""
+        lines.append(f"{poses.kind}: {said}")
     return "\n".join(lines)
