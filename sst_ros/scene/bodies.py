@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.errors import Problem, refuse_unless
-from sst_ros.scene.schema import Rules, Section, coefficient, entry, positive
-from sst_ros.state import Array, Vector3
+from sst_ros.scene.schema import Rules, Section, amount, coefficient, entry
+from sst_ros.state import ZERO, Array, Vector3
 
 RELATIVE_ROUNDING = 1e-9
 
@@ -73,16 +73,12 @@ class Base(Section):
     ONE_OF = "v", "arcs_deg"
 
     v: tuple[Vector3, Vector3, Vector3] = entry(
-        "directions of P1, P2, P3 seen from O, right-handed; their lengths do not matter",
-        "1",
-        least=-1e6,
-        most=1e6,
-        default=None,
+        "directions of P1, P2, P3 seen from O, right-handed, of any length", "1", default=None
     )
     arcs_deg: Vector3 | None = entry(
         "lengths of the arcs 1-2, 2-3, 3-1, in place of v", "deg", least=1e-6
     )
-    radius: float = positive("radius of the base sphere", "m")
+    radius: float = amount("radius of the base sphere", "m")
 
     def settle(self) -> Iterator[Problem]:
         """Replace arcs by directions; refuse those that close no triangle."""
@@ -126,15 +122,10 @@ class Link(Section):
     inertia: Inertia | None = entry("inertia of the link in its own frame")
     mass: float = coefficient("mass, for gravity", "kg")
     centre: Vector3 = entry(
-        "centre of mass in the frame of the inertia",
-        "m",
-        default=(0.0, 0.0, 0.0),
-        acts_on=("mass",),
+        "centre of mass in the frame of the inertia", "m", default=ZERO, acts_on=("mass",)
     )
     inertia_about: str = entry(
-        "point of the inertia; the scene that is read has it about O",
-        choices=(ABOUT_O, ABOUT_CENTRE),
-        default=ABOUT_O,
+        "point of the inertia; once read it is O", choices=(ABOUT_O, ABOUT_CENTRE), default=ABOUT_O
     )
 
     @property
@@ -171,8 +162,8 @@ class Star(Link):
     """The moving spherical star."""
 
     inertia: Inertia = entry("inertia of the star in {E}")
-    alpha_deg: Vector3 = entry("angles between the planes of arcs 1-2, 2-3, 3-1", "deg", above=0.0)
-    radius: float = positive("radius of the star's sphere, distance O E", "m")
+    alpha_deg: Vector3 = amount("angles between the planes of arcs 1-2, 2-3, 3-1", "deg")
+    radius: float = amount("radius of the star's sphere, distance O E", "m")
 
     def rules(self) -> Rules:
         """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
@@ -187,7 +178,7 @@ class Payload(Section):
 
     EFFECTS = "mass", "inertia"
 
-    mass: float = positive("mass", "kg")
+    mass: float = amount("mass", "kg")
     centre: Vector3 = entry("centre of mass in {E}", "m")
     inertia: Inertia | None = entry(
         "inertia about the payload's centre of mass, axes of {E}; none for a point"
@@ -212,21 +203,16 @@ class Stroke(Section):
     """
 
     at_end: str = entry(
-        "what happens at an end of the stroke",
-        choices=("stop", "ignore", "elastic"),
-        default="stop",
+        "what happens at its ends", choices=("stop", "ignore", "elastic"), default="stop"
     )
-    stiffness: float | None = positive("stiffness of elastic stops", "N m/rad")
+    stiffness: float | None = amount("stiffness of elastic stops", "N m/rad")
     damping: float = coefficient(
-        "damping of elastic stops: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
+        "damping: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
     )
     restitution: float | None = entry(
-        "rate after an impact / rate before, at impact_rate; in place of damping",
-        "1",
-        least=0.01,
-        most=1.0,
+        "rate after an impact / rate before, in place of damping", "1", least=0.01, most=1.0
     )
-    impact_rate: float | None = positive("rate of the impacts that have this restitution", "rad/s")
+    impact_rate: float | None = amount("rate of the impacts that have this restitution", "rad/s")
 
     def rules(self) -> Rules:
         """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
@@ -246,7 +232,7 @@ class Stroke(Section):
 class Workspace(Section):
     """Where E may be: on the base triangle, 0 < beta_k <= beta_max."""
 
-    beta_max_deg: float = positive(
+    beta_max_deg: float = amount(
         "largest angle between E and the intermediate link", "deg", default=90.0, most=180.0
     )
     at_edge: str = entry(

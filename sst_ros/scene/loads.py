@@ -13,8 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.scene.schema import Rules, Section, angles, coefficient, entry, positive
-from sst_ros.state import Quaternion, Vector3
+from sst_ros.scene.schema import Rules, Section, amount, angles, coefficient, entry
+from sst_ros.state import ZERO, Quaternion, Vector3
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
 MOMENTS = ("moment_x", "moment_y", "moment_z")  # beside the torques of a tick
@@ -52,15 +52,12 @@ class Friction(Section):
 
     viscous: float = coefficient("viscous coefficient", "N m s/rad")
     coulomb: float = coefficient("Coulomb torque", "N m")
-    smoothing: float = positive(
-        "rate over which the Coulomb torque changes sign",
-        "rad/s",
-        default=1e-2,
-        acts_on=("coulomb", "static"),
+    smoothing: float = amount(
+        "rate over which its sign changes", "rad/s", default=1e-2, acts_on=("coulomb", "static")
     )
     static: float = coefficient("breakaway torque (Stribeck); 0 for none", "N m")
-    stribeck: float = positive(
-        "rate at which the breakaway torque has faded", "rad/s", default=0.1, acts_on=("static",)
+    stribeck: float = amount(
+        "rate at which that has faded", "rad/s", default=0.1, acts_on=("static",)
     )
 
     def rules(self) -> Rules:
@@ -85,7 +82,7 @@ class Spring(Section):
     EFFECTS = ("stiffness",)
 
     joint: str = entry("joint", choices=JOINTS)
-    stiffness: float = positive("stiffness", "N m/rad")
+    stiffness: float = amount("stiffness", "N m/rad")
     rest: float = entry("angle without torque", "rad")
 
 
@@ -102,22 +99,18 @@ class Actuators(Section):
     )  # fmt: skip
 
     rotor_inertia: float = coefficient("inertia of the motor's rotor", "kg m^2")
-    gear_ratio: float = positive(
-        "motor turns per joint turn",
-        "1",
-        default=1.0,
-        acts_on=("rotor_inertia",),
+    gear_ratio: float = amount(
+        "motor turns per joint turn", "1", default=1.0, acts_on=("rotor_inertia",)
     )
-    torque_limit: float | None = positive("largest torque", "N m")
-    time_constant: float | None = positive("time constant of a first-order lag of the torque", "s")
+    torque_limit: float | None = amount("largest torque", "N m")
+    time_constant: float | None = amount("time constant of a first-order lag of the torque", "s")
     idle_damping: float = coefficient(
-        "torque -idle_damping gamma_dot in place of a command that is too old; 0 for no torque",
-        "N m s/rad",
+        "torque -idle_damping gamma_dot in place of a command that is too old", "N m s/rad"
     )
-    velocity_limit: float | None = positive(
+    velocity_limit: float | None = amount(
         "largest rate of a desired motion; a simulation does not hold it", "rad/s"
     )
-    acceleration_limit: float | None = positive(
+    acceleration_limit: float | None = amount(
         "largest acceleration of a desired motion; a simulation does not hold it", "rad/s^2"
     )
 
@@ -126,12 +119,11 @@ class Initial(Section):
     """The state at t = 0."""
 
     gamma: Vector3 = angles("actuator angles at t = 0")
-    gamma_dot: Vector3 = entry("actuator rates at t = 0", "rad/s", default=(0.0, 0.0, 0.0))
+    gamma_dot: Vector3 = entry("actuator rates at t = 0", "rad/s", default=ZERO)
     orientation: Quaternion | None = entry(
-        "quaternion (x, y, z, w) of {E} in {B} that selects the assembly mode where gamma has "
-        "several admissible ones; within 0.1 rad",
+        "quaternion (x, y, z, w) of {E} in {B}, within 0.1 rad, that selects the assembly mode "
+        "where gamma has several admissible ones",
         "1",
-        default=None,
     )
 
 

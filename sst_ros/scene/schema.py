@@ -110,6 +110,8 @@ def entry(doc: str, unit: str = "", default: Any = REQUIRED, **rules: Any) -> An
 angles = partial(entry, unit="rad", least=-TURN, most=TURN)
 """Angles of the three actuators, at most a turn."""
 positive = partial(entry, above=0.0)
+amount = partial(entry, least=1e-12)
+"""A positive number of a scene: less is a slip of units, and powers leave double precision."""
 coefficient = partial(entry, least=0.0, default=0.0)
 
 

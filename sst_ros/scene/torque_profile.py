@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import InputError, Problem, refuse_unless
 from sst_ros.scene.schema import Section, entry
-from sst_ros.state import Array, State, Vector3, finite_vector
+from sst_ros.state import ZERO, Array, State, Vector3, finite_vector
 
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
@@ -75,7 +75,7 @@ class SineTorque(TorqueProfile, Section):
 
     amplitude: Vector3 = entry("amplitudes", "N m")
     frequency: Vector3 = entry("angular frequencies", "rad/s", least=0.0)
-    phase: Vector3 = entry("phases", "rad", default=(0.0, 0.0, 0.0))
+    phase: Vector3 = entry("phases", "rad", default=ZERO)
 
     def at(self, time: float) -> Vector3:
         """Torques [N m] at a time [s]."""
@@ -149,11 +149,11 @@ class PolynomialTorque(TorqueProfile):
         """See `TorqueProfile`."""
         piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
         if not 0 <= piece < self.c.shape[1]:
-            return (0.0, 0.0, 0.0)
+            return ZERO
         start, rows = float(self.x[piece]), self.c[:, piece].tolist()
 
         def torque(t: float) -> Vector3:
-            x, total = t - start, (0.0, 0.0, 0.0)
+            x, total = t - start, ZERO
             for a, b, c in rows:
                 total = total[0] * x + a, total[1] * x + b, total[2] * x + c
             return total

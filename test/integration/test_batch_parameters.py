@@ -205,7 +205,7 @@ def test_bad_parameters_are_refused_by_key_and_row(parameters, said):
 def test_numbers_of_a_term_that_is_left_out_are_held_to_what_is_allowed_too():
     """Friction of zero is none, but its smoothing is no less wrong."""
     values = {"viscous": [0.0, 0.1], "coulomb": [0.0, 0.1], "smoothing": [-1.0, 0.1]}
-    said = "scenario 0: friction.beta.smoothing = -1.0: must be a finite number > 0"
+    said = "scenario 0: friction.beta.smoothing = -1.0: must be a finite number >= 1e-12"
     with pytest.raises(InputError, match=said):
         Batch(LOADED, parameters={f"friction.beta.{key}": rows for key, rows in values.items()})
 

@@ -130,7 +130,7 @@ CONTENTS = [
     ("ORIENTATION", "quaternion.w", 3.0, "orientation.*must have length 1"),
     ("APPLIED", "joint_names", ["a", "b", "c"], "applied_torques.*gamma_1, gamma_2, gamma_3"),
     ("APPLIED", "header.stamp", -2_500_000, "ticks overlap"),
-    ("SCENE", "data", ("radius: 0.4", "radius: -0.4"), "/sst_simulator/scene: .*star.radius.*> 0"),
+    ("SCENE", "data", ("radius: 0.4", "radius: -0.4"), "scene: .*star.radius.*>= 1e-12"),
 ]
 
 
