@@ -253,6 +253,11 @@ An estimate over the error below 1 is too small; the grey band of the picture re
 "Stopped" counts runs that have no end to compare: at a singularity, or refused. "Beyond 3
 tolerances" counts runs with status 0 whose true error is more than three times the tolerance.
 
+The estimate of a run with `control_period` is that of the motion under the torques that were held.
+How a controller answers the error is not in it: a function is called once a period, and may have a
+memory. A controller that stabilises makes the true error smaller, one that does not makes it
+larger: what is too small is in the class "held".
+
 ## Seed {fresh}, which was not used while building
 
 {tables[1]}

@@ -87,8 +87,9 @@ def simulate(
             `error_estimate` exceeds it is run again by smaller steps, up to three times; if it
             still does, `status` is 2. With `control_period` it runs once.
         control_period: a function is called once a period [s], at its beginning, and its torques
-            are held until the next, as those of a controller. Without it a function is part of the
-            differential equation, called in each stage of a step, and must have no memory.
+            are held until the next, as those of a controller; the error estimate is that of the
+            motion under these torques. Without it a function is part of the differential equation,
+            called in each stage of a step, and must have no memory.
         breaks: times at which a function jumps or has a kink [s], ascending. Jumps in time are
             found without it, unless a pulse is shorter than a step.
         max_step: longest step [s]; by default the error alone decides. Not for collocation.
