@@ -249,10 +249,14 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
     for name, spec in known.items():
         if spec.default is REQUIRED and name not in values:
             problems.append(Problem(name, None, "is missing; " + spec.describe()))
+    given = {name: value for name, value in values.items() if name in known}
+    for name, value in given.items():
+        if known[name].kind == "text" and isinstance(value, (int, float)):  # as in a YAML file
+            given[name] = str(value)
     try:
-        given = _freeze_all((name, known[name], values[name]) for name in values if name in known)
+        frozen = _freeze_all((name, known[name], value) for name, value in given.items())
         if not problems:
-            return cls(**given)
+            return cls(**frozen)
     except InputError as error:
         problems += error.problems
     raise InputError(origin, problems)
@@ -333,11 +337,10 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _freeze_text(value: Any) -> str:
-    """Return text, or a number as text, without outer blanks, or raise ValueError."""
-    text = str(value).strip()
-    if not isinstance(value, (str, int, float)) or not text or _UNPRINTABLE.search(text):
+    """Return text without its outer blanks, or raise ValueError."""
+    if not isinstance(value, str) or not value.strip() or _UNPRINTABLE.search(value):
         raise ValueError
-    return text
+    return value.strip()
 
 
 def has_effect(value: Any) -> bool:
