@@ -23,9 +23,9 @@ import numpy as np
 
 from benchmark.measure import describe_machine, join_line, read_options, time_in_turn
 from sst_ros import load_scene, sweep
-from sst_ros.sweeps.engine import run_chunk, run_local
-from sst_ros.sweeps.prepared import prepare
+from sst_ros.sweeps.prepared import PreparedSweep
 from sst_ros.sweeps.results import read_sweep
+from sst_ros.sweeps.sweep import run_local
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 
 BODIES = (
@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
     found["seconds of the first 1,000 rows, imports and code"] = time.perf_counter() - began
     found |= _study(options.rows)
     began = time.perf_counter()
-    _arrays(study_of(100_000), found["steps"])
+    _arrays(PreparedSweep(study_of(100_000), found["steps"]))
     found["seconds to prepare 1e5 rows"] = time.perf_counter() - began
     found |= _ratios(found["steps"])
     if options.mujoco:
@@ -70,9 +70,9 @@ def _study(rows: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         began, processor = time.perf_counter(), time.process_time()
         study = study_of(rows)
-        ready = prepare(study)
+        ready = PreparedSweep(study)
         prepared_s = time.perf_counter() - began
-        _chunks(study, ready.steps, folder)
+        _chunks(ready, folder)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
         size = sum(path.stat().st_size for path in Path(folder).iterdir())
         table = read_sweep(Path(folder))
@@ -89,10 +89,10 @@ def _study(rows: int) -> dict[str, float]:
     }  # fmt: skip
 
 
-def _arrays(study: SweepStudy, steps: int) -> tuple[Any, list[Any]]:
+def _arrays(ready: PreparedSweep) -> tuple[Any, list[Any]]:
     """Sample and check all rows; return their batch, states, inputs and codes."""
+    study = ready.study
     values = study.draw(0, study.rows)
-    ready = prepare(study, steps)
     scenarios, _, _ = ready.scenarios(values)
     batch = ready.batch.with_parameters(scenarios)
     y, code = batch.start(study.scene.initial.gamma, (0.0, 0.0, 0.0))
@@ -104,12 +104,13 @@ def _ratios(steps: int) -> dict[str, float]:
 
     Also in processor time, which a busy machine changes less.
     """
-    study = study_of(CHUNKS * CHUNK)
-    batch, (y, given, code) = _arrays(study, steps)
+    ready = PreparedSweep(study_of(CHUNKS * CHUNK), steps)
+    study = ready.study
+    batch, (y, given, code) = _arrays(ready)
     times = []
     for _ in range(ROUNDS):
         with tempfile.TemporaryDirectory() as folder:
-            whole = _timed(partial(_chunks, study, steps, folder))
+            whole = _timed(partial(_chunks, ready, folder))
         more = np.full(study.rows, np.nan), np.zeros(study.rows)
         arrays = y.copy(), given, code.copy(), *more
         alone = _timed(partial(batch.advance, 0, steps, study.length / steps, *arrays))
@@ -124,10 +125,10 @@ def _ratios(steps: int) -> dict[str, float]:
     }
 
 
-def _chunks(study: SweepStudy, steps: int, folder: str) -> None:
+def _chunks(ready: PreparedSweep, folder: str) -> None:
     """Compute and write all chunks of a study, on all cores."""
-    compute = partial(run_chunk, study, steps, Path(folder))
-    run_local(compute, range(study.chunks), lambda _: None, len(os.sched_getaffinity(0)))
+    chunks, cores = range(ready.study.chunks), len(os.sched_getaffinity(0))
+    run_local(ready, Path(folder), chunks, lambda *_: None, cores)
 
 
 def _timed(call: Callable[[], Any]) -> tuple[float, float]:

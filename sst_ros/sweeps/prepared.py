@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
 from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -114,8 +113,8 @@ class PreparedSweep:
             "inputs": [name for one in self.study.variations for name in one.columns],
         }
 
-    def chunk(self, index: int) -> tuple[pa.Table, pa.Table | None]:
-        """Table of the rows of a chunk, and of their trajectories if the study asks for some."""
+    def chunk(self, index: int) -> pa.Table:
+        """Table of the rows of a chunk."""
         pyarrow, study = require("pyarrow"), self.study
         rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
         values = study.draw(int(rows[0]), len(rows))
@@ -149,17 +148,7 @@ class PreparedSweep:
         arrays["reason"] = pyarrow.DictionaryArray.from_arrays(
             reason.astype(np.int32), pyarrow.array(texts, pyarrow.string())
         )
-        trajectory, asked = None, study.trajectory
-        if asked is not None and rows[0] < asked["rows"]:
-            kept = rows[rows < asked["rows"]]
-            scenarios, starts, _ = self.scenarios({k: x[: len(kept)] for k, x in values.items()})
-            every = max(1, self.steps // asked["samples"])
-            states = self.run(scenarios, starts, kept, self.steps, every)[0].kept
-            assert states is not None
-            found: Columns = {"scenario": np.broadcast_to(kept, states.t.shape)}
-            found |= columns_of(states, self._quantities)
-            trajectory = pyarrow.table({name: column.ravel() for name, column in found.items()})
-        return pyarrow.table(arrays), trajectory
+        return pyarrow.table(arrays)
 
     def scenarios(
         self, values: dict[str, Array]
@@ -181,11 +170,10 @@ class PreparedSweep:
         starts: dict[str, Array],
         rows: NDArray[np.int64],
         steps: int,
-        kept: int = 0,
     ) -> tuple[BatchResult, Columns]:
         """Return results of rows by a number of steps, and their extremes or tracking figures."""
         batch = self.batch.with_parameters(scenarios)
-        every = kept or (-(-steps // PARTS) if "extremes" in self.study.outputs else 0)
+        every = -(-steps // PARTS) if "extremes" in self.study.outputs else 0
         if self.controlled is not None:
             result, more = self.controlled.run(batch, starts, rows, steps, every)
         else:
@@ -196,7 +184,7 @@ class PreparedSweep:
                 gamma = np.broadcast_to(gamma, (len(rows), 3))
             step = self.study.length / steps
             result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
-        if result.kept is not None and not kept:
+        if result.kept is not None:
             with np.errstate(all="ignore"):
                 for (name, end), k in itertools.product(EXTREMES, range(3)):
                     angles = getattr(result.kept, name)[..., k]
@@ -212,21 +200,6 @@ class PreparedSweep:
             for key, array in one.parameters(values[one.key]).items():
                 (outside if key.startswith(("initial.", "control.")) else inside)[key] = array
         return inside, outside
-
-
-_PREPARED: dict[tuple[str, int | None], PreparedSweep] = {}
-
-_LOCK = threading.Lock()
-
-
-def prepare(study: SweepStudy, steps: int | None = None) -> PreparedSweep:
-    """Return the prepared study; prepared once in a process."""
-    with _LOCK:
-        key = study.digest, steps
-        if key not in _PREPARED:
-            _PREPARED.clear()
-            _PREPARED[key] = PreparedSweep(study, steps)
-        return _PREPARED[key]
 
 
 def find_range_ends(study: SweepStudy) -> dict[str, Array]:

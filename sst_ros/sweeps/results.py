@@ -29,18 +29,10 @@ _SHOWN = 8
 _NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
 
 
-def name_part(index: int, kind: str = "part") -> str:
-    """Return the name of the file of a chunk."""
-    return f"{kind}-{index:07d}.parquet"
-
-
-def write(table: pa.Table, folder: Path, name: str, about: Mapping[str, Any]) -> None:
-    """Write a table as a file that is there whole or not at all."""
-    names = set(table.column_names)
-    units = {name: unit for name, unit in about["units"].items() if name in names}
-    metadata = json.dumps({**about, "units": units}).encode()
-    table = table.replace_schema_metadata({METADATA: metadata})
-    with replace_file(folder / name) as own:
+def write_part(table: pa.Table, folder: Path, index: int, about: Mapping[str, Any]) -> None:
+    """Write the table of a chunk as a file that is there whole or not at all."""
+    table = table.replace_schema_metadata({METADATA: json.dumps(about).encode()})
+    with replace_file(folder / f"part-{index:07d}.parquet") as own:
         # Random mantissas do not compress, and their least and greatest help no reader.
         require("pyarrow.parquet").write_table(
             table, own, compression="none", use_dictionary=["reason"], write_statistics=False
@@ -58,40 +50,40 @@ def read_about(path: Path) -> dict[str, Any] | None:
         return None
 
 
-def find_complete(folder: Path, study: SweepStudy, steps: int) -> set[int]:
-    """Return the chunks whose files are there; raises InputError at one of another study."""
-    expected = {"digest": study.digest, "steps": steps, "version": VERSION}
+def find_complete(folder: Path, study: SweepStudy) -> tuple[set[int], int | None]:
+    """Return the chunks whose files are there, and the number of steps of their runs.
+
+    Raises InputError at a file of another study or version.
+    """
+    expected: dict[str, Any] = {"digest": study.digest, "version": VERSION}
     found = set()
-    for path in folder.glob("part-*.parquet"):
+    for path in sorted(folder.glob("part-*.parquet")):
         about = read_about(path)
         if about is None:
             continue
         if any(about[key] != value for key, value in expected.items()):
             allowed = "is of another study or version: choose another --out"
             raise InputError("sweep", [Problem("--resume", str(path), allowed)])
+        expected["steps"] = about["steps"]
         index = int(path.stem.removeprefix("part-"))
-        rows, trajectory = study.rows_of(index), folder / name_part(index, "trajectory")
-        kept = study.trajectory is not None and rows.start < study.trajectory["rows"]
-        if about["rows"] == len(rows) and (not kept or read_about(trajectory) is not None):
+        if about["rows"] == len(study.rows_of(index)):
             found.add(index)
-    return found
+    return found, expected.get("steps")
 
 
-def read_sweep(folder: Path, kind: str = "part") -> pd.DataFrame:
+def read_sweep(folder: Path) -> pd.DataFrame:
     """Read the results in a folder as one table, units and study in its `attrs`, or refuse it."""
-    paths = sorted(folder.glob(f"{kind}-*.parquet"))
+    paths = sorted(folder.glob("part-*.parquet"))
     about = next(filter(None, map(read_about, paths)), None)
     if about is None:
-        allowed = f"must be a folder with files {kind}-*.parquet of `sst-ros sweep`"
+        allowed = "must be a folder with files part-*.parquet of `sst-ros sweep`"
         raise InputError("sweep", [Problem("DIR", str(folder), allowed)])
     return to_frame(require("pyarrow.parquet").read_table(list(map(str, paths))), about)
 
 
 def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
     """Return a table as pandas, with its metadata as `attrs`."""
-    frame: pd.DataFrame = table.replace_schema_metadata(None).to_pandas()
-    if "status" in frame:
-        frame = frame.set_index("scenario")
+    frame: pd.DataFrame = table.replace_schema_metadata(None).to_pandas().set_index("scenario")
     frame.attrs = {key: value for key, value in about.items() if key != "rows"}
     return frame
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a study: distributions, early ends, scatter matrix of the worst runs."""
+"""The pictures of a study: distributions of the outputs, scatter matrix of the worst runs."""
 
 from __future__ import annotations
 
@@ -31,12 +31,8 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     The worst runs are those that ended first; where none ended early, those with the largest
     tracking error, or with the outputs farthest from their medians.
     """
-    ended = table["status"] != 0
-    complete = table.loc[~ended, list_outputs(table)]
+    complete = table.loc[table["status"] == 0, list_outputs(table)]
     figures = {"distributions": draw_distributions(complete, table.attrs["units"])}
-    if ended.any():
-        counts = table["reason"].astype(str).value_counts()
-        figures["early_ends"] = draw_early_ends(correlate(table), counts)
     score, title = _score(table)
     if shown := correlate(table, score).index[:MOST_INPUTS].tolist():
         worst = np.argsort(score.to_numpy())[-MOST_RUNS:]
@@ -69,19 +65,6 @@ def draw_distributions(outputs: pd.DataFrame, units: Mapping[str, str]) -> Figur
         axes = figure.add_subplot(rows, COLUMNS, i + 1)
         axes.hist(values[np.isfinite(values)], 60, color=BLUE)
         axes.set(title=f"{name} [{units.get(str(name), '1')}]", yticks=[])
-    return figure
-
-
-@styled
-def draw_early_ends(correlations: pd.Series, counts: pd.Series) -> Figure:
-    """Rank correlation of each input with an early end, and how many runs ended how."""
-    figure = Figure(figsize=(11.0, 1.2 + 0.3 * max(len(correlations), len(counts), 4)))
-    left, right = figure.subplots(1, 2)
-    left.barh(correlations.index[::-1], correlations[::-1], color=VERMILION)
-    ticks, title = [-1.0, -0.5, 0.0, 0.5, 1.0], "Rank correlation of inputs with an early end"
-    left.set(xlim=(-1.0, 1.0), xticks=ticks, title=title)
-    right.barh(counts.index[::-1], counts[::-1], color=GREY)
-    right.set(title="Runs by how they ended", xscale="symlog")
     return figure
 
 

@@ -28,7 +28,6 @@ from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import plain
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
-    LARGEST_HYPERCUBE,
     SAMPLINGS,
     TINY,
     Target,
@@ -94,9 +93,6 @@ class SweepStudy(Section):
         "quantities of the final state, and `extremes` of joints at the ends of the steps",
         default=DEFAULT_OUTPUTS,
     )
-    trajectory: Mapping[str, int] | None = anything(
-        "{rows: m, samples: k}: k + 1 states of each of the first m runs"
-    )
     chunk: int = _count("rows of a task and of a file", default=CHUNK)
 
     def __post_init__(self) -> None:
@@ -107,22 +103,19 @@ class SweepStudy(Section):
         _ = self.variations, self.rows, self.length
 
     def check(self) -> Iterator[Problem]:
-        """Refuse outputs, torques and trajectories that are none."""
+        """Refuse keys, outputs and torques that are none."""
+        if not isinstance(self.vary, Mapping):
+            allowed = "must be a mapping from keys of the scene to distributions or values"
+            yield Problem("vary", self.vary, allowed)
         for name in self.outputs:
             if name not in OUTPUTS:
                 yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
-        torque, kept = self.torque, self.trajectory
+        torque = self.torque
         if torque is not None and self.control is not None:
             yield Problem("torque", "given", _NO_TORQUE)
         constant = not isinstance(torque, (Mapping, SineTorque, type(None)))
         if constant and finite_vector(torque) is None:
             yield Problem("torque", torque, "must be three finite numbers [N m] or a mapping")
-        whole = isinstance(kept, Mapping) and all(
-            type(x) is int and 1 <= x <= 100_000 for x in kept.values()
-        )
-        if kept is not None and not (whole and kept.keys() == {"rows", "samples"}):
-            allowed = "must be {rows: m, samples: k}, whole numbers from 1 to 100000"
-            yield Problem("trajectory", kept, allowed)
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what was given, not what has been computed from it."""
@@ -186,7 +179,7 @@ class SweepStudy(Section):
         """What varies, key by key."""
         found: list[Variation] = []
         problems = []
-        for key, given in self.vary.items():
+        for key, given in {str(key): given for key, given in self.vary.items()}.items():
             try:
                 found.append(read_variation(key, given, self._targets(key)))
             except (ValueError, TypeError, OverflowError) as error:
@@ -202,7 +195,7 @@ class SweepStudy(Section):
                 found.append(tabulate(key, own, self._targets(key)))
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
-        if not found:
+        if not (found or problems):
             problems.append(Problem("vary", None, "must name at least one key of the scene"))
         if problems:
             raise InputError("sweep", problems)
@@ -223,8 +216,6 @@ class SweepStudy(Section):
             allowed = f"must be <= {natural}, the rows of the table"
         elif grid > 1 and rows % grid:
             allowed = f"must be a multiple of {grid}, the size of the grid"
-        elif self.sampling == "latin_hypercube" and rows > LARGEST_HYPERCUBE:
-            allowed = f"must be <= {LARGEST_HYPERCUBE} with latin_hypercube; use sobol"
         if allowed:
             given = {"table": sorted(lengths), "n": self.n or (rows if rows > 1 else None)}
             raise InputError("sweep", [Problem(key, given[key], allowed)])
@@ -255,25 +246,14 @@ class SweepStudy(Section):
         """Numbers in (0, 1), shape (count, width)."""
         if sampling == "random" or not self._width:
             return philox(self.seed, first, count, self._width)
-        if sampling == "latin_hypercube":
-            points = self._hypercube[first : first + count]
-        else:
-            from scipy.stats import qmc
-
-            engine = qmc.Sobol(self._width, seed=np.random.default_rng(self.seed))
-            if first:
-                engine.fast_forward(first)
-            with warnings.catch_warnings():  # that a chunk of rows is no power of two
-                warnings.simplefilter("ignore", UserWarning)
-                points = engine.random(count)
-        return np.clip(points, TINY, 1.0 - TINY)
-
-    @cached_property
-    def _hypercube(self) -> Array:
         from scipy.stats import qmc
 
-        engine = qmc.LatinHypercube(self._width, seed=np.random.default_rng(self.seed))
-        return np.asarray(engine.random(self.rows))
+        engine = qmc.Sobol(self._width, seed=np.random.default_rng(self.seed))
+        if first:
+            engine.fast_forward(first)
+        with warnings.catch_warnings():  # that a chunk of rows is no power of two
+            warnings.simplefilter("ignore", UserWarning)
+            return np.asarray(np.clip(engine.random(count), TINY, 1.0 - TINY))
 
     @property
     def chunks(self) -> int:

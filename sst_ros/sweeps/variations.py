@@ -9,7 +9,7 @@ whole ("star.inertia") has one factor, so its principal moments keep their ratio
 
 Row i depends on the seed and on i alone, whatever is drawn before or beside it. Random numbers come
 from the counter-based generator Philox (Salmon et al., SC 2011), whose counter is the number of the
-row; Sobol points from their index; a Latin hypercube from all n rows at once.
+row; Sobol points from their index.
 """
 
 from __future__ import annotations
@@ -31,10 +31,7 @@ from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
 KINDS = ("uniform", "normal", "grid", "linspace")
 EXPECTED = {"uniform": "low, high", "normal": "mean, standard deviation[, low, high]"}
 
-SAMPLINGS = ("random", "sobol", "latin_hypercube")
-
-LARGEST_HYPERCUBE = 10_000_000
-"""Rows of a Latin hypercube: each process holds all of them, 80 bytes for ten columns."""
+SAMPLINGS = ("random", "sobol")
 
 TINY = 2.0**-53
 

@@ -71,7 +71,8 @@ def test_each_torque_is_that_of_the_python_controller(request, case, by):
     # Off the reference, for feedback to act.
     off = np.array([0.01, -0.02, 0.005])
     starts["initial.gamma"] = np.tile(start.gamma + off, (3, 1))
-    result, _ = ready.run(scenarios, starts, rows, 2 * SAMPLES, kept=2)
+    batch = ready.batch.with_parameters(scenarios)
+    result, _ = ready.controlled.run(batch, starts, rows, 2 * SAMPLES, 2)
     assert result.success.all()
     channel = {key: case[key] for key in CHANNEL if key in case}
     settings = ControllerSettings(**{k: v for k, v in case.items() if k not in CHANNEL})

@@ -50,8 +50,8 @@ def test_correlations_are_spearmans(folder):
 def test_plot_draws_the_pictures(folder, tmp_path, capsys, undrawn):
     assert run_command(["sweep", "plot", str(folder / "out"), "--out", str(tmp_path)]) == 0
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["distributions.png", "early_ends.png", "worst.png"]
-    assert capsys.readouterr().out.count(".png") == 3
+    assert names == ["distributions.png", "worst.png"]
+    assert capsys.readouterr().out.count(".png") == 2
 
 
 REFUSED = [
