@@ -38,6 +38,7 @@ EXTRAS = {
     "sweep": ["numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "cluster": ["dask[distributed]>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "view": ["viser>=1.1,<2"],
+    "control": ["control>=0.9.4"],
 }
 EXTRAS["all"] = ["argcomplete", "xarray", *chain.from_iterable(EXTRAS.values())]
 EXTRAS |= {
@@ -59,6 +60,7 @@ EXTRAS |= {
         "catkin_pkg",  # for rosidl_adapter
         "codespell",
         "colcon-common-extensions",
+        "control",
         "hypothesis",
         "jsonschema",
         "mpmath",

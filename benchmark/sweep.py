@@ -14,6 +14,7 @@ import resource
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -23,9 +24,10 @@ import numpy as np
 
 from benchmark.measure import describe_machine, join_line, read_options, time_in_turn
 from sst_ros import load_scene, sweep
+from sst_ros.host.many_runs import run_many
 from sst_ros.sweeps.prepared import PreparedSweep
 from sst_ros.sweeps.results import read_sweep
-from sst_ros.sweeps.sweep import run_local
+from sst_ros.sweeps.sweep import run_chunk
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 
 BODIES = (
@@ -127,8 +129,8 @@ def _ratios(steps: int) -> dict[str, float]:
 
 def _chunks(ready: PreparedSweep, folder: str) -> None:
     """Compute and write all chunks of a study, on all cores."""
-    chunks, cores = range(ready.study.chunks), len(os.sched_getaffinity(0))
-    run_local(ready, Path(folder), chunks, lambda *_: None, cores)
+    work, chunks = partial(run_chunk, ready, Path(folder)), range(ready.study.chunks)
+    deque(run_many(work, chunks, workers=0), maxlen=0)
 
 
 def _timed(call: Callable[[], Any]) -> tuple[float, float]:

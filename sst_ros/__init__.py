@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from sst_ros.control.controller import Controller as Controller
     from sst_ros.control.controller import InverseDynamics as InverseDynamics
     from sst_ros.control.law import ControllerSettings as ControllerSettings
+    from sst_ros.control.linearize import LinearModel as LinearModel
+    from sst_ros.control.linearize import equilibrium as equilibrium
+    from sst_ros.control.linearize import linearize as linearize
     from sst_ros.control.reference_motions import reference_motion as reference_motion
     from sst_ros.errors import AssemblyError as AssemblyError
     from sst_ros.errors import InputError as InputError
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
     from sst_ros.integration.batch import Batch as Batch
     from sst_ros.mechanism import kinematics as _kinematics
     from sst_ros.mechanism.geometry import Geometry as Geometry
+    from sst_ros.mechanism.workspace import distance_to_singularity as distance_to_singularity
     from sst_ros.mechanism.workspace import workspace as workspace
     from sst_ros.plot.workspace import plot_workspace as plot_workspace
     from sst_ros.recording import recording as _recording
@@ -47,7 +51,7 @@ if TYPE_CHECKING:
     from sst_ros.sweeps.sweep import sweep as sweep
 
     direct_kinematics, inverse_kinematics = _kinematics.direct, _kinematics.inverse
-    load_scene, read_bag = _scene.load, _recording.read
+    load_scene, read_bag = _scene.scene_of, _recording.read
 
 __version__ = VERSION
 
@@ -56,6 +60,7 @@ _MODULES = {
     "control.actuator_space": "ReferenceMotion",
     "control.controller": "Controller InverseDynamics",
     "control.law": "ControllerSettings",
+    "control.linearize": "LinearModel equilibrium linearize",
     "control.reference_motions": "reference_motion",
     "errors": "AssemblyError InputError RunStopped SingularConfiguration SstError",
     "identification.identify": "identify",
@@ -63,11 +68,11 @@ _MODULES = {
     "integration.batch": "Batch",
     "mechanism.geometry": "Geometry",
     "mechanism.kinematics": "direct_kinematics:direct inverse_kinematics:inverse",
-    "mechanism.workspace": "workspace",
+    "mechanism.workspace": "distance_to_singularity workspace",
     "plot.workspace": "plot_workspace",
     "recording.recording": "Recording read_bag:read",
     "scene.bodies": "arc_inertia",
-    "scene.scene": "Scene load_scene:load",
+    "scene.scene": "Scene load_scene:scene_of",
     "scene.torque_profile": "PolynomialTorque SineTorque TorqueTable",
     "simulation.simulate": "prepare simulate",
     "simulation.simulation": "Simulation",

@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import functools
 import importlib
-from collections.abc import Iterable, Sequence
+import inspect
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from numbers import Integral, Real
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +20,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
-SHOWN = 80  # characters of a value in a message
+SHOWN, LONGEST_PATH = 80, 4096  # characters of a value in a message, and of a path
 
 
 class SstError(Exception):
@@ -37,8 +42,11 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
-        text, half = repr(self.value), SHOWN // 2 - 2
-        if len(text) > SHOWN:  # the end of a path names the file
+        text, half = f"a {type(self.value).__name__} without a text", SHOWN // 2 - 2
+        with contextlib.suppress(Exception):  # as of an integer of 5,000 digits
+            text = repr(self.value)
+        path = isinstance(self.value, str) and os.sep in text  # is whole: it can be copied
+        if len(text) > (LONGEST_PATH if path else SHOWN):
             text = f"{text[:half]}...{text[-half:]}"
         return f"{where}{self.key or 'document'} = {text}: {self.allowed}"
 
@@ -55,11 +63,117 @@ class InputError(SstError):
         super().__init__("\n".join(map(printable, lines)))
 
 
-def refuse_unless(origin: str, *checks: tuple[str, object, bool, str]) -> None:
-    """Raise InputError for each argument that is not good: (name, value, good, what is allowed)."""
+Check: TypeAlias = tuple[str, object, bool, str]
+"""Name of an argument, its value, whether it is good, and what is allowed."""
+
+
+def refuse_unless(origin: str, *checks: Check) -> None:
+    """Raise InputError with each argument that is not good."""
     problems = [Problem(name, value, allowed) for name, value, good, allowed in checks if not good]
     if problems:
         raise InputError(origin, problems)
+
+
+_KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "bool": (lambda x: isinstance(x, (bool, np.bool_)), "must be True or False"),
+    "int": (
+        lambda x: isinstance(x, Integral) and not isinstance(x, bool) and abs(int(x)) < 2**64,
+        "must be a whole number",
+    ),
+    "float": (
+        lambda x: isinstance(x, Real) and not isinstance(x, bool) and float(x) is not None,
+        "must be a number",
+    ),
+    "str": (lambda x: isinstance(x, str), "must be text"),
+    "str | Path": (
+        lambda x: isinstance(x, (str, os.PathLike)) and b"\0" not in os.fsencode(x),
+        "must be a path",
+    ),
+    "ArrayLike": (
+        lambda x: (
+            (kind := (array := np.asarray(x)).dtype.kind) in "fiub"
+            or (kind == "O" and [float(one) for one in array.flat])
+        ),
+        "must be numbers",
+    ),
+    "Mapping": (
+        lambda x: isinstance(x, Mapping) and all(isinstance(key, str) for key in x),
+        "must be a mapping from text",
+    ),
+    "Collection": (
+        lambda x: isinstance(x, Collection) and all(isinstance(one, str) for one in x),
+        "must be a list of text",
+    ),
+    "Callable": (callable, "must be a function"),
+}
+"""Whether an argument is what an annotation says up to its brackets, and this in words."""
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def check_kinds(function: F, *, late: bool = False) -> F:
+    """Refuse arguments of another kind than the annotations of a function say, by InputError.
+
+    Annotations are those of `_KINDS`, and classes, with or without `| None`. What else an argument
+    must be is checked by the function itself.
+    """
+    names = inspect.signature(function).parameters
+    texts = {name: str(function.__annotations__.get(name, "")) for name in names}
+    origin = function.__qualname__.removesuffix(".__init__").rpartition(".")[2].lower()
+
+    def find_fault(text: str, value: Any) -> str:
+        kind = text.removesuffix(" | None")
+        if value is None and kind != text:
+            return ""
+        known = function.__globals__.get(kind)
+        good, allowed = _KINDS.get(kind.partition("[")[0], (None, f"must be a {kind}"))
+        if good is None:
+            wrong = isinstance(known, type) and known is not Any and not isinstance(value, known)
+            return allowed if wrong else ""
+        try:
+            return "" if good(value) else allowed
+        except (TypeError, ValueError, OverflowError):
+            return allowed
+
+    def check(args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        given = [*zip(texts, args, strict=False), *options.items()]
+        found = [(name, value, find_fault(texts.get(name, ""), value)) for name, value in given]
+        if problems := [Problem(*one) for one in found if one[2]]:
+            raise InputError(origin, problems)
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        if not late:
+            check(args, options)
+            return function(*args, **options)
+        try:
+            return function(*args, **options)
+        except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError):
+            check(args, options)
+            raise
+
+    return cast("F", call)
+
+
+def check_kinds_late(function: F) -> F:
+    """Refuse as `check_kinds`, but only where the function fails: that takes microseconds."""
+    return check_kinds(function, late=True)
+
+
+def refusal(origin: object, key: str, value: object, allowed: str) -> InputError:
+    """Return the error of one fault of an origin, which may be a path."""
+    return InputError(str(origin), [Problem(key, value, allowed)])
+
+
+@contextlib.contextmanager
+def refuse_errors(
+    origin: str, key: str, value: object, allowed: str, *errors: type[Exception]
+) -> Iterator[None]:
+    """Raise InputError where a block raises one of the errors, with its words as the reason."""
+    try:
+        yield
+    except errors as error:
+        raise refusal(origin, key, value, f"{allowed} ({error})") from None
 
 
 class MotionRefused(InputError):
@@ -146,7 +260,7 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 _RECORD = ("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard")
 EXTRAS = {
     **{"distributed": "cluster", "matplotlib": "plot", "numba": "fast", "pinocchio": "engines"},
-    **{"viser": "view", "xarray": "all", **dict.fromkeys(_RECORD, "record")},
+    **{"control": "control", "viser": "view", "xarray": "all", **dict.fromkeys(_RECORD, "record")},
 }
 """Extra of this package that installs a module."""
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import html
 import math
-from collections.abc import Callable, Iterable, Sequence
+import textwrap
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -45,6 +47,39 @@ def finite_vector(value: Any) -> Vector3 | None:
     return (first, second, third) if finite else None
 
 
+class Explained:
+    """An object that says what it is in at most ten lines, and as a table in a notebook."""
+
+    def _facts(self) -> dict[str, object]:
+        """Return what to say of the object: at most nine names, with units, and their values."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        said = {name: _say(value) for name, value in self._facts().items()}
+        width = max(map(len, said))
+        return "\n".join(
+            [type(self).__name__, *(f"  {name:<{width}}  {text}" for name, text in said.items())]
+        )
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
+            f"<td style='text-align:left'>{html.escape(_say(value))}</td></tr>"
+            for name, value in self._facts().items()
+        )
+        return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
+
+
+def _say(value: object) -> str:
+    """Write a value on one line: numbers with six digits, several in brackets, "none" for none."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, (tuple, list, np.ndarray)):
+        texts = [_say(each) for each in value]
+        return f"({', '.join(texts)})" if isinstance(value[0], float) else ", ".join(texts)
+    return textwrap.shorten(str(value), 200, placeholder=" ...")
+
+
 class Joints(NamedTuple):
     """Angles [rad] and rates [rad/s] of all nine joints, by kind and leg."""
 
@@ -56,8 +91,8 @@ class Joints(NamedTuple):
     beta_dot: Vector3
 
 
-@dataclass(frozen=True)
-class State:
+@dataclass(frozen=True, repr=False)
+class State(Explained):
     """The manipulator at one instant.
 
     Attributes:
@@ -83,6 +118,17 @@ class State:
         j: Any = joints if type(joints) is tuple else tuple(joints)
         by_kind = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])
         return cls(time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), by_kind, torque)
+
+    def _facts(self) -> dict[str, object]:
+        kinds = ("gamma", "mu", "beta")
+        return {
+            "time [s]": self.time_ns / NANOSECONDS,
+            "quaternion": self.quaternion,
+            "body_rate [rad/s]": self.body_rate,
+            **{f"{kind} [rad]": getattr(self.joints, kind) for kind in kinds},
+            "gamma_dot [rad/s]": self.joints.gamma_dot,
+            "torque [N m]": self.torque,
+        }
 
 
 @dataclass(frozen=True)
@@ -130,28 +176,6 @@ UNITS = {"t": "s"}
 for _name, (_unit, _dimension) in QUANTITIES.items():
     UNITS |= {f"{_name}_{_part}": _unit for _part in DIMENSIONS[_dimension]}
 UNITS["energy"] = "J"
-
-
-def columns_of(states: Any, names: Iterable[str] = (*QUANTITIES, "energy")) -> dict[str, Array]:
-    """Columns of a motion or a batch, each of the shape of t, by the names of `UNITS`."""
-    columns: dict[str, Array] = {"t": states.t}
-    for name in names:
-        array = getattr(states, name)
-        if name in QUANTITIES:
-            parts = enumerate(DIMENSIONS[QUANTITIES[name][1]])
-            columns |= {f"{name}_{part}": array[..., i] for i, part in parts}
-        else:
-            columns[name] = array
-    return columns
-
-
-def arrays_of(states: Any, *first: str) -> dict[str, Any]:
-    """Arrays of a motion or a batch as xarray takes them; `first` are their first dimensions."""
-    arrays: dict[str, Any] = {
-        name: ((*first, dimension), getattr(states, name), {"units": unit})
-        for name, (unit, dimension) in QUANTITIES.items()
-    }
-    return arrays | {"energy": (first, states.energy, {"units": "J"})}
 
 
 BASE_FRAME = "base_link"  # root of the robot (REP 105): frame {B} of the paper

@@ -4,19 +4,19 @@
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
 import sys
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sst_ros.errors import SstError
-from sst_ros.host.output import require_free, slices
+from sst_ros.errors import SstError, require
+from sst_ros.host.many_runs import run_many
+from sst_ros.host.output import require_free
 
 DOCS = Path(__file__).parents[1] / "docs"
+PAGES = Path(__file__).parent / "pages"
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -55,38 +55,21 @@ def run(
 
 
 def run_jobs(
-    function: Callable[[Job], Result],
-    jobs: Sequence[Job],
-    progress: str = "",
-    workers: int | None = None,
+    function: Callable[[Job], Result], jobs: Sequence[Job], label: str = "", workers: int = 0
 ) -> list[Result]:
     """Call a function of a module for each job; return the results in the order of the jobs.
 
-    A result may depend on its job only: then all bits are the same for any number of workers.
-
-    Args:
-        function: what to call; each process imports it by its name.
-        jobs: its arguments.
-        progress: label of a bar on the terminal; empty for none.
-        workers: processes; None for one a core, 1 for this process alone.
-
+    They are called in processes of this machine, by default one a core, or in this one for 1
+    worker; a bar with the label is drawn. A result may depend on its job only: then all bits are
+    the same for any number of workers.
     """
-    workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
-    bar = slices(len(jobs), 1, progress, bool(progress))
-    if workers <= 1:
-        return [function(jobs[part.start]) for part in bar]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _end_with_the_parent) as pool:
-        return [result for _, result in zip(bar, pool.map(function, jobs), strict=True)]
+    client = None if workers == 1 else _processes(workers or len(os.sched_getaffinity(0)))
+    found = dict(run_many(function, jobs, client=client, label=label))
+    return [found[number] for number in range(len(jobs))]
 
 
-def _end_with_the_parent() -> None:
-    """End a worker whose parent was killed; nothing else would end it."""
-    parent = multiprocessing.parent_process()
-
-    def wait() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+@cache
+def _processes(count: int) -> Any:
+    """Return a client of processes that end with this one."""
+    given = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
+    return require("distributed").Client(**given, set_as_default=False)

@@ -260,7 +260,7 @@ def is_stable(loop: ControlLoop, bandwidth: float) -> bool:
     ticks = 600 + 200 * loop.settings.delay
     start, seconds = loop.motion.at(0.0), ticks * loop.period_ns / NANOSECONDS
     pose = Reference(start.quaternion, ZERO, ZERO, start.gamma, ZERO, ZERO)
-    rest: Any = SimpleNamespace(duration=seconds, at=lambda _: pose)
+    rest = ReferenceMotion(lambda _: pose, (0.0, seconds))
     settings = replace(loop.settings, mode="computed_torque", bandwidth=bandwidth)
     held = replace(loop, motion=rest, settings=settings, offset=OFFSET, lost=_LOST)
     track, _, failure = run_loop(held)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,21 +22,21 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.host.output import slices
+from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, VERMILION, styled
+from sst_ros.host.many_runs import run_many
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, VERMILION, styled
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
     ReferenceSolution,
     solve_reference,
 )
-from sst_ros.report.results import data_frame, markdown, provenance, publish, records
+from sst_ros.report.results import data_frame, publish, records, render
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
-from studies import DOCS, run
+from studies import DOCS, PAGES, run
 from studies.control_loop import run_in_loop
 from studies.sampled_data import ORDERS, slope
 
@@ -160,11 +159,13 @@ def control_study(
 
     whole = [rate for rate in rates if problem.interval_ns % (NANOSECONDS // rate) == 0]
     points, rows = list(itertools.product(whole, methods, HOLDS)), []
-    for part in slices(len(points), 1, f"{scene.name:<16}", shown):
-        rate, method, hold = points[part.start]
-        times_ns, states, estimate, tick = run_controlled(
-            scene, problem.seconds, rate, method, hold, compiled=compiled
-        )
+
+    def run_one(point: tuple[int, str, str]) -> Run:
+        return run_controlled(scene, problem.seconds, *point, compiled=compiled)
+
+    for number, found in run_many(run_one, points, label=f"{scene.name:<16}" * shown):
+        rate, method, hold = points[number]
+        times_ns, states, estimate, tick = found
         chosen = np.isin(times_ns, problem.interval_ns * np.arange(problem.count + 1))
         final, largest = problem.errors(states[chosen], reference.states)
         errors = final.orientation, largest.orientation
@@ -204,23 +205,6 @@ WRONG_ORDER = 0.2
 SCENES = ("example2", "friction")
 """Scenes of the page."""
 
-INTRODUCTION = """\
-# Control rate and accuracy
-
-Written by `python -m studies.control_rate`; all figures are from the machine and the date below.
-
-A simulator in a control loop holds each torque over a control period. What the motion then differs
-from that under the continuous torques is the error of the hold, not that of the integrator. Each
-point is a real run of the run loop of the simulator node, without ROS and as fast as possible, with
-a sample at every tick, by one method at the node's default tolerance; the torque of a tick is that
-of the start of its hold, that of its middle, or the profile itself, for which nothing is held. It
-is compared with the reference solution of the accuracy page. Theory: the error falls with the
-period to the power 1 for the start, 2 for the middle (`studies/sampled_data.py`).
-
-Processor time is that of the thread of the run per tick, its median, with the making of the sample,
-without publishing it; a share of a core is that time the rate.
-"""
-
 
 def report(options: argparse.Namespace) -> bool:
     """Study scenes; print the page, and write control_rate.csv, .json, .md and figures."""
@@ -229,11 +213,10 @@ def report(options: argparse.Namespace) -> bool:
         studies.append(control_study(scenes.load(name), shown=True))
     rows = data_frame(row for study in studies for row in records(study.rows))
     print(page(studies))
-    publish(
-        options.out, "control_rate", csv=rows, page=page(studies),
-        document={"rows": records(rows), "advice": {s.scene: advice(s) for s in studies}},
-        figures={f"control_rate_{s.scene}": figure(s) for s in studies},
-    )  # fmt: skip
+    document = {"rows": records(rows), "advice": {s.scene: advice(s) for s in studies}}
+    figures = {f"control_rate_{s.scene}.png": figure(s) for s in studies}
+    files = {".csv": rows, ".json": document, ".md": page(studies), **figures}
+    publish(options.out, "control_rate", files)
     return True
 
 
@@ -306,20 +289,15 @@ def figure(study: ControlStudy) -> Figure:
                markerfacecolor="none") for method in loop.method.unique()
     ]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    found, _, why = advice(study).partition(": ")
-    title = f"{study.scene} over {study.seconds:g} s: {found}\n{textwrap.fill(why, 125)}"
-    figure.suptitle(title, fontsize=12)
+    found = advice(study).partition(": ")[0]  # the page gives the reasons
+    figure.suptitle(f"{study.scene} over {study.seconds:g} s: {found}", fontsize=12)
     return figure
 
 
 def page(studies: Sequence[ControlStudy]) -> str:
     """Write studies as one Markdown page."""
-    lines = [INTRODUCTION]
-    for study in studies:
-        picture = f"![error against control period](control_rate_{study.scene}.png)"
-        lines += [f"## {study.scene}", "", picture, "", *(f"- {line}" for line in findings(study))]
-        lines += ["", markdown(grid(study)), ""]
-    return "\n".join([*lines, provenance(), ""])
+    given = {"findings": findings, "grid": grid}
+    return render(PAGES / "control_rate.md", studies=studies, **given)
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.host.compiled_module import numba_version
+from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import METHODS, Method, Rosenbrock
-from sst_ros.plot.style import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
-from sst_ros.report.results import data_frame, markdown, provenance, publish, records
+from sst_ros.report.results import data_frame, publish, records, render
 from sst_ros.report.scene_summary import eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Array
-from studies import DOCS, run, run_jobs
+from studies import DOCS, PAGES, run, run_jobs
 from studies.control_loop import run_in_loop
 from studies.extreme_cases import LOOSE, Case, apart, catalogue
 
@@ -210,36 +210,15 @@ def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
     return unresolved or EstimateCheck(None, None, "there is no run at a loose tolerance", False)
 
 
-INTRODUCTION = f"""\
-# Stability
-
-Written by `python -m studies.extreme --long`, on the machine and the date below. Without `--long`
-the cases of 1e5 s and of a thousand contacts are left out.
-
-Each case is run by `Simulation` interpreted, a control period a call; through the run loop of the
-simulator node; and compiled, in as few calls as possible. It passes if its result is that of theory
-within the bound, or the named error where the motion must end, and if all runs end in the same
-bits. Energy is the energy residual relative to the energy. Times include the making of the scene,
-those of compiled runs compilation too; "compiled only" would take hours in plain Python.
-
-The error estimate must lie within a factor {FACTOR:g} of the true error, or the column "estimate"
-gives the reason why there is nothing to compare. The case is run at the tolerance {LOOSE:g}, or at
-{LOOSER:g} where an error is resolved only there, with steps as long as that allows, and compared
-with its run at the default tolerance, 1e-10. An estimate of an error that is not resolved must not
-be above {FACTOR:g} times what is resolved.
-"""
-
-
 def report(out: Path, *, long: bool = False) -> bool:
     """Run all cases, with `long` those of minutes, too; write the page; whether all passed."""
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
     cases = run_jobs(_evaluate, jobs[::-1], "extreme cases   ")[::-1]
     print(page(cases))
     table = data_frame(asdict(case) | {"passed": case.passed} for case in cases)
-    publish(
-        out, "stability", csv=table, page=page(cases), document={"cases": records(table)},
-        figures={"stability_regions": draw_regions(scene_points())},
-    )  # fmt: skip
+    drawn = {"stability_regions.png": draw_regions(scene_points())}
+    document = {"cases": records(table)}
+    publish(out, "stability", {".csv": table, ".json": document, ".md": page(cases), **drawn})
     return all(case.passed for case in cases)
 
 
@@ -249,26 +228,13 @@ def _evaluate(number: int) -> CaseResult:
 
 def page(cases: Sequence[CaseResult]) -> str:
     """Write the report as one Markdown page."""
-    failed, both, loops, checked = np.sum([
-        (not case.passed, case.same_bits is not None, case.run_loop is not None,
-         case.loose_error is not None) for case in cases
-    ], axis=0)  # fmt: skip
-    counts = (
-        f"{len(cases)} cases, {failed} failed; {both} run interpreted and compiled, and {loops} "
-        f"through the run loop, with the same bits compared; error estimate checked in {checked}, "
-        "the others give the reason."
-    )
-    parts = [INTRODUCTION, f"**{counts}**", ""]
-    parts += ["## Regions of absolute stability", "",
-              "![regions of absolute stability](stability_regions.png)", "",
-              "The marks are the eigenvalues of the linearised scenes at their start, times the "
-              "step that `scene show` recommends. Steps at the ends of the intervals are tested on "
-              "`stiff` and on a star that swings on springs.", "",
-              *(f"- {line}." for line in limits_of_theory()), "", "## Cases", ""]  # fmt: skip
-    for group in dict.fromkeys(case.group for case in cases):
-        own = [case for case in cases if case.group == group]
-        parts += [f"### {group}", "", markdown(data_frame(map(_row, own))), ""]
-    return "\n".join([*parts, provenance(), ""])
+    groups = {
+        group: data_frame(_row(case) for case in cases if case.group == group)
+        for group in dict.fromkeys(case.group for case in cases)
+    }
+    numbers = {"factor": f"{FACTOR:g}", "loose": f"{LOOSE:g}", "looser": f"{LOOSER:g}"}
+    given = {"cases": cases, "groups": groups, "limits": limits_of_theory()}
+    return render(PAGES / "stability.md", **given, **numbers)
 
 
 def _row(case: CaseResult) -> dict[str, str]:

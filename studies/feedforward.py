@@ -33,13 +33,13 @@ from sst_ros.control.controller import InverseDynamics
 from sst_ros.control.law import INSTANTS, MODES
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import TrackingMetrics
-from sst_ros.plot.style import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, styled
-from sst_ros.report.results import data_frame, markdown, provenance, publish, records
+from sst_ros.host.figures import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, styled
+from sst_ros.report.results import data_frame, publish, records, render
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.state import NANOSECONDS, Vector3
 from sst_ros.sweeps.sweep_study import SampledControl
-from studies import DOCS, run, run_jobs
+from studies import DOCS, PAGES, run, run_jobs
 from studies import control_loop as loops
 from studies.control_loop import SHARE, ControlLoop, ModelError, model_errors, run_loop
 from studies.sampled_data import ORDERS, slope
@@ -128,7 +128,7 @@ class FeedforwardStudy:
 
 
 def feedforward_study(
-    plan: FeedforwardPlan, *, workers: int | None = None, shown: bool = False
+    plan: FeedforwardPlan, *, workers: int = 0, shown: bool = False
 ) -> FeedforwardStudy:
     """Run the grid on all cores; the same bits for any number of workers.
 
@@ -235,30 +235,13 @@ def _unheld(plant: Scene) -> tuple[float, float]:
     return float(np.abs(desired - found.gamma).max()), found.error_estimate
 
 
-INTRODUCTION = """\
-# How good feedforward is
-
-Written by `python -m studies.feedforward`; all figures are from the machine and the date
-below.
-
-Every control mode tracks the reference motion of the scene with every model error: bodies 20 % too
-heavy or too light in the controller's model (masses and inertias together), friction or gravity
-missing from it, commands delayed by some samples, encoders with a finite number of counts a turn
-(they measure no rate: it is the difference of the last two angles), and noise on angle (1e-4 rad)
-and rate (1e-2 rad/s). Plant and controller run in lockstep in one process. Errors are those of the
-true state. A loop with feedback that, long after the motion has ended, swings by more than 2 % of
-the longest path of a joint, or has a torque at its limit, does not come to rest: it has failed,
-as one that leaves its stroke or its workspace. `studies/feedforward.py` and
-`sampled_data.py` derive the theory.
-"""
-
-
 def report(options: argparse.Namespace) -> bool:
     """Run a study; print it, and write feedforward.csv, .json, .md and .png."""
     study = feedforward_study(FeedforwardPlan(load(options.scene)), shown=True)
     print(page(study), flush=True)
-    publish(options.out, "feedforward", csv=study.loops, document=document(study),
-            page=page(study), figures={"feedforward": draw_study(study, title(study))})  # fmt: skip
+    drawn = draw_study(study, title(study))
+    files = {".csv": study.loops, ".json": document(study), ".md": page(study), ".png": drawn}
+    publish(options.out, "feedforward", files)
     return True
 
 
@@ -319,15 +302,12 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
 
 def page(study: FeedforwardStudy) -> str:
     """Write a study as one Markdown page."""
-    lines = [
-        INTRODUCTION, f"**{title(study)}.**", "", "![the study](feedforward.png)", "",
-        "## Theory and findings", "", *(f"- {line.strip()}" for line in findings(study)), "",
-        "## RMS error of gamma [rad]", "", markdown(rms_table(study)), "",
-    ]  # fmt: skip
+    failures = []
     for number, row in enumerate(study.failed.itertuples(), start=1):
         at = "" if row.mode == OPEN_LOOP else f" at {row.bandwidth_rad_per_s:g} rad/s"
-        lines.append(f"- [{number}] {row.error}, {row.mode}{at}: {row.failure}")
-    return "\n".join([*lines, "", provenance(), ""])
+        failures.append(f"[{number}] {row.error}, {row.mode}{at}: {row.failure}")
+    given = {"about": title(study), "findings": findings(study), "table": rms_table(study)}
+    return render(PAGES / "feedforward.md", failures=failures, **given)
 
 
 _LOOKS = ((GREY, "D"), (BLUE, "o"), (GREEN, "^"), (VERMILION, "s"), (ORANGE, "v"))

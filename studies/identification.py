@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from sst_ros.demo import FOLLOWED, follow
+from sst_ros.host.figures import BLUE, VERMILION, hide_zeros, legend, stack, styled
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
-from sst_ros.plot.style import BLUE, VERMILION, hide_zeros, legend, save_figure, stack, styled
 from sst_ros.recording.recording import read as read_bag
 from sst_ros.report import tracking
+from sst_ros.report.results import publish
 from sst_ros.scene.scene import Scene, load
 from sst_ros.scene.yaml_document import dump
 from studies import run
@@ -98,11 +99,10 @@ def compare(out: Path, identified: str) -> str:
         error = hide_zeros(np.abs(followed.track.error).max(axis=1))
         axes.semilogy(followed.track.time, error, color=colour, linewidth=1.6, label=label)
     text = "\n".join([*lines, f"{'ratio':32}{rms[0] / rms[1]:12.1f}"])
-    (out / "identification.txt").write_text(f"{identified}\n{text}\n", encoding="utf-8")
     named = f"Tracking error, {MODE.replace('_', ' + ')}"
     axes.set_title(f"{named}: RMS {rms[0]:.1e} to {rms[1]:.1e} rad", pad=22)
     legend(axes)
-    save_figure(figure, out / "identification.png")
+    publish(out, "identification", {".txt": f"{identified}\n{text}\n", ".png": figure})
     return text
 
 

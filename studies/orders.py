@@ -22,14 +22,14 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import InputError
 from sst_ros.host.compiled_module import numba_version
+from sst_ros.host.figures import GREY, INK, MARKERS, styled
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array, Geometry, angle_between
-from sst_ros.plot.style import GREY, INK, MARKERS, styled
-from sst_ros.report.results import data_frame, markdown, provenance, publish
+from sst_ros.report.results import data_frame, publish, render
 from sst_ros.simulation.simulate_gauss import GAUSS, NODES
-from studies import DOCS, run, run_jobs
+from studies import DOCS, PAGES, run, run_jobs
 from studies.extreme_scenes import FREE, Changes, bouncing, changed
 from studies.sampled_data import slope
 
@@ -254,55 +254,6 @@ def draw(
     return figure
 
 
-PAGE = """# Orders of the methods, and errors of samples, events and energy
-
-Written by `python -m studies.orders`. Each error is the angle between orientations, or what the
-axis says, to a run by DOP853 at a tolerance of 1e-13; the dotted line is its distance from one by
-Dormand-Prince 5, and a point on it lies there or below. How far the error estimates of such runs
-can be trusted is on [another page](estimate.md), the methods are [here](methods/index.md).
-
-## Error over the step
-
-`simulate(..., max_step=h)` with a tolerance that no step exceeds; collocation with a number of
-steps and twenty iterations. Errors above 0.05 rad, as of unstable steps, are not drawn.
-
-![Error over the length of a step](orders.png)
-
-A method loses order where the motion is not smooth on the scale of a step: under friction and lag
-until the step is short enough, at a kink that is not known with any step, and the implicit method
-under a strong decay (order reduction). The error constant is C in error = C (h / 100 ms)^p, with
-the order p of the shortest steps; errors below thirty times what is known are left out.
-
-{orders}
-
-## Samples between the ends of steps
-
-Largest error at 300 random instants: given as `t_eval`, and by `Trajectory.at` of a run with the
-default samples.
-
-![Error of samples over the tolerance](orders_samples.png)
-
-## Time of an event
-
-The motion ends at the end of the stroke; or it meets an elastic stop, where the end is right only
-if the contact is located. The table has the largest error over the tolerance, where it is resolved.
-
-![Error of the time of a stop, and of the end after a contact](orders_events.png)
-
-{ratios}
-
-## Energy over {seconds:g} s of motion
-
-`Simulation("swing", method, compiled=True)` by periods of 5 ms, without friction or torque; the
-energy is {energy:.3g} J. A residual of independent rounding errors grows as sqrt(t), a truncation
-error of one sign as t.
-
-![Energy residual over time](orders_energy.png)
-
-{provenance}
-"""
-
-
 def report(options: argparse.Namespace) -> bool:
     """Measure all; write orders.csv, .json, .md and the pictures."""
     steps = list(product(SHOWN, ALL))
@@ -316,20 +267,17 @@ def report(options: argparse.Namespace) -> bool:
     rows = data_frame(row._asdict() for part in parts for row in part)
     samples = [(of, name) for name in ("smooth", "friction") for of in ("t_eval", "at")]
     swing = Simulation("swing")
-    page = PAGE.format(
-        orders=markdown(order_table(rows)), ratios=markdown(ratio_table(rows)),
-        energy=swing.dynamics.total_energy(swing.sample[0]), seconds=options.seconds,
-        provenance=provenance(),
-    )  # fmt: skip
+    given = {"energy": swing.dynamics.total_energy(swing.sample[0]), "seconds": options.seconds}
+    page = render(PAGES / "orders.md", orders=order_table(rows), ratios=ratio_table(rows), **given)
     figures = {
-        "orders": draw(rows, [("step", name) for name in SHOWN], "step [s]"),
-        "orders_samples": draw(rows, samples, "tolerance [rad]", TOLERANCE),
-        "orders_events": draw(
+        ".png": draw(rows, [("step", name) for name in SHOWN], "step [s]"),
+        "orders_samples.png": draw(rows, samples, "tolerance [rad]", TOLERANCE),
+        "orders_events.png": draw(
             rows, [("stop", "stop"), ("contact", "contact")], "tolerance [rad]", TOLERANCE
         ),
-        "orders_energy": draw(rows, [("energy", "swing")], "time [s]", ROUNDING),
+        "orders_energy.png": draw(rows, [("energy", "swing")], "time [s]", ROUNDING),
     }
-    publish(options.out, "orders", csv=rows, document={}, page=page, figures=figures)
+    publish(options.out, "orders", {".csv": rows, ".json": {}, ".md": page, **figures})
     return True
 
 

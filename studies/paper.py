@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from benchmark.peers.pinocchio_peer import Model
 from benchmark.peers.task import KINDS, Task
 from sst_ros import demo
 from sst_ros.errors import MissingDependency, require
+from sst_ros.host.figures import BLUE, VERMILION, hide_zeros, stack, styled
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, angle_between, quaternion_of, rotation_matrix
@@ -32,12 +32,12 @@ from sst_ros.plot.pictures import (
     draw_position,
     save,
 )
-from sst_ros.plot.style import BLUE, VERMILION, hide_zeros, stack, styled
 from sst_ros.recording import recording
+from sst_ros.report.results import publish, render
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
-from studies import run
+from studies import PAGES, run
 
 NODES_LIMIT, ENGINE_LIMIT, TORQUE_LIMIT = 5e-5, 1e-9, 1e-8
 """Largest differences that are expected: of angles [rad], and of torques [N m]."""
@@ -88,7 +88,10 @@ def paper(out: Path) -> list[LargestDifference]:
         found.append(difference)
         paths.insert(2, path)
         lines = [*map(str, found), *dict.fromkeys(notes)]
-        (out / "index.html").write_text(_page(paths, lines), encoding="utf-8")
+        page = render(
+            PAGES / "paper.html", lines=lines, paths=paths, assumption=ASSUMPTION.capitalize()
+        )
+        publish(out, "paper", {"index.html": page})
     print("\n".join([*lines, f"Files: {out}: index.html, {len(paths)} pictures"]), flush=True)
     return found
 
@@ -201,21 +204,6 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
     path = save(figure, title, out, "fig09_inverse_dynamics", ["png"])[0]
     what = "torques by inverse dynamics against 1.13 sin 12t"
     return path, LargestDifference(scene.name, what, float(apart.max()), TORQUE_LIMIT, "N m")
-
-
-def _page(paths: Sequence[Path], lines: Sequence[str]) -> str:
-    """Format the index page."""
-    text = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
-    figure = "<figure><img alt='{0.stem}' src='{0.name}'></figure>"
-    pictures = "".join(map(figure.format, paths))
-    return (
-        "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><title>Figs. 8 to 14</title>"
-        "<style>body{font-family:sans-serif;max-width:60em;margin:2em auto}img{max-width:100%}"
-        "</style></head><body><h1>Figs. 8 to 14 of the paper</h1>"
-        f"<p>{html.escape(ASSUMPTION.capitalize())}. The paper's own figures are not "
-        "known to us, only their captions.</p>"
-        f"<h2>Largest differences</h2><ul>{text}</ul>{pictures}</body></html>\n"
-    )
 
 
 def main(words: Sequence[str] | None = None) -> int:

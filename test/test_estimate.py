@@ -29,6 +29,7 @@ def square(t):
 
 PIECES = PolynomialTorque([[[30.0, 9.0, -20.0]], [[-4.0, 2.0, 3.0]]], [0.0, 0.2])
 SATURATED = EXAMPLE2.with_values({"actuators.torque_limit": 2.5, "stroke.at_end": "ignore"})
+FREE = EXAMPLE2.with_values({"stroke.at_end": "ignore", "workspace.at_edge": "ignore"})
 WEAK = EXAMPLE2.with_values({"actuators.torque_limit": 0.5})
 RUNS = {
     "clamped sine": {"scene": SATURATED, "torque": SINE, "duration": 0.4},
@@ -102,6 +103,28 @@ def test_breakpoints_of_a_table_are_not_rounded_to_nanoseconds():
     rounded = simulate(torque=TorqueTable(times.round(9), torques), method="dop853", **arguments)
     assert angle_between(found.quaternion[-1], other.quaternion[-1]) < 1e-12
     assert angle_between(found.quaternion[-1], rounded.quaternion[-1]) > 1e-10
+
+
+def law(t, state):
+    rows = zip(state.joints.gamma, state.joints.gamma_dot, strict=True)
+    return [-4.0 * (angle - 0.8) - 0.8 * rate for angle, rate in rows]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_answer_of_a_held_controller_to_the_error_is_in_the_estimate(seed):
+    """Held for so long that the loop is unstable: the error grows, and the torques with it."""
+    rng = np.random.default_rng(seed)
+    period, tolerance = round(float(rng.uniform(0.1, 0.25)), 3), 10.0 ** rng.uniform(-9.0, -5.0)
+    arguments = {"torque": law, "duration": 0.9, "control_period": period, "t_eval": [0.9]}
+    truth = simulate(FREE, method="dop853", tolerance=1e-13, memoryless=True, **arguments)
+    for method in STEPPED:
+        run = functools.partial(simulate, FREE, method=method, tolerance=tolerance, **arguments)
+        found, other = run(memoryless=True), run()
+        error, unseen = (
+            angle_between(x.quaternion[-1], truth.quaternion[-1]) for x in (found, other)
+        )
+        assert found.success and error <= found.error_estimate <= 4.0 * error + 1e-13
+        assert unseen <= 3.0 * other.error_estimate
 
 
 def test_a_tolerance_that_is_not_met_is_said():

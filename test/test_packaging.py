@@ -32,7 +32,7 @@ PYTHON_KEYS = {name: f"python3-{name}" for name in (*_SAME.split(), "pytest-time
 }
 """Keys of rosdep/python.yaml of github.com/ros/rosdistro, commit 8468e88c of 2026-08-22."""
 
-WITHOUT_KEY = {"dask", "pyarrow", "viser", "xarray"}
+WITHOUT_KEY = {"control", "dask", "pyarrow", "viser", "xarray"}
 """Python packages of setup.py that have no key there: `pip install sst_ros[all]`."""
 
 ROS_KEYS = {

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """simulate() and prepare(): what they take and return, and that it is the run of Simulation."""
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
@@ -192,7 +193,7 @@ def test_another_start():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"scene": "nosuch"}, "must be a readable"),
+        ({"scene": "swin"}, "one of [^(]*did you mean 'swing'"),
         ({"scene": 3}, "must be a Scene"),
         ({"torque": 1.0}, "three finite numbers"),
         ({"torque": (1.0, float("nan"), 0.0)}, "three finite numbers"),
@@ -211,10 +212,12 @@ def test_another_start():
         ({"duration": None}, r"duration(.|\n)*must be given"),
         ({"torque": jerk, "control_period": 1e-9}, "period = 1e-09: must be at least .* s"),
         ({"breaks": [0.2, 0.1]}, "breaks(.|\n)*ascending"),
-        ({"breaks": "x"}, "breaks(.|\n)*ascending"),
+        ({"initial": {"gamma": [0.8] * 3, "orientation": [0, 0, 0, 0]}}, "must not be zero"),
+        ({"torque": lambda state, t: (0.0, 0.0, 0.0)}, "f.t, state., in this order"),
+        ({"breaks": "x"}, "breaks = 'x': must be numbers"),
         ({"max_step": 0.0}, "max_step(.|\n)*> 0"),
         ({"max_step": float("nan")}, "max_step(.|\n)*> 0"),
-        ({"max_step": "1"}, "max_step(.|\n)*> 0"),
+        ({"max_step": "1"}, "max_step = '1': must be a number"),
         ({"method": "gauss", "max_step": 0.001}, "no max_step"),
     ],
 )
@@ -306,3 +309,12 @@ def test_a_run_that_goes_on_in_compiled_code_has_the_same_digits(
     assert found.gamma_dot.tobytes() == plain.gamma_dot.tobytes()
     told = ("error_estimate", "evaluations", "method", "energy_residual", "step")
     assert [getattr(found, name) for name in told] == [getattr(plain, name) for name in told]
+
+
+def test_a_motion_that_its_budget_will_not_finish_is_said_early():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        with pytest.raises(
+            RuntimeWarning, match=r"swing: 100,.* % of the motion; it stops at 10,0"
+        ):
+            simulate("swing", duration=1e5, t_eval=[1e5])

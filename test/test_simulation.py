@@ -215,7 +215,7 @@ def test_a_torque_function_in_a_compiled_simulation_warns_once_and_a_sine_never(
             one.step(lambda t: (t, 0.0, 1.0), MILLISECOND)
     assert len(caught) == 1
     assert simulation.state == plain.state
-    with pytest.raises(TypeError, match="must return three torques"):  # and not Diverged
+    with pytest.raises(InputError, match="must return three torques"):  # and not Diverged
         plain.step(lambda t: (t, t), MILLISECOND)
 
 

@@ -162,6 +162,18 @@ def test_between_samples_it_is_as_accurate_as_at_them(scene, torque):
         coarse.at(0.3)
 
 
+@pytest.mark.parametrize("rows", [slice(None, 5), slice(2, None, 3), slice(-4, -1)])
+def test_a_slice_has_its_samples_and_goes_on_between_them(run, rows):
+    part = run[rows]
+    for name in ("t", "quaternion", "body_rate", "torque", "gamma", "beta_dot", "energy"):
+        assert np.array_equal(getattr(part, name), getattr(run, name)[rows])
+    middle = 0.5 * (part.t[0] + part.t[-1])
+    np.testing.assert_allclose(part.at(middle).gamma, run.at(middle).gamma, rtol=0, atol=1e-11)
+    for wrong in (3, slice(5, 5), slice(None, None, -1)):
+        with pytest.raises(InputError, match=r"trajectory: (rows|t) = "):
+            run[wrong]
+
+
 def test_samples_under_held_torques_need_nothing_else():
     """As those of a recording: each torque is that of the interval that ends there."""
     times, torques = np.arange(11) / 100, [(0.1 * k, 0.5, -0.3) for k in range(10)]

@@ -18,10 +18,10 @@ from matplotlib.patches import FancyBboxPatch
 from numpy.typing import ArrayLike
 
 from sst_ros import load_scene
+from sst_ros.host.figures import BLUE, GREEN, GREY, INK, VERMILION
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.virtual_work import link_frames, posture
-from sst_ros.plot.style import BLUE, GREEN, GREY, INK, VERMILION
 
 GAMMA = np.array([0.95, 0.62, 0.80])
 """The pose of all pictures [rad]: no two lines of geometry.png fall together in it."""

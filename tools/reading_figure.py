@@ -14,12 +14,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmark.measure import DOCS
+from sst_ros.host.figures import BLUE, GREY, INK, save_figure, styled
 from sst_ros.identification.measured_motion import take_readings
-from sst_ros.identification.parameters import value_of
-from sst_ros.identification.simulation_fit import Sensitivities, describe_combination
+from sst_ros.identification.simulation_fit import FittedMotion, describe_combination
 from sst_ros.mechanism.geometry import Array
-from sst_ros.plot.style import BLUE, GREY, INK, save_figure, styled
 from sst_ros.scene.scene import load
+from sst_ros.scene.yaml_document import find_number
 
 ERROR = math.radians(1.0)
 READINGS = 26
@@ -53,8 +53,8 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     lengths = ERROR * (scene.star.radius if "x" in read else 1.0)
     data = {"t": t, "deviation": lengths} | {key: np.zeros(READINGS) for key in read}
     torque, found = take_readings(data, scene)
-    motion = Sensitivities(scene, names, torque)
-    values = np.array([value_of(scene, key) for key in names], dtype=float)
+    motion = FittedMotion(scene, names, torque)
+    values = np.array([find_number(scene, key) for key in names], dtype=float)
     _, slopes = motion.compare(values, found)
     _, singular, rows = np.linalg.svd(slopes * values)
     relative = 1.0 / np.maximum(singular, 1e-9)

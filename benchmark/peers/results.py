@@ -24,7 +24,7 @@ from benchmark.peers.floor import Floor
 from benchmark.peers.ours import ENGINE as OURS
 from benchmark.peers.ours import PUBLIC
 from benchmark.peers.study import TARGETS, Curve, Point, Reference, reach
-from sst_ros.plot.style import BLUE, GREEN, INK, VERMILION, save_figure, styled
+from sst_ros.host.figures import BLUE, GREEN, INK, VERMILION, Looks, save_figure, styled
 from sst_ros.report.results import markdown
 
 PACKAGES = ("numpy", "numba", "mujoco", "pin", "scipy", "mpmath")
@@ -218,29 +218,36 @@ def _format(value: float) -> str:
 def draw(folder: Path) -> None:
     """Write peers.png beside peers.csv and peers.json.
 
-    One thin curve a method, and the best of all; of sst_ros that of the public call.
+    A thin curve with a number is a method; thick is the best, of sst_ros the public call.
     """
     rows = pd.read_csv(folder / "peers.csv")
     rows = rows[rows.median_ms.notna() & rows.failed.isna()]
     machine = json.loads((folder / "peers.json").read_text(encoding="utf-8"))["machine"]
-    note = f"Thin: single methods. {machine['processor']}, one core, {machine['date']}."
+    note = f"{machine['processor']}, one core, {machine['date']}."
     figure = Figure(figsize=(10.5, 5.4), layout="constrained")
     axes = figure.subplots()
+    number = 0
     for engine, (colour, marker) in STYLES.items():
         own = rows[rows.engine == engine]
-        for _, group in own.groupby("method"):
-            axes.plot(*find_front(group), color=colour, linewidth=1.0, alpha=0.3)
         public = own[own.method.str.startswith(PUBLIC)]
-        best = find_front(own if public.empty else public)
-        label = engine if len(own) else ""
-        axes.plot(*best, color=colour, marker=marker, markersize=5, label=label, zorder=3)
+        best, what = (own, "best of all") if public.empty else (public, f"by {PUBLIC}")
+        label = f"{engine}, {what}" if len(own) else ""
+        looks: Looks = {"marker": marker, "markersize": 5, "zorder": 3, "label": label}
+        axes.plot(*find_front(best), color=colour, **looks)
+        for method, group in own.drop(public.index).groupby("method"):
+            (times, errors), number = find_front(group), number + 1
+            looks = {"linewidth": 1.0, "alpha": 0.4, "label": f"{number}  {method}"}
+            axes.plot(times, errors, color=colour, **looks)
+            height = 4 - 7 * (number % 3) if errors[-1] > 1e-4 else -3  # these end together
+            beside: Looks = {"textcoords": "offset points", "fontsize": 8, "color": colour}
+            axes.annotate(str(number), (times[-1], errors[-1]), (3, height), **beside)
     for error in (1e-6, 1e-9):  # which the tables name
         axes.axhline(error, color="#666666", linewidth=0.8, linestyle=(0, (6, 4)), zorder=1)
     axes.set(xscale="log", yscale="log", ylim=(0.5 * SMALLEST, LARGEST))
     axes.set_xlabel("processor time of one simulated second [ms], median")
     axes.set_ylabel("error of the orientation at t = 1 s [rad]")
     axes.set_title("Work-precision diagram: Example 2 of the paper", loc="left")
-    figure.legend(loc="outside right upper", fontsize=9.5, title="best of all settings")
+    figure.legend(loc="outside right upper", fontsize=8.5)
     figure.supxlabel(note, fontsize=8.5, color="#444444")
     save_figure(figure, folder / "peers.png")
 

@@ -11,6 +11,7 @@ from sst_ros.cli.commands import free_out, function
 from sst_ros.control.plan import UNITS, examine_motion, plan_json, time_scaling, write_torques
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import refuse_unless
+from sst_ros.host.many_runs import connect
 from sst_ros.host.output import require_free, write_into
 from sst_ros.identification.excitation import ExcitingMotion, design
 from sst_ros.identification.identify import identify
@@ -19,7 +20,7 @@ from sst_ros.report.results import render
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
 from sst_ros.sweeps.results import read_sweep, summarize
-from sst_ros.sweeps.sweep import connect, run_study
+from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
 PLOT, DESIGN = "plot", "design"  # words in place of a study, and of a bag
@@ -67,7 +68,7 @@ def run_sweep(options: argparse.Namespace) -> None:
         if client is not None:
             end.callback(client.close, timeout=5)
         found = run_study(study, out, client=client, workers=workers, resume=resume)
-    print(summarize(found))
+    print(summarize(found), end="")
     print(f"Results in {out}; `sst-ros sweep plot {out}` draws them.")
 
 

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from pathlib import Path
 
 from sst_ros import demo
 from sst_ros.cli.commands import free_out, function
-from sst_ros.host.output import results_folder
+from sst_ros.host.output import replace_file, require_free, results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
 from sst_ros.scene.scene import load, names
@@ -36,22 +38,39 @@ def report_stability(options: argparse.Namespace) -> int:
 
 
 def draw_pictures(options: argparse.Namespace) -> int:
-    """Draw recorded runs, or list the pictures."""
+    """Draw a recorded run, or list the pictures."""
     if options.list:
         for name, picture in pictures.PICTURES.items():
             print(f"{name:<18}{picture.title}; needs {', '.join(picture.needs)}")
-        print(f"{'with --compare':<18}{', '.join(compare.PICTURES)}")
+        print(f"{'sst-ros compare':<18}{', '.join(compare.PICTURES)}")
         return 0
-    bags = [*options.bags, *options.compare]
-    if not bags or (len(bags) > 1 and not options.compare):
-        options.parser.error("name one BAG, or several with --compare")
-    out = free_out(options, results_folder(bags[0], "plots"))
-    runs = [read_signals(bag) for bag in bags]
     if options.compare:
-        print(compare.difference_text(runs))
-        paths, missing = compare.draw_comparison(runs, out, options.only)
-    else:
-        paths, missing = pictures.draw_run(runs[0], out, options.only)
+        print("plot --compare is deprecated: use sst-ros compare", file=sys.stderr)
+        options.bags, options.csv = [*filter(None, [options.bag]), *options.compare], None
+        return compare_runs(options)
+    if options.bag is None:
+        options.parser.error("name a BAG")
+    out = free_out(options, results_folder(options.bag, "plots"))
+    return _tell(*pictures.draw_run(read_signals(options.bag), out, options.only))
+
+
+def compare_runs(options: argparse.Namespace) -> int:
+    """Print and draw how recorded runs differ from the first."""
+    out = free_out(options, results_folder(options.bags[0], "compared"))
+    if options.csv is not None:
+        require_free(options.csv, "compare", force=options.force)
+    runs = [read_signals(bag) for bag in options.bags]
+    drawn = compare.draw_comparison(runs, out, options.only)
+    print(compare.difference_text(runs))
+    if options.csv is not None:
+        with replace_file(options.csv) as path:
+            compare.differences(runs).to_csv(path, lineterminator="\n")
+        print(options.csv)
+    return _tell(*drawn)
+
+
+def _tell(paths: list[Path], missing: dict[str, str]) -> int:
+    """Print which pictures were drawn, and which not; return the exit status."""
     for path in paths:
         print(path)
     for name, why in missing.items():

@@ -23,6 +23,7 @@ from sst_ros.host.output import SUFFIXES, require_free, results_folder
 from sst_ros.integration import compiled_method
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.report.results import render
 from sst_ros.report.scene_summary import summary
 from sst_ros.scene.scene import Scene, load, text_of
 from sst_ros.scene.yaml_document import line_of, read
@@ -113,7 +114,7 @@ def map_workspace(options: argparse.Namespace) -> None:
     chart = workspace.over_orientations(geometry, directions, turns=180, progress=True)
     print(workspace.report_singularities(geometry, chart))
     figure = function("plot.workspace:plot_workspace")(chart, titles=[scene.name])
-    function("plot.style:save_figure")(figure, out)
+    function("host.figures:save_figure")(figure, out)
     print(out)
 
 
@@ -134,19 +135,12 @@ def run_simulation(options: argparse.Namespace) -> int:
     trajectory = simulate(options.scene, progress=True, **given)
     if count is not None:
         trajectory = trajectory.at(np.linspace(trajectory.t[0], trajectory.t[-1], count + 1))
-    gamma = ", ".join(f"{angle:.9f}" for angle in trajectory.gamma[-1])
-    print(f"{trajectory.scene.name}: {trajectory.message}")
-    print(f"simulated        {trajectory.t[-1]:.9g} s, {len(trajectory)} samples")
-    print(f"method           {trajectory.method}")
-    print(f"gamma at the end {gamma} rad")
-    print(f"error estimate   {trajectory.error_estimate:.1e} rad")
-    print(f"energy residual  {trajectory.energy_residual:.1e} J")
-    print(f"loop closure     {trajectory.closure_error:.1e}")
+    print(render("motion.txt", motion=trajectory), end="")
     if out is not None:
         trajectory.save(out, overwrite=options.force)
         print(out)
     if picture is not None:
-        function("plot.style:save_figure")(trajectory.plot(), picture)
+        function("host.figures:save_figure")(trajectory.plot(), picture)
         print(picture)
     return 0 if trajectory.success else 1
 

@@ -22,12 +22,18 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_for_arrays, compile_program, trace
-from sst_ros.errors import SingularConfiguration
+from sst_ros.errors import (
+    SingularConfiguration,
+    SstError,
+    check_kinds,
+    check_kinds_late,
+    refuse_unless,
+)
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.state import ZERO, Quaternion, Vector3
+from sst_ros.state import ZERO, Explained, Quaternion, Vector3
 
 ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
 CLOSED = 1e-14  # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
@@ -49,7 +55,7 @@ class Reference:
     gamma_ddot: Vector3  # [rad/s^2]
 
 
-class ReferenceMotion:
+class ReferenceMotion(Explained):
     """A desired motion; it rests before time 0 and after `duration` [s].
 
     It is made of a function that gives the reference at a time from 0 to `duration`, in which an
@@ -57,11 +63,17 @@ class ReferenceMotion:
     from one to the next the motion is so smooth that some ten samples resolve it.
     """
 
+    @check_kinds
     def __init__(self, inside: Callable[[float], Reference], pieces: tuple[float, ...]) -> None:
+        some = isinstance(pieces, tuple) and len(pieces) > 0
+        refuse_unless("motion", ("pieces", pieces, some, "must be rising times [s], a tuple"))
         self._inside, self.pieces, self.duration = inside, pieces, pieces[-1]
 
+    @check_kinds_late
     def at(self, time: float) -> Reference:
         """Return the reference at a time [s]; raises SingularConfiguration in a singularity."""
+        if math.isnan(time):
+            refuse_unless("motion", ("time", time, False, "must be a number [s]"))
         inside = min(max(time, 0.0), self.duration)
         try:
             found = self._inside(inside)
@@ -71,6 +83,14 @@ class ReferenceMotion:
         if time == inside:
             return found
         return Reference(found.quaternion, ZERO, ZERO, found.gamma, ZERO, ZERO)
+
+    def _facts(self) -> dict[str, object]:
+        pieces = len(self.pieces) - 1
+        facts: dict[str, object] = {"duration [s]": self.duration, "smooth pieces": pieces}
+        with contextlib.suppress(SstError):  # an end is singular
+            facts["begins at gamma [rad]"] = self.at(0.0).gamma
+            facts["ends at gamma [rad]"] = self.at(self.duration).gamma
+        return facts
 
 
 def equal_pieces(duration: float, count: int) -> tuple[float, ...]:

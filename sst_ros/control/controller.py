@@ -12,22 +12,30 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
 from sst_ros.control.law import Command, ControllerSettings
+from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import SingularConfiguration, SstError, refuse_unless
+from sst_ros.errors import (
+    SingularConfiguration,
+    SstError,
+    check_kinds,
+    check_kinds_late,
+    refuse_unless,
+)
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.generic_math import triple
-from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
-from sst_ros.scene.scene import Scene
-from sst_ros.state import ZERO, Quaternion, State, Vector3
+from sst_ros.mechanism.generic_math import symmetric_rows, triple
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
+from sst_ros.scene.scene import Scene, terms
+from sst_ros.state import ZERO, Explained, Quaternion, State, Vector3, finite_vector
 
 SINGULAR = 1e-10  # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
 
 
-class InverseDynamics:
+class InverseDynamics(Explained):
     """Torques at the joints of a scene, all its terms included.
 
     It is the model that the simulation integrates, solved for the torques: tau = M gamma_ddot + h
@@ -35,10 +43,12 @@ class InverseDynamics:
     (limit, lag) is no part of it.
     """
 
+    @check_kinds
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         dynamics = Dynamics.of(scene)
         self._has_moment_topic, self._program = dynamics.has_moment_topic, dynamics.inverse
+        self._model = dynamics.model
 
     def torque(
         self,
@@ -54,9 +64,10 @@ class InverseDynamics:
         SingularConfiguration, serial (sin(mu_k) = 0) or parallel (det J2 = 0), where no torques
         control the star; InputError for numbers that are no state.
         """
-        acting = moment if self._has_moment_topic else ()
-        given = (*quaternion, *body_rate, *body_acceleration, *acting)
-        with contextlib.suppress(ArithmeticError, ValueError):
+        parts = quaternion, body_rate, body_acceleration, moment if self._has_moment_topic else ()
+        given: Any = parts
+        with contextlib.suppress(ArithmeticError, TypeError, ValueError):
+            given = *parts[0], *parts[1], *parts[2], *parts[3]
             first, second, third, determinant, *squares = self._program(*given)
             det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
             # Comparisons with NaN are false: what is not finite is refused, too.
@@ -65,6 +76,7 @@ class InverseDynamics:
                 return first, second, third
         raise self._refusal(quaternion, given)
 
+    @check_kinds_late
     def reference_torque(self, reference: Reference) -> Vector3:
         """Torques [N m] of a reference: the feedforward; raises as `torque`."""
         return self.torque(reference.quaternion, reference.body_rate, reference.body_acceleration)
@@ -76,18 +88,74 @@ class InverseDynamics:
         or at the quaternion (x, y, z, w) of {E} in {B}, shape (4,). Raises as `torque`, and
         AssemblyError where gamma has no unique admissible assembly.
         """
-        pose = at.quaternion if isinstance(at, State) else tuple(at)
+        return self.torque(self._orientation(at), ZERO, ZERO)
+
+    def mass_matrix(self, at: State | Sequence[float]) -> Array:
+        """M of tau = M gamma_ddot + h [kg m^2], rotors included; symmetric, shape (3, 3).
+
+        `at` and what is raised are as in `gravity_torque`.
+        """
+        inertia, reach = self._reduce(self._orientation(at))
+        back = np.linalg.inv(reach)
+        found = back.T @ inertia @ back
+        return np.asarray(0.5 * (found + found.T))
+
+    @check_kinds
+    def bias(self, state: State, moment: Vector3 = ZERO) -> Vector3:
+        """Torques h of tau = M gamma_ddot + h [N m]: those that keep gamma_dot in a state.
+
+        The moment and what is raised are as in `torque`.
+        """
+        q, rate = state.quaternion, state.body_rate
+        rest = kernel.actuator_acceleration(self._model, (*q, *rate), ZERO)
+        acceleration = np.linalg.solve(self._reduce(q)[1], np.negative(rest))
+        return self.torque(q, rate, triple(acceleration.tolist()), moment)
+
+    @check_kinds
+    def torque_of_moment(self, at: State | Sequence[float], moment: ArrayLike) -> Vector3:
+        """Torques [N m] at the actuators that do the work of a moment on the star in {B} [N m].
+
+        `at` and what is raised are as in `gravity_torque`. They stand for loads that a scene has
+        not, in a function for `simulate`.
+        """
+        three = finite_vector(moment) is not None
+        refuse_unless("inverse dynamics", ("moment", moment, three, "must be three numbers [N m]"))
+        q = self._orientation(at)
+        acting = rotation_matrix(q).T @ np.asarray(moment, dtype=float)
+        return triple(np.linalg.solve(self._reduce(q)[1].T, acting).tolist())
+
+    def _orientation(self, at: State | Sequence[float]) -> Quaternion:
+        """Quaternion of {E} in {B} of a state, of angles gamma or of itself."""
+        pose: Any = at.quaternion if isinstance(at, State) else at
+        fits = np.array(pose, object).shape in ((3,), (4,))
+        allowed = "must be a State, three angles gamma or a quaternion"
+        refuse_unless("inverse dynamics", ("at", at, fits, allowed))
         if len(pose) == 3:
             rotation = kinematics.admissible(Geometry.of(self.scene), pose).rotation
-            pose = tuple(quaternion_of(rotation).tolist())
-        allowed = "must be a State, three angles gamma or a quaternion"
-        refuse_unless("gravity_torque", ("at", at, len(pose) == 4, allowed))
-        x, y, z, w = pose
-        return self.torque((x, y, z, w), ZERO, ZERO)
+            pose = quaternion_of(rotation)
+        x, y, z, w = np.asarray(pose).tolist()
+        return x, y, z, w
+
+    def _reduce(self, q: Quaternion) -> tuple[Array, Array]:
+        """Return the inertia reduced to the star [kg m^2] and the rows g_k; raises as `torque`."""
+        self.torque(q, ZERO, ZERO)
+        inertia, _, reach = kernel.balance(self._model, q, ZERO, ZERO)
+        return np.array(symmetric_rows(inertia)), np.array(reach)
+
+    def _facts(self) -> dict[str, object]:
+        actuators = ("torque limit", "actuator lag")
+        return {
+            "scene": self.scene.name,
+            "torques for": [term for term in ("star", *terms(self.scene)) if term not in actuators],
+            "not for": actuators,
+            "external moment": "given with a state" if self._has_moment_topic else "none is given",
+        }
 
     def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> SingularConfiguration:
         """Return why there is no torque; raises InputError where numbers are wrong."""
-        finite = all(map(math.isfinite, given))
+        finite = False
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            finite = len(given) in (10, 13) and all(map(math.isfinite, given))
         short = finite and math.hypot(*quaternion) < 1e-100
         refuse_unless(
             "inverse dynamics",
@@ -131,6 +199,7 @@ class Controller:
     where the motion begins in a singularity.
     """
 
+    @check_kinds
     def __init__(
         self, model: Scene, motion: ReferenceMotion, settings: ControllerSettings, period_s: float
     ) -> None:
@@ -160,6 +229,7 @@ class Controller:
         self._known, self._integral = self._begin, ZERO
         self._failure: ControlStopped | None = None
 
+    @check_kinds
     def follow(self, motion: ReferenceMotion) -> None:
         """Track another motion, from the present reference on; gains and integral stay."""
         self._motion = motion
@@ -177,6 +247,7 @@ class Controller:
             held = self._inverse.reference_torque(self._motion.at(time + 0.5 * self._period_s))
         return desired, now, held
 
+    @check_kinds_late
     def command(self, time: float, measured: Measurement) -> Command:
         """Return the command at a time of the motion [s], to be held for a period.
 

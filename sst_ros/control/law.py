@@ -27,18 +27,17 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sst_ros.control.actuator_space import Reference
-from sst_ros.errors import Problem
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import Quadruple, Scalar, Triple, add, axpy, triple
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Section, coefficient, entry, positive
+from sst_ros.scene.schema import Rules, Section, coefficient, entry, positive
 from sst_ros.state import ZERO, Array, Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
@@ -93,13 +92,13 @@ class ControllerSettings(Section):
         default="start",
     )
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse gains of a joint where there is none."""
-        if self.direct and self.mode == "computed_torque" and self.space == "so3":
-            allowed = "is a joint's: on so3 give bandwidth and damping_ratio"
-            yield Problem("stiffness", self.stiffness, allowed)
-        if self.direct and not any(self.stiffness) and self.integral_rate:
-            yield Problem("integral_rate", self.integral_rate, "acts on stiffness: give it")
+        alone = self.direct and self.mode == "computed_torque" and self.space == "so3"
+        allowed = "is a joint's: on so3 give bandwidth and damping_ratio"
+        yield alone, "stiffness", self.stiffness, allowed
+        idle = self.direct and not any(self.stiffness) and self.integral_rate
+        yield idle, "integral_rate", self.integral_rate, "acts on stiffness: give it"
 
     @property
     def direct(self) -> bool:

@@ -29,6 +29,7 @@ from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import values_at
 from sst_ros.simulation.trajectory import Trajectory
 
 SAMPLES = 16  # parts of a piece of the motion; even, for Simpson's rule
@@ -132,8 +133,7 @@ def examine_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
     squares = simpson(samples[pieces, :3] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
     rms = np.sqrt(squares / times[-1]).tolist()
-    given = {name: getattr(scene.actuators, f"{name}_limit", None) for name in UNITS}
-    limits = {name: limit for name, limit in given.items() if limit is not None}
+    limits = {name: x for name in UNITS for x in values_at(scene, f"actuators.{name}_limit")}
     faults = tuple(_faults(distances, peaks, limits))
     return MotionPlan(motion, trajectory, peaks, limits, rms, distances, faults)
 

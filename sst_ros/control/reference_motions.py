@@ -31,7 +31,14 @@ from sst_ros.control.actuator_space import (
     follow_assembly,
 )
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.errors import InputError, Problem, SingularConfiguration, refuse_unless
+from sst_ros.errors import (
+    Check,
+    InputError,
+    SingularConfiguration,
+    check_kinds,
+    refusal,
+    refuse_unless,
+)
 from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.generic_math import axpy, multiply, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
@@ -53,6 +60,7 @@ ActuatorPath: TypeAlias = Callable[[float], tuple[Vector3, Vector3, Vector3]]
 OpenPoints: TypeAlias = Sequence[Sequence[float] | None]
 
 
+@check_kinds
 def reference_motion(
     scene: Scene, read_motion: Callable[[str], Any] | None = None
 ) -> ReferenceMotion:
@@ -65,11 +73,12 @@ def reference_motion(
     """
     motion, geometry = scene.motion, Geometry.of(scene)
     if motion is None:
-        raise InputError(scene.name, [Problem("motion", None, "the scene has no desired motion")])
+        raise refusal(scene.name, "motion", None, "the scene has no desired motion")
     if motion.recorded:
-        bag, allowed = motion.recorded.bag, "a recorded motion cannot be read here"
+        bag = motion.recorded.bag
         if read_motion is None:
-            raise InputError(scene.name, [Problem("motion.recorded", bag, allowed)])
+            allowed = "a recorded motion cannot be read here"
+            raise refusal(scene.name, "motion.recorded", bag, allowed)
         found = read_motion(bag)
         x, y, z, w = found.quaternion[0].tolist()
         return through_samples(geometry, (x, y, z, w), found.t, found.gamma, found.gamma_dot)
@@ -217,9 +226,8 @@ def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
     for begin, end in pairwise(pieces):
         rough = [path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()]
         length = sum(math.dist(a, b) for a, b in pairwise(rough))
-        if not length < LONGEST:
-            allowed = f"must be less than {LONGEST:g} rad between {begin:.9g} s and {end:.9g} s"
-            raise InputError("motion", [Problem("path length of gamma", length, allowed)])
+        allowed = f"must be less than {LONGEST:g} rad between {begin:.9g} s and {end:.9g} s"
+        refuse_unless("motion", ("path length of gamma", length, length < LONGEST, allowed))
         count = max(_SAMPLES, math.ceil(4.0 * length / STEP))
         times.append(np.linspace(begin, end, count + 1)[1:])
     fine = np.concatenate(times)
@@ -276,17 +284,14 @@ def through_points(
     minimum jerk between them. Raises InputError for points that make no motion, and as
     `move_actuators`.
     """
-    count = len(times)
-    problems = [] if count else [Problem("points", 0, "must be one or more")]
+    checks: list[Check] = [("points", len(times), len(times) > 0, "must be one or more")]
     names = "times", "positions", "velocities", "accelerations"
     given = [[time] for time in times], positions, velocities, accelerations
-    rows = [_read_rows(*one, count, problems) for one in zip(names, given, strict=True)]
-    if not problems:
-        at, gamma, rates, seconds = map(np.array, rows)
-        at = at.ravel()
-        problems += _faults(at, rates)
-    if problems:
-        raise InputError("trajectory", problems)
+    rows = [_read_rows(*one, len(times), checks) for one in zip(names, given, strict=True)]
+    refuse_unless("trajectory", *checks)
+    at, gamma, rates, seconds = map(np.array, rows)
+    at = at.ravel()
+    refuse_unless("trajectory", *_check_points(at, rates))
     here = kinematics.inverse(geometry, rotation_matrix(start))[0]
     if at[0] > 0.0:
         at, gamma = np.append(0.0, at), np.vstack([here, gamma])
@@ -316,33 +321,34 @@ def through_samples(
 
 
 def _read_rows(
-    name: str, rows: OpenPoints | None, count: int, problems: list[Problem]
+    name: str, rows: OpenPoints | None, count: int, checks: list[Check]
 ) -> list[list[float]]:
-    """Read rows of numbers; one that is open becomes NaN. What is wrong joins the problems."""
+    """Read rows of numbers; one that is open becomes NaN. What they must be joins the checks."""
     rows = [None] * count if rows is None else rows
-    if len(rows) != count:
-        problems.append(Problem(name, len(rows), f"must have a row for each of {count} points"))
+    whole = f"must have a row for each of {count} points"
+    checks.append((name, len(rows), len(rows) == count, whole))
     size, allowed = (1, "must be finite") if name == "times" else (3, "must be 3 finite numbers")
     found = [[] if row is None else list(map(float, row)) for row in rows]
     for index, numbers in enumerate(found):
         if not numbers and name in ("velocities", "accelerations"):
             numbers += [math.nan] * size
-        elif len(numbers) != size or not all(map(math.isfinite, numbers)):
-            problems.append(Problem(f"{name}[{index}]", numbers, allowed))
+        else:
+            good = len(numbers) == size and all(map(math.isfinite, numbers))
+            checks.append((f"{name}[{index}]", numbers, good, allowed))
     return found
 
 
-def _faults(at: Array, rates: Array) -> Iterator[Problem]:
-    """Yield what is wrong with points of finite numbers."""
+def _check_points(at: Array, rates: Array) -> Iterator[Check]:
+    """Yield what points of finite numbers must be."""
     for index in np.flatnonzero(at[1:] <= at[:-1]) + 1:
         allowed = f"must be > {at[index - 1]:g} s, that of the point before"
-        yield Problem(f"times[{index}]", float(at[index]), allowed)
-    if at[0] < 0.0 or (at[0] == 0.0 and len(at) == 1):
-        yield Problem("times[0]", float(at[0]), "must be >= 0 s, that of a single point > 0 s")
+        yield f"times[{index}]", float(at[index]), False, allowed
+    early = at[0] < 0.0 or (at[0] == 0.0 and len(at) == 1)
+    yield "times[0]", float(at[0]), not early, "must be >= 0 s, that of a single point > 0 s"
     for end in {0, len(at) - 1} if at[0] == 0.0 else {len(at) - 1}:
-        if np.nan_to_num(rates[end]).any():
-            allowed = "must be zero: a motion begins and ends at rest"
-            yield Problem(f"velocities[{end}]", rates[end].tolist(), allowed)
+        still = not np.nan_to_num(rates[end]).any()
+        allowed = "must be zero: a motion begins and ends at rest"
+        yield f"velocities[{end}]", rates[end].tolist(), still, allowed
 
 
 def _quintic_path(times: Array, *nodes: Array) -> ActuatorPath:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking metrics of a recorded or simulated motion, and their table."""
+"""Tracking metrics of a recorded or simulated motion."""
 
 from __future__ import annotations
 
@@ -101,25 +101,3 @@ def _since(known: float | None, wrong: NDArray[np.bool_], time: Array) -> float 
         return known
     rest = int(np.max(np.flatnonzero(wrong), initial=-1)) + 1
     return float(time[rest]) if rest < len(time) else None
-
-
-def tracking_table(found: TrackingMetrics) -> str:
-    """Return the metrics as text; what is unknown is a dash."""
-    rows = {
-        "error, RMS [rad]": found.rms,
-        "error, largest [rad]": found.largest,
-        "error at the end [rad]": found.last,
-        "torque, RMS [N m]": found.torque_rms,
-        "torque, largest [N m]": found.torque_largest,
-    }
-    cells = {label: [f"{value:.3e}" for value in row] for label, row in rows.items()}
-    for label, row in zip(("feedforward", "feedback"), found.shares, strict=True):
-        shares = ["-" if np.isnan(share) else f"{100.0 * share:.2f}" for share in row]
-        cells[f"{label}, share [%]"] = shares
-    lines = [f"{'':24}{'gamma_1':>12}{'gamma_2':>12}{'gamma_3':>12}"]
-    lines += [f"{label:24}" + "".join(f"{one:>12}" for one in row) for label, row in cells.items()]
-    settled = "-" if found.settling is None else f"{found.settling:.4f}"
-    limited = "-" if found.limited is None else found.limited
-    lines += [f"{'settling time [s]':24}{settled:>12}  (to {found.band:.2e} rad)"]
-    lines += [f"{'samples at a limit':24}{limited:>12}  (of {found.samples})"]
-    return "\n".join(lines) + "\n"

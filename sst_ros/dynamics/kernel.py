@@ -193,6 +193,12 @@ def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
     return a_rest, at.a_dot * (2.0 * at.a * at.gamma_dot - along) / at.u
 
 
+def actuator_acceleration(model: Model, state: Sequence[Scalar], acceleration: Triple) -> Triple:
+    """Return gamma_ddot [rad/s^2] of a state, which begins with quaternion and W, and W_dot."""
+    at_rest = ((at, rest_accelerations(at, triple(state[4:7]))) for at in leg_motions(model, state))
+    return triple(dot3(at.g, acceleration) + rest[1] for at, rest in at_rest)
+
+
 def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     """Kinetic energy of all seven links, payload and rotors [J]."""
     wx, wy, wz = state[4:7]

@@ -98,6 +98,25 @@ class Dynamics:
         return compile_program(trace(torques, (*MOTION, *BODY_ACCELERATION, *more)))
 
     @cached_property
+    def actuator_motion(self) -> Function:
+        """Coordinates x and x_dot of state and drive; both by each number of the state, and torque.
+
+        They are x = (gamma, gamma_dot, lagged torques if any).
+        """
+        size = len(self.state)
+
+        def motion(*inputs: Any) -> tuple[Any, ...]:
+            state, torque, moment = inputs[:size], inputs[size : size + 3], inputs[size + 3 :]
+            slope = kernel.derivative(self.model, state, torque, moment or None)
+            gamma_ddot = kernel.actuator_acceleration(self.model, state, slope[4:7])
+            joints = kernel.joints(self.model, state)
+            x = (*joints.gamma, *joints.gamma_dot, *state[7:])
+            return (*x, *joints.gamma_dot, *gamma_ddot, *slope[7:])
+
+        inputs = (*self.state, *self.drive)
+        return compile_program(trace(motion, inputs, (*self.state, *TORQUE)))
+
+    @cached_property
     def energies(self) -> Function:
         """Kinetic and potential energy [J] of the state."""
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, MissingDependency, Problem, refuse_unless, require
+from sst_ros.errors import MissingDependency, refuse_errors, refuse_unless, require
 
 TEMPORARY = ".part-"
 """How the name of a file begins that is not whole yet, or that a killed process has left."""
@@ -45,11 +45,8 @@ def require_free(out: Path, origin: str, *, force: bool = False, option: str = "
     An InputError names `origin`, the command that writes, and `option`, which gave `out`: that is
     a file, or a folder that is not empty, and `force` is not set; or it cannot be read.
     """
-    try:
+    with refuse_errors(origin, option, str(out), "must be a path that can be written", OSError):
         taken = any(out.iterdir()) if out.is_dir() else out.exists()
-    except OSError as error:
-        allowed = f"must be a path that can be written ({error})"
-        raise InputError(origin, [Problem(option, str(out), allowed)]) from None
     allowed = f"exists already: choose another {option}, or overwrite it with --force"
     refuse_unless(origin, (option, str(out), force or not taken, allowed))
     return out
@@ -58,12 +55,9 @@ def require_free(out: Path, origin: str, *, force: bool = False, option: str = "
 @contextmanager
 def write_into(out: Path, origin: str) -> Iterator[None]:
     """Make the folder `out` for a block that writes into it, or raise an InputError of `origin`."""
-    try:
+    with refuse_errors(origin, "--out", str(out), "must be a folder that can be written", OSError):
         out.mkdir(parents=True, exist_ok=True)
         yield
-    except OSError as error:
-        allowed = f"must be a folder that can be written ({error})"
-        raise InputError(origin, [Problem("--out", str(out), allowed)]) from None
 
 
 @contextmanager

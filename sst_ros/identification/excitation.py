@@ -33,6 +33,7 @@ from sst_ros.identification import parameters
 from sst_ros.identification.parameters import BaseParameters, Regressor, find_base_parameters
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.yaml_document import values_at
 
 POINTS = 12  # samples, and points of the scene, in a period of the highest harmonic
 SHARE = 0.9  # of each range that the motion may use: the manipulator is not quite its model
@@ -186,7 +187,7 @@ class _Trial:
         excess.append(LEAST_SINE - np.hstack([sines, np.abs(det_j2)]))
         reached = {"torque": torque, "velocity": rate, "acceleration": acceleration}
         for name, values in reached.items():
-            if (limit := getattr(self._scene.actuators, f"{name}_limit", None)) is not None:
+            for limit in values_at(self._scene, f"actuators.{name}_limit"):
                 excess.append(np.abs(values) / limit - SHARE)
         beyond = np.hstack(excess)
         columns = columns[..., chosen].reshape(-1, len(chosen))

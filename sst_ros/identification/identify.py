@@ -24,20 +24,21 @@ docs/howto/identify.md has the bias with and without them, measured.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.fft import dst
 from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 from scipy.linalg import solve_triangular
 from scipy.signal import butter, sosfiltfilt
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.errors import AssemblyError, InputError, Problem, refuse_unless
+from sst_ros.errors import AssemblyError, check_kinds, refuse_errors, refuse_unless
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, fit_weighted, scales
 from sst_ros.identification.measured_motion import Measured, MeasuredMotion, open_data, read_motion
@@ -88,35 +89,26 @@ class TorqueFit(Identification):
         """Whether bodies that can exist explain the estimates within their uncertainty."""
         return self.excess < SIGNIFICANT
 
-    def _notes(self) -> Iterator[str]:
-        noise = ", ".join(f"{value:.3g}" for value in self.noise)
-        band = "" if self.band is None else f", frequencies up to {self.band:.3g} Hz"
-        yield f"{self.samples} samples{band}; noise of the torques {noise} N m (std. dev.)"
-        yield f"condition number {self.condition:.3g} (columns of length one)"
+    @property
+    def largest_correlation(self) -> tuple[float, str, str] | None:
+        """The largest correlation of two estimates, and their parameters; None for one alone."""
         pairs = np.abs(np.triu(self.correlation, 1))
-        if pairs.size > 1:
-            i, j = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
-            first, second = self.names[self.base.chosen[i]], self.names[self.base.chosen[j]]
-            yield f"largest correlation {self.correlation[i, j]:+.3f}: {first}, {second}"
-        if not self.consistent:
-            yield (
-                f"no bodies that can exist have these estimates (chi^2 {self.excess:.3g}): the "
-                "scene has the nearest; a load may be missing, or a torque may be wrong"
-            )
-        yield from (f"not determined by this motion: {label}" for label in self.undetermined)
-        yield from (f"uncertain by more than its size: {label}" for label in self.vague)
-        if self.undetermined or self.vague:
-            yield "another motion would help: `sst-ros identify design` makes one"
+        if pairs.size < 2:
+            return None
+        i, j = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
+        first, second = (self.names[self.base.chosen[k]] for k in (i, j))
+        return float(self.correlation[i, j]), first, second
 
 
+@check_kinds
 def identify(
     data: Measured,
     scene: Scene | Mapping[str, Any] | str | Path | None = None,
-    parameters: Iterable[str] | None = None,
+    parameters: Collection[str] | None = None,
     method: str = "inverse_dynamics",
     *,
     cutoff: float | None = None,
-    noise: Iterable[float] | None = None,
+    noise: ArrayLike | None = None,
 ) -> Identification:
     """Identify constants of a scene from a motion.
 
@@ -170,7 +162,7 @@ def fit_torques(
     scene: Scene,
     requested: Iterable[str] | None,
     cutoff: float | None,
-    noise: Iterable[float] | None,
+    noise: ArrayLike | None,
 ) -> TorqueFit:
     """Identify by torques; arguments as for `identify`."""
     names = parameters.select_names(scene, requested)
@@ -288,11 +280,9 @@ def _follow_orientations(
     length = np.cumsum(np.linalg.norm(np.diff(gamma, axis=0, prepend=first), axis=1))
     known = np.unique(np.searchsorted(length, np.arange(0.0, length[-1] + STEP, STEP)))
     points = np.vstack([first, gamma[known[known < len(gamma)]]])
-    try:
+    refused = "gamma", first[0].tolist(), "must be angles of this manipulator"
+    with refuse_errors("identify", *refused, AssemblyError, continuation.BranchEnds):
         coarse, _ = continuation.follow(coordinates.geometry, points, start)
-    except (AssemblyError, continuation.BranchEnds) as error:
-        allowed = f"must be angles of this manipulator ({error})"
-        raise InputError("identify", [Problem("gamma", first[0].tolist(), allowed)]) from None
     nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
     return coordinates.orientations(quaternion_of(coarse)[nearest], gamma)
 

@@ -7,18 +7,20 @@ are. Identification by torques takes a `MeasuredMotion`, identification by simul
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sst_ros.errors import InputError, Problem, refuse_unless
+from sst_ros.errors import Problem, refusal, refuse_errors, refuse_unless
 from sst_ros.scene import torque_profile as torques
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import Rules, Section, build, entry
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import Array
+from sst_ros.state import Array, Quaternion
 
 if TYPE_CHECKING:
     from sst_ros.recording.recording import Recording
@@ -27,33 +29,48 @@ if TYPE_CHECKING:
 Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any] | str | Path"
 
 FEWEST = 20  # samples to identify anything: filters and splines have transients at both ends
-NEEDED, OPTIONAL = ("t", "gamma", "torque"), ("gamma_dot", "quaternion", "held")
 _HELD = (torques.TorqueTable, torques.ConstantTorque)
 OBSERVABLES = ("gamma_1", "gamma_2", "gamma_3", "theta", "phi", "psi", "x", "y", "z")
 """Actuator angles and ZYZ angles [rad], position of E in {B} [m]."""
 
 
-class MeasuredMotion(NamedTuple):
-    """Samples of the actuators.
+class MeasuredMotion(Section):
+    """Samples of the actuators. Held torques act from sample k to the next (n or n - 1 rows)."""
 
-    Attributes:
-        t: times [s], rising, shape (n,).
-        gamma: angles [rad], shape (n, 3).
-        torque: torques at the joints [N m]: at the samples, shape (n, 3), or means over the
-            intervals between them where they are held, shape (n - 1, 3).
-        gamma_dot: measured rates [rad/s], shape (n, 3); None where there are none.
-        quaternion: orientation (x, y, z, w) of {E} in {B} at the first sample, to select the
-            assembly mode; None for the admissible one.
-        held: whether torques are held over the intervals.
+    ORIGIN = "identify"
 
-    """
+    t: Array = entry("times, rising", "s")
+    gamma: Array = entry("angles", "rad", shape=(3,))
+    torque: Array = entry(
+        "torques at the joints: at the samples, or means over the intervals between them where "
+        "they are held",
+        "N m",
+        shape=(3,),
+    )
+    gamma_dot: Array | None = entry("measured rates", "rad/s", shape=(3,))
+    quaternion: Quaternion | None = entry(
+        "orientation (x, y, z, w) of {E} in {B} at the first sample, to select the assembly mode; "
+        "by default the admissible one",
+        "1",
+    )
+    held: bool = entry("whether torques are held over the intervals", default=False)
 
-    t: Array
-    gamma: Array
-    torque: Array
-    gamma_dot: Array | None = None
-    quaternion: Array | None = None
-    held: bool = False
+    def settle(self) -> Iterator[Problem]:
+        """Leave out the torque that is held from the last sample on."""
+        if self.held and len(self.torque) == len(self.t):
+            vars(self).update(torque=self.torque[:-1])
+        return super().settle()
+
+    def rules(self) -> Rules:
+        """Refuse times that do not rise, few samples, and other numbers of rows."""
+        n = len(self.t)
+        yield not torques.ascend(self.t), "t", self.t, "must be rising times [s], shape (n,)"
+        yield n < FEWEST, "t", n, f"must be {FEWEST} samples or more"
+        rows = {"gamma": n, "torque": n - self.held, "gamma_dot": n}
+        for name, count in rows.items():
+            array = getattr(self, name)
+            wrong = array is not None and len(array) != count
+            yield wrong, name, np.shape(array), f"must have the shape {count, 3}"
 
 
 def open_data(data: Measured) -> Recording | Trajectory | Mapping[str, Any]:
@@ -66,43 +83,11 @@ def open_data(data: Measured) -> Recording | Trajectory | Mapping[str, Any]:
 
 
 def read_motion(data: Measured) -> MeasuredMotion:
-    """Read a motion from a recording, a trajectory, or arrays, see `identify`, or refuse it.
-
-    Held torques act from sample k to the next (n or n - 1 rows).
-    """
+    """Read a motion from a recording, a trajectory, or arrays, see `identify`, or refuse it."""
     data = open_data(data)
-    given = dict(data) if isinstance(data, Mapping) else _take_samples(data)
-    held = bool(given.pop("held", False))
-    arrays: dict[str, Any] = {}
-    problems = [Problem(k, None, "must be given") for k in NEEDED if given.get(k) is None]
-    for name, value in given.items():
-        if name not in NEEDED + OPTIONAL:
-            allowed = f"must be one of {', '.join(NEEDED + OPTIONAL)}"
-            problems.append(Problem(name, value, allowed))
-        elif value is not None:
-            try:
-                arrays[name] = np.asarray(value, dtype=float)
-            except (TypeError, ValueError):
-                problems.append(Problem(name, value, "must be numbers"))
-    for name, array in arrays.items():
-        for bad in np.argwhere(~np.isfinite(array))[:1].tolist():
-            problems.append(Problem(f"{name}{bad}", "not finite", "must be finite numbers"))
-    if problems:
-        raise InputError("identify", problems)
-    t, n = arrays["t"], arrays["t"].size
-    good = torques.ascend(t)
-    refuse_unless("identify", ("t", t, good, "must be rising times [s], shape (n,)"))
-    if held and arrays["torque"].shape == (n, 3):
-        arrays["torque"] = arrays["torque"][:-1]
-    shapes = {"t": (n,), "torque": (n - held, 3), "quaternion": (4,)}
-    if n < FEWEST:
-        problems.append(Problem("t", n, f"must be {FEWEST} samples or more"))
-    for name, array in arrays.items():
-        if array.shape != (shape := shapes.get(name, (n, 3))):
-            problems.append(Problem(name, array.shape, f"must have the shape {shape}"))
-    if problems:
-        raise InputError("identify", problems)
-    return MeasuredMotion(**arrays, held=held)
+    given = data if isinstance(data, Mapping) else _take_samples(data)
+    known = {name: value for name, value in given.items() if value is not None}
+    return build(MeasuredMotion, known, "identify")
 
 
 def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
@@ -120,7 +105,7 @@ def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
         law = "sampled" if data.scene.lags else torques.TorqueTable(begins, ticks.torque)
     else:
         allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
-        raise InputError("identify", [Problem("data", data, allowed)])
+        raise refusal("identify", "data", data, allowed)
     t, torque = motion.t[rows], motion.torque[rows]
     held = law is None or isinstance(law, _HELD)
     if held:  # without a law to their sample, see `Trajectory`
@@ -172,7 +157,7 @@ def take_readings(data: Measured, scene: Scene) -> tuple[torques.TorqueProfile, 
         torque = _average(data.law, data.t) if held else data.law.values(data.t)
         if np.isfinite(torque).all():  # not of the state, and not lost
             limit = data.scene.torque_limit or np.inf
-            measured = measured._replace(torque=np.clip(torque, -limit, limit), held=held)
+            measured = replace(measured, torque=np.clip(torque, -limit, limit), held=held)
     if measured.held:
         return torques.TorqueTable(t[:-1], measured.torque), (t, values, None)
     spline = CubicSpline(t, measured.torque)
@@ -183,27 +168,26 @@ def _take_figure(data: Mapping[str, Any], scene: Scene) -> tuple[torques.TorqueP
     t = np.atleast_1d(np.asarray(data.get("t", ()), dtype=float))
     good = t.size > 0 and torques.ascend(t) and bool(t[0] >= 0.0)
     refuse_unless("identify", ("t", t, good, "must be ascending times >= 0 [s]"))
-    values = np.full((t.size, len(OBSERVABLES)), np.nan)
-    known, problems = f"one of {', '.join(OBSERVABLES)}", []
-    for name, given in data.items():
-        if name in OBSERVABLES:
-            row = np.atleast_1d(np.asarray(given, dtype=float))
-            if row.shape == t.shape and not np.any(np.isinf(row)):
-                values[:, OBSERVABLES.index(name)] = row
-            else:
-                problems.append(Problem(name, row.shape, f"must have the shape {t.shape}"))
-        elif name not in ("t", "deviation"):
-            problems.append(Problem(name, given, f"must be t, deviation or {known}"))
-    columns = [i for i, name in enumerate(OBSERVABLES) if name in data]
-    if not columns:
-        problems.append(Problem("data", list(data), f"must have {known}"))
-    deviation = data.get("deviation")
-    if deviation is not None and not np.all(np.asarray(deviation) > 0.0):
-        problems.append(Problem("deviation", deviation, "must be > 0"))
-    if scene.torque is None:
-        problems.append(Problem("torque", None, "must be in the scene, or be given as samples"))
-    if problems or scene.torque is None:
-        raise InputError("identify", problems)
+    known, deviation = f"one of {', '.join(OBSERVABLES)}", data.get("deviation")
+    with refuse_errors("identify", "data", list(data), "must be numbers", TypeError, ValueError):
+        read = {name: np.atleast_1d(np.asarray(x, dtype=float)) for name, x in data.items()}
+    rows = {name: row for name, row in read.items() if name in OBSERVABLES}
+    positive = deviation is None or bool((read["deviation"] > 0.0).all())
+    named, shape = f"must be t, deviation or {known}", f"must have the shape {t.shape}"
+    refuse_unless(
+        "identify",
+        *((x, data[x], x in (*OBSERVABLES, "t", "deviation"), named) for x in data),
+        *(
+            (x, y.shape, y.shape == t.shape and not np.isinf(y).any(), shape)
+            for x, y in rows.items()
+        ),
+        ("data", list(data), bool(rows), f"must have {known}"),
+        ("deviation", deviation, positive, "must be > 0"),
+        ("torque", None, scene.torque is not None, "must be in the scene, or be given as samples"),
+    )
+    assert scene.torque is not None
+    values, columns = np.full((t.size, len(OBSERVABLES)), np.nan), [*map(OBSERVABLES.index, rows)]
+    values[:, columns] = np.transpose(list(rows.values()))
     spread = None if deviation is None else np.ones_like(values)
     if spread is not None:
         spread[:, columns] = deviation

@@ -20,9 +20,9 @@ states of a motion it shows what that motion leaves undetermined as well.
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,17 +30,16 @@ import numpy as np
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_for_arrays, mark_present, trace
 from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE
-from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.errors import Check, refuse_unless, suggestion
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
-from sst_ros.scene.bodies import Link, Star
+from sst_ros.report.results import render
 from sst_ros.scene.loads import Friction
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import LINKS, Scene
 from sst_ros.scene.schema import build, build_unchecked, drop_idle
-from sst_ros.scene.yaml_document import find_fields, plain, replace_values
+from sst_ros.scene.yaml_document import find_number, plain, replace_values, values_at
 
 JOINT_KINDS = ("gamma", "mu", "beta")
-LINKS = ("actuated_links", "intermediate_links")
 NEGLIGIBLE = 1e-12  # friction coefficient below which a scene has no such friction
 # Distance of a column from the span of those before it, over its own length, below which it counts
 # as one of them: between rounding (1e-13) and the least of any mechanism tried (1e-4).
@@ -60,22 +59,20 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
     if requested is None:
         return tuple(own)
     names: dict[str, None] = {}
-    problems, known = [], dict.fromkeys(own + others)
+    checks, known = list[Check](), dict.fromkeys(own + others)
     for begin in [requested] if isinstance(requested, str) else requested:
         found = [name for name in known if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)]
         if str(begin) in LINKS:  # the three alike
             found = [name for name in found if "[" not in name]
-        if not found:
-            allowed = "begins no parameter of the scene" + suggestion(str(begin), known)
-            problems.append(Problem("parameters", begin, allowed))
+        near = "" if found else suggestion(str(begin), known)
+        allowed = f"begins no parameter of the scene{near}"
+        checks.append(("parameters", begin, bool(found), allowed))
         names |= dict.fromkeys(found)
     for kind in LINKS:
         both = {name.removeprefix(kind)[:1] for name in names if name.startswith(kind)}
-        if len(both) > 1:
-            allowed = f"name {kind} alike, or {kind}[0] to {kind}[2], not both"
-            problems.append(Problem("parameters", kind, allowed))
-    if problems:
-        raise InputError("identify", problems)
+        allowed = f"name {kind} alike, or {kind}[0] to {kind}[2], not both"
+        checks.append(("parameters", kind, len(both) <= 1, allowed))
+    refuse_unless("identify", *checks)
     return tuple(names)
 
 
@@ -84,18 +81,9 @@ def values(scene: Scene, names: Sequence[str]) -> Array:
     found = []
     for name in names:
         body, moment, _ = name.partition(".moment.")
-        mass = (value_of(scene, f"{body}.mass") or 0.0) if moment else 1.0
-        found.append(mass * (value_of(scene, _of_centre(name)) or 0.0))
+        mass = (find_number(scene, f"{body}.mass") or 0.0) if moment else 1.0
+        found.append(mass * (find_number(scene, _of_centre(name)) or 0.0))
     return np.array(found)
-
-
-def value_of(scene: Scene, name: str) -> float | None:
-    """Return a number of a scene by its key, the first of a list; None where there is none."""
-    try:
-        _, value, spec = next(find_fields(scene, name, components=True))
-    except ValueError:
-        return None
-    return None if spec.kind != "number" or value is None else float(np.ravel(value)[0])
 
 
 def _of_centre(name: str) -> str:
@@ -110,7 +98,7 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
     for name, number in found.items():
         body, _, part = name.partition(".")
         if part.startswith("moment."):
-            mass = found.get(f"{body}.mass", value_of(scene, f"{body}.mass"))
+            mass = found.get(f"{body}.mass", find_number(scene, f"{body}.mass"))
             centre = [found.get(f"{body}.moment.{axis}", 0.0) for axis in "xyz"]
             changed[f"{body}.centre"] = [h / mass for h in centre] if mass else [0.0] * 3
         elif not name.startswith("offset"):
@@ -133,29 +121,26 @@ def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
     """
     parts = STANDARD if scene.gravity is not None else STANDARD[4:]
 
-    def name_parts(name: str, body: Star | Link) -> list[str]:
-        return [f"{name}.{part}" for part in parts] if body.inertia else []
+    def name_parts(*bodies: str) -> list[str]:
+        massive = (body for body in bodies if values_at(scene, f"{body}.inertia"))
+        return [f"{body}.{part}" for body in massive for part in parts]
 
-    own, others = name_parts("star", scene.star), list[str]()
+    own, others = name_parts("star"), list[str]()
     for kind in LINKS:
-        links = getattr(scene, kind)
-        each = [key for k in range(3) for key in name_parts(f"{kind}[{k}]", links[k])]
-        alike = name_parts(kind, links[0])
-        own += alike if links[0] == links[1] == links[2] else each
+        each, alike = name_parts(*(f"{kind}[{k}]" for k in range(3))), name_parts(f"{kind}[0]")
+        alike = [name.replace("[0]", "") for name in alike]
+        first, *rest = values_at(scene, kind)[0]
+        own += alike if rest == [first, first] else each
         others += each + alike
-    for kind in JOINT_KINDS:
-        terms = getattr(scene.friction, kind, None)
-        present = (part for part in ("viscous", "coulomb", "static") if getattr(terms, part, 0.0))
-        own += (f"friction.{kind}.{part}" for part in present)
-        others += (f"friction.{kind}.viscous", f"friction.{kind}.coulomb")
-    own += (f"springs[{i}].stiffness" for i in range(len(scene.springs)))
-    if scene.actuators is not None and scene.actuators.rotor_inertia:
-        own.append("actuators.rotor_inertia")
+    terms = [f"friction.{kind}.{part}" for kind in JOINT_KINDS for part in Friction.EFFECTS]
+    springs = [f"springs[{i}].stiffness" for i in range(len(scene.springs))]
+    own += filter(partial(find_number, scene), [*terms, *springs, "actuators.rotor_inertia"])
+    others += (name for name in terms if not name.endswith("static"))
     return own, [*others, "actuators.rotor_inertia", *(f"offset[{k}]" for k in range(3))]
 
 
 @dataclass(frozen=True)
-class Identification(ABC):
+class Identification:
     """Identified constants of a scene, by torques or by simulation.
 
     Attributes:
@@ -193,16 +178,8 @@ class Identification(ABC):
 
     def table(self) -> str:
         """Return estimates, standard deviations, and what the motion leaves open, as text."""
-        lines = [f"{'given':>12} {'estimate':>12} {'std. dev.':>10} {'relative':>10}  parameter"]
         rows = zip(self.before, self.estimate, self.deviation, self.labels, strict=True)
-        for given, value, deviation, label in rows:
-            share = f"{deviation / abs(value):.2%}" if deviation < abs(value) else "-"
-            lines.append(f"{given:12.5g} {value:12.5g} {deviation:10.2g} {share:>10}  {label}")
-        return "\n".join([*lines, "", *self._notes(), *self.warnings]) + "\n"
-
-    @abstractmethod
-    def _notes(self) -> Iterator[str]:
-        """Yield lines below the estimates."""
+        return render("identification.txt", found=self, rows=rows)
 
 
 class Regressor:

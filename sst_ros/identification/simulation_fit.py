@@ -1,15 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification by simulation: the motion that fits measured angles, by any constant of a scene.
 
-Gauss-Newton steps of SciPy's `least_squares` with the sensitivities S = dy/dp of the motion
-y' = f(y, t, p), which obey the variational equation
-
-    S' = (df/dy) S + df/dp,  S(0) = dy(0)/dp
-
-(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14). Both
-derivatives are those of the traced equation of motion, exact to rounding, and one error control
-holds for S and the motion. Where an elastic stop is met or left f is continuous, and so is S (Leine
-and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, Springer 2004, 7.2).
+Gauss-Newton steps of SciPy's `least_squares` with the sensitivities of the motion, exact to
+rounding (see `sensitivities`).
 
 In sizes of the parameters, the singular values of the sensitivities over the measuring errors show
 which combinations are known and how well: often fewer than there are parameters.
@@ -18,39 +11,30 @@ which combinations are known and how well: often fewer than there are parameters
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_for_arrays, compile_program, mark_present, trace
-from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.traced_dynamics import LAG, QUATERNION, RATE, TORQUE
-from sst_ros.errors import InputError, Problem
+from sst_ros.dynamics.expression import compile_for_arrays, trace
+from sst_ros.dynamics.traced_dynamics import QUATERNION
+from sst_ros.errors import InputError, refuse_unless
 from sst_ros.identification import parameters
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
-from sst_ros.identification.parameters import Identification, value_of, with_parameters
-from sst_ros.mechanism.generic_math import atan2, quaternion_rate, rotation_rows, sqrt
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.identification.parameters import Identification, with_parameters
+from sst_ros.mechanism.generic_math import atan2, rotation_rows, sqrt
+from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import build_unchecked
-from sst_ros.scene.torque_profile import TorqueProfile, torque_at
-from sst_ros.scene.yaml_document import plain, replace_values
+from sst_ros.scene.yaml_document import find_number
+from sst_ros.simulation.sensitivities import VariationalEquations
 from sst_ros.state import ZERO
 
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
 POSITIVE = re.compile(r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$")
-TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size of a parameter
-AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivatives loses its order
-GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
-RESTITUTION = "stroke.restitution"
 
 
 @dataclass(frozen=True)
@@ -69,22 +53,26 @@ class SimulationFit(Identification):
     directions: Array
     error: float
 
-    def _notes(self) -> Iterator[str]:
-        yield f"root of the mean square of the residuals {self.error:.3g}"
-        for deviation, row in zip(self.relative, self.directions, strict=True):
-            known = f"known to {deviation:.2g}" if deviation < NOT_DETERMINED else "not determined"
-            yield f"{known}: {describe_combination(row, self.names)}"
+    @property
+    def combinations(self) -> list[tuple[float, str]]:
+        """The combinations as text, each with its relative standard deviation."""
+        texts = [describe_combination(row, self.names) for row in self.directions]
+        return list(zip(self.relative.tolist(), texts, strict=True))
 
 
 def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None) -> SimulationFit:
     """Identify by simulation; arguments as for `identify`."""
-    names = (requested,) if isinstance(requested, str) else tuple(requested or ())
-    if not names:
-        allowed = "must be keys of numbers of the scene, with method simulation"
-        raise InputError("identify", [Problem("parameters", requested, allowed)])
+    given = () if requested is None else requested
+    names = (given,) if isinstance(given, str) else tuple(given)
+    allowed = "must be keys of numbers of the scene, with method simulation"
+    refuse_unless("identify", ("parameters", requested, bool(names), allowed))
     torque, read = take_readings(data, scene)
-    motion = Sensitivities(scene, names, torque)
-    given = np.array([value_of(scene, name) for name in names], dtype=float)
+    motion = FittedMotion(scene, names, torque, caller="identify")
+    given = np.array([find_number(scene, name) for name in names], dtype=float)
+    least = np.where([bool(POSITIVE.match(name)) for name in names], 1e-3, -np.inf)
+    allowed = "must not be 0 in the scene: it begins there, and must be > 0"
+    begins = zip(names, given, (given > 0.0) | np.isinf(least), strict=True)
+    refuse_unless("identify", *((name, x, bool(good), allowed) for name, x, good in begins))
     size = np.abs(given) + (given == 0.0)
 
     @lru_cache(maxsize=1)  # SciPy asks for residuals and slopes one after the other
@@ -95,7 +83,7 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
         lambda x: compare(*x)[0],
         given / size,
         lambda x: compare(*x)[1] * size,
-        bounds=(np.where([bool(POSITIVE.match(name)) for name in names], 1e-3, -np.inf), np.inf),
+        bounds=(least, np.inf),
         xtol=1e-13,
         ftol=1e-13,
         gtol=None,
@@ -149,23 +137,8 @@ def describe_combination(row: Array, names: tuple[str, ...]) -> str:
     )
 
 
-class Sensitivities:
-    """Motions of a scene under torques over time, and their derivatives by parameters.
-
-    Those are numbers of the scene by key, as "friction.gamma.smoothing", "initial.gamma_dot[0]" or
-    "actuators.time_constant", but not of its geometry; a list without index means all its entries.
-    """
-
-    def __init__(self, scene: Scene, names: Sequence[str], torque: TorqueProfile) -> None:
-        self.scene, self.names = scene, tuple(names)
-        self._torque, self._geometry = torque, Geometry.of(scene)
-        for name in self.names:
-            allowed = "is geometry, which is taken as known" if name.startswith(GEOMETRY) else ""
-            if value_of(scene, name) is None:
-                allowed = "must be the key of a number that the scene has"
-            if allowed:
-                raise InputError("identify", [Problem("parameters", name, allowed)])
-        self._state = (*QUATERNION, *RATE, *(LAG if scene.lags else ()))
+class FittedMotion(VariationalEquations):
+    """Motions of a scene, their sensitivities, and how far they are from what was read."""
 
     def compare(self, values: Array, read: Readings) -> tuple[Array, Array]:
         """Return computed less read numbers, in standard deviations, and how they change.
@@ -174,8 +147,7 @@ class Sensitivities:
         (r, p), in order of time; those of a time follow each other.
         """
         t, given, deviation = read
-        count, times = len(t), t if t[-1] > 0.0 else np.append(t, 1e-9)
-        states, slopes = (part[:count] for part in self.run(values, times))
+        count, (states, slopes) = len(t), self.run(values, t)
         found = self._observables(*states[:, :4].T)
         rows = np.stack([np.broadcast_to(row, count) for row in found]).reshape(5, -1, count)
         off = rows[0].T - given
@@ -184,70 +156,6 @@ class Sensitivities:
         changes = np.einsum("qcn,nqp->ncp", rows[1:], slopes[:, :4])
         there = np.isfinite(given)
         return (off / unit)[there], (changes / unit[:, :, None])[there]
-
-    def run(self, values: Array, t: Array) -> tuple[Array, Array]:
-        """Integrate the motion and its sensitivities with values of the parameters, shape (p,).
-
-        Returns states (q, W and lagged torques) at times t [s], shape (n,), ascending from 0 on, of
-        shape (n, m), and their derivatives, (n, m, p); raises InputError where there is no motion.
-        """
-        # Inertias between iterations of a fit need not be those of bodies that can exist.
-        outer = zip(self.names, values.tolist(), strict=True)
-        scene = self.scene.with_values(
-            {name: value for name, value in outer if name.startswith(("initial", "stroke"))}
-        )
-        given, chain = values.tolist(), np.ones(len(values))
-        if RESTITUTION in self.names:
-            place = self.names.index(RESTITUTION)
-            chain[place], given[place] = differentiate_damping(scene), damping_of(scene.stroke)
-        state, slopes = self._start(scene)
-        size, y = len(state), np.concatenate([state, slopes.ravel()])
-        derivatives, torque = self._derivatives, self._torque
-
-        def rates(time: float, y: Array, acting: Callable[[float], Any]) -> Array:
-            found = np.array(derivatives(*y[:size].tolist(), *acting(time), *given))
-            rate, by_state, by_parameter = np.split(found.reshape(-1, size), [1, 1 + size])
-            flow = by_state.T @ y[size:].reshape(size, -1) + by_parameter.T * chain
-            return np.concatenate([rate[0], flow.ravel()])
-
-        tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
-        least = np.append(np.ones(size), np.tile(1.0 / (np.abs(values) + (values == 0.0)), size))
-        breaks = torque.kinks()
-        inside = breaks[(breaks > 0.0) & (breaks < t[-1])]
-        rows, begin = np.empty((len(t), len(y))), 0.0
-        rows[t <= 0.0] = y
-        for end in np.unique(np.append(inside, t[-1])).tolist():
-            here = (t > begin) & (t <= end)
-            acting = torque.acting(begin, end)
-            try:
-                run = solve_ivp(
-                    rates, (begin, end), y, "DOP853", np.union1d(t[here], end),
-                    rtol=tolerance, atol=tolerance * least, args=(partial(torque_at, acting),),
-                )  # fmt: skip
-            except (ArithmeticError, ValueError):
-                run = None
-            if run is None or run.status != 0:
-                problem = Problem("parameters", values.tolist(), "leave no motion to the last time")
-                raise InputError("identify", [problem])
-            rows[here], y, begin = run.y.T[: int(here.sum())], run.y[:, -1], end
-        return rows[:, :size], rows[:, size:].reshape(len(t), size, -1)
-
-    @cached_property
-    def _derivatives(self) -> Callable[..., tuple[float, ...]]:
-        """y', then its derivatives by each component of y and by each parameter."""
-        size = len(self._state)
-
-        def derivative(*inputs: Any) -> tuple[Any, ...]:
-            symbols = dict(zip(self.names, map(mark_present, inputs[size + 3 :]), strict=True))
-            if RESTITUTION in symbols:  # its number is that of the damping
-                symbols |= {"stroke.damping": symbols[RESTITUTION], RESTITUTION: None}
-            opened = build_unchecked(Scene, replace_values(plain(self.scene), symbols))
-            model = kernel.model_of(opened, self._geometry)
-            return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
-
-        varied = tuple(f"p{i}" for i in range(len(self.names)))
-        inputs, by = (*self._state, *TORQUE, *varied), (*self._state, *varied)
-        return compile_program(trace(derivative, inputs, by))
 
     @cached_property
     def _observables(self) -> Callable[..., tuple[Any, ...]]:
@@ -266,40 +174,3 @@ class Sensitivities:
             )
 
         return compile_for_arrays(trace(function, QUATERNION, QUATERNION))
-
-    def _start(self, scene: Scene) -> tuple[Array, Array]:
-        """Return the initial state, and its derivatives by the parameters, shape (m, p)."""
-        state = np.zeros(len(self._state))
-        state[:7] = initial_state(scene, self._geometry)
-        slopes = np.zeros((len(state), len(self.names)))
-        quaternion, rate = state[:4], np.array(scene.initial.gamma_dot)
-        to_star = ActuatorSpaceMap(self._geometry).star_rates
-
-        def body_rate(q: Array, gamma_dot: Array) -> Array:
-            return np.array(to_star(*q, *gamma_dot, 0.0, 0.0, 0.0)[:3])
-
-        for column, name in enumerate(self.names):
-            if name.startswith("initial"):
-                unit = np.eye(3)[int(name[-2])] if name.endswith("]") else np.ones(3)
-                turn = body_rate(quaternion, unit)
-                if name.startswith("initial.gamma_dot"):
-                    slopes[4:7, column] = turn
-                    continue
-                along: Any = np.array(quaternion_rate(tuple(quaternion), tuple(turn)))
-                slopes[:4, column] = along
-                # Complex step: exact to rounding, as the map is rational.
-                slopes[4:7, column] = body_rate(quaternion + 1e-30j * along, rate).imag / 1e-30
-        return state, slopes
-
-
-def differentiate_damping(scene: Scene) -> float:
-    """Return the derivative of the damping of elastic stops by the restitution [s/rad].
-
-    By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de =
-    d / (1 - e - e d), which is -3 where e = 1.
-    """
-    e, v = scene.stroke.restitution, scene.stroke.impact_rate
-    assert e is not None and v is not None
-    d = float(damping_of(scene.stroke) * v)
-    change = d / (1.0 - e - e * d) if d else -3.0
-    return (change - d) / ((1.0 + e) * v)

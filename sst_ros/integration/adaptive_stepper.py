@@ -111,6 +111,7 @@ class Step(NamedTuple):
     begin: Point
     end: Point
     drive: Vector  # what acts
+    other: Vector | None  # on the second solution, None where it is the same
     machine: CompiledMethod  # what has taken it
     last: bool  # whether it ends with the period
 
@@ -184,9 +185,17 @@ class AdaptiveStepper:
             self._machines.clear()
 
     def accepted_steps(
-        self, t: float, end: float, at: Point, d: Vector, origin: float = 0.0
+        self,
+        t: float,
+        end: float,
+        at: Point,
+        d: Vector,
+        origin: float = 0.0,
+        other: Vector | None = None,
     ) -> Iterator[Step]:
         """Step from t to end; `origin` is the time of the run at which these are zero [s].
+
+        The second solution has the drive `other`, by default that of the first.
 
         Raises:
             CannotStep: steps shrink below the rounding of time.
@@ -202,8 +211,8 @@ class AdaptiveStepper:
             if stops:  # a step ends before a jump, the next one steps over it
                 h = min(h, stops[0] - t)
             machine = self._machine(at.method)
-            self.budget.charge(3 * machine.cost)
-            after, size = machine.step_pair(t, h, at, d)
+            self.budget.charge((3 if other is None else 6) * machine.cost)
+            after, size = machine.step_pair(t, h, at, d, other=other)
             error, order = size / self.tolerance, at.method.error_order
             if size > self.tolerance:
                 stops = self._jump_in(t, h, at.y, origin)
@@ -223,7 +232,7 @@ class AdaptiveStepper:
             at = after._replace(h=longest, attempts=at.attempts)
             if h < left or isinstance(at.method, Rosenbrock):
                 at = self._choose_method(t + h, h, at, d, origin)
-            yield Step(t, h, begin, at, d, machine, h == left)
+            yield Step(t, h, begin, at, d, other, machine, h == left)
             if h == left:
                 return
             t = stops.pop(0) if stopped else t + h
@@ -250,8 +259,8 @@ class AdaptiveStepper:
 
     def part(self, step: Step, x: float) -> Point:
         """Return the point x [s] after the begin of an accepted step, by a shorter one."""
-        self.budget.charge(3 * step.machine.cost)
-        end, _ = step.machine.step_pair(step.t, x, step.begin, step.drive)
+        self.budget.charge((3 if step.other is None else 6) * step.machine.cost)
+        end, _ = step.machine.step_pair(step.t, x, step.begin, step.drive, other=step.other)
         return step.end._replace(y=end.y, z=end.z, joints=end.joints)
 
     def _choose_method(

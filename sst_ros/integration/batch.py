@@ -8,31 +8,29 @@ from __future__ import annotations
 
 import copy
 import os
+from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.model import limits_of
+from sst_ros.dynamics.motion_table import MotionTable
 from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
-from sst_ros.errors import refuse_unless, require
+from sst_ros.errors import check_kinds, refuse_unless, require
 from sst_ros.host import compiled_module
+from sst_ros.host.many_runs import run_many
 from sst_ros.host.output import slices
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
-from sst_ros.mechanism.geometry import Array, rotation_matrix, zyz_angles
+from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import TURN
-from sst_ros.state import DIMENSIONS, UNITS, arrays_of, columns_of
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
+from sst_ros.state import Explained
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
@@ -45,6 +43,9 @@ FINE = 16
 _BLOCK = 1024
 """States whose joints are computed at once: all numbers of the program are arrays as long."""
 
+_MOST = 10**9
+"""Steps of a run: a compiled loop cannot be interrupted."""
+
 OUTSIDE = -3
 _REASONS = {
     0: "reached the end",
@@ -55,14 +56,15 @@ _REASONS = {
 }
 """How a scenario ended, by the codes that are no limit's: below zero it did not start."""
 
-_SCENARIO = ("status", "message", "fault_time", "local_error")
+_SCENARIO = {"status": "", "message": "", "fault_time": "s", "local_error": ""}
+"""What is known of a scenario beside its motion, with units."""
 
 Advance = Callable[..., None]
 """(first, count, step, *arrays, rows=None): advances states by steps from step `first`, and changes
 the arrays of `batch_source`. `rows` are those whose last step is repeated; None for all."""
 
 
-class Batch:
+class Batch(Explained):
     """A scene compiled for many scenarios, by an explicit method with fixed steps.
 
     Args:
@@ -83,6 +85,7 @@ class Batch:
 
     """
 
+    @check_kinds
     def __init__(
         self,
         scene: Scene,
@@ -118,10 +121,12 @@ class Batch:
         other._scenarios, other.columns = scenarios, self.model.columns(scenarios)
         return other
 
+    @check_kinds
     def scenario(self, row: int) -> Scene:
         """Return the scene of a scenario: a document that runs by itself."""
         return self._scenarios.scene(row)
 
+    @check_kinds
     def run(
         self,
         gamma: ArrayLike,
@@ -153,12 +158,14 @@ class Batch:
             InputError: an argument is not allowed; names it and what is.
 
         """
+        allowed = f"must be >= 0 and <= {_MOST:g}"
         whole = {"count": count, "keep_every": keep_every, "threads": threads}
         refuse_unless(
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
-            *((name, value, value >= 0, "must be >= 0") for name, value in whole.items()),
+            *((name, n, 0 <= n <= _MOST, allowed) for name, n in whole.items()),
         )
+        step, count = float(step), int(count)  # compiled code is made for these
         loop = advance or partial(self.advance, threads=threads)
         y, code = self.start(gamma, gamma_dot)
         number = y.shape[1]
@@ -184,6 +191,14 @@ class Batch:
             samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
             result.kept = BatchResult(*facts, samples, np.stack(kept))
         return result
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "scene": self.scene.name,
+            "method": f"{self._method.name}, fixed steps",
+            "scenarios": self._scenarios.count or "as many as are given to run",
+            "varied": [*self._scenarios.rows] or "the start and the torques alone",
+        }
 
     def start(self, gamma: ArrayLike, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
@@ -229,17 +244,13 @@ class Batch:
         """
         threads = threads or len(os.sched_getaffinity(0))
         blocks, run = -(-columns[0].shape[1] // SIMD_WIDTH), self.module.batch
-        if threads == 1 or rows is not None:
-            run(step, first, count, 0, blocks, *columns)
-            return
-        size = max(1, -(-blocks // (4 * threads)))
-        with ThreadPoolExecutor(threads) as pool:
-            jobs = [
-                pool.submit(run, step, first, count, begin, min(begin + size, blocks), *columns)
-                for begin in range(0, blocks, size)
-            ]
-        for job in jobs:
-            job.result()
+        shares = 1 if threads == 1 or rows is not None else 4 * threads
+        size = max(1, -(-blocks // shares))
+        parts = [(begin, min(begin + size, blocks)) for begin in range(0, blocks, size)]
+        work = run_many(
+            lambda part: run(step, first, count, *part, *columns), parts, workers=threads
+        )
+        deque(work, maxlen=0)
 
     @cached_property
     def module(self) -> ModuleType:
@@ -285,11 +296,7 @@ def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
     return rows
 
 
-def _of_joints(name: str, meaning: str) -> Any:
-    return property(lambda states: states._quantity(name), doc=f"{meaning}, shape (..., N, 3).")
-
-
-class BatchResult:
+class BatchResult(MotionTable):
     """N scenarios, each in its state at the end, or in its last valid one. Arrays are read-only.
 
     Attributes:
@@ -320,6 +327,8 @@ class BatchResult:
         y: Array,  # state of the integration, shape (state, N) or (samples, state, N)
     ) -> None:
         self._model, self._columns, self._torque = model, columns, torque
+        self.scene = model.scene
+        self._axes = ("time", "scenario") if t.ndim == 2 else ("scenario",)
         self.code, self.fault_time, self.local_error = code, fault_time, local_error
         self.status = np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code))
         self.t, self._state = t, np.moveaxis(y, -2, -1)
@@ -328,19 +337,12 @@ class BatchResult:
         self.kept: BatchResult | None = None
         self._computed: dict[str, Array] = {}
 
-    gamma = _of_joints("gamma", "Angles of the actuators [rad], nan where there is no start")
-    mu = _of_joints("mu", "Angles between base arcs and arcs of the star [rad]")
-    beta = _of_joints("beta", "Angles from the carriages to E [rad]")
-    gamma_dot = _of_joints("gamma_dot", "Rates of gamma [rad/s]")
-    mu_dot = _of_joints("mu_dot", "Rates of mu [rad/s]")
-    beta_dot = _of_joints("beta_dot", "Rates of beta [rad/s]")
-
     @property
     def energy(self) -> Array:
         """Kinetic and potential energy [J], shape (..., N)."""
-        return self._quantity("energy")[..., 0]
+        return self._joint("energy")[..., 0]
 
-    def _quantity(self, name: str) -> Array:
+    def _joint(self, name: str) -> Array:
         if name not in self._computed:
             function, inputs = self._model.outputs[name], self._columns.inputs
             states, count = np.moveaxis(self._state, -1, 0)[:7], self.t.shape[-1]
@@ -355,11 +357,6 @@ class BatchResult:
             found[..., self.code < 0] = np.nan
             self._computed[name] = np.moveaxis(found, 0, -1)
         return self._computed[name]
-
-    @cached_property
-    def euler_zyz(self) -> Array:
-        """ZYZ angles (theta, phi, psi) of {E} in {B} [rad], shape (..., N, 3)."""
-        return np.asarray(zyz_angles(rotation_matrix(self.quaternion)))
 
     @cached_property
     def torque(self) -> Array:
@@ -398,28 +395,13 @@ class BatchResult:
             texts.append(_REASONS.get(code) or limits[code - 1].reason)
         return np.array(texts, dtype=object), index
 
-    def to_xarray(self) -> xr.Dataset:
-        """Arrays with the dimension scenario, behind time in `kept`; needs the package xarray."""
-        first = ("time", "scenario") if self.t.ndim == 2 else ("scenario",)
-        arrays = arrays_of(self, *first) | {"t": (first, self.t, {"units": "s"})}
-        arrays |= {name: ("scenario", np.array(getattr(self, name))) for name in _SCENARIO}
-        coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1]), **DIMENSIONS}
-        about = {"scene": self._model.scene.name}
-        found: xr.Dataset = require("xarray").Dataset(arrays, coordinates, about)
-        found["fault_time"].attrs["units"] = "s"
-        return found
+    def _of_each(self) -> dict[str, tuple[Any, str]]:
+        return {name: (getattr(self, name), unit) for name, unit in _SCENARIO.items()}
 
-    def to_pandas(self) -> pd.DataFrame:
-        """Table of the ends with a row a scenario and a column a number, units in its `attrs`."""
-        columns: dict[str, Any] = {name: getattr(self, name) for name in _SCENARIO}
-        table: pd.DataFrame = require("pandas").DataFrame(columns | columns_of(self))
-        table.index.name = "scenario"
-        table.attrs = {"units": UNITS | {"fault_time": "s"}, "scene": self._model.scene.name}
-        return table
-
-    def __len__(self) -> int:
-        return len(self.status)
-
-    def __repr__(self) -> str:
-        name, ended = self._model.scene.name, np.count_nonzero(self.status)
-        return f"<BatchResult of {name}: {len(self)} scenarios, {ended} ended early>"
+    def _facts(self) -> dict[str, object]:
+        return {
+            "scene": self.scene.name,
+            "scenarios": len(self),
+            "ended early": np.count_nonzero(self.status),
+            "time [s]": f"{self.t.min(initial=np.inf):g} to {self.t.max(initial=-np.inf):g}",
+        }

@@ -134,11 +134,19 @@ class CompiledMethod:
         self.step_pair(0.0, 1e-3, Point(y, y, (0.0,) * 18, self.method), drive)
 
     def step_pair(
-        self, t: float, h: float, at: Point, d: Vector, *, parts: int = 3
+        self,
+        t: float,
+        h: float,
+        at: Point,
+        d: Vector,
+        *,
+        other: Vector | None = None,
+        parts: int = 3,
     ) -> tuple[Point, float]:
         """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
 
-        With one part in place of three the second one has no meaning.
+        The second one has the drive `other`, by default that of the first; with one part in place
+        of three it has no meaning.
 
         Returns:
             Where they end, and the local error estimate in units of the tolerance; infinite where
@@ -147,7 +155,11 @@ class CompiledMethod:
         """
         one, begin = self.hold(h, d), at._replace(h=math.inf)
         done, end = self.step_many(0, 1, one, begin, ranges=self._no_ranges, t=t, parts=parts)
-        return end, float(self._run[9]) if done else math.inf
+        size = float(self._run[9]) if done else math.inf
+        if other is None:
+            return end, size
+        second, finite = self.step_pair(t, h, at, other)
+        return end._replace(z=second.z), size if finite < math.inf else math.inf
 
     def slope(self, t: float, y: Vector, d: Vector) -> tuple[float, ...]:
         """Return the derivative of the state."""

@@ -14,6 +14,7 @@ import numpy as np
 from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.model import Limit, contact_events_of, free_range, limits_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, recent_ode
+from sst_ros.errors import InputError, Problem
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper, EvaluationBudget, Step, TorqueLaw
 from sst_ros.integration.compiled_method import compile_derivative
@@ -141,9 +142,17 @@ class Propagator:
         return self._others[sine], (*self.torque.begin(torque, start), *moment)
 
     def steps(
-        self, at: Point, start: float, h: float, torque: Torque, moment: Moment
+        self,
+        at: Point,
+        start: float,
+        h: float,
+        torque: Torque,
+        moment: Moment,
+        other: Vector3 | None = None,
     ) -> Iterator[Step]:
         """Yield the steps of a period: of their own lengths, each up to the first event in it.
+
+        The second solution has the constant torques `other`, by default those of the first.
 
         Raises:
             LimitReached, CannotStep, ArithmeticError, ValueError: as `advance`, after the last
@@ -151,11 +160,12 @@ class Propagator:
 
         """
         stepper, drive = self._begin_period(torque, start, moment)
+        second = None if other is None else (*other, *moment)
         self.budget.begin()
         x = 0.0
         while x < h:
             event = None
-            for step in stepper.accepted_steps(x, h, at, drive, start):
+            for step in stepper.accepted_steps(x, h, at, drive, start, second):
                 event, ends = None, (step.begin.joints, step.end.joints)
                 if not step_loops.all_far(self._ranges, *ends, step.h):  # type: ignore[no-untyped-call]
                     try:
@@ -291,10 +301,13 @@ class AppliedTorque:
             lagged = (y[7], y[8], y[9]) if len(self._dynamics.state) > 7 else (0.0, 0.0, 0.0)
             joints = self._dynamics.joints(*y[:7])
             given = time, State.of(round(time * NANOSECONDS), y, joints, lagged)
-        found: Any = tuple(map(float, torque_at(torque, *given)))
-        if len(found) != 3:  # a ValueError would count as a motion that diverges
-            raise TypeError(f"a torque function must return three torques [N m], not {len(found)}")
-        return clamp(found, self.limit)
+        found = torque_at(torque, *given)
+        try:
+            first, second, third = map(float, found)
+        except (TypeError, ValueError):  # a ValueError would count as a motion that diverges
+            allowed = "a torque function must return three torques [N m]"
+            raise InputError("torque", [Problem(f"f({time:g})", found, allowed)]) from None
+        return clamp((first, second, third), self.limit)
 
     def derivative(self, t: float, *inputs: Any) -> tuple[float, ...]:
         """Differentiate the state by time; inputs are its numbers, then those of the drive."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.state import Array as Array
 
 _KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
@@ -49,18 +50,26 @@ class Geometry:
     @classmethod
     def of(cls, scene: Any) -> Geometry:
         """Derive the geometry of a `Scene`."""
+        if not hasattr(scene, "workspace"):
+            refuse_unless("geometry", ("scene", scene, False, "must be a Scene"))
         return _recent(scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg)
 
     @classmethod
-    def build(cls, v: ArrayLike, alpha: ArrayLike, beta_max: Any = np.pi / 2) -> Geometry:
+    @check_kinds
+    def build(cls, v: ArrayLike, alpha: ArrayLike, beta_max: ArrayLike = np.pi / 2) -> Geometry:
         """Derive the geometry from directions v, shape (3, 3), and angles alpha [rad], (3,).
 
         Shapes (n, 3, 3), (n, 3) and (n,) of beta_max [rad] give n geometries.
 
         The sense of the star (t_k+1 = Rot(s, +alpha_k) t_k) is the one that has admissible
-        assemblies over a right-handed base triangle.
+        assemblies over a right-handed base triangle. InputError refuses other shapes.
         """
         directions = np.array(v, dtype=float)
+        shapes = v_shape, *others = directions.shape, np.shape(alpha), np.shape(beta_max)
+        good = v_shape[-2:] == (3, 3) and others[0] == v_shape[:-1]
+        good = good and others[1] in ((), v_shape[:-2])
+        allowed = "must have the shapes (3, 3), (3,) and ()"
+        refuse_unless("geometry", ("v, alpha, beta_max", shapes, good, allowed))
         directions /= np.linalg.norm(directions, axis=-1)[..., None]
         following = np.roll(directions, -1, axis=-2)
         normals = np.cross(directions, following)
@@ -70,7 +79,7 @@ class Geometry:
         first, second = angles[..., 0], angles[..., 1]
         f = np.stack([np.zeros_like(first), first, first + second], axis=-1)
         e = np.stack([-np.sin(f), np.cos(f), np.zeros_like(f)], axis=-1)
-        most = beta_max if np.ndim(beta_max) else float(beta_max)
+        most: Any = beta_max if others[1] else float(np.asarray(beta_max))
         arrays = (directions, normals / sines[..., None], e, angles, np.arctan2(sines, cosines))
         frozen(*arrays)
         return cls(*arrays, most)

@@ -18,13 +18,18 @@ are rounded too: they come out as one, with det J2 near 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
+from sst_ros.errors import (
+    AmbiguousAssembly,
+    AssemblyError,
+    NoAdmissibleAssembly,
+    check_kinds,
+    refuse_unless,
+)
 from sst_ros.mechanism.geometry import (
     Array,
     Geometry,
@@ -77,8 +82,9 @@ def closure(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Array:
     return dot(carriage_directions(geometry, gamma), t)
 
 
+@check_kinds
 def inverse(
-    geometry: Geometry, rotation: ArrayLike, signs: Sequence[int] = (1, 1, 1)
+    geometry: Geometry, rotation: ArrayLike, signs: ArrayLike = (1, 1, 1)
 ) -> tuple[Array, Array, Array]:
     """Joint angles (gamma, mu, beta) [rad], each shape (..., 3), of orientations R (..., 3, 3).
 
@@ -89,9 +95,15 @@ def inverse(
       on it beta_k changes sign smoothly at the edge of the workspace.
     - sign -1, -r_k: gamma_k + pi, -mu_k and beta_k + pi, wrapped to (-pi, pi].
 
-    Where t_k = +-w_k (serial singularity) every gamma_k fits and it comes out as 0.
+    Where t_k = +-w_k (serial singularity) every gamma_k fits and it comes out as 0. InputError
+    refuses other shapes.
     """
     matrices = np.asarray(rotation, dtype=float)
+    refuse_unless(
+        "inverse",
+        ("rotation", matrices.shape, matrices.shape[-2:] == (3, 3), "must be (..., 3, 3)"),
+        ("signs", signs, np.shape(signs) == (3,), "must be three of 1 and -1"),
+    )
     t, s = geometry.e @ np.swapaxes(matrices, -1, -2), matrices[..., None, :, 2]
     p = cross(t, geometry.w)
     sine = np.sqrt(dot(p, p))
@@ -103,6 +115,7 @@ def inverse(
     return gamma, mu, beta
 
 
+@check_kinds
 def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     """All real assemblies at actuator angles gamma [rad], shape (3,); up to eight.
 

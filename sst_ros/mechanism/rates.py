@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.errors import SingularConfiguration
+from sst_ros.errors import SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
 from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture, Three
@@ -161,18 +161,32 @@ def of_motion(
 ) -> Reactions:
     """Constraint moments, and torques, that a motion asks for: gamma_dot [rad/s], gamma_ddot.
 
-    The moment is n_ext [N m] in {B}. For the motion that torques cause see
-    `virtual_work.direct_dynamics`.
+    The moment is n_ext [N m] in {B}, beside the weights of all bodies. For the motion that torques
+    cause see `virtual_work.direct_dynamics`. InputError refuses scenes with friction, springs or
+    elastic stops.
     """
-    torque = virtual_work.inverse_dynamics(mechanism, at, gamma_dot, gamma_ddot, moment)
-    motion = of_actuators(at, gamma_dot, gamma_ddot)
+    allowed = f"a scene with {', '.join(mechanism.others)} has moments that are not known here"
+    refuse_unless("reactions", ("scene", mechanism.others, not mechanism.others, allowed))
     frames = virtual_work.link_frames(at)
+    of_star, *of_links = mechanism.weights
+    weight = np.asarray(moment) + cross(at.rotation @ of_star, mechanism.gravity)
+    torque = virtual_work.inverse_dynamics(mechanism, at, gamma_dot, gamma_ddot, weight)
+    # Moments of the weights of links about O in their own frames, which work by their Jacobians.
+    local_weights = [
+        cross(centre, mechanism.gravity @ frame)
+        for centre, frame in zip(of_links, frames, strict=True)
+    ]
+    for jacobian, acting in zip(virtual_work.link_jacobians(at), local_weights, strict=True):
+        torque = torque - np.einsum("kij,ki->j", jacobian, acting)
+    motion = of_actuators(at, gamma_dot, gamma_ddot)
     inertias = mechanism.actuated, mechanism.intermediate
     rates = (motion.omega_a, motion.omega_a_dot), (motion.omega_ipl, motion.omega_ipl_dot)
-    # I omega_dot + omega x I omega of three links in their own frames, then in {B}.
+    # I omega_dot + omega x I omega of three links in their own frames, less weights; then in {B}.
     changes = (
-        np.einsum("kij,kj->ki", i, omega_dot) + cross(omega, np.einsum("kij,kj->ki", i, omega))
-        for i, (omega, omega_dot) in zip(inertias, rates, strict=True)
+        np.einsum("kij,kj->ki", i, omega_dot)
+        + cross(omega, np.einsum("kij,kj->ki", i, omega))
+        - acting
+        for i, (omega, omega_dot), acting in zip(inertias, rates, local_weights, strict=True)
     )
     d1, d2 = (np.einsum("kij,kj->ki", f, d) for f, d in zip(frames, changes, strict=True))
     # With t.m = 0 and r, N = r x t across t: m = x r + y N, and w.r = 0, w.N = c.

@@ -15,16 +15,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import refuse_unless
+from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.host.output import slices
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
+from sst_ros.scene.scene import Scene
 
 _BLOCK, _BISECTIONS = 20_000, 55
+_RAYS, _RAY, _REFINED = 400, 64, 6
+"""Rays from a pose, points of each, and the nearest changes of sign that are refined."""
+
+_MOST = 20_000_000
+"""Poses of a map: 4 GB."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +110,7 @@ def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measu
     return Measures(*frozen(angles, mu, beta, *limits, np.prod(c, axis=-1), det_j2, cond_j))
 
 
+@check_kinds
 def workspace(
     geometry: Geometry, divisions: int = 40, turns: int = 180, progress: bool = False
 ) -> OrientationMap:
@@ -112,8 +120,9 @@ def workspace(
     `divisions`; `turns` are values of the third ZYZ angle psi, evenly over a full turn. InputError
     refuses less than 1 of them. With `progress` a bar is drawn on a terminal.
     """
-    counts = {"divisions": divisions, "turns": turns}
-    checks = ((name, n, n >= 1, "must be at least 1") for name, n in counts.items())
+    counts, poses = {"divisions": divisions, "turns": turns}, int(divisions) ** 2 * int(turns) // 2
+    allowed = f"must be at least 1, and make no more than {_MOST:g} poses"
+    checks = ((name, n, n >= 1 and poses <= _MOST, allowed) for name, n in counts.items())
     refuse_unless("workspace", *checks)
     return over_orientations(geometry, triangle_directions(geometry, divisions)[0], turns, progress)
 
@@ -237,6 +246,71 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
         found.append([part[inside] for part in (rotation, gamma, beta, np.full(points, k), c)])
     arrays = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return SingularPoses("serial", *frozen(*arrays))
+
+
+@dataclass(frozen=True)
+class NearestSingularity:
+    """The singular pose that the least turn of the star reaches. Arrays are read-only."""
+
+    kind: str  #: "parallel" or "serial"
+    leg: int  #: index k of the singular leg; -1 of a parallel one, which involves all
+    distance: float  #: angle of the turn [rad]
+    axis: Array  #: of the turn, in {E}, shape (3,)
+    rotation: Array  #: R of the singular pose, shape (3, 3)
+
+
+@check_kinds
+def distance_to_singularity(where: Scene | Geometry, gamma: ArrayLike) -> NearestSingularity:
+    """Find the singular pose that is nearest to a pose: by the least turn of the star.
+
+    Limits of strokes and arcs are not looked at. To a serial one the distance is closed: that of
+    t_k from the line of w_k. Nearer than it det J2 is smooth: rays in even directions find where it
+    changes sign, and from the nearest of these the least turn is sought. A parallel singularity is
+    overlooked only where it comes nearer than that between all rays.
+
+    Args:
+        where: a scene or its geometry.
+        gamma: angles of the actuators in the one admissible assembly [rad], shape (3,).
+
+    Raises:
+        AssemblyError: there is no unique admissible assembly.
+
+    """
+    from scipy.optimize import minimize
+    from scipy.spatial.transform import Rotation
+
+    geometry = where if isinstance(where, Geometry) else Geometry.of(where)
+    start = kinematics.admissible(geometry, gamma).rotation
+    t = start.T @ geometry.w.T  # columns: w_k in {E}
+    cosines = np.sum(geometry.e.T * t, axis=0)
+    angles = np.arctan2(np.linalg.norm(np.cross(geometry.e, t.T), axis=1), np.abs(cosines))
+    leg = int(angles.argmin())
+    kind, turn = "serial", np.cross(geometry.e[leg], np.copysign(1.0, cosines[leg]) * t[:, leg])
+    turn = angles[leg] * turn / np.linalg.norm(turn)
+
+    def det_j2(turns: Array) -> Array:
+        rotation = start @ Rotation.from_rotvec(turns).as_matrix()
+        found, _, _ = kinematics.inverse(geometry, rotation)
+        return measures(geometry, found, rotation).det_j2
+
+    lengths = np.linspace(0.0, 1.0 - 1e-9, _RAY) * angles[leg]
+    # Even directions: points of a Fibonacci lattice on the sphere.
+    z = 1.0 - (2.0 * np.arange(_RAYS) + 1.0) / _RAYS
+    phi, rim = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(_RAYS), np.sqrt(1.0 - z * z)
+    rays = np.column_stack([rim * np.cos(phi), rim * np.sin(phi), z])
+    at_pose = det_j2(np.zeros(3))
+    values = det_j2(rays[:, None] * lengths[:, None]) / at_pose
+    first = np.where(values.min(axis=1) <= 0.0, (values <= 0.0).argmax(axis=1), _RAY)
+    equal: Any = {"type": "eq", "fun": lambda turn: det_j2(turn) / at_pose}
+    for row in np.argsort(first, kind="stable")[:_REFINED]:
+        if first[row] < _RAY:
+            begin, most = rays[row] * lengths[first[row]], {"ftol": 1e-12, "maxiter": 60}
+            found = minimize(lambda x: x @ x, begin, constraints=equal, options=most).x
+            if abs(equal["fun"](found)) < 1e-9 and np.linalg.norm(found) < np.linalg.norm(turn):
+                kind, leg, turn = "parallel", -1, found
+    distance = float(np.linalg.norm(turn))
+    rotation = start @ Rotation.from_rotvec(turn).as_matrix()
+    return NearestSingularity(kind, leg, distance, *frozen(turn / distance, rotation))
 
 
 def report_singularities(geometry: Geometry, chart: OrientationMap) -> str:

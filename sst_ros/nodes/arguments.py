@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.errors import Check, refuse_unless, suggestion
 from sst_ros.runtime import settings
 from sst_ros.scene.schema import Section, Spec, accept
 
@@ -73,11 +73,11 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
     dashed = [re.sub("^--[^=]*", lambda m: m[0].replace("_", "-"), word) for word in plain]
     given, unknown = make_parser(command).parse_known_args(dashed)
     named = [re.split("[=:]", word)[0] for word in unknown]
-    problems = [unknown_name(word, map(_option, known)) for word in named]
+    checks = [unknown_name(word, map(_option, known)) for word in named]
     for flag, rule in pairwise(ros):
         name = rule.partition(":=")[0].rpartition(":")[2]
         if flag in ("-p", "--param") and name not in known and not name.startswith(FOREIGN):
-            problems.append(unknown_name(name, known))
+            checks.append(unknown_name(name, known))
     options: list[str] = []
     for name, word in vars(given).items():
         spec = known[name]
@@ -85,18 +85,17 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
             options += ["-p", f"{name}:={_as_yaml(spec, word)}"]
         except ValueError:
             needs = "" if word else "needs a value, which "
-            problems.append(Problem(_option(name), word or None, needs + spec.describe()))
-    if problems:
-        raise InputError(command, problems)
+            checks.append((_option(name), word or None, False, needs + spec.describe()))
+    refuse_unless(command, *checks)
     return ["--ros-args", *ros, *options] if ros or options else []
 
 
-def unknown_name(name: str, known: Iterable[str]) -> Problem:
-    """Return the fault of a name that is no parameter or option."""
+def unknown_name(name: str, known: Iterable[str]) -> Check:
+    """Return the failed check of a name that is no parameter or option."""
     names = [*known]
     near = suggestion(name, names) or f"; known are {', '.join(names)}"
     behind = ", unless behind --ros-args" if name.startswith("-") else ""
-    return Problem(name, name, f"is no parameter of the node{behind}{near}")
+    return name, name, False, f"is no parameter of the node{behind}{near}"
 
 
 def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:

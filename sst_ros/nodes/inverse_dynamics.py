@@ -20,11 +20,12 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.control.controller import Measurement
 from sst_ros.control.law import Command
-from sst_ros.control.tracking import TrackingMetrics, tracking_table
+from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.errors import SstError
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker, every
 from sst_ros.nodes.topics import ActionGoal
+from sst_ros.report.results import render
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
@@ -279,7 +280,7 @@ def _measure(state: JointState) -> Measurement:
 
 def _print(tracking: TrackingMetrics | None) -> None:
     if tracking is not None:
-        print(tracking_table(tracking), flush=True)
+        print(render("tracking.txt", found=tracking), flush=True)
 
 
 def _point(time: float, angles: Vector3, rates: Vector3, torques: Vector3) -> JointTrajectoryPoint:

@@ -33,7 +33,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.errors import Check, InputError, SstError, refuse_unless
 from sst_ros.host.processes import is_orphan
 from sst_ros.nodes import arguments, signals, topics
 from sst_ros.nodes.topics import Endpoint
@@ -117,7 +117,7 @@ def _declare(
     # rclpy has no public call for the values that were given; Jazzy and Kilted have this.
     given: dict[str, Any] = {name: one.value for name, one in node._parameter_overrides.items()}
     defaults, values = {**vars(cls()), **more_defaults(given)}, dict[str, Any]()
-    problems: list[Problem] = []
+    origin, checks = node.get_fully_qualified_name(), list[Check]()
     for name, spec in cls.SPECS.items():
         value = given.get(name, defaults[name])
         if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
@@ -129,19 +129,18 @@ def _declare(
         try:
             node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
-            problems.append(Problem(name, value, spec.describe()))
+            checks.append((name, value, False, spec.describe()))
     ours = {name for _, parameters in arguments.COMMANDS.values() for name in parameters.SPECS}
     for name in sorted(given.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")
         elif not name.startswith(arguments.FOREIGN):
-            problems.append(arguments.unknown_name(name, values))
+            checks.append(arguments.unknown_name(name, values))
+    refuse_unless(origin, *checks)
     try:
-        if problems:
-            raise InputError("", problems)
-        return cls(**values)
+        return cls(**values)  # `build` would take a number for text, as a YAML file has it
     except InputError as error:
-        raise InputError(node.get_fully_qualified_name(), error.problems) from None
+        raise InputError(origin, error.problems) from None
 
 
 def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:

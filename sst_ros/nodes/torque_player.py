@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from sensor_msgs.msg import JointState
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refusal
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker
 from sst_ros.runtime.settings import PlayerParameters
@@ -74,5 +74,5 @@ def _load(given: PlayerParameters) -> tuple[TorqueFunction, float]:
     played = scene.load(given.scene)
     if played.torque is None or played.duration is None:
         allowed = "must have torque and duration to be played, or csv must name a file"
-        raise InputError("torque_player", [Problem("scene", played.name, allowed)])
+        raise refusal("torque_player", "scene", played.name, allowed)
     return played.torque.at, played.duration

@@ -15,11 +15,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
+from sst_ros.host.figures import DEGREES, LINES, SMALLEST_SHOWN, hide_zeros, legend, styled
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.plot import pictures, workspace
-from sst_ros.plot.pictures import DEGREES, Picture, draw_legs, tick_torques
-from sst_ros.plot.style import LINES, hide_zeros, legend, stack, styled
+from sst_ros.plot.pictures import KINDS, Picture, draw_legs, tick_torques
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 
@@ -31,28 +31,31 @@ Drawn: TypeAlias = "Sequence[tuple[Signals, str, dict[str, Any]]]"
 
 
 def _overlay(quantity: str, label: str, scale: float = 1.0) -> Callable[[Drawn], Figure]:
-    """Return what draws a quantity of the legs of all runs."""
-    return lambda runs: draw_legs(
-        label, [(name, run.seconds(), scale * run.legs(quantity), look) for run, name, look in runs]
-    )
+    """Return what draws a quantity of the legs of all runs, and below how far they are apart."""
+
+    def draw(runs: Drawn) -> Figure:
+        legs = [(name, run.seconds(), scale * run.legs(quantity), look) for run, name, look in runs]
+        below = f"largest difference\nfrom the first {label.partition(' ')[2]}"
+        figure, first = draw_legs(label, legs, below), runs[0][0]
+        axes = figure.axes[-1]
+        axes.set_yticks([])  # none until a run differs
+        for run, name, look in runs[1:]:
+            here, there = _common(first, run)
+            apart = scale * np.abs(run.legs(quantity)[there] - first.legs(quantity)[here])
+            largest = hide_zeros(apart.max(axis=1, initial=0.0))
+            if differs := bool(np.isfinite(largest).any()):
+                axes.set_yscale("log")
+            same = len(there) and bool((apart <= SMALLEST_SHOWN).all())
+            said = "" if differs else ": no difference" if same else ": no samples in common"
+            axes.plot(run.seconds()[there], largest, label=name + said, **look)
+        legend(axes)
+        return figure
+
+    return draw
 
 
 def _torques(runs: Drawn) -> Figure:
     return draw_legs("τ [N m]", [(name, *tick_torques(run), look) for run, name, look in runs])
-
-
-def _difference(runs: Drawn) -> Figure:
-    figure, panels = stack(["largest |Δγₖ| [rad]", "largest |Δγ̇ₖ| [rad/s]"], 2.6)
-    first = runs[0][0]
-    for axes, name in zip(panels, ("gamma", "gamma_dot"), strict=True):
-        for run, label, style in runs[1:]:
-            here, there = _common(first, run)
-            apart = np.abs(run.legs(name)[there] - first.legs(name)[here])
-            largest = apart.max(axis=1, initial=0.0)
-            axes.plot(run.seconds()[there], hide_zeros(largest), label=label, **style)
-        axes.set_yscale("log")
-    legend(panels[0])
-    return figure
 
 
 def _sphere(runs: Drawn) -> Figure:
@@ -70,7 +73,6 @@ PICTURES = {
         "Desired less measured angles", (ERROR,), _overlay("gamma_error", "Δγ [rad]")
     ),
     "torques": Picture("Applied torques", (TICKS,), _torques),
-    "difference": Picture("Differences from the first run", (JOINTS,), _difference),
     "sphere": Picture("Path of E in the workspace", (TURN, SCENE.key), _sphere),
 }
 
@@ -85,9 +87,8 @@ def draw_comparison(
         InputError: there are too many runs, a name is unknown, or `out` cannot be written.
 
     """
-    if not 2 <= len(runs) <= len(LINES):
-        allowed = f"must be 2 to {len(LINES)} bags, which can be distinguished"
-        raise InputError("plot", [Problem("compare", len(runs), allowed)])
+    allowed = f"must be 2 to {len(LINES)} bags, which can be distinguished"
+    refuse_unless("compare", ("bags", len(runs), 2 <= len(runs) <= len(LINES), allowed))
     paths: list[Path] = []
     missing: dict[str, str] = {}
     for name in pictures.known(only, PICTURES):
@@ -106,31 +107,40 @@ def draw_comparison(
 def differences(runs: Sequence[Signals]) -> DataFrame:
     """Compare each run with the first one, at the stamps that both have.
 
-    A row of the table is a run, by its label: samples in common, of how many; largest difference of
-    an angle gamma_k, and root of the mean square over samples and legs [rad]; the same of the rates
-    [rad/s]; largest angle between the orientations of the star [rad]; nan for what cannot be
-    compared.
+    A row of the table is a joint of a run, by its label, or the star, whose difference is the angle
+    between the orientations: largest difference of the angle and root of its mean square [rad],
+    and the same of the rate [rad/s]; samples in common, of how many. What cannot be compared is
+    nan.
     """
-    from pandas import DataFrame, Series
+    from pandas import DataFrame, Series, concat
 
-    first = runs[0]
-    rows: list[dict[str, float]] = []
-    for run in runs[1:]:
-        (here, there), absent = _common(first, run), {*first.missing, *run.missing}
-        of = len(run.tables["samples"]) if "samples" in run.tables else 0
-        row: dict[str, float] = {"samples": len(here), "of": of}
-        for quantity, name, unit in (("gamma", "γ", "rad"), ("gamma_dot", "rate", "rad/s")):
-            apart = Series(dtype=float)
-            if JOINTS not in absent:
-                apart = Series(np.ravel(run.legs(quantity)[there] - first.legs(quantity)[here]))
-            row[f"{name} max [{unit}]"] = apart.abs().max()
-            row[f"{name} rms [{unit}]"] = (apart**2).mean() ** 0.5
+    first, tables = runs[0], {}
+    joints = [f"{kind}_{leg}" for kind in KINDS for leg in (1, 2, 3)]
+    rated = [f"{kind}_dot_{leg}" for kind in KINDS for leg in (1, 2, 3)]
+    for run, label in zip(runs[1:], labels(runs)[1:], strict=True):
+        here, there = _common(first, run)
+        absent = {*first.missing, *run.missing}
+        angles, rates = (
+            DataFrame(columns=joints, dtype=float),
+            DataFrame(columns=joints, dtype=float),
+        )
+        if JOINTS not in absent:
+            angles, rates = (
+                DataFrame(run.take(*names)[there] - first.take(*names)[here], columns=joints)
+                for names in (joints, rated)
+            )
         turn = Series(dtype=float)
         if TURN not in absent:
             one, other = (each.take(*pictures.QUATERNION) for each in (first, run))
             turn = Series(angle_between(one[here], other[there]))
-        rows.append(row | {"turn max [rad]": turn.max()})
-    return DataFrame(rows, index=labels(runs)[1:])
+        angles = concat([angles, turn.rename("star")], axis=1)
+        table = DataFrame(index=angles.columns)
+        for name, apart in ("max_rad", angles), ("rate_max_rad_per_s", rates):
+            table[name] = apart.abs().max()
+            table[name.replace("max", "rms")] = (apart**2).mean() ** 0.5
+        of = len(run.tables["samples"]) if "samples" in run.tables else 0
+        tables[label] = table.assign(samples=len(here), of=of)
+    return concat(tables, names=["run", "joint"])
 
 
 def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -150,12 +160,17 @@ def labels(runs: Sequence[Signals]) -> list[str]:
 
 
 def difference_text(runs: Sequence[Signals]) -> str:
-    """Write the differences as text."""
-    shown = differences(runs)
-    counts = shown.pop("samples").astype(str) + " of " + shown.pop("of").astype(str)
-    shown.insert(0, "samples", counts)
-    return (
+    """Write the differences as text, a table for each run."""
+    said = [
         f"Differences from {labels(runs)[0]}, at samples that both have at the same time since "
-        "the start of each run\n(whole nanoseconds, nothing interpolated):\n\n"
-        f"{shown.to_string(na_rep='-', float_format=lambda x: f'{x:.3e}')}\n"
-    )
+        "the start of each run\n(whole nanoseconds, nothing interpolated)"
+    ]
+    for label, table in differences(runs).groupby(level="run", sort=False):
+        samples, of = table.pop("samples").iloc[0], table.pop("of").iloc[0]
+        text = (
+            table.droplevel("run")
+            .rename_axis(None)
+            .to_string(na_rep="-", float_format=lambda x: f"{x:.3e}")
+        )
+        said.append(f"{label}: {samples} of {of} samples\n{text}")
+    return "\n\n".join(said) + "\n"

@@ -19,19 +19,19 @@ from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import CubicHermiteSpline
 
 from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
+from sst_ros.host import figures
+from sst_ros.host.figures import BLUE, DEGREES, GREY, LINES, VERMILION, Looks, leg_names, stack
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
 from sst_ros.mechanism.rates import body_rates
-from sst_ros.plot import style, workspace
-from sst_ros.plot.style import BLUE, GREY, LINES, VERMILION, Looks, leg_names, lines, stack
+from sst_ros.plot import workspace
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 
 FORMATS = ("pdf", "png")
-DEGREES = float(np.degrees(1.0))  # angles are drawn in degrees, their errors in radians
 QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
 NUMBERS = {
@@ -61,14 +61,9 @@ Curves: TypeAlias = "tuple[str, Sequence[str], Callable[[Signals], Array]]"
 
 def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], Figure]:
     """Return what draws panels one above the other."""
-
-    def make(run: Signals, _: Scene) -> Figure:
-        figure, grid = stack([panel[0] for panel in panels], height)
-        for axes, (_label, names, values) in zip(grid, panels, strict=True):
-            lines(axes, run.seconds(), values(run), names)
-        return figure
-
-    return make
+    return lambda run, _: figures.draw_panels(
+        run.seconds(), [(label, names, values(run)) for label, names, values in panels], height
+    )
 
 
 def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
@@ -76,14 +71,19 @@ def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
     return label, leg_names(letter), lambda run: scale * run.legs(quantity)
 
 
-def draw_legs(label: str, series: Sequence[tuple[str, Array, Array, Mapping[str, Any]]]) -> Figure:
-    """Draw series of a name, times [s] (n,), values (n, 3) and a style: a panel for each leg."""
+def draw_legs(
+    label: str, series: Sequence[tuple[str, Array, Array, Mapping[str, Any]]], *below: str
+) -> Figure:
+    """Draw series of a name, times [s] (n,), values (n, 3) and a style: a panel for each leg.
+
+    Panels of the labels `below` follow, in which nothing is drawn yet.
+    """
     letter, _, unit = label.partition(" ")
-    figure, panels = stack([f"{name} {unit}" for name in leg_names(letter)])
+    figure, panels = stack([*(f"{name} {unit}" for name in leg_names(letter)), *below])
     for name, seconds, values, looks in series:
-        for axes, column in zip(panels, values.T, strict=True):
+        for axes, column in zip(panels, values.T, strict=False):
             axes.plot(seconds, column, label=name, **looks)
-    style.legend(panels[0])
+    figures.legend(panels[0])
     return figure
 
 
@@ -137,7 +137,7 @@ def _over_time(
     """Draw columns over time; differences from the first solution below where there are several."""
     if len(names) == 1:
         figure, (axes,) = stack([label], 3.2)
-        lines(axes, seconds, values[0], list(letters), least_span=least)
+        figures.lines(axes, seconds, values[0], list(letters), least_span=least)
         return figure
     unit = label.split("[")[1].rstrip("]")
     figure, (above, below) = stack([label, f"difference from\n{names[0]} [{unit}]"], 2.7)
@@ -145,16 +145,19 @@ def _over_time(
         above.plot(seconds, columns, **looks)[0].set_label(name)
         if columns is not values[0]:
             apart = np.abs(columns - values[0]).max(axis=1)
-            largest = f"{name}: {np.nanmax(apart):.1e} {unit}"
-            below.plot(seconds, style.hide_zeros(apart), label=largest, **looks)
-    style.widen(above, values[0], least)
-    if len(letters) > 1:  # each beside its last value
+            largest = f"{name}: at most {np.nanmax(apart):.1e} {unit}"
+            below.plot(seconds, figures.hide_zeros(apart), label=largest, **looks)
+    figures.widen(above, values[0], least)
+    if len(letters) > 1:  # beside the last value, those that lie there together on one line
         beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
-        for letter, last in zip(letters, values[0][-1], strict=True):
-            above.annotate(letter, (seconds[-1], last), (4, 0), **beside)
-    style.legend(above)
+        last, apart = values[0][-1], 0.06 * np.ptp(above.get_ylim())
+        order = np.argsort(last, kind="stable")
+        for near in np.split(order, np.flatnonzero(np.diff(last[order]) > apart) + 1):
+            text = ", ".join(letters[k] for k in sorted(near))
+            above.annotate(text, (seconds[-1], last[near].mean()), (4, 0), **beside)
+    figures.legend(above)
     below.set_yscale("log")
-    below.legend(fontsize=8, loc="best", title="largest difference", title_fontsize=8)
+    figures.legend(below)
     return figure
 
 
@@ -164,20 +167,24 @@ def draw_path(scene: Scene, _: Array, solutions: Solutions) -> Figure:
     axes = figure.add_subplot(projection="3d")
     geometry = Geometry.of(scene)
     base, star = scene.base.radius, scene.star.radius
-    outline = np.concatenate(style.sides(geometry, 40))
+    outline = np.concatenate(workspace.sides(geometry, 40))
     axes.plot(*(base * outline).T, color=GREY, linewidth=1.6, label="base triangle P₁P₂P₃")
     if star != base:
         image = {"linewidth": 0.9, "linestyle": ":", "label": "its image on the sphere of E"}
         axes.plot(*(star * outline).T, color=GREY, **image)
-    for name, point in zip(leg_names("P"), 1.14 * max(base, star) * geometry.v, strict=True):
+    middle = geometry.v.sum(axis=0) / np.linalg.norm(geometry.v.sum(axis=0))
+    inside = geometry.v + 0.22 * (middle - geometry.v)  # outside are the numbers of the axes
+    for name, point in zip(leg_names("P"), base * inside, strict=True):
         axes.text(*point, name, ha="center", va="center")
     paths = [position_of_e(scene, each).T for each in solutions.values()]
     for name, path, looks in zip(solutions, paths, LINES, strict=False):
         axes.plot(*path, label=name, **looks)
-    style.mark_ends(axes, *paths[0])
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    figures.mark_ends(axes, *paths[0])
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.zaxis.set_rotate_label(False)  # by itself it stands on its head
+    axes.set_zlabel("z [m]", rotation=90.0)
     axes.set_box_aspect(np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1))
-    x, y, z = geometry.v.sum(axis=0)
+    x, y, z = middle
     height, azimuth = np.degrees(np.arctan2(z, np.hypot(x, y))), np.degrees(np.arctan2(y, x))
     axes.view_init(elev=height - 8.0, azim=azimuth + 8.0)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
@@ -281,10 +288,12 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     shown = {"kinetic": kinetic, "potential, gained": raised, "work of the actuators": done}
     if not np.nanmax(np.abs(raised), initial=0.0):
         del shown["potential, gained"]  # no gravity, no springs
-    figure, panels = stack(["energy [J]", "energy gained − work [J]"], 2.8)
-    lines(panels[0], run.seconds(), np.stack([*shown.values()], axis=1), list(shown))
-    lines(panels[1], run.seconds(), (gained - done)[:, None], ["residual"])
-    panels[1].axhline(0.0, color=GREY, linewidth=0.8)
+    panels = (
+        ("energy [J]", list(shown), np.stack([*shown.values()], axis=1)),
+        ("energy gained − work [J]", ["residual"], (gained - done)[:, None]),
+    )
+    figure = figures.draw_panels(run.seconds(), panels, 2.8)
+    figure.axes[1].axhline(0.0, color=GREY, linewidth=0.8)
     return figure
 
 
@@ -295,7 +304,7 @@ def _margins(run: Signals, scene: Scene) -> Figure:
     most = {"gamma": geometry.arc, "beta": geometry.beta_max}
     for axes, (name, limit) in zip(panels, most.items(), strict=True):
         left = np.minimum(run.legs(name), limit - run.legs(name))
-        lines(axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)])
+        figures.lines(axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)])
         axes.axhline(0.0, color="black", linewidth=0.8)
     return figure
 
@@ -354,7 +363,7 @@ PICTURES = {
 }
 
 
-@style.styled
+@figures.styled
 def draw_run(
     run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
 ) -> tuple[list[Path], dict[str, str]]:
@@ -386,14 +395,12 @@ def save(
     figure.suptitle(title, fontsize=11)
     paths = [out / f"{stem}.{form}" for form in formats]
     with write_into(out, "plot"):
-        style.save_figure(figure, *paths)
+        figures.save_figure(figure, *paths)
     return paths
 
 
 def known(only: Sequence[str], names: Iterable[str]) -> list[str]:
     """Return the names that are asked for, all where none is; raises InputError for another."""
     allowed = "must be one of " + ", ".join(names)
-    problems = [Problem("only", name, allowed) for name in only if name not in names]
-    if problems:
-        raise InputError("plot", problems)
+    refuse_unless("plot", *(("only", name, name in names, allowed) for name in only))
     return list(only or names)

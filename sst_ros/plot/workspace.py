@@ -20,10 +20,11 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
+from sst_ros.errors import refuse_unless
+from sst_ros.host.figures import BLUE, INK, Looks, mark_ends, styled
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap
-from sst_ros.plot.style import BLUE, INK, Looks, mark_ends, sides, styled
 from sst_ros.scene.scene import Scene
 
 CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)  # levels of cond J; above all are the same
@@ -36,6 +37,10 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
 
     Each map is a row of pictures, with a title if there are any.
     """
+    fits = all(isinstance(one, OrientationMap) for one in charts) and isinstance(titles, Sequence)
+    fits = fits and len(charts) > 0 and len(titles) in (0, len(charts))
+    allowed = "must be maps of `workspace`, and a title for each or none"
+    refuse_unless("plot_workspace", ("charts, titles", (*charts, titles), fits, allowed))
     figure = Figure(figsize=(13.5, 4.3 * len(charts)))
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
     names = titles or ["E on the base triangle"] * len(charts)
@@ -107,6 +112,13 @@ def _panel(
         beside: Looks = {"textcoords": "offset points", "fontsize": 9, "ha": "center", "bbox": box}
         axes.annotate(text, (x[best], y[best]), (0, 8), color=INK, **beside)
     draw_triangle(axes, chart.geometry)
+
+
+def sides(geometry: Geometry, points: int) -> Array:
+    """Points on the three sides of the base triangle on the unit sphere, shape (3, points, 3)."""
+    angle = np.multiply.outer(geometry.arc, np.linspace(0.0, 1.0, points))[:, :, None]
+    across = np.cross(geometry.w, geometry.v)
+    return np.asarray(np.cos(angle) * geometry.v[:, None] + np.sin(angle) * across[:, None])
 
 
 def draw_triangle(axes: Axes, geometry: Geometry) -> None:

@@ -28,7 +28,7 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, refusal
 
 _DATA_END_SIZE = 9 + 4  # bytes of opcode and length, and of its content
 _PIECE = 1 << 20
@@ -325,11 +325,6 @@ def _records(source: bytes | IO[bytes], *, chunks: bool = False) -> Iterator[Mca
 def message_types() -> Any:
     """Return the message types of ROS 2 with their compiled (de)serializers."""
     return get_typestore(Stores.ROS2_KILTED)
-
-
-def refusal(path: Path, key: str, value: object, allowed: str) -> InputError:
-    """Make the error about one fault of a recording."""
-    return InputError(str(path), [Problem(key, value, allowed)])
 
 
 def _one_line(error: object) -> str:

@@ -15,8 +15,8 @@ from rosbags.interfaces import Connection, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.enums import CompressionMode
 
-from sst_ros.errors import InputError, Problem, SstError
-from sst_ros.recording.bag_reader import McapFile, message_types, refusal
+from sst_ros.errors import SstError, refusal, refuse_errors
+from sst_ros.recording.bag_reader import McapFile, message_types
 
 FLUSH_PERIOD_S = 1.0  # a process that is killed loses the messages of this time at most
 _CHUNK_BYTES = 512 * 1024
@@ -84,13 +84,11 @@ class BagWriter(Writer):
 
     def __init__(self, path: Path) -> None:
         self._typestore, self._flushed = message_types(), time.monotonic()
-        try:
+        given = "output", str(path), "must be a new folder"
+        with refuse_errors("recorder", *given, WriterError, OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             super().__init__(path, version=self.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
             self.open()
-        except (WriterError, OSError) as error:
-            allowed = f"must be a new folder ({error})"
-            raise InputError("recorder", [Problem("output", str(path), allowed)]) from None
 
     @property
     def messages(self) -> int:

@@ -17,18 +17,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sst_ros.errors import InputError, require
+from sst_ros.dynamics.motion_table import JOINTS
+from sst_ros.errors import InputError, refusal, require
 from sst_ros.host.output import require_free, write_into, write_table
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import topic_tables as topics
-from sst_ros.recording.bag_reader import Bag, refusal
+from sst_ros.recording.bag_reader import Bag
 from sst_ros.recording.topic_tables import Integers, Series, TopicTable, places
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import NANOSECONDS, Explained
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,7 +47,7 @@ class Status(NamedTuple):
     values: dict[str, str]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Signals:
     """All that a recording holds of a run, as tables."""
 
@@ -189,7 +190,7 @@ class Ticks:
         return int(np.count_nonzero(self.start_ns[1:] != self.end_ns[:-1]))
 
 
-class Recording:
+class Recording(Explained):
     """A run from all tables of its bag. Samples are in order of time; rows belong to samples.
 
     Raises InputError, which names the fault, where they are not those of a whole run.
@@ -225,6 +226,8 @@ class Recording:
     """
 
     def __init__(self, found: Signals) -> None:
+        if not isinstance(found, Signals):
+            raise refusal(Path(), "found", found, "must be `Signals`, of `read_signals`")
         self.signals, self.path, self.table = found, found.bag.path, found.table
         absent = found.bag.absent
         if problems := [absent[topic.key] for topic in ESSENTIAL if topic.key in absent]:
@@ -292,10 +295,35 @@ class Recording:
         largest = np.abs(self.effort - self.ticks.torque[at]).max(axis=1)
         return np.where(at >= 0, largest, np.nan)
 
+    def _facts(self) -> dict[str, object]:
+        ticks, reported = self.ticks, self.diagnostics
+        return {
+            "path": self.path,
+            "scene": self.scene.name,
+            "samples": f"{len(self.time_ns)}, one in {self.period_ns / NANOSECONDS:g} s",
+            "time [s]": (self.seconds[0], self.seconds[-1]),
+            "ticks": f"{len(ticks.end_ns)} of {ticks.period_ns / 1e9:g} s; {ticks.gaps} gaps",
+            "commands": len(self.commands),
+            "ended": reported.get("fault") or reported.get("phase") or "not reported",
+            "missing": self.missing or "nothing",
+            "damage": self.signals.bag.damage or "none",
+        }
+
     @property
     def seconds(self) -> Array:
         """Time of each sample since the start of the run [s], shape (n,)."""
         return np.asarray(self.time_ns / NANOSECONDS)
+
+    @cached_property
+    def states(self) -> Array:
+        """Quaternion, body rate and torques that lag at each sample, shape (n, 7 or 10).
+
+        Torques that lag are the efforts; nan where the orientation was lost.
+        """
+        rates = self.gamma_dot, self.mu_dot, self.beta_dot
+        body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
+        lagged = [self.effort] if self.scene.lags else []
+        return np.hstack([self.quaternion, body_rate, *lagged])
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -305,9 +333,7 @@ class Recording:
         method and message are those that the simulator reported.
         """
         known, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
-        rates = (self.gamma_dot, self.mu_dot, self.beta_dot)
-        body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
-        joints = np.hstack([self.gamma, self.mu, self.beta, *rates])
+        joints = np.hstack([getattr(self, name) for name in JOINTS])
         reported, error_estimate = self.diagnostics, np.nan
         with contextlib.suppress(ValueError):
             error_estimate = float(reported.get("error_estimate", "nan"))
@@ -316,7 +342,7 @@ class Recording:
             self.scene,
             self.seconds[known],
             self.quaternion[known],
-            body_rate[known],
+            self.states[known, 4:7],
             self.effort[known],
             joints=joints[known],
             status=1 if fault else 0,
@@ -349,6 +375,8 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
     With `damaged`, what is intact of a damaged recording; `signals.bag.damage` names the rest.
     Raises InputError, which names the fault, where it is no recording of a run, or a damaged one.
     """
+    if not isinstance(path, (str, Path)):
+        raise refusal(Path(), "path", path, "must be a path")
     return Recording(read_signals(path, damaged=damaged))
 
 

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.recording.bag_reader import Topic, refusal
+from sst_ros.errors import refusal
+from sst_ros.recording.bag_reader import Topic
 from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.state import Array, is_idle, nanoseconds
 

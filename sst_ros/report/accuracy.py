@@ -23,17 +23,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from sst_ros.errors import SstError
-from sst_ros.host.output import slices
+from sst_ros.host.figures import INK, MARKERS, Looks, note, styled
+from sst_ros.host.many_runs import run_many
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS, RK4, Method
-from sst_ros.plot.style import INK, MARKERS, Looks, note, styled
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
     ReferenceSolution,
     Run,
     solve_reference,
 )
-from sst_ros.report.results import data_frame, markdown, provenance, publish, records, render
+from sst_ros.report.results import data_frame, provenance, publish, records, render
 from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
@@ -129,10 +129,11 @@ def study_scene(
     than `longest_s`. Raises what the problem and its reference do.
     """
     problem = InitialValueProblem(scene)
-    grid, truth = list_settings(problem), solve_reference(problem)
-    rows: list[dict[str, Any]] = []
-    for part in slices(len(grid), 1, f"{scene.name:<16}", shown):
-        rows += _refine(grid[part.start], problem, truth, longest_s)
+    grid, truth = list(list_settings(problem)), solve_reference(problem)
+    refine = partial(_refine, problem=problem, truth=truth, longest_s=longest_s)
+    # One after another: computing times are those of a core that is free.
+    results = run_many(refine, grid, label=f"{scene.name:<16}" * shown)
+    rows = [row for _, refined in results for row in refined]
     motion, measured = simulate(scene, duration=problem.seconds, t_eval=problem.times), None
     if len(motion) > problem.count:  # else a limit stops it before
         states = np.hstack([motion.quaternion, motion.body_rate])
@@ -158,17 +159,15 @@ class SolverSetting(NamedTuple):
     timed: Callable[[], object]  # does the same work with the least overhead
 
 
-def list_settings(problem: InitialValueProblem) -> list[Iterator[SolverSetting]]:
-    """Return the settings by method and kind, each from coarse to fine."""
-    found: list[Iterator[SolverSetting]] = []
+def list_settings(problem: InitialValueProblem) -> Iterator[Iterator[SolverSetting]]:
+    """Yield the settings by method and kind, each from coarse to fine."""
     for method in METHODS.values():
         if not problem.clamped:  # fixed steps know no limit of torque
-            found.append(_list_steps(problem, method))
+            yield _list_steps(problem, method)
         if method is not RK4:  # its steps in a run are fixed
-            found.append(_list_tolerances(problem, method.name))
+            yield _list_tolerances(problem, method.name)
     if not problem.kinked:
-        found += [_list_collocation(problem, kind) for kind in (FIXED, TOLERANCE)]
-    return found
+        yield from (_list_collocation(problem, kind) for kind in (FIXED, TOLERANCE))
 
 
 def _list_steps(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
@@ -220,15 +219,16 @@ def _refine(
     problem: InitialValueProblem,
     truth: ReferenceSolution,
     longest_s: float,
-) -> Iterator[dict[str, Any]]:
+) -> list[dict[str, Any]]:
     """Go from coarse to fine until a run takes long or two errors lie below the floor."""
-    below, floor = 0, ABOVE_REFERENCE * truth.own.orientation
-    for number, setting in enumerate(settings, start=1):
-        row = _measure(setting, problem, truth)
-        yield row
-        below += row.get(ERROR, math.inf) < max(floor, ROUNDING)
-        if (row["wall_min_s"] > longest_s and number >= LEAST_SETTINGS) or below > 1:
-            return
+    rows, below = list[dict[str, Any]](), 0
+    floor = max(ABOVE_REFERENCE * truth.own.orientation, ROUNDING)
+    for setting in settings:
+        rows.append(row := _measure(setting, problem, truth))
+        below += row.get(ERROR, math.inf) < floor
+        if (row["wall_min_s"] > longest_s and len(rows) >= LEAST_SETTINGS) or below > 1:
+            break
+    return rows
 
 
 def _measure(
@@ -271,14 +271,9 @@ def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision
         studies.append(study)
         print(accuracy_text(study), flush=True)
         rows = [row for one in studies for row in records(one.rows)]
-        publish(
-            out,
-            "accuracy",
-            csv=data_frame(rows),
-            document={"rows": rows},
-            page=accuracy_page(studies),
-            figures={} if study.rests else {f"accuracy_{each.name}": draw_accuracy(study)},
-        )
+        files = {".csv": data_frame(rows), ".json": {"rows": rows}, ".md": accuracy_page(studies)}
+        drawn = {} if study.rests else {f"accuracy_{each.name}.png": draw_accuracy(study)}
+        publish(out, "accuracy", {**files, **drawn})
     return studies
 
 
@@ -288,22 +283,17 @@ def name_fastest(study: WorkPrecision) -> str:
     if study.rests:
         return "It rests: it has no torques of its own, a controller drives it along its motion."
     if best is not None:
-        return f"{TARGET:.0e} rad over {study.seconds:g} s: {_setting(best)}, {_time(best)}."
+        return f"{TARGET:.0e} rad over {study.seconds:g} s: {_setting(best)}."
     least = study.rows[ERROR].astype(float).min()
     reached = f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
     return f"No setting that was tried reaches {TARGET:.0e} rad with every finer one; {reached}."
 
 
 def _setting(row: Series[Any]) -> str:
-    """Return method and setting in words."""
-    if row.kind == TOLERANCE:
-        return f"{row.method}, tolerance {row.setting:.0e}"
-    return f"{row.method}, {1e3 * row.setting:.4g} ms steps"
-
-
-def _time(row: Series[Any]) -> str:
-    wall_ms = 1e3 * row.wall_min_s
-    return f"{wall_ms:.2g} ms" if wall_ms < 99.5 else f"{wall_ms:.0f} ms"
+    """Return method, setting and time in words."""
+    fixed, wall_ms = f"{1e3 * row.setting:.4g} ms steps", 1e3 * row.wall_min_s
+    setting = f"tolerance {row.setting:.0e}" if row.kind == TOLERANCE else fixed
+    return f"{row.method}, {setting}, {wall_ms:{'.2g' if wall_ms < 99.5 else '.0f'}} ms"
 
 
 def accuracy_text(study: WorkPrecision) -> str:
@@ -316,20 +306,8 @@ def accuracy_text(study: WorkPrecision) -> str:
 
 def accuracy_page(studies: Sequence[WorkPrecision], *, whole: bool = True) -> str:
     """Write studies as one Markdown page, or without its introduction and summary."""
-    rows = []
-    for each in studies:
-        words = {target: f"{_setting(x)}: {_time(x)}" for target, x in each.fastest.items()}
-        cells = {f"{target:.0e} rad": words.get(target) for target in TARGETS}
-        run = "at rest" if each.rests else f"{each.seconds:g} s"
-        rows.append({"scene": each.scene, "run": run, **cells})
-    return render(
-        "accuracy.md",
-        whole=whole,
-        studies=studies,
-        summary=markdown(data_frame(rows)),
-        fastest=name_fastest,
-        provenance=provenance(),
-    )
+    given = {"targets": TARGETS, "fastest": name_fastest, "setting": _setting}
+    return render("accuracy.md", whole=whole, studies=studies, **given)
 
 
 @styled

@@ -24,8 +24,7 @@ from sst_ros.host.output import Bar
 from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.propagator import LimitReached, Propagator
-from sst_ros.mechanism.geometry import Array, Geometry, angle_between
-from sst_ros.mechanism.rates import body_rates
+from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.scene.scene import Scene
@@ -113,20 +112,6 @@ def held_torques(recording: Recording) -> Held | None:
     return ticks.start_ns, ticks.end_ns, np.hstack(drives)
 
 
-def of_samples(recording: Recording, samples: slice | Integers) -> Array:
-    """States at samples, shape (n, 7 or 10); nan where the orientation was lost.
-
-    Torques that lag are the efforts.
-    """
-    quaternion = recording.quaternion[samples]
-    rates = (recording.gamma_dot, recording.mu_dot, recording.beta_dot)
-    rate = body_rates(
-        Geometry.of(recording.scene), quaternion, *(joint[samples] for joint in rates)
-    )
-    lagged = [recording.effort[samples]] if recording.scene.lags else []
-    return np.hstack([quaternion, rate, *lagged])
-
-
 def begins(recording: Recording) -> bool:
     """Return whether the first sample is that of the start of the run.
 
@@ -204,7 +189,7 @@ def _compare(
     compiled = len(recording.ticks.end_ns) > COMPILED_FROM
     motion, count = TickPropagator(recording.scene, torque, compiled=compiled), len(start_ns)
     model = motion.dynamics.model
-    state = of_samples(recording, slice(1))[0]
+    state = recording.states[0]
     known = known and bool(count and np.isfinite(state[0]))
     if known:  # by what the first sample is off, the simulator was
         start = recording.scene.initial
@@ -229,7 +214,7 @@ def _compare(
             if lost[k : after[0] + 1].any():
                 begun.append(int(start_ns[after[0]]))
             k = int(after[0])
-            state = of_samples(recording, sample[k : k + 1])[0]
+            state = recording.states[sample[k]]
             energy[sample[k]], done = residual, _energy(model, state[None])[0] - residual
         end = min(int(stops[np.searchsorted(stops, k, side="right")]), k + CHUNK)
         reached = motion.follow((start_ns[k:end], end_ns[k:end], drives[k:end]), state)
@@ -238,7 +223,7 @@ def _compare(
         first, second = (_joints(model, states) for states in (found[:, 0], found[:, 1]))
         distances[0, rows] = _measure([values[rows] for values in samples], first)
         distances[1, rows] = _measure(second, first)
-        energy[rows] = _energy(model, of_samples(recording, rows)) - done - found[:, 0, -1]
+        energy[rows] = _energy(model, recording.states[rows]) - done - found[:, 0, -1]
         residual = next((x for x in energy[rows][::-1].tolist() if np.isfinite(x)), residual)
         k += len(reached)
         known = k == end and k not in stops

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
 from sst_ros.host import compiled_module
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.compiled_method import CompiledMethod
@@ -79,9 +79,9 @@ class InitialValueProblem:
         motion = simulate(scene, duration=scene.duration or WHOLE_RUN_S)
         whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
         self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""  # before the duration
-        if whole * NANOSECONDS < 1000 * INTERVALS:
-            allowed = f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
-            raise InputError(scene.name, [Problem("initial", whole, allowed)])
+        lasts = whole * NANOSECONDS >= 1000 * INTERVALS
+        allowed = f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
+        refuse_unless(scene.name, ("initial", whole, lasts, allowed))
         # Instants of comparison lie 1, 2 or 5 times a power of ten apart.
         whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)  # may be a little less than it is called
         lengths = (f * 10**n for n in range(18) for f in (1, 2, 5))

@@ -9,31 +9,26 @@ import json
 import os
 import platform
 import re
+from base64 import b64encode
 from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jinja2
+import numpy as np
 
 from sst_ros.errors import require
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import write_into
+from sst_ros.state import Array
+from sst_ros.version import VERSION
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 WHOLE_RUN_S = 1.0
 """Length of a run [s] where the scene names no duration."""
-
-_templates = jinja2.Environment(
-    loader=jinja2.PackageLoader("sst_ros.report"),
-    autoescape=jinja2.select_autoescape(["html"]),
-    undefined=jinja2.StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
 
 
 def data_frame(
@@ -54,6 +49,11 @@ def records(frame: DataFrame) -> list[dict[str, Any]]:
     return list(frame.astype(object).where(frame.notna(), None).to_dict("records"))
 
 
+def largest(values: Array) -> float | None:
+    """Return the largest known value; None where none is known."""
+    return float(np.nanmax(values)) if np.isfinite(values).any() else None
+
+
 def markdown(frame: DataFrame) -> str:
     """Return a table of texts as Markdown."""
     lines = ["| " + " | ".join(map(str, frame.columns)) + " |", "| --- " * len(frame.columns) + "|"]
@@ -62,32 +62,42 @@ def markdown(frame: DataFrame) -> str:
     return "\n".join(lines)
 
 
-def render(template: str, **values: Any) -> str:
-    """Fill in a template of this folder; no line ends with blanks."""
-    lines = _templates.get_template(template).render(values)
-    return "".join(f"{line.rstrip()}\n" for line in lines.splitlines())
+def render(template: str | Path, **values: Any) -> str:
+    """Fill in a template, one of this folder by its name or another file.
+
+    No line ends with blanks, and no two lines that follow each other are empty.
+    """
+    if isinstance(template, Path):
+        found = _templates.from_string(template.read_text(encoding="utf-8"))
+    else:
+        found = _templates.get_template(template)
+    lines = "".join(f"{line.rstrip()}\n" for line in found.render(values).splitlines())
+    return re.sub("\n{3,}", "\n\n", lines.lstrip("\n"))
 
 
-def publish(
-    out: Path,
-    name: str,
-    *,
-    csv: DataFrame,
-    document: Mapping[str, Any],
-    page: str,
-    figures: Mapping[str, Figure],
-) -> None:
-    """Write NAME.csv, NAME.json, NAME.md and figures as PNG into `out`; InputError if it cannot."""
-    from sst_ros.plot.style import save_figure  # needs matplotlib, which a summary does not
+def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
+    """Write files of a report into `out`: tables, documents (JSON), pages and figures.
 
-    whole = {**document, "report": made_on()}
-    text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
+    The name of a file that begins with a point follows that of the report.
+
+    Raises:
+        InputError: `out` cannot be written; it names the report.
+
+    """
     with write_into(out, name):
-        csv.to_csv(out / f"{name}.csv", index=False)
-        (out / f"{name}.json").write_text(text, encoding="utf-8")
-        (out / f"{name}.md").write_text(page, encoding="utf-8")
-        for stem, figure in figures.items():
-            save_figure(figure, out / f"{stem}.png")
+        for file, content in files.items():
+            path = out / (f"{name}{file}" if file.startswith(".") else file)
+            if hasattr(content, "to_csv"):
+                content.to_csv(path, index=False)
+            elif hasattr(content, "savefig"):
+                from sst_ros.host.figures import save_figure  # needs matplotlib
+
+                save_figure(content, path)
+            else:
+                if isinstance(content, Mapping):
+                    whole = {**content, "report": content.get("report") or made_on()}
+                    content = json.dumps(whole, indent=2, allow_nan=False) + "\n"
+                path.write_text(content, encoding="utf-8")
 
 
 def provenance(made: Mapping[str, Any] | None = None) -> str:
@@ -102,12 +112,8 @@ def provenance(made: Mapping[str, Any] | None = None) -> str:
 
 def made_on() -> dict[str, Any]:
     """Return versions, machine and date of a report."""
-    try:
-        own = metadata.version("sst_ros")
-    except metadata.PackageNotFoundError:  # run from a source tree that is not installed
-        own = "not installed"
     return {
-        "sst_ros": own,
+        "sst_ros": VERSION,
         "python": platform.python_version(),
         **{name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")},
         "numba": numba_version(),
@@ -125,3 +131,17 @@ def processor() -> str:
         said = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     named = re.search(r"^model name\s*: *(.*\S)", said, re.MULTILINE)
     return named[1] if named else platform.machine()
+
+
+_templates = jinja2.Environment(
+    loader=jinja2.PackageLoader("sst_ros.report"),
+    autoescape=jinja2.select_autoescape(["html"], default_for_string=False),
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_templates.globals |= {
+    "base64": lambda path: b64encode(path.read_bytes()).decode("ascii"),
+    "markdown": markdown,
+    "provenance": provenance,
+}

@@ -18,8 +18,6 @@ applies its values. Two delays are measured:
 
 from __future__ import annotations
 
-import base64
-import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,16 +26,18 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from sst_ros.host import figures
+from sst_ros.host.figures import BLUE, GREY, LINES, Looks, hide_zeros
 from sst_ros.host.output import write_into
-from sst_ros.plot import pictures, style
-from sst_ros.plot.style import BLUE, GREY, LINES, VERMILION, hide_zeros
+from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.report import reference, tracking
 from sst_ros.report.reference import QUANTITIES, Comparison
-from sst_ros.report.results import made_on, provenance, render
+from sst_ros.report.results import largest, made_on, provenance, publish, render
 from sst_ros.state import NANOSECONDS, Array
 
 if TYPE_CHECKING:
@@ -119,23 +119,11 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
         drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
         title = f"Error against run time, {run.scene.name}"
         drawn += pictures.save(draw_errors(run.seconds, found), title, out, "error", ["png"])
-        style.save_figure(draw_overview(run, found), out / PAGE)
+        figures.save_figure(draw_overview(run, found), out / PAGE)
         result = found.summary | {"pictures": [path.name for path in drawn], "page": [PAGE, HTML]}
-        encoded = {
-            path.stem.replace("_", " "): base64.b64encode(path.read_bytes()).decode("ascii")
-            for path in (out / PAGE, *drawn)
-        }
-        page = render(
-            "run.html",
-            s=result,
-            table=summary_table(result),
-            overview=encoded.pop("page"),
-            pictures=encoded.items(),
-            made=provenance(result["report"]),
-        )
-        (out / HTML).write_text(page, encoding="utf-8")
-        document = json.dumps(result, indent=2, allow_nan=False) + "\n"
-        (out / "summary.json").write_text(document, encoding="utf-8")
+        given = {"s": result, "table": summary_table(result), "overview": out / PAGE}
+        page = render("run.html", pictures=drawn, **given)
+        publish(out, "report", {HTML: page, "summary.json": result})
     return result
 
 
@@ -146,7 +134,7 @@ def summary_text(summary: dict[str, Any], folder: str) -> str:
 
 def summary_table(summary: dict[str, Any]) -> str:
     """Format a whole summary as an aligned table; what is unknown is a dash."""
-    return render("run.txt", part="table", s=summary, made=provenance(summary["report"]))
+    return render("run.txt", part="table", s=summary)
 
 
 def summarise(run: Recording, integration: Comparison, ideal: Comparison | None) -> dict[str, Any]:
@@ -217,11 +205,6 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "unknown": measured.missing,
         "report": made_on(),
     }
-
-
-def largest(values: Array) -> float | None:
-    """Return the largest known value; None where none is known."""
-    return float(np.nanmax(values)) if np.isfinite(values).any() else None
 
 
 def measure_timing(recording: Recording) -> Timing:
@@ -330,13 +313,13 @@ def _measure_answers(recording: Recording, paired: DataFrame) -> dict[str, float
     return {"samples_answered_percent": share, "command_age_mean_s": age}
 
 
-@style.styled
+@figures.styled
 def draw_errors(seconds: Array, found: RunEvaluation) -> Figure:
     """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
     panels = {"(a) integration error, against the same torques": found.integration}
     if found.ideal is not None:
         panels["(b) sample-and-hold error, against continuous torques"] = found.ideal
-    figure, grid = style.stack(["largest difference"] * len(panels), 3.1)
+    figure, grid = figures.stack(["largest difference"] * len(panels), 3.1)
     for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
         _draw_comparison(axes, seconds, comparison)
         axes.set_title(title)
@@ -345,7 +328,8 @@ def draw_errors(seconds: Array, found: RunEvaluation) -> Figure:
 
 def _draw_comparison(axes: Axes, seconds: Array, comparison: Comparison) -> None:
     """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
-    least, floor = style.SMALLEST_SHOWN, np.fmax(comparison.own.max(axis=1), style.SMALLEST_SHOWN)
+    least = figures.SMALLEST_SHOWN
+    floor = np.fmax(comparison.own.max(axis=1), least)
     axes.fill_between(
         seconds, least, floor, color=GREY, alpha=0.3, linewidth=0.0, label="error of the reference"
     )
@@ -357,12 +341,12 @@ def _draw_comparison(axes: Axes, seconds: Array, comparison: Comparison) -> None
     axes.legend(fontsize=8, ncol=2, loc="lower right")
 
 
-@style.styled
+@figures.styled
 def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     """Draw a run on one page; a panel without data says that it has none."""
     seconds, measured, reported = run.seconds, found.timing, found.timing.reported
-    figure = Figure(figsize=(12.0, 13.7))
-    grid = iter(figure.subplots(4, 2).ravel())
+    figure = Figure(figsize=(12.0, 10.4))
+    grid = iter(figure.subplots(3, 2).ravel())
 
     def panel(title: str, values: Any, xlabel: str = "time t [s]") -> Axes:
         """Begin the next panel, which shows values."""
@@ -381,27 +365,30 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     axes = panel("Energy residual", found.integration.energy)
     axes.set_ylabel("energy residual [J]")
     axes.plot(seconds, found.integration.energy, color=BLUE, linewidth=1.4)
-    axes = panel("Real-time factor (recorder clock)", measured.pace)
+    axes.yaxis.set_major_formatter("{x:.1e}")
+    axes = panel("Real-time factor (recorder clock), and losses", measured.pace)
     axes.set_ylabel("real-time factor")
     axes.plot(measured.pace.index, measured.pace, color=BLUE, marker=".")
     axes.axhline(1.0, color=GREY, linewidth=0.9, linestyle="--")
-    style.widen(axes, np.append(measured.pace, 1.0), 0.04)
+    figures.widen(axes, np.append(measured.pace, 1.0), 0.04)
+    missed = reported.dropna(subset="ticks_missed").set_index("time_s").ticks_missed
+    total = f"{missed.iloc[-1]:g}" if len(missed) else "unknown"
+    losses = {
+        f"{len(measured.lost_s)} samples lost": measured.lost_s,
+        f"{len(measured.gaps_s)} gaps of torques": measured.gaps_s,
+        f"{total} ticks missed": missed.index[missed.diff().fillna(missed) > 0.0],
+    }
+    foot: Looks = {"transform": axes.get_xaxis_transform(), "linestyle": "none"}
+    marks = zip(losses.items(), ("r|", "gx", "kv"), (0.03, 0.07, 0.11), strict=True)
+    for (name, times), mark, height in marks:
+        axes.plot(times, np.full(len(times), height), mark, label=name, **foot)
+    axes.legend(fontsize=8, loc="best", ncol=3)
     label = "deviation from the nominal period [µs]"
     axes = panel("Period between received samples", measured.period_us, xlabel=label)
     axes.hist(measured.period_us - run.period_ns / 1e3, bins=80, color=BLUE, log=True)
     axes.set_ylabel("samples")
     axes.set_ylim(bottom=0.5)
-    missed = reported.dropna(subset="ticks_missed").set_index("time_s").ticks_missed
-    total = f"{missed.iloc[-1]:g}" if len(missed) else "not recorded"
-    losses = {
-        f"samples lost:\n{len(measured.lost_s)}": measured.lost_s,
-        f"gaps between\ntorques: {len(measured.gaps_s)}": measured.gaps_s,
-        f"ticks missed:\n{total}": missed.index[missed.diff().fillna(missed) > 0.0],
-    }
-    axes = panel("Losses, and reports of missed ticks", seconds)
-    axes.eventplot([*losses.values()], colors=VERMILION)
-    axes.set_yticks(range(len(losses)), list(losses))
-    axes.set_ylim(-0.6, 2.6)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
     commands = measured.commands
     title = "Latency: reception of a command to the step that applies it"
     axes = panel(title, commands.received_us)
@@ -426,7 +413,6 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
         marker = "" if name == "integration error" else "o"
         axes.plot(1e3 * times, hide_zeros(values), label=name, marker=marker, **looks)
     axes.legend(fontsize=8, loc="best")
-    next(grid).set_axis_off()
     figure.suptitle(f"Run of {run.scene.name}: {seconds[-1]:g} s, {len(seconds)} samples")
-    style.note(figure, provenance(found.summary["report"]), 200)
+    figures.note(figure, provenance(found.summary["report"]), 200)
     return figure

@@ -28,7 +28,9 @@ from sst_ros.errors import InputError, SstError
 from sst_ros.integration.methods import DORMAND_PRINCE, Method, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.results import WHOLE_RUN_S, render
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import TERMS, Scene, terms
+from sst_ros.scene.schema import build, drop_idle
+from sst_ros.scene.yaml_document import replace_values
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulate_gauss import GAUSS
 
@@ -46,7 +48,7 @@ def summary(scene: Scene) -> str:
         dynamics=dynamics,
         operations=ODE(dynamics).program.operations,
         costs=costs(scene),
-        absent=[term for term in TERMS if not has(scene, term)],
+        absent=[term for term in TERMS if term not in terms(scene)],
         damping=damping_of(scene.stroke) if scene.stroke.at_end == "elastic" else 0.0,
         limits=len(list(limits_of(scene, geometry))),
         advice=step_advice(scene).text,
@@ -57,42 +59,14 @@ def summary(scene: Scene) -> str:
     )  # fmt: skip
 
 
-LINKS = ("actuated_links", "intermediate_links")
-
-TERMS: dict[str, tuple[str, ...]] = {
-    "actuated links": (LINKS[0],),
-    "intermediate links": (LINKS[1],),
-    "payload": ("payload",),
-    "gravity": ("gravity",),
-    "external moment": ("moment",),
-    "friction in gamma": ("friction", "gamma"),
-    "friction in mu": ("friction", "mu"),
-    "friction in beta": ("friction", "beta"),
-    "springs": ("springs",),
-    "rotors": ("actuators", "rotor_inertia", "gear_ratio"),
-    "torque limit": ("actuators", "torque_limit"),
-    "actuator lag": ("actuators", "time_constant"),
-    "elastic stops": ("stroke", "stiffness"),
-}
-"""Section of a scene that has each term, and the fields of that section where not all are its."""
-
-
-def has(scene: Scene, term: str) -> bool:
-    """Return whether a scene has one of TERMS."""
-    section, *fields = TERMS[term]
-    value: Any = getattr(scene, section)
-    if section in LINKS:
-        return any(link.inertia for link in value)
-    return bool(value and getattr(value, fields[0]) if fields else value)
-
-
 def without(scene: Scene, term: str) -> Scene:
     """Return a scene without one of TERMS; gravity goes with the last links that it acts on."""
-    section, *fields = TERMS[term]
-    whole: dict[str, Any] = {section: [{}] if section in LINKS else None}
-    for change in ({f"{section}.{name}": None for name in fields} or whole, whole):
-        with contextlib.suppress(InputError):  # nothing is left in the section, or for gravity
-            return scene.with_values(change)
+    key, links = TERMS[term], term.endswith("links")
+    whole: dict[str, Any] = {key.partition(".")[0]: [{}] if links else None}
+    for change in (whole if links else {key: None}, whole):
+        with contextlib.suppress(InputError):  # a kind of stops without its own, or gravity
+            document = replace_values(scene, change)
+            return build(Scene, drop_idle(Scene, document), scene.name)
     return scene.with_values({**whole, "gravity": None})
 
 
@@ -112,7 +86,7 @@ class Cost(NamedTuple):
 def costs(scene: Scene) -> list[Cost]:
     """Count the operations of every term that a scene has: traced with it and without it."""
     total = operations(scene)
-    bare = {term: operations(without(scene, term)) for term in TERMS if has(scene, term)}
+    bare = {term: operations(without(scene, term)) for term in terms(scene)}
     return [Cost(term, total - count, count) for term, count in bare.items()]
 
 

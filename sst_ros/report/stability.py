@@ -23,12 +23,12 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from sst_ros.dynamics import kernel
-from sst_ros.errors import InputError, Problem, SstError, suggestion
-from sst_ros.host.output import slices
+from sst_ros.errors import SstError, refuse_unless, suggestion
+from sst_ros.host.figures import BLUE, MARKERS, VERMILION, legend, note, styled
+from sst_ros.host.many_runs import run_many
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
-from sst_ros.plot.style import BLUE, MARKERS, VERMILION, legend, note, styled
 from sst_ros.report import scene_summary as advised
 from sst_ros.report.results import WHOLE_RUN_S, data_frame, provenance, publish, records, render
 from sst_ros.scene.scene import Scene, with_initial
@@ -88,8 +88,8 @@ def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) ->
     print(said)
     steps, runs = records(found.steps.replace(math.inf, None)), records(found.runs)
     document = {"scene": found.scene, "advice": found.advice, "steps": steps, "runs": runs}
-    figures = {"stability": draw_stability(found)}
-    publish(out, "stability", csv=found.runs, document=document, page=said, figures=figures)
+    files = {".csv": found.runs, ".json": document, ".md": said, ".png": draw_stability(found)}
+    publish(out, "stability", files)
     return found.passed
 
 
@@ -97,10 +97,9 @@ def examine_stability(
     scene: Scene, only: Sequence[str] = (), *, shown: bool = False
 ) -> StabilityReport:
     """Find the stable steps along the motion of a scene, and run it with other numbers."""
-    for name in only:
-        if name not in ROWS:
-            allowed = f"must be one of {', '.join(ROWS)}{suggestion(name, ROWS)}"
-            raise InputError("report stability", [Problem("--only", name, allowed)])
+    known = f"must be one of {', '.join(ROWS)}"
+    wrong = (("--only", name, name in ROWS, known + suggestion(name, ROWS)) for name in only)
+    refuse_unless("report stability", *wrong)
     chosen = [name for name in ROWS if name in only or not only]
     seconds = min(scene.duration or WHOLE_RUN_S, advised.LONGEST_S)
     began = time.perf_counter()
@@ -118,11 +117,13 @@ def examine_stability(
             name: advised.largest_stable_step(method, values) for name, method in METHODS.items()
         }
         steps.append({"t_s": t, **fastest, **longest})
-    runs = []
-    for part in slices(len(chosen), 1, f"{scene.name:<16}", shown):
-        what, change = ROWS[chosen[part.start]]
-        row = {"name": chosen[part.start], "change": what}
-        runs.append(row | _run(change(scene, motion), seconds))
+
+    def run(name: str) -> dict[str, Any]:
+        what, change = ROWS[name]
+        return {"name": name, "change": what, **_run(change(scene, motion), seconds)}
+
+    # One after another: computing times are those of a core that is free.
+    runs = [row for _, row in run_many(run, chosen, label=f"{scene.name:<16}" * shown)]
     advice = advised.step_advice(scene).text
     return StabilityReport(scene.name, data_frame(steps), advice, data_frame(runs))
 
@@ -260,7 +261,7 @@ ROWS: dict[str, tuple[str, Change]] = {
 def stability_page(found: StabilityReport) -> str:
     """Write the report as Markdown."""
     given = {"factor": FACTOR, "rounding": ROUNDING, "methods": METHODS, "inf": math.inf}
-    return render("stability.md", found=found, provenance=provenance(), **given)
+    return render("stability.md", found=found, **given)
 
 
 @styled

@@ -11,23 +11,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.tracking import Track, TrackingMetrics, track_of, tracking_table
-from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.host.output import write_into
+from sst_ros.control.tracking import Track, TrackingMetrics, track_of
+from sst_ros.errors import InputError, SingularConfiguration, refusal
 from sst_ros.mechanism import continuation
-from sst_ros.mechanism.geometry import (
-    Array,
-    Geometry,
-    angle_between,
-    quaternion_of,
-    rotation_matrix,
-)
+from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
-from sst_ros.recording.bag_reader import refusal
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, places
-from sst_ros.state import NANOSECONDS
+from sst_ros.report.results import largest, publish, render
+from sst_ros.state import NANOSECONDS, Array
 
 KEYS = (REFERENCE.key, TRACKING_ERROR.key)
 DRAWN = ("tracking", "tracking_error", "control_torques")
@@ -112,14 +105,9 @@ def write_tracking_report(bag: Path, out: Path) -> str:
     The table is returned. Raises InputError as `read_tracking`, or where `out` cannot be written.
     """
     tracked = read_tracking(bag)
-    title, error = (
-        f"Tracking of {tracked.recording.scene.name}, from {bag}",
-        tracked.orientation_error,
-    )
-    text = f"{title}\n\n{tracking_table(tracked.metrics)}"
-    if np.isfinite(error).any():
-        text += f"\n{'orientation, largest [rad]':26}{np.nanmax(error):10.3e}\n"
-    with write_into(out, "report"):
-        (out / "tracking.txt").write_text(text, encoding="utf-8")
+    title = f"Tracking of {tracked.recording.scene.name}, from {bag}"
+    given = {"found": tracked.metrics, "turned": largest(tracked.orientation_error)}
+    text = render("tracking.txt", title=title, **given)
+    publish(out, "report", {"tracking.txt": text})
     pictures.draw_run(tracked.recording.signals, out, DRAWN, ["png"])
     return text

@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
 from functools import partial
 from typing import Any, ClassVar
 
 from sst_ros.control.law import ControllerSettings
-from sst_ros.errors import Problem
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
-from sst_ros.scene.schema import Section, entry
+from sst_ros.scene.schema import Rules, Section, entry
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
 from sst_ros.state import NANOSECONDS
 
@@ -115,15 +113,15 @@ class SimulatorParameters(Section):
         most=1000000,
     )
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse rates that have no whole period, and bounds too small to be meant."""
-        if NANOSECONDS % self.rate:
-            yield Problem("rate", self.rate, "must divide 1e9, so that a step is whole nanoseconds")
-        if self.rate % self.publish_rate:
-            yield Problem("publish_rate", self.publish_rate, f"must divide rate = {self.rate}")
+        rate, shown = self.rate, self.publish_rate
+        whole = "must divide 1e9, so that a step is whole nanoseconds"
+        yield NANOSECONDS % rate, "rate", rate, whole
+        yield rate % shown, "publish_rate", shown, f"must divide rate = {rate}"
         for name in self.CHANGEABLE:
-            if 0.0 < getattr(self, name) < 1e-3:
-                yield Problem(name, getattr(self, name), "must be 0 or >= 0.001")
+            value = getattr(self, name)
+            yield 0.0 < value < 1e-3, name, value, "must be 0 or >= 0.001"
 
     @property
     def run(self) -> RunSettings:
@@ -160,11 +158,11 @@ class AnsweringParameters(Section):
     )
     timeout: float = _number("longest silence of joint_states", "s", 10.0, least=0.1)
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse a rate without a whole period."""
-        yield from super().check()
-        if NANOSECONDS % self.rate:
-            yield Problem("rate", self.rate, "must divide 1e9, so that a period is whole")
+        yield from super().rules()
+        whole = "must divide 1e9, so that a period is whole"
+        yield NANOSECONDS % self.rate, "rate", self.rate, whole
 
     @property
     def period_ns(self) -> int:

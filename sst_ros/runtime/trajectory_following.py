@@ -24,7 +24,7 @@ from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference_motions import reference_motion, through_points
 from sst_ros.control.tracking import TrackingMetrics, track_of
-from sst_ros.errors import InputError, Problem, refuse_unless
+from sst_ros.errors import Check, refusal, refuse_unless
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
@@ -93,20 +93,23 @@ class TrajectoryGoal:
     """
 
     def __init__(self, message: Any, defaults: ControllerNodeParameters) -> None:
-        self._problems = []
-        places = ("multi_dof_trajectory.joint_names", "multi_dof_trajectory.points")
-        for name in (*places, "component_path_tolerance", "component_goal_tolerance"):
-            if rows := len(attrgetter(name)(message)):
-                allowed = "must be empty: joints have one freedom"
-                self._problems.append(Problem(name, f"{rows} entries", allowed))
+        names = (
+            "multi_dof_trajectory.joint_names",
+            "multi_dof_trajectory.points",
+            "component_path_tolerance",
+            "component_goal_tolerance",
+        )
+        rows, allowed = attrgetter(*names)(message), "must be empty: joints have one freedom"
+        self._checks: list[Check] = [
+            (name, f"{len(x)} entries", not x, allowed) for name, x in zip(names, rows, strict=True)
+        ]
         self._path = self._resolve_all(message, "path_tolerance", defaults.path_tolerance, 0.0)
         still = defaults.stopped_velocity_tolerance
         self._goal = self._resolve_all(message, "goal_tolerance", defaults.goal_tolerance, still)
         name = "goal_time_tolerance"
         late = nanoseconds(message.goal_time_tolerance) / NANOSECONDS
         self._late = self._resolve(name, late, defaults.goal_time_tolerance)
-        if self._problems:
-            raise InputError("follow_joint_trajectory", self._problems)
+        refuse_unless("follow_joint_trajectory", *self._checks)
         points = message.trajectory.points
         self._times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in points]
 
@@ -118,9 +121,8 @@ class TrajectoryGoal:
         found = {(quantity, joint): own[quantity] for quantity in own for joint in ACTUATORS}
         for index, tolerance in enumerate(getattr(message, name)):
             place = f"{name}[{index}]"
-            if tolerance.name not in ACTUATORS:
-                allowed = f"must be one of {', '.join(ACTUATORS)}"
-                self._problems.append(Problem(f"{place}.name", tolerance.name, allowed))
+            known, allowed = tolerance.name in ACTUATORS, f"must be one of {', '.join(ACTUATORS)}"
+            self._checks.append((f"{place}.name", tolerance.name, known, allowed))
             for quantity, default in own.items():
                 value = getattr(tolerance, quantity)
                 resolved = self._resolve(f"{place}.{quantity}", value, default)
@@ -128,12 +130,9 @@ class TrajectoryGoal:
         return found
 
     def _resolve(self, name: str, value: float, default: float) -> float:
-        if value == NO_TOLERANCE:
-            return 0.0
-        if not 0.0 <= value < math.inf:
-            allowed = "must be > 0, 0 for the default or -1 for none"
-            self._problems.append(Problem(name, value, allowed))
-        return value or default
+        none, allowed = value == NO_TOLERANCE, "must be > 0, 0 for the default or -1 for none"
+        self._checks.append((name, value, none or 0.0 <= value < math.inf, allowed))
+        return 0.0 if none else value or default
 
     def index(self, time: float) -> int:
         """Return the index of the point that is approached at a time of the motion [s]."""
@@ -330,7 +329,7 @@ class TrajectoryFollower:
         """Return the reference at rest at the measured angles."""
         if seen is None:
             allowed = "must come first: a trajectory begins there"
-            raise InputError("joint_trajectory", [Problem("joint_states", None, allowed)])
+            raise refusal("joint_trajectory", "joint_states", None, allowed)
         named = self._model.initial.orientation
         meant = None if named is None else rotation_matrix(named)
         assembly = kinematics.admissible(self._geometry, seen.gamma, meant)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.errors import Problem, refuse_unless
+from sst_ros.errors import Problem, check_kinds, refuse_unless
 from sst_ros.scene.schema import Rules, Section, amount, coefficient, entry
 from sst_ros.state import ZERO, Array, Vector3
 
@@ -279,6 +279,7 @@ def _is_positive(entries: Sequence[Any], more: Any) -> Any:
     return np.asarray((first > 0.0) & (second > 0.0) & (third > 0.0))
 
 
+@check_kinds
 def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) -> Inertia:
     """Inertia about O of a thin, uniform arc of a great circle. Inertias of several arcs add up.
 

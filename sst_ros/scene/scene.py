@@ -16,19 +16,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.errors import InputError, Problem, check_kinds, refusal, suggestion
 from sst_ros.scene import loads, schema
 from sst_ros.scene.bodies import Base, Link, Payload, Star, Stroke, Workspace
 from sst_ros.scene.schema import Place, Section, Spec, amount, entry, key_of
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.scene.yaml_document import NO_NUMBER, find_fields, plain, read, replace_values
-from sst_ros.state import Array
+from sst_ros.scene.yaml_document import (
+    NO_NUMBER,
+    find_fields,
+    plain,
+    read,
+    replace_values,
+    values_at,
+)
+from sst_ros.state import Array, Explained
 
 LARGEST = 1e9
 """No number of a scene is larger: it is a slip of units, and its powers leave double precision."""
 
 
-class Scene(Section):
+LINKS = ("actuated_links", "intermediate_links")
+
+
+class Scene(Explained, Section):
     """All that is simulated."""
 
     name: str = entry("short name")
@@ -57,6 +67,7 @@ class Scene(Section):
         "where the values come from, by key", default=()
     )
 
+    @check_kinds
     def with_values(self, values: Mapping[str, Any]) -> Scene:
         """Return the scene with other values by key, as in {"star.inertia.zz": 0.3}.
 
@@ -67,10 +78,11 @@ class Scene(Section):
         """
         try:
             changed = replace_values(self, plain(values))
+        except RecursionError:
+            raise InputError(self.name, [Problem("", values, "must not hold itself")]) from None
         except KeyError as error:
-            key = error.args[0]
-            problem = Problem(str(key), values[key], "names nothing in this scene")
-            raise InputError(self.name, [problem]) from None
+            key, allowed = error.args[0], "names nothing in this scene"
+            raise refusal(self.name, str(key), values[key], allowed) from None
         return schema.build(Scene, changed, self.name)
 
     @property
@@ -83,6 +95,20 @@ class Scene(Section):
         """Whether the torques of the actuators lag behind what is commanded."""
         return self.actuators is not None and self.actuators.time_constant is not None
 
+    def _facts(self) -> dict[str, object]:
+        present = terms(self)
+        return {
+            "name": self.name,
+            "description": self.description,
+            "has": present or "nothing but the star",
+            "has not": [term for term in TERMS if term not in present] or "all terms are there",
+            "gamma(0) [rad]": self.initial.gamma,
+            "gamma_dot(0) [rad/s]": self.initial.gamma_dot,
+            "torque": "sines" if self.torque else "none of its own",
+            "motion": self.motion.kind if self.motion else "none of its own",
+            "duration [s]": self.duration or "open",
+        }
+
     def rules(self) -> schema.Rules:
         """Refuse slips of units, centres of mass far from the bodies, gravity without a mass.
 
@@ -91,9 +117,12 @@ class Scene(Section):
         allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
         for place, value in schema.leaves(self).items():
             yield abs(value) > LARGEST, key_of(place), value, allowed
+        if (q := self.initial.orientation) is not None:
+            zero = np.equal(sum(part * part for part in q), 0.0)
+            yield zero, "initial.orientation", q, "must not be zero"
         reach = np.maximum(self.base.radius, self.star.radius)
         bodies = {"star": self.star}
-        for name in ("actuated_links", "intermediate_links"):
+        for name in LINKS:
             bodies |= {f"{name}[{k}]": link for k, link in enumerate(getattr(self, name))}
         mass: Any = 0.0 if self.payload is None else self.payload.mass
         for name, body in bodies.items():
@@ -109,6 +138,34 @@ class Scene(Section):
             yield strange, f"provenance.{key}", note, "is about a key that no scene has"
 
 
+TERMS = {
+    "actuated links": f"{LINKS[0]}.inertia",
+    "intermediate links": f"{LINKS[1]}.inertia",
+    "payload": "payload",
+    "gravity": "gravity",
+    "external moment": "moment",
+    "friction in gamma": "friction.gamma",
+    "friction in mu": "friction.mu",
+    "friction in beta": "friction.beta",
+    "springs": "springs",
+    "rotors": "actuators.rotor_inertia",
+    "torque limit": "actuators.torque_limit",
+    "actuator lag": "actuators.time_constant",
+    "elastic stops": "stroke.stiffness",
+}
+"""Key of each term in a scene."""
+
+
+def has(scene: Scene, term: str) -> bool:
+    """Return whether a scene has one of TERMS."""
+    return schema.has_effect(values_at(scene, TERMS[term]))
+
+
+def terms(scene: Scene) -> list[str]:
+    """Return those of TERMS that a scene has."""
+    return [term for term in TERMS if has(scene, term)]
+
+
 def _has_key(cls: type[Section], key: str) -> bool:
     """Return whether documents of a class may have a key without indices."""
     name, _, rest = key.partition(".")
@@ -119,7 +176,11 @@ def _has_key(cls: type[Section], key: str) -> bool:
 
 
 def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
-    """Return a scene as it is, built from its document as a dict, or as `load` does."""
+    """Return a scene by its path (ends in .yaml) or by the name of one that comes with sst_ros.
+
+    It may also be its document as a dict, or a `Scene`, which is returned as it is. InputError is
+    raised where there is no such scene, or its document is refused.
+    """
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, Mapping):
@@ -127,7 +188,7 @@ def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
     if isinstance(scene, (str, Path)):
         return load(scene)
     allowed = "must be a Scene, the name or path of one, or its document as a dict"
-    raise InputError("scene", [Problem("scene", scene, allowed)])
+    raise refusal("scene", "scene", scene, allowed)
 
 
 def with_initial(scene: Scene, initial: Any) -> Scene:
@@ -144,7 +205,7 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
             gamma, gamma_dot = initial
         except (TypeError, ValueError):
             allowed = "must be (gamma, gamma_dot), a mapping or Initial"
-            raise InputError("initial", [Problem("initial", initial, allowed)]) from None
+            raise refusal("initial", "initial", initial, allowed) from None
         initial = {"gamma": gamma, "gamma_dot": gamma_dot}
     return replace(scene, initial=initial)
 
@@ -160,14 +221,14 @@ def load(name_or_path: str | Path) -> Scene:
 def text_of(name_or_path: str | Path) -> tuple[str, str]:
     """Return the YAML text of a scene, found as by `load`, and the path that it is from."""
     path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
+    if is_name := path.suffix not in (".yaml", ".yml"):
         path = share_directory() / "config" / "scenes" / f"{name_or_path}.yaml"
     try:
         return path.read_text(encoding="utf-8"), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        allowed = f"must be a readable .yaml file or one of {', '.join(names())} ({error})"
-        allowed += suggestion(str(name_or_path), names())
-        raise InputError("scene", [Problem("scene", str(name_or_path), allowed)]) from None
+        allowed = f"must be a readable .yaml file or one of {', '.join(names())}"
+        allowed += suggestion(str(name_or_path), names()) if is_name else f" ({error})"
+        raise refusal("scene", "scene", str(name_or_path), allowed) from None
 
 
 def names() -> list[str]:
@@ -181,7 +242,7 @@ def share_directory() -> Path:
         for candidate in (parent, parent / "share" / "sst_ros"):
             if (candidate / "config" / "scenes").is_dir():
                 return candidate
-    raise InputError("installation", [Problem("config/scenes", __file__, "was not installed")])
+    raise refusal("installation", "config/scenes", __file__, "was not installed")
 
 
 class Scenarios:
@@ -211,7 +272,7 @@ class Scenarios:
                     self._places[place], self._specs[key] = key, spec
                 self.rows[key] = self._rows_of(value, spec.shape)
                 self.count = len(self.rows[key])
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 problems.append(Problem(key, value, str(error)))
         if problems:
             raise InputError(scene.name, problems)

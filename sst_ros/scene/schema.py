@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 
-from sst_ros.errors import InputError, Problem, suggestion
+from sst_ros.errors import Array, InputError, Problem, refusal, refuse_unless, suggestion
+from sst_ros.state import Explained
 
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
@@ -80,10 +81,12 @@ class Spec:
         what = f"{size} finite numbers" if size else "a finite number"
         ends = (">", self.above), (">=", self.least), ("<=", self.most)
         bounds = "".join(f" {sign} {end:g}" for sign, end in ends if math.isfinite(end))
+        row = ", ".join(map(str, ("n", *self.shape))) + "," * (not self.shape)
         counts = " or ".join(map(str, self.lengths)) + " " if self.lengths else ""
         keys = ", ".join(self.section.SPECS) if self.section else ""
         return {
             "number": f"must be {what}{bounds}{unit}",
+            "samples": f"must be finite numbers, shape ({row}){unit}",
             "integer": f"must be a whole number from {self.least} to {self.most}{unit}",
             "flag": "must be true or false",
             "text": "must be text without control characters",
@@ -101,7 +104,7 @@ def entry(doc: str, unit: str = "", default: Any = REQUIRED, **rules: Any) -> An
 
     It may be float, a tuple of as many, or of such; int, bool, str, a section, a tuple of any
     number of them, or of three, for which one may stand; tuple[tuple[str, str], ...] is a mapping
-    to text. `rules` has more of what `Spec` says.
+    to text, Array has a row of some `shape` for each sample. `rules` has more of what `Spec` says.
     """
     given = MISSING if default is REQUIRED else default
     return field(default=given, metadata={"spec": Spec("", doc, unit, **rules)}, kw_only=True)
@@ -116,7 +119,7 @@ coefficient = partial(entry, least=0.0, default=0.0)
 
 
 def anything(doc: str, **default: Any) -> Any:
-    """Declare what `Section.check` checks; it may be given by its place, too."""
+    """Declare what `Section.rules` check; it may be given by its place, too."""
     return field(metadata={"spec": Spec("anything", doc)}, **default)
 
 
@@ -150,7 +153,7 @@ class Section:
             declared = vars(cls).get(name)
             if isinstance(declared, Field) and str(hint).endswith("| None"):
                 declared.default = None if declared.default is MISSING else declared.default
-        dataclass(frozen=True)(cls)
+        dataclass(frozen=True, repr=not issubclass(cls, Explained))(cls)
         hints, specs = typing.get_type_hints(cls), {}
         for one in fields(cls):
             spec: Spec = one.metadata["spec"]
@@ -165,11 +168,15 @@ class Section:
         kept = (one for one in given if one[2] is not None or one[1].default is not None)
         try:
             vars(self).update(_freeze_all(kept))
-            problems = [*self.settle()] or [*self._find_idle(), *self.check()]
+            problems = [*self.settle()] or [*self._find_idle(), *self._find_broken()]
         except InputError as error:
             problems = [*error.problems]
         if problems:
             raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
+
+    def __dir__(self) -> list[str]:
+        """Show what a document has, and nothing of how it is checked."""
+        return [name for name in super().__dir__() if name[0] == "_" or name not in vars(Section)]
 
     def _find_idle(self) -> Iterator[Problem]:
         """Yield what has no effect, and what is not one of several."""
@@ -193,13 +200,13 @@ class Section:
         """Put what may be given in several forms into one; yield what forbids that."""
         return iter(())
 
-    def check(self) -> Iterator[Problem]:
-        """Yield the faults that no single field shows; override where rules are not enough."""
+    def _find_broken(self) -> Iterator[Problem]:
+        """Yield the rules that are broken."""
         with np.errstate(all="ignore"):
             yield from (Problem(*found) for broken, *found in self.rules() if broken)
 
     def rules(self) -> Rules:
-        """Yield the rules that numbers of several fields must keep.
+        """Yield the rules that no single field shows.
 
         They also hold for columns in place of numbers: what is broken is then an array.
         """
@@ -211,7 +218,7 @@ S = TypeVar("S", bound=Section)
 
 _KINDS = {
     float: "number", int: "integer", bool: "flag", str: "text", tuple[str, ...]: "texts",
-    tuple[tuple[str, str], ...]: "notes",
+    tuple[tuple[str, str], ...]: "notes", Array: "samples",
 }  # fmt: skip
 
 
@@ -241,7 +248,7 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
     known = cls.SPECS
     if not isinstance(values, Mapping):
         allowed = Spec("section", "", section=cls).describe()
-        raise InputError(origin, [Problem("", values, allowed)])
+        raise refusal(origin, "", values, allowed)
     problems = []
     for name in [name for name in values if name not in known]:
         allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(str(name), known)}"
@@ -287,6 +294,8 @@ def accept(spec: Spec, value: Any) -> Any:
     it are, with their keys.
     """
     kind, section = spec.kind, spec.section or Section
+    if kind == "samples":
+        return _freeze_samples(spec, value)
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if kind == "number":
@@ -334,6 +343,15 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if not (math.isfinite(result) and spec.allows(result)):
         raise ValueError
     return result
+
+
+def _freeze_samples(spec: Spec, value: Any) -> Array:
+    array = np.array(value, dtype=float)
+    fits = array.ndim > 0 and array.shape[1:] == spec.shape
+    refuse_unless("", ("", array.shape, fits, spec.describe()))
+    for place in np.argwhere(~np.isfinite(array))[:1].tolist():
+        raise refusal("", str(place), float(array[tuple(place)]), "must be finite")
+    return array
 
 
 def _freeze_text(value: Any) -> str:

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.errors import InputError, Problem, refuse_unless
+from sst_ros.errors import InputError, Problem, check_kinds, refusal, refuse_errors, refuse_unless
 from sst_ros.scene.schema import Section, entry
 from sst_ros.state import ZERO, Array, State, Vector3, finite_vector
 
@@ -116,6 +116,7 @@ class PolynomialTorque(TorqueProfile):
     raised where shapes, order or numbers are not allowed.
     """
 
+    @check_kinds
     def __init__(self, coefficients: ArrayLike, breakpoints: ArrayLike) -> None:
         self.c, self.x = np.array(coefficients, dtype=float), np.array(breakpoints, dtype=float)
         good, pieces = self.x.size > 1 and ascend(self.x), max(self.x.size - 1, 1)
@@ -169,7 +170,7 @@ class FunctionTorque(TorqueProfile):
 
     def __init__(self, function: Callable[..., Sequence[float]]) -> None:
         self._function = function
-        self.feedback = _count_arguments(function) == 2
+        self.feedback = count_arguments(function) == 2
 
     def __call__(self, t: float, *state: State) -> Vector3:
         """Torques [N m] at a time [s], and a state where it is an argument."""
@@ -187,10 +188,10 @@ def _three(value: Any, name: str) -> Vector3:
     if (vector := finite_vector(value)) is not None:
         return vector
     allowed = "must be three finite numbers [N m], a profile, or a function f(t) or f(t, state)"
-    raise InputError("simulate", [Problem(name, value, allowed)])
+    raise refusal("simulate", name, value, allowed)
 
 
-def _count_arguments(function: Callable[..., Any]) -> int:
+def count_arguments(function: Callable[..., Any]) -> int:
     """Positional arguments that a function must be given, 1 or 2, or refuse it."""
     try:
         signature = inspect.signature(function)
@@ -199,9 +200,12 @@ def _count_arguments(function: Callable[..., Any]) -> int:
     for count in (1, 2):
         with contextlib.suppress(TypeError):
             signature.bind(*range(count))
-            return count
-    allowed = "must be a function f(t) or f(t, state)"
-    raise InputError("simulate", [Problem("torque", function, allowed)])
+            named = [*signature.parameters][:count]
+            if named[0] != "state" and (count == 1 or named[-1] not in ("t", "time")):
+                return count
+            break
+    allowed = "must be a function f(t) or f(t, state), in this order"
+    raise refusal("simulate", "torque", function, allowed)
 
 
 class TorqueTable(TorqueProfile):
@@ -211,6 +215,7 @@ class TorqueTable(TorqueProfile):
     raised where shapes, order or numbers are not allowed.
     """
 
+    @check_kinds
     def __init__(self, times: ArrayLike, torques: ArrayLike) -> None:
         self.times = np.array(times, dtype=float)
         self.torques = np.array(torques, dtype=float)
@@ -225,20 +230,21 @@ class TorqueTable(TorqueProfile):
         )
 
     @classmethod
+    @check_kinds
     def read(cls, path: str | Path) -> TorqueTable:
         """Read a CSV file with the header time, tau_1, tau_2, tau_3 [s, N m].
 
         InputError says why the file cannot be read, or lists every bad row with its line.
         """
         origin, header = str(path), ["time", "tau_1", "tau_2", "tau_3"]
-        try:
-            with Path(path).open(newline="", encoding="utf-8") as file:
-                reader = csv.reader(file)
-                names = [name.strip() for name in next(reader, [])]
-                lines = [(reader.line_num, row) for row in reader]
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
-            problem = Problem("csv", origin, f"must be readable ({error})")
-            raise InputError(origin, [problem]) from None
+        unread = OSError, UnicodeDecodeError, csv.Error
+        with (
+            refuse_errors(origin, "csv", origin, "must be readable", *unread),
+            Path(path).open(newline="", encoding="utf-8") as file,
+        ):
+            reader = csv.reader(file)
+            names = [name.strip() for name in next(reader, [])]
+            lines = [(reader.line_num, row) for row in reader]
         problems = [] if lines else [Problem("rows", 0, "must be one or more")]
         if names != header:
             problems = [Problem("header", names or None, "must be " + ", ".join(header), 1)]

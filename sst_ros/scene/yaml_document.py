@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, refusal
 from sst_ros.scene.schema import REQUIRED, Place, S, Section, Spec, build
 
 NO_NUMBER = "must name a number, as star.mass does"
@@ -55,7 +55,7 @@ def read(cls: type[S], source: str, origin: str) -> S:
     problems: list[Problem] = []
     try:
         if len(source) > LONGEST:
-            raise InputError("", [Problem("", "more", LIMITS)])
+            raise refusal("", "", "more", LIMITS)
         values = _values(yaml.compose(source, Loader=_Loader), "", lines, problems)
         result = build(cls, values, origin)
     except InputError as refused:
@@ -187,6 +187,21 @@ def find_fields(
     for word in _split(key):
         found = [one for part in found for one in _below(*part, word, components)]
     yield from found
+
+
+def find_number(tree: Section, key: str) -> float | None:
+    """Return a number by its key, the first of a list; None where there is none."""
+    found = values_at(tree, key, "number")
+    return float(np.ravel(found[0])[0]) if found else None
+
+
+def values_at(tree: Section, key: str, kind: str = "") -> list[Any]:
+    """List the values that a key names, of a kind where it is given; none where there is none."""
+    try:
+        found = [*find_fields(tree, key, components=True)]
+    except ValueError:
+        return []
+    return [x for _, x, spec in found if x is not None and spec.kind in (kind or spec.kind,)]
 
 
 def _below(

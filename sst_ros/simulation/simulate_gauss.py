@@ -146,6 +146,7 @@ class CollocatedMotion:
             step=self._h,
             law=task.torque,
             dense=self.at,
+            parameters=task.parameters,
         )
 
     def _balance_energy(self) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sst_ros.dynamics.initial_state import derive_by_paper, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
-from sst_ros.errors import Diverged, StepBudgetExceeded, refuse_unless
+from sst_ros.errors import Diverged, StepBudgetExceeded, check_kinds, refuse_unless
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import BudgetSpent, CannotStep, EvaluationBudget
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
@@ -23,14 +23,17 @@ from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.torque_profile import SineTorque, Torque
-from sst_ros.state import NANOSECONDS, State, Vector3, finite_vector
+from sst_ros.scene.torque_profile import SineTorque, Torque, count_arguments
+from sst_ros.state import NANOSECONDS, Explained, State, Vector3, finite_vector
 
 AUTO = "auto"
 INTEGRATORS = (AUTO, *METHODS)
 
 EQUATIONS = ("quaternion", "virtual_work")
 """Equations of motion: in the quaternion and the body rate, or the paper's Eqs. 1 to 92."""
+
+_THREE = "must be three finite numbers [N m]"
+_TORQUE = f"{_THREE}, a SineTorque or a function of t [s]"
 
 _PLAIN_BUDGET = 3_000_000
 """Operations a step in plain Python may take: 0.12 s at 37 ns each, on a 3 GHz core."""
@@ -52,11 +55,12 @@ def default_budget(dynamics: Dynamics, equations: str, *, compiled: bool) -> int
 
 
 def _whole(value: Any) -> int:
-    """Return a whole number of any type as int, 0 for anything else."""
+    """Return a whole number of any type as int, 0 for anything else and from 2^63 on."""
     try:
-        return 0 if isinstance(value, bool) else operator.index(value)
+        found = 0 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         return 0
+    return found if found < 2**63 else 0
 
 
 def _one_of(names: tuple[str, ...]) -> str:
@@ -72,7 +76,7 @@ class _Instant(NamedTuple):
     moment: tuple[float, ...] = ()
 
 
-class Simulation:
+class Simulation(Explained):
     """Direct dynamics of a scene from its initial state.
 
     Args:
@@ -106,6 +110,7 @@ class Simulation:
 
     """
 
+    @check_kinds
     def __init__(
         self,
         scene: Scene | str | Path | dict[str, Any],
@@ -133,7 +138,7 @@ class Simulation:
         self.compiled = compiled and numba_version() is not None
         if compiled and not self.compiled:
             text = "no numba (or SST_ROS_NUMBA=0): running plain Python, slower, the same digits"
-            warnings.warn(text, RuntimeWarning, stacklevel=2)
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
         self.step_budget = step_budget or default_budget(
             self.dynamics, equations, compiled=self.compiled
         )
@@ -186,11 +191,10 @@ class Simulation:
         length, number = _whole(dt_ns), _whole(count)
         if not (length > 0 and number > 0 and finite_vector(torque) and finite_vector(moment)):
             known = callable(torque) or isinstance(torque, SineTorque) or finite_vector(torque)
-            three = "must be three finite numbers [N m]"
             refuse_unless(
                 "step",
-                ("torque", torque, bool(known), f"{three}, a SineTorque or a function of t [s]"),
-                ("moment", moment, finite_vector(moment) is not None, three),
+                ("torque", torque, bool(known), _TORQUE),
+                ("moment", moment, finite_vector(moment) is not None, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
                 ("count", count, number > 0, "must be > 0, a whole number"),
             )
@@ -203,7 +207,13 @@ class Simulation:
 
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
-        return self._propagator.torque.acting(torque)
+        try:
+            if callable(torque) and not getattr(torque, "feedback", False):
+                refuse_unless("step", ("torque", torque, count_arguments(torque) == 1, _TORQUE))
+            return self._propagator.torque.acting(torque)
+        except (TypeError, ValueError, OverflowError):
+            refuse_unless("step", ("torque", torque, False, _TORQUE))
+            raise
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""
@@ -226,6 +236,7 @@ class Simulation:
             self._now = _Instant(at.time_ns + done * dt_ns, point, torque, held)
             count -= done
 
+    @check_kinds
     def within(self, time_ns: int) -> State:
         """State at a time inside the last step, to the full accuracy of the run.
 
@@ -330,6 +341,18 @@ class Simulation:
     def conditioning(self) -> dict[str, float]:
         """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
         return conditioning(self.geometry, self.state)
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "scene": self.scene.name,
+            "time [s]": self.time_ns / NANOSECONDS,
+            "method": self.method + (", compiled" if self.compiled else ", plain Python"),
+            "accepted steps": self.accepted_steps,
+            "error estimate [rad]": self.error_estimate,
+            "gamma [rad]": self.state.joints.gamma,
+            "gamma_dot [rad/s]": self.state.joints.gamma_dot,
+            "conditioning": describe_conditioning(self.geometry, self.state),
+        }
 
     def _as_state(self, at: _Instant) -> State:
         return State.of(at.time_ns, at.point.y, at.point.joints, self._torque(at))

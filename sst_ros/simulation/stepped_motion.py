@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,15 +20,19 @@ from sst_ros.integration.adaptive_stepper import (
     Step,
 )
 from sst_ros.integration.compiled_method import CompiledMethod, has_step_code
-from sst_ros.integration.point import state_distance
+from sst_ros.integration.point import Point, state_distance
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import Torque, TorqueProfile, torque_at
-from sst_ros.state import NANOSECONDS, Array, State, Vector3
+from sst_ros.state import NANOSECONDS, Array, State, Vector3, clamp
 
 _WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000
 """Evaluations after which a run goes on with compiled code that is there, and makes it: in plain
 Python they take one second and five; to compile the steps of a method takes four."""
+
+_WARN_AFTER, _HOPELESS = WHOLE_MOTION_BUDGET // 100, 3.0
+"""Evaluations, a second of work, after which a motion is looked at that will not reach its end by
+three times its budget: a warning then, and not a stop after half a minute."""
 
 _SAMPLES = 200
 """Intervals of a motion without times of samples."""
@@ -48,8 +53,10 @@ class Task:
     method: str  # name, or auto
     tolerance: float  # largest error estimate at the end [rad]
     period: int | None = None  # of control [ns], from time zero; None where torques are not held
+    memoryless: bool = False  # whether torques that are held depend on time and state alone
     breaks: Sequence[float] | Array = ()  # further times at which the torques jump, ascending
     max_step: float = math.inf  # longest step
+    parameters: tuple[str, ...] = ()  # by which the motion is differentiated
 
     def sample_times(self) -> Array:
         """Return the times of the samples of a motion by steps."""
@@ -104,9 +111,11 @@ class SteppedMotion:
         self.rows: list[tuple[float, ...]] = []
         self._wanted: list[float] = task.sample_times()[::-1].tolist()
         self._torque: Torque = (0.0, 0.0, 0.0)
+        self._other: Vector3 | None = None  # on the second solution, where they differ
         self._segment = task.span
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
         self._compile_after = _WORTH_LOADING if numba_version() else math.inf
+        self._warn_after: float = _WARN_AFTER
 
     def run(self) -> SteppedMotion:
         """Go to the end or a limit: through segments of a smooth torque, by steps, to events."""
@@ -117,7 +126,9 @@ class SteppedMotion:
                 self._torque = self.propagator.torque.acting(torque)
                 self._take_if_wanted(begin, self.at.y)
                 with np.errstate(all="ignore"):
-                    for step in self.propagator.steps(self.at, begin, h, self._torque, moment):
+                    for step in self.propagator.steps(
+                        self.at, begin, h, self._torque, moment, self._other
+                    ):
                         self._pass(step)
         except LimitReached as reached:
             self.status, stop = 1, reached.limit.reason
@@ -132,8 +143,11 @@ class SteppedMotion:
 
     def state(self) -> State:
         """Return the last valid state."""
-        acting = self.propagator.acting(self._torque, self.time, self.at)
-        return State.of(round(self.time * NANOSECONDS), self.at.y, self.at.joints, acting)
+        return self._state_of(self.at, self._torque)
+
+    def _state_of(self, at: Point, torque: Torque) -> State:
+        acting = self.propagator.acting(torque, self.time, at)
+        return State.of(round(self.time * NANOSECONDS), at.y, at.joints, acting)
 
     def _segments(self) -> Iterator[tuple[float, float, float, Torque]]:
         """Yield begin, length and end of segments [s], and the torque, smooth in each."""
@@ -146,6 +160,8 @@ class SteppedMotion:
                 state = (self.state(),) if task.torque.feedback else ()
                 held = torque_at(task.torque, time, *state)
                 self.held.append((time, held))
+                if task.torque.feedback and task.memoryless:
+                    self._other = self._answer_second(time)
                 stop = min(start + task.period, last)
                 yield time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held
             return
@@ -154,6 +170,13 @@ class SteppedMotion:
         for start, stop in pairwise([begin, *inside, end]):
             acting = task.torque.acting(start, stop)
             yield start, stop - start, stop, acting
+
+    def _answer_second(self, time: float) -> Vector3:
+        """Return what a function without memory gives to the second solution [N m]."""
+        at = self.propagator.begin(self.at.z)
+        before = self._torque if self._other is None else self._other
+        found = torque_at(self._task.torque, time, self._state_of(at, before))
+        return clamp(found, self.propagator.torque.limit)
 
     def _pass(self, step: Step) -> None:
         """Take samples in an accepted step."""
@@ -171,7 +194,15 @@ class SteppedMotion:
         self.time, self.at = end, step.end
         self._take_if_wanted(end, step.end.y)
         begin, last = self._task.span
-        self._bar.draw((end - begin) / (last - begin))
+        share = (end - begin) / (last - begin)
+        self._bar.draw(share)
+        if self.budget.spent > self._warn_after:
+            self._warn_after = math.inf
+            if _HOPELESS * WHOLE_MOTION_BUDGET * share < self.budget.spent:
+                done = f"{self.budget.spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+                most = f"it stops at {WHOLE_MOTION_BUDGET:,}: shorten it, or change its method"
+                text = f"{self._task.scene.name}: {done}; {most}"
+                warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     def _compile(self, machine: CompiledMethod) -> None:
         """Take compiled steps from now on, if their code is there or the run is long.

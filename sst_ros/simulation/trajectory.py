@@ -7,10 +7,8 @@ Between its samples states are propagated from the sample before, under the torq
 from __future__ import annotations
 
 import contextlib
-import html
-import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +17,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
+from sst_ros.dynamics.motion_table import JOINTS, MotionTable
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import Diverged, InputError, MissingDependency, Problem, refuse_unless, require
+from sst_ros.errors import (
+    Diverged,
+    InputError,
+    MissingDependency,
+    Problem,
+    check_kinds,
+    refusal,
+    refuse_errors,
+    refuse_unless,
+    require,
+)
 from sst_ros.host.output import SUFFIXES, load_table, write_table
 from sst_ros.integration.methods import DOP853
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.geometry import Geometry, rotation_matrix, unwrap_zyz, zyz_angles
+from sst_ros.mechanism.generic_math import triple
+from sst_ros.mechanism.geometry import Geometry, rotation_matrix, unwrap_zyz
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import (
     LostTorque,
@@ -35,16 +45,14 @@ from sst_ros.scene.torque_profile import (
     record_of,
 )
 from sst_ros.scene.yaml_document import dump, read
+from sst_ros.simulation.sensitivities import Sensitivities, Sensitivity
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, arrays_of, columns_of
+from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
     from matplotlib.figure import Figure
 
 _KEY, _FORMAT = "sst_ros", 1
-_JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
 _FIGURES = (
     "status", "message", "method", "error_estimate", "energy_residual", "evaluations", "step",
 )  # fmt: skip
@@ -69,13 +77,7 @@ def check_error(error: float, tolerance: float, status: int, message: str) -> tu
     return status or _UNMET, f"{message}; {unmet}"
 
 
-def _joint(first: int, meaning: str) -> cached_property[Array]:
-    found = cached_property[Array](lambda motion: motion._joints[:, first : first + 3])
-    found.__doc__ = f"{meaning}, shape (n, 3)."
-    return found
-
-
-class Trajectory:
+class Trajectory(MotionTable):
     """A motion over n instants. Arrays are its own, and read-only.
 
     Args:
@@ -98,6 +100,7 @@ class Trajectory:
         law: torques that act between the samples, for `at`, as `simulate` takes them; by default
             each is held over the interval that ends at its sample.
         dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses instead.
+        parameters: numbers of the scene, its start or its torques that `sensitivities` are by.
 
     Raises:
         InputError: shapes do not fit, or times do not ascend.
@@ -122,13 +125,16 @@ class Trajectory:
         step: float = float("nan"),
         law: Any = None,
         dense: Callable[[Array], Array] | None = None,
+        parameters: Sequence[str] = (),
     ) -> None:
         self.scene = scene
         self.t, self.quaternion, self.body_rate = _own(t), _own(quaternion), _own(body_rate)
         self.torque = _own(torque)
         if joints is not None:
             self._joints = _own(joints)
-        n, problems = len(self.t), []
+        n, problems = self.t.size, []
+        if not isinstance(scene, Scene):
+            problems.append(Problem("scene", scene, "must be a Scene"))
         if not ascend(self.t):
             problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
         for name, size in (("quaternion", 4), ("body_rate", 3), ("torque", 3), ("_joints", 18)):
@@ -142,7 +148,7 @@ class Trajectory:
         self.error_estimate, self._residual = error_estimate, energy_residual
         self.evaluations, self.step = evaluations, step
         self.law: TorqueProfile | None = None if law is None else profile_of(law)
-        self.dense = dense
+        self.dense, self._parameters = dense, tuple(parameters)
 
     def with_states(self, y: Array) -> Trajectory:
         """Return the same run with other read-only states (n, 7 or 10), before anything is derived.
@@ -154,9 +160,6 @@ class Trajectory:
         if y.shape[1] > 7:
             again.torque = y[:, 7:10]
         return again
-
-    def __len__(self) -> int:
-        return len(self.t)
 
     @property
     def success(self) -> bool:
@@ -170,17 +173,26 @@ class Trajectory:
             found = kernel.joints(self._dynamics.model, self._columns)
         return np.stack([np.broadcast_to(x, self.t.shape) for row in found for x in row], axis=1)
 
-    gamma = _joint(0, "Angles of the actuators [rad]")
-    mu = _joint(3, "Angles between base arcs and arcs of the star [rad]")
-    beta = _joint(6, "Angles from the carriages to E [rad]")
-    gamma_dot = _joint(9, "Rates of gamma [rad/s]")
-    mu_dot = _joint(12, "Rates of mu [rad/s]")
-    beta_dot = _joint(15, "Rates of beta [rad/s]")
+    def _joint(self, name: str) -> Array:
+        first = 3 * JOINTS.index(name)
+        return self._joints[:, first : first + 3]
+
+    @cached_property
+    def gamma_ddot(self) -> Array:
+        """Accelerations of the actuators under `torque` and the scene's loads [rad/s^2], (n, 3).
+
+        A moment from a topic is no part of them.
+        """
+        model, y = self._dynamics.model._replace(time_constant=None), self._columns
+        with np.errstate(all="ignore"):
+            slope = kernel.derivative(model, y, triple(self.torque.T))
+            found = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
+        return np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1)
 
     @cached_property
     def euler_zyz(self) -> Array:
         """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], shape (n, 3)."""
-        return unwrap_zyz(zyz_angles(rotation_matrix(self.quaternion)))
+        return unwrap_zyz(super().euler_zyz)
 
     @cached_property
     def energy(self) -> Array:
@@ -201,6 +213,16 @@ class Trajectory:
         rotation, geometry = rotation_matrix(self.quaternion), Geometry.of(self.scene)
         return float(np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0))
 
+    @cached_property
+    def sensitivities(self) -> dict[str, Sensitivity]:
+        """Derivatives of the samples by each parameter that `simulate` was given, by its name.
+
+        They are computed when they are first asked for. Raises InputError: no motion is found.
+        """
+        if not self._parameters or self.law is None:
+            return {}
+        return Sensitivities(self.scene, self._parameters, self.law).at(self.t)
+
     @property
     def _dynamics(self) -> Dynamics:
         return Dynamics.of(self.scene)
@@ -209,6 +231,7 @@ class Trajectory:
     def _columns(self) -> tuple[Array, ...]:
         return (*self.quaternion.T, *self.body_rate.T)
 
+    @check_kinds
     def at(self, t: ArrayLike) -> Trajectory:
         """Sample the motion at other times, ascending, to the accuracy of the run.
 
@@ -224,35 +247,32 @@ class Trajectory:
         """
         times = np.atleast_1d(np.asarray(t, dtype=float))
         inside = (times >= self.t[0]) & (times <= self.t[-1])
-        if times.ndim != 1 or not np.all(inside):
-            allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
-            raise InputError("at", [Problem("t", t, allowed)])
-        if isinstance(self.law, LostTorque) and not np.all(np.isin(times, self.t)):
-            allowed = "must be times of samples: the function of the torques is not in the file"
-            raise InputError("at", [Problem("t", t, allowed)])
+        fits = times.ndim == 1 and times.size > 0 and bool(np.all(inside))
+        allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
+        refuse_unless("at", ("t", t, fits, allowed))
+        known = not isinstance(self.law, LostTorque) or bool(np.all(np.isin(times, self.t)))
+        allowed = "must be times of samples: the function of the torques is not in the file"
+        refuse_unless("at", ("t", t, known, allowed))
         y = _propagate(self, times)
+        return self._sampled(times, y[:, :4], y[:, 4:7], y[:, 7:])
+
+    def __getitem__(self, rows: slice) -> Trajectory:
+        """Return the samples of a slice, as in `motion[::10]`; InputError: it is none, or empty."""
+        chosen = isinstance(rows, slice) and len(self.t[rows])
+        refuse_unless("trajectory", ("rows", rows, bool(chosen), "must be a slice with samples"))
+        arrays = self.t, self.quaternion, self.body_rate, self.torque
+        return self._sampled(*(array[rows] for array in arrays), joints=self._joints[rows])
+
+    def _sampled(self, *arrays: Array, joints: Array | None = None) -> Trajectory:
         return Trajectory(
-            self.scene, times, y[:, :4], y[:, 4:7], y[:, 7:],
+            self.scene, *arrays, joints=joints,
             status=self.status, message=self.message, method=self.method,
             error_estimate=self.error_estimate, energy_residual=lambda: self.energy_residual,
             evaluations=self.evaluations, step=self.step, law=self.law, dense=self.dense,
+            parameters=self._parameters,
         )  # fmt: skip
 
-    def to_pandas(self) -> pd.DataFrame:
-        """Table with a row an instant and a column a number, units in its `attrs`."""
-        table: pd.DataFrame = require("pandas").DataFrame(columns_of(self))
-        table.attrs = {"units": UNITS, "scene": self.scene.name}
-        return table
-
-    def to_xarray(self) -> xr.Dataset:
-        """Arrays with the dimensions time, leg, axis and part; needs the package xarray."""
-        found: xr.Dataset = require("xarray").Dataset(
-            arrays_of(self, "time"),
-            {"time": ("time", self.t, {"units": "s"}), **DIMENSIONS},
-            {"scene": self.scene.name} | self._figures(),
-        )
-        return found
-
+    @check_kinds
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write a file: whole, or not at all; others may read and write the same path meanwhile.
 
@@ -273,19 +293,17 @@ class Trajectory:
             ("path", str(path), path.suffix in SUFFIXES, ends),
             ("path", str(path), free, "exists; overwrite=True replaces it"),
         )
-        about = self._figures() | {
+        about = self._of_run() | {
             "format": _FORMAT,
             "scene": dump(self.scene),
             "torque": self.law and record_of(self.law),
         }
         units = {name: {"unit": unit} for name, unit in UNITS.items()}
-        try:
-            write_table(columns_of(self), path, units, {_KEY: json.dumps(about)})
-        except OSError as error:
-            allowed = f"must be writable ({error})"
-            raise InputError("save", [Problem("path", str(path), allowed)]) from None
+        with refuse_errors("save", "path", str(path), "must be writable", OSError):
+            write_table(self.columns(), path, units, {_KEY: json.dumps(about)})
 
     @classmethod
+    @check_kinds
     def load(cls, path: str | Path) -> Trajectory:
         """Read a Parquet or NPZ file that `save` has written.
 
@@ -300,9 +318,9 @@ class Trajectory:
             about = json.loads(texts[_KEY])
         except (KeyError, ValueError) as error:
             reason = f" ({error})" if isinstance(error, ValueError) else ""
-            raise InputError("load", [Problem("path", str(path), allowed + reason)]) from None
-        if about["format"] != _FORMAT:
-            raise InputError("load", [Problem("format", about["format"], f"must be {_FORMAT}")])
+            raise refusal("load", "path", str(path), allowed + reason) from None
+        form = about["format"]
+        refuse_unless("load", ("format", form, form == _FORMAT, f"must be {_FORMAT}"))
         arrays = {
             name: np.stack([columns[f"{name}_{part}"] for part in DIMENSIONS[dimension]], axis=1)
             for name, (_, dimension) in QUANTITIES.items()
@@ -311,65 +329,58 @@ class Trajectory:
             read(Scene, about["scene"], str(path)),
             columns["t"],
             *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
-            joints=np.hstack([arrays[name] for name in _JOINTS]),
+            joints=np.hstack([arrays[name] for name in JOINTS]),
             law=about["torque"] and profile_from(about["torque"]),
             **{name: about[name] for name in _FIGURES if name in about},
         )
 
-    def _figures(self) -> dict[str, Any]:
+    def _of_run(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in _FIGURES}
 
     def plot(self) -> Figure:
         """Draw actuator angles, rates, torques and the energy over time; needs matplotlib."""
         require("matplotlib")
-        from matplotlib.figure import Figure
+        from sst_ros.host.figures import DEGREES, draw_panels, leg_names
 
         shown = self
         if 2 <= len(self.t) < _FEW and not isinstance(self.law, LostTorque):
             shown = self.at(np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _FEW)))
-        figure = Figure(figsize=(8.0, 9.0), layout="constrained")
-        panels = figure.subplots(4, 1, sharex=True)
-        for axes, name in zip(panels, ("gamma", "gamma_dot", "torque"), strict=False):
-            for k, column in enumerate(getattr(shown, name).T, start=1):
-                axes.plot(shown.t, column, label=f"leg {k}", linewidth=1.2)
-            axes.set_ylabel(f"{name} [{QUANTITIES[name][0]}]")
-        panels[0].legend(loc="best", ncols=3)
-        panels[3].plot(shown.t, shown.energy, color="black", linewidth=1.2)
-        panels[3].set(ylabel="energy [J]", xlabel="time [s]")
-        for axes in panels:
-            axes.grid(alpha=0.3)
+        panels = (
+            ("γ [deg]", leg_names("γ"), DEGREES * shown.gamma),
+            ("γ̇ [rad/s]", leg_names("γ̇"), shown.gamma_dot),
+            ("τ [N m]", leg_names("τ"), shown.torque),
+            ("energy [J]", ["energy"], shown.energy[:, None]),
+        )
+        figure = draw_panels(shown.t, panels)
         figure.suptitle(f"{self.scene.name}: {self.message}")
         return figure
 
-    def __repr__(self) -> str:
-        span = f"{self.t[0]:g} to {self.t[-1]:g} s" if len(self) else "no samples"
-        return (
-            f"<Trajectory of {self.scene.name}: {len(self)} samples, {span}; {self.message}; "
-            f"{self.method}; error estimate {self.error_estimate:.1e} rad>"
-        )
-
-    def _repr_html_(self) -> str:
-        rows = {
+    def _facts(self) -> dict[str, object]:
+        return {
             "scene": self.scene.name,
-            "samples": f"{len(self)}, {self.t[0]:g} to {self.t[-1]:g} s",
+            "samples": len(self),
+            "time [s]": f"{self.t[0]:g} to {self.t[-1]:g}" if len(self) else "no samples",
             "status": f"{self.status}: {self.message}",
             "method": self.method,
-            "error estimate": f"{self.error_estimate:.1e} rad",
+            "error estimate [rad]": self.error_estimate,
         }
-        cells = "".join(
-            f"<tr><th style='text-align:left'>{name}</th><td>{html.escape(value)}</td></tr>"
-            for name, value in rows.items()
-        )
-        picture = io.StringIO()
+
+    def _repr_html_(self) -> str:
+        svg = ""
         with contextlib.suppress(MissingDependency):
-            self.plot().savefig(picture, format="svg")
-        svg = picture.getvalue()
-        return f"<table>{cells}</table>{svg[max(svg.find('<svg'), 0) :]}"
+            figure = self.plot()
+            from sst_ros.host.figures import encode
+
+            svg = encode(figure, "svg").decode()
+        return super()._repr_html_() + svg[max(svg.find("<svg"), 0) :]
 
 
 def _own(value: ArrayLike) -> Array:
     """Return an array that nothing can change: a copy, unless it is one already."""
-    array: Array = np.asarray(value, dtype=float)
+    try:
+        array: Array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError("trajectory", [Problem("array", value, "must be numbers")]) from None
     if array is value and (array.flags.writeable or not array.flags.owndata):
         array = array.copy()
     array.flags.writeable = False

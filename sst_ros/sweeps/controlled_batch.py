@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
 from sst_ros.control.controller import Controller
+from sst_ros.control.tracking import BAND
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, indent, loop
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import refuse_unless
 from sst_ros.host import compiled_module
 from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.integration.batch_source import SIMD_WIDTH, load_lanes, over_blocks, replace_valid
@@ -146,12 +147,12 @@ class ControlledBatch:
         self._control: SampledControl = study.control
         control, length, period = self._control, study.length, self._control.period
         self.samples = round(length / period)
-        if not self.samples or abs(self.samples * period - length) > 1e-9 * length:
-            allowed = f"must be a whole number of control periods of {period:g} s"
-            raise InputError("sweep", [Problem("duration", length, allowed)])
-        if study.steps and study.steps % self.samples:
-            allowed = f"must be a multiple of {self.samples}, the control periods of a run"
-            raise InputError("sweep", [Problem("steps", study.steps, allowed)])
+        fits = self.samples > 0 and abs(self.samples * period - length) <= 1e-9 * length
+        allowed = f"must be a whole number of control periods of {period:g} s"
+        refuse_unless("sweep", ("duration", length, fits, allowed))
+        whole = not study.steps or study.steps % self.samples == 0
+        allowed = f"must be a multiple of {self.samples}, the control periods of a run"
+        refuse_unless("sweep", ("steps", study.steps, whole, allowed))
         self._controller = Controller(self._scene, self._motion, control, period)
         varied = {one.key for one in study.variations}
 
@@ -166,9 +167,11 @@ class ControlledBatch:
             "queue": 3 * control.delay,
             "before": 3 if control.counts else 0,
             "observed": 4 if control.observes else 0,
-            "squares": 3,
-            "largest": 3,
+            "squares": 6,  # of the error and of the torque
+            "largest": 6,
             "limited": 1,
+            "samples": 1,
+            "unsettled": 1,  # samples to the last one outside of the band
         }
 
     @cached_property
@@ -223,10 +226,14 @@ class ControlledBatch:
             new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
             sent = law.bound(sent, gains["plant_limit"][0])
         off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
-        sums, most = (zip(memory[name], off, strict=True) for name in ("squares", "largest"))
+        sums, most = (zip(memory[x], (*off, *sent), strict=True) for x in ("squares", "largest"))
         new |= {"observed": observed, "integral": found.integral}
         new["squares"] = tuple(s + e * e for s, e in sums)
         new["largest"] = tuple(s + positive(positive(e) + positive(-e) - s) for s, e in most)
+        (count,), (last,) = memory["samples"], memory["unsettled"]
+        beyond = [positive(e - self._band) + positive(-e - self._band) for e in off]
+        new["samples"] = (count + 1.0,)
+        new["unsettled"] = (last + law.is_above(sum(beyond)) * (count + 1.0 - last),)
         return (*sent, *(number for name in self._memory_sizes for number in new[name]))
 
     def run(
@@ -271,16 +278,33 @@ class ControlledBatch:
 
         step = self.samples * control.period / steps
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
-        # Root of the mean square and largest error of gamma [rad] at the samples of a run.
+        # Root of the mean square and largest error of gamma [rad] at the samples of a run and its
+        # end, and of the torque [N m]; when the error of all joints is in the band for good [s].
         final = np.array(divide(REFERENCES, self._references[-1])["gamma"]) - result.gamma
         complete = result.success[:, None]
-        squares = np.stack(blocks["squares"], axis=1) + np.where(complete, final**2, 0.0)
-        largest = np.stack(blocks["largest"], axis=1)
-        largest = np.where(complete, np.maximum(largest, np.abs(final)), largest)
-        samples = np.floor(result.t / control.period + 1e-9) + 1
-        errors = {"rms": np.sqrt(squares / samples[:, None]), "max": largest}
-        columns = {f"error_{name}_{k + 1}": x[:, k] for name, x in errors.items() for k in range(3)}
+        last = np.hstack([np.where(complete, final, 0.0), np.zeros((count, 3))])
+        largest = np.maximum(np.stack(blocks["largest"], axis=1), np.abs(last))
+        squares = np.stack(blocks["squares"], axis=1) + last**2
+        begun = np.floor(result.t / control.period + 1e-9)[:, None]
+        samples = np.hstack([begun + 1.0] * 3 + [begun + ~complete] * 3)
+        figures = {"rms": np.sqrt(squares / samples), "max": largest}
+        columns = {
+            f"{what}_{name}_{k + 1}": x[:, 3 * part + k]
+            for part, what in enumerate(("error", "torque"))
+            for name, x in figures.items()
+            for k in range(3)
+        }
+        settled = result.success & (np.abs(final).max(axis=1) <= self._band)
+        columns["settling_time"] = np.where(
+            settled, blocks["unsettled"][0] * control.period, np.nan
+        )
         return result, columns | {"limited_samples": blocks["limited"][0]}
+
+    @cached_property
+    def _band(self) -> float:
+        """Settling band [rad]: a share of the largest range of a desired angle."""
+        desired = [divide(REFERENCES, row)["gamma"] for row in self._references]
+        return BAND * float(np.ptp(desired, axis=0).max())
 
     @cached_property
     def _references(self) -> Array:

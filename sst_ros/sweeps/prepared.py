@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import InputError, Problem, require
+from sst_ros.errors import InputError, refusal, require
 from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.scene.scene import Scenarios
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints, columns_of
+from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints
 from sst_ros.sweeps.controlled_batch import ControlledBatch
 from sst_ros.sweeps.sweep_study import SweepStudy
 from sst_ros.version import VERSION
@@ -50,7 +50,7 @@ class PreparedSweep:
         for row, error in ends.faults(most=1).items():
             texts = [str(one).replace(f"scenario {row}: ", "") for one in error.problems]
             allowed = "within its range: " + "; ".join(texts)
-            raise InputError("sweep", [Problem("vary", "makes no scene", allowed)])
+            raise refusal("sweep", "vary", "makes no scene", allowed)
         profile = study.model_scene.torque is not None
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
         self.controlled = None if study.control is None else ControlledBatch(self.batch, study)
@@ -59,6 +59,9 @@ class PreparedSweep:
         self._quantities = [name for name in study.outputs if name != "extremes"]  # of a state
         self.pilot_error = math.nan
         self.steps = steps or study.steps or self._choose_steps()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PreparedSweep, (self.study, self.steps)  # a worker compiles for itself
 
     def _choose_steps(self) -> int:
         """Find the least number of steps, about, that keeps the tolerance in the pilot rows.
@@ -88,7 +91,7 @@ class PreparedSweep:
             if count > MOST_STEPS:
                 break
         allowed = f"is not reached by {MOST_STEPS} steps; give `steps`, or a larger tolerance"
-        raise InputError("sweep", [Problem("tolerance", tolerance, allowed)])
+        raise refusal("sweep", "tolerance", tolerance, allowed)
 
     def check(self, values: dict[str, Array]) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
@@ -101,6 +104,7 @@ class PreparedSweep:
         for k in DIMENSIONS["leg"]:
             joints = {f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES}
             units |= joints | {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
+            units |= {f"torque_rms_{k}": "N m", f"torque_max_{k}": "N m", "settling_time": "s"}
         for one in self.study.variations:
             units |= dict.fromkeys(one.columns, "1" if one.factor else one.targets[0].spec.unit)
         return {
@@ -126,7 +130,7 @@ class PreparedSweep:
             "fault_time": result.fault_time,
             "local_error": result.local_error,
         }
-        columns |= columns_of(result, self._quantities) | more
+        columns |= result.columns(self._quantities) | more
         texts, reason = result.reasons
         if faults:  # no numbers, and the first problem as the reason
             wrong = list(faults)

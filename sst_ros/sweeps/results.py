@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_ros.errors import InputError, Problem, require
+from sst_ros.errors import refusal, refuse_unless, require
 from sst_ros.host.output import replace_file
+from sst_ros.report.results import render
 from sst_ros.sweeps.sweep_study import SweepStudy
 from sst_ros.version import VERSION
 
@@ -61,9 +62,9 @@ def find_complete(folder: Path, study: SweepStudy) -> tuple[set[int], int | None
         about = read_about(path)
         if about is None:
             continue
-        if any(about[key] != value for key, value in expected.items()):
-            allowed = "is of another study or version: choose another --out"
-            raise InputError("sweep", [Problem("--resume", str(path), allowed)])
+        same = all(about[key] == value for key, value in expected.items())
+        allowed = "is of another study or version: choose another --out"
+        refuse_unless("sweep", ("--resume", str(path), same, allowed))
         expected["steps"] = about["steps"]
         index = int(path.stem.removeprefix("part-"))
         if about["rows"] == len(study.rows_of(index)):
@@ -77,7 +78,7 @@ def read_sweep(folder: Path) -> pd.DataFrame:
     about = next(filter(None, map(read_about, paths)), None)
     if about is None:
         allowed = "must be a folder with files part-*.parquet of `sst-ros sweep`"
-        raise InputError("sweep", [Problem("DIR", str(folder), allowed)])
+        raise refusal("sweep", "DIR", str(folder), allowed)
     return to_frame(require("pyarrow.parquet").read_table(list(map(str, paths))), about)
 
 
@@ -90,20 +91,17 @@ def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
 
 def summarize(table: pd.DataFrame) -> str:
     """Return a text of the table of a study."""
-    steps, length = table.attrs["steps"], table.attrs["duration"]
-    lines = [f"{len(table)} runs of {length:g} s, {steps} steps each"]
-    counts = table["reason"].value_counts()
-    lines += [f"  {count:>10}  {reason}" for reason, count in counts.items() if count]
-    causes = correlate(table)
-    if len(causes):
-        lines.append("Rank correlation of inputs with an early end:")
-        lines += [f"  {value:>10.3f}  {name}" for name, value in causes.head(_SHOWN).items()]
     outputs = table.loc[table["status"] == 0, list_outputs(table)]
-    if len(outputs):
-        shown = outputs.describe(percentiles=[0.01, 0.99]).T[["mean", "std", "1%", "99%"]]
-        shown["unit"] = [table.attrs["units"].get(name, "") for name in shown.index]
-        lines.append(shown.to_string(float_format="{:.6g}".format))
-    return "\n".join(lines)
+    shown = outputs.describe(percentiles=[0.01, 0.99]).T[["mean", "std", "1%", "99%"]]
+    shown["unit"] = [table.attrs["units"].get(name, "") for name in shown.index]
+    return render(
+        "sweep.txt",
+        runs=len(table),
+        about=table.attrs,
+        reasons=table["reason"].value_counts(),
+        causes=correlate(table).head(_SHOWN).to_dict(),
+        outputs=shown.to_string(float_format="{:.6g}".format) if len(outputs) else "",
+    )
 
 
 def list_outputs(table: pd.DataFrame) -> list[str]:

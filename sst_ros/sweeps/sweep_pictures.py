@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sst_ros.host.output import write_into
-from sst_ros.plot.style import BLUE, GREY, VERMILION, save_figure, styled
+from sst_ros.host.figures import BLUE, GREY, VERMILION, styled
+from sst_ros.report.results import publish
 from sst_ros.sweeps.results import correlate, list_outputs
 
 if TYPE_CHECKING:
@@ -32,16 +32,13 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     tracking error, or with the outputs farthest from their medians.
     """
     complete = table.loc[table["status"] == 0, list_outputs(table)]
-    figures = {"distributions": draw_distributions(complete, table.attrs["units"])}
+    figures = {"distributions.png": draw_distributions(complete, table.attrs["units"])}
     score, title = _score(table)
     if shown := correlate(table, score).index[:MOST_INPUTS].tolist():
         worst = np.argsort(score.to_numpy())[-MOST_RUNS:]
-        figures["worst"] = draw_scatter(table[shown], worst, title)
-    paths = {out / f"{name}.png": figure for name, figure in figures.items()}
-    with write_into(out, "sweep plot"):
-        for path, figure in paths.items():
-            save_figure(figure, path)
-    return list(paths)
+        figures["worst.png"] = draw_scatter(table[shown], worst, title)
+    publish(out, "sweep plot", figures)
+    return [out / name for name in figures]
 
 
 def _score(table: pd.DataFrame) -> tuple[pd.Series, str]:

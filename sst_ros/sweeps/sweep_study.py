@@ -9,7 +9,7 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ import yaml
 from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.errors import InputError, Problem
+from sst_ros.errors import InputError, Problem, refuse_errors, refuse_unless
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.schema import Section, anything, build, entry, positive
+from sst_ros.scene.schema import Rules, Section, anything, build, entry, positive
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import plain
 from sst_ros.state import QUANTITIES, finite_vector
@@ -102,20 +102,17 @@ class SweepStudy(Section):
         super().__post_init__()
         _ = self.variations, self.rows, self.length
 
-    def check(self) -> Iterator[Problem]:
+    def rules(self) -> Rules:
         """Refuse keys, outputs and torques that are none."""
-        if not isinstance(self.vary, Mapping):
-            allowed = "must be a mapping from keys of the scene to distributions or values"
-            yield Problem("vary", self.vary, allowed)
+        mapping, torque = isinstance(self.vary, Mapping), self.torque
+        allowed = "must be a mapping from keys of the scene to distributions or values"
+        yield not mapping, "vary", self.vary, allowed
         for name in self.outputs:
-            if name not in OUTPUTS:
-                yield Problem("outputs", name, f"must be of {', '.join(OUTPUTS)}")
-        torque = self.torque
-        if torque is not None and self.control is not None:
-            yield Problem("torque", "given", _NO_TORQUE)
-        constant = not isinstance(torque, (Mapping, SineTorque, type(None)))
-        if constant and finite_vector(torque) is None:
-            yield Problem("torque", torque, "must be three finite numbers [N m] or a mapping")
+            yield name not in OUTPUTS, "outputs", name, f"must be of {', '.join(OUTPUTS)}"
+        yield torque is not None and self.control is not None, "torque", "given", _NO_TORQUE
+        wrong = torque is not None and not isinstance(torque, (Mapping, SineTorque))
+        wrong = wrong and finite_vector(torque) is None
+        yield wrong, "torque", torque, "must be three finite numbers [N m] or a mapping"
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what was given, not what has been computed from it."""
@@ -124,14 +121,12 @@ class SweepStudy(Section):
     @classmethod
     def read(cls, path: Path) -> SweepStudy:
         """Read a YAML file; `scene` is a name, a path relative to the file, or a document."""
-        try:
+        refused = "STUDY", str(path), "must be a readable .yaml file"
+        with refuse_errors("sweep", *refused, OSError, UnicodeDecodeError, yaml.YAMLError):
             values = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            allowed = f"must be a readable .yaml file ({error})"
-            raise InputError("sweep", [Problem("STUDY", str(path), allowed)]) from None
-        if not isinstance(values, dict) or not isinstance(values.get("vary", {}), dict):
-            allowed = "must be a mapping with the keys scene and vary"
-            raise InputError(str(path), [Problem("", type(values).__name__, allowed)])
+        mapping = isinstance(values, dict) and isinstance(values.get("vary", {}), dict)
+        allowed = "must be a mapping with the keys scene and vary"
+        refuse_unless(str(path), ("", type(values).__name__, mapping, allowed))
         return cls.from_values(values, path.parent)
 
     @classmethod
@@ -168,10 +163,9 @@ class SweepStudy(Section):
     def length(self) -> float:
         """Length of a run [s]."""
         moving = None if self.motion is None else self.motion.duration
-        duration = self.duration or moving or self.scene.duration
-        if duration is None:
-            allowed = "must be given [s]: the scene has none"
-            raise InputError("sweep", [Problem("duration", None, allowed)])
+        duration = self.duration or moving or self.scene.duration or 0.0
+        allowed = "must be given [s]: the scene has none"
+        refuse_unless("sweep", ("duration", None, duration > 0.0, allowed))
         return duration
 
     @cached_property
@@ -196,7 +190,9 @@ class SweepStudy(Section):
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
         if not (found or problems):
-            problems.append(Problem("vary", None, "must name at least one key of the scene"))
+            problems.append(
+                Problem("vary", dict(self.vary), "must name at least one key of the scene")
+            )
         if problems:
             raise InputError("sweep", problems)
         return tuple(found)
@@ -206,19 +202,18 @@ class SweepStudy(Section):
         """Number of runs."""
         grid = math.prod(len(one.numbers) for one in self.variations if one.kind == "grid")
         lengths = {len(values) for values in (self.table or {}).values()}
+        alone = len(lengths) <= 1 and not (lengths and grid > 1)
+        allowed = "must have columns of equal length, and no grid beside it"
+        refuse_unless("sweep", ("table", sorted(lengths), alone, allowed))
         natural = min(lengths, default=grid)
-        rows, key, allowed = self.n or natural, "n", ""
-        if len(lengths) > 1 or (lengths and grid > 1):
-            key, allowed = "table", "must have columns of equal length, and no grid beside it"
-        elif not (self.n or lengths or grid > 1) and any(one.drawn for one in self.variations):
-            allowed = "must be given with distributions"
-        elif lengths and rows > natural:
-            allowed = f"must be <= {natural}, the rows of the table"
-        elif grid > 1 and rows % grid:
-            allowed = f"must be a multiple of {grid}, the size of the grid"
-        if allowed:
-            given = {"table": sorted(lengths), "n": self.n or (rows if rows > 1 else None)}
-            raise InputError("sweep", [Problem(key, given[key], allowed)])
+        rows, known = self.n or natural, bool(self.n or lengths or grid > 1)
+        drawn, fits = any(one.drawn for one in self.variations), not lengths or rows <= natural
+        refuse_unless(
+            "sweep",
+            ("n", self.n, known or not drawn, "must be given with distributions"),
+            ("n", self.n, fits, f"must be <= {natural}, the rows of the table"),
+            ("n", self.n, rows % grid == 0, f"must be a multiple of {grid}, the size of the grid"),
+        )
         return rows
 
     def draw(self, first: int, count: int, sampling: str = "") -> dict[str, Array]:

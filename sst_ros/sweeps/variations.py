@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.errors import InputError, Problem, require
+from sst_ros.errors import refuse_errors, require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Place, Section, Spec, key_of
@@ -153,8 +153,10 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
         raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
     nominal = np.ones(()) if factor else targets[0].nominal
     if kind == "linspace":
-        low, high, count = numbers
-        kind, numbers = "grid", np.linspace(low, high, int(count))
+        if len(numbers) != 3:
+            raise ValueError("linspace takes low, high, count")
+        low, high = (np.broadcast_to(np.array(x, float), nominal.shape) for x in numbers[:2])
+        kind, numbers = "grid", np.linspace(low, high, int(numbers[2]))
     if kind == "normal" and len(numbers) == 2:
         numbers = (*numbers, -np.inf, np.inf)
     expected = EXPECTED.get(kind, "")
@@ -196,7 +198,8 @@ def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) 
 
 def read_table(given: Any) -> dict[str, Array]:
     """Read columns of numbers from a DataFrame, a mapping, or a CSV or Parquet file."""
-    try:
+    refused = "table", str(given), "must be columns of numbers, or a .csv or .parquet file of them"
+    with refuse_errors("sweep", *refused, OSError, ValueError, TypeError, LookupError):
         if isinstance(given, Path):
             kind = "parquet" if given.suffix == ".parquet" else "csv"
             given = getattr(require("pandas"), f"read_{kind}")(given)
@@ -204,9 +207,6 @@ def read_table(given: Any) -> dict[str, Array]:
         if all(column.ndim == 1 for column in columns.values()):
             return columns
         raise ValueError("a column has one number for each row")
-    except (OSError, ValueError, TypeError, LookupError) as error:
-        allowed = f"must be columns of numbers, or a .csv or .parquet file of them ({error})"
-        raise InputError("sweep", [Problem("table", str(given), allowed)]) from None
 
 
 def philox(seed: int, first: int, count: int, width: int) -> Array:

@@ -29,7 +29,7 @@ from viser import ViserServer
 from websockets import Request, Response
 from websockets.asyncio.server import ServerConnection
 
-from sst_ros.errors import InputError, Problem, SstError
+from sst_ros.errors import SstError, refusal, refuse_errors, refuse_unless
 
 LOCAL = "127.0.0.1"
 PORT = 8080
@@ -148,22 +148,19 @@ def _swap_serve(check: AccessCheck) -> Iterator[None]:
 
 def _free_port(host: str, port: int) -> int:
     """Return the first free port; viser would look without end, or stop with a traceback."""
-    if not _PORTS[0] <= port <= _PORTS[1]:
-        allowed = f"must be between {_PORTS[0]} and {_PORTS[1]}"
-        raise InputError("view", [Problem("port", port, allowed)])
-    try:
+    allowed = f"must be between {_PORTS[0]} and {_PORTS[1]}"
+    refuse_unless("view", ("port", port, _PORTS[0] <= port <= _PORTS[1], allowed))
+    known = "host", host, "must be an address of this machine"
+    with refuse_errors("view", *known, OSError, ValueError):
         # An empty name would be every address: getaddrinfo knows none of it.
         addresses = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
         _listen(addresses, 0)
-    except (OSError, ValueError) as error:
-        allowed = f"must be an address of this machine ({error})"
-        raise InputError("view", [Problem("host", host, allowed)]) from None
     last = min(port + _TRIED - 1, _PORTS[1])
     for tried in range(port, last + 1):
         with contextlib.suppress(OSError):
             _listen(addresses, tried)
             return tried
-    raise InputError("view", [Problem("port", port, f"no port up to {last} is free")])
+    raise refusal("view", "port", port, f"no port up to {last} is free")
 
 
 def _listen(addresses: list[Any], port: int) -> None:

@@ -2,13 +2,12 @@
 """The controllers against the paper's equations, closed forms and what a closed loop must do."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sst_ros.control.actuator_space import ActuatorSpaceMap
+from sst_ros.control.actuator_space import ActuatorSpaceMap, ReferenceMotion
 from sst_ros.control.controller import Controller, ControlStopped, Measurement
 from sst_ros.control.law import MODES, ControllerSettings
 from sst_ros.control.reference_motions import geodesic_motion
@@ -27,7 +26,7 @@ HEAVY = scene.load("example2_heavy")
 
 def standing(desired):
     """The same for all times."""
-    return SimpleNamespace(duration=0.0, at=lambda _: desired)
+    return ReferenceMotion(lambda _: desired, (0.0,))
 
 
 def turned(model, vector=(0.1, 0.0, 0.0), duration=0.4):

@@ -15,6 +15,7 @@ from mechanism.test_loads import laden, loaded
 from models import FAST, folding_star, samples, seeded_samples
 from scipy.spatial.transform import Rotation
 
+from sst_ros import Trajectory, simulate
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
@@ -25,6 +26,7 @@ from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import State
 
 FEW = settings(FAST, max_examples=25)  # each traces programs of its own
 EPS = np.finfo(float).eps
@@ -75,6 +77,34 @@ def test_the_torque_that_holds_is_the_slope_of_the_potential_energy(sample):
     expected = -np.array(truth.loads(sample.gamma, np.zeros(3)))
     found = InverseDynamics(scene).gravity_torque(sample.quaternion)
     assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+@FEW
+@given(samples(), st.floats(0.0, 1.0))
+def test_the_equation_of_motion_at_a_state_is_that_of_the_paper_with_every_load(sample, number):
+    scene, start = loaded(sample, number), np.array([sample.state])
+    inverse, state = InverseDynamics(scene), State.of(0, sample.state, (0.0,) * 18, (0.0,) * 3)
+    motion = Trajectory(scene, [0.0], start[:, :4], start[:, 4:], [sample.torque])
+    mass, bias, gamma_ddot = inverse.mass_matrix(state), inverse.bias(state), motion.gamma_ddot[0]
+    bound = 1e-12 * np.linalg.cond(sample.posture.j) ** 2
+    terms = np.abs(mass) @ np.abs(gamma_ddot) + np.abs(bias)
+    assert np.abs(mass @ gamma_ddot + bias - sample.torque).max() <= bound * terms.max()
+
+    paper, still, moment = (sample.mechanism, sample.posture), np.zeros(3), sample.moment
+    inverse = InverseDynamics(sample.scene)
+    t1, _ = virtual_work.equation_of_motion(*paper, sample.gamma_dot)
+    assert np.abs(inverse.mass_matrix(state) + t1).max() <= bound * np.linalg.norm(t1)
+    against = virtual_work.inverse_dynamics(*paper, still, still, moment)
+    found = inverse.torque_of_moment(state, moment)
+    assert np.abs(found + against).max() <= bound * np.linalg.norm(moment)
+
+
+def test_gamma_ddot_of_a_trajectory_is_the_slope_of_gamma_dot():
+    motion = simulate("friction", lambda t: (math.sin(9.0 * t), 2.0 * t, -1.0), 0.5)
+    times, h = np.linspace(0.1, 0.4, 7), 1e-4
+    before, after = (motion.at(times + step).gamma_dot for step in (-h, h))
+    found = motion.at(times).gamma_ddot
+    assert np.abs(found - (after - before) / (2.0 * h)).max() <= 1e-4 * np.abs(found).max()
 
 
 def test_the_forward_program_is_as_short_as_before_it_shared_its_terms():

@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from sst_ros.control.tracking import BAND, TRACK, TrackingMetrics, track_of, tracking_table
+from sst_ros.control.tracking import BAND, TRACK, TrackingMetrics, track_of
+from sst_ros.report.results import render
 
 TIME = np.linspace(0.0, 2.0, 2001)
 
@@ -56,7 +57,8 @@ def test_shares_are_those_of_the_torque_and_sum_to_one():
 
 
 def test_the_table_says_what_it_knows():
-    lines = tracking_table(TrackingMetrics(track(0.0 * TIME, gamma=TIME), limited=7))
+    found = TrackingMetrics(track(0.0 * TIME, gamma=TIME), limited=7)
+    lines = render("tracking.txt", found=found)
     assert "nan" not in lines
     assert "7  (of 2001)" in lines
     assert lines.count("\n") == 10

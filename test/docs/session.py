@@ -87,7 +87,10 @@ class Session:
             self._wait_ready(terminal)
         for terminal in self._terminals:
             if _ends_by_itself(terminal.words):
-                terminal.end()
+                try:
+                    terminal.end()
+                except AssertionError as error:
+                    raise AssertionError("\n".join(map(str, self._terminals))) from error
         for terminal in self._terminals:
             if "recorder" in terminal.words:
                 files = (self.folder / _value(terminal.words, "output")).glob

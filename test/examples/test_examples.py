@@ -69,6 +69,13 @@ CHECKS = {
     "energy": lambda found: np.ptp(found["motion"].energy) < 1e-12,
     "inverse_dynamics": lambda found: np.abs(found["torque"].T - found["applied"]).max() < 1e-4,
     "work_precision": lambda found: min(found["errors"]) < 1e-6,
+    "iterative_lqr": lambda found: (
+        found["errors"][-1] < 1e-4 and found["changes"][-1] < 1e-4 * found["changes"][0]
+    ),
+    "minimum_effort": lambda found: (
+        max(found["errors"].values()) < 1e-8
+        and 4 * found["motions"]["exact derivatives"] < found["motions"]["differences"]
+    ),
     "zero_order_hold": lambda found: found["order"] == pytest.approx(2.0, abs=0.1),
 }
 """What an example shows, by its names."""

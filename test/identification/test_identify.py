@@ -134,13 +134,14 @@ def samples():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"gamma": None}, "gamma = None: must be given"),
-        ({"t": None}, "t = None: must be given$"),
-        ({"t": [[0.0], [1.0, 2.0]]}, "must be numbers$"),
+        ({"gamma": None}, r"gamma = None: is missing; must be finite numbers, shape \(n, 3\)"),
+        ({"t": None}, r"t = None: is missing; must be finite numbers, shape \(n,\) \[s\]$"),
+        ({"t": [[0.0], [1.0, 2.0]]}, r"must be finite numbers, shape \(n,\) \[s\]$"),
         ({"t": np.zeros(400)}, "must be rising times"),
-        ({"torque": np.zeros((400, 2))}, r"torque = \(400, 2\): must have the shape \(400, 3\)"),
-        ({"speed": 1.0}, "speed = 1.0: must be one of t, gamma"),
-        ({"gamma": np.full((400, 3), np.nan)}, "must be finite numbers"),
+        ({"torque": np.zeros((400, 2))}, r"torque = \(400, 2\): must be finite.*shape \(n, 3\)"),
+        ({"torque": np.zeros((397, 3))}, r"torque = \(397, 3\): must have the shape \(400, 3\)"),
+        ({"speed": 1.0}, "speed = 1.0: unknown key; allowed are t, gamma"),
+        ({"gamma": np.full((400, 3), np.nan)}, r"gamma\[0, 0\] = nan: must be finite"),
         (
             {"gamma": np.linspace(3.0, 3.1, 1200).reshape(400, 3)},
             "must be angles of this manipulator",

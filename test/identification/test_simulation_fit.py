@@ -13,8 +13,8 @@ from sst_ros import load_scene, simulate
 from sst_ros.dynamics.model import damping_of
 from sst_ros.errors import InputError
 from sst_ros.identification.identify import identify
-from sst_ros.identification.parameters import value_of
-from sst_ros.identification.simulation_fit import Sensitivities, differentiate_damping
+from sst_ros.scene.yaml_document import find_number
+from sst_ros.simulation.sensitivities import VariationalEquations, differentiate_damping
 from tools.reading_figure import PANELS, determined
 
 
@@ -81,8 +81,8 @@ def slow(*case):
 def test_sensitivities_are_derivatives_of_what_simulate_finds(build, end, name):
     """A polynomial through runs of scenes with other values; nothing jumps where a stop is met."""
     scene = build()
-    value = value_of(scene, name)
-    motion = Sensitivities(scene, (name,), scene.torque)
+    value = find_number(scene, name)
+    motion = VariationalEquations(scene, (name,), scene.torque)
     _, slopes = motion.run(np.array([value]), np.array([end]))
     nodes, states, width = chebyshev.chebpts1(10), [], 0.02 * value
     for node in nodes.tolist():

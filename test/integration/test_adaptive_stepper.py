@@ -31,9 +31,9 @@ def pairs(monkeypatch):
     counts = {}
     attempt = CompiledMethod.step_pair
 
-    def counted(self, *arguments):
+    def counted(self, *arguments, **options):
         counts[self.method.name] = counts.get(self.method.name, 0) + 1
-        return attempt(self, *arguments)
+        return attempt(self, *arguments, **options)
 
     monkeypatch.setattr(CompiledMethod, "step_pair", counted)
     return counts

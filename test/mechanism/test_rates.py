@@ -12,8 +12,12 @@ from hypothesis import strategies as st
 from lagrange import Lagrange, Motion
 from mechanism.closed_chains import ISOTROPIC, random_sample
 
-from sst_ros.errors import SingularConfiguration
+from sst_ros.control.controller import InverseDynamics
+from sst_ros.errors import InputError, SingularConfiguration
 from sst_ros.mechanism import kinematics, rates, virtual_work
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.virtual_work import Mechanism
+from sst_ros.scene.scene import load
 
 EXACT = 1e-12
 RELATIVE = 1e-10
@@ -154,3 +158,26 @@ def test_a_serial_singularity_is_told(ask):
     rotation = np.stack([np.cross(t, s), t, s], axis=1)
     with pytest.raises(SingularConfiguration, match="serial"):
         ask(rotation, kinematics.inverse(ISOTROPIC, rotation)[0])
+
+
+def test_reactions_at_rest_carry_the_weight():
+    scene, gamma = load("gravity_payload"), np.array(load("gravity_payload").initial.gamma)
+    scene = scene.with_values({"friction": None, "springs": None})
+    at, mechanism = virtual_work.posture(Geometry.of(scene), gamma), Mechanism.of(scene)
+    found = rates.of_motion(mechanism, at, np.zeros(3), np.zeros(3))
+    held = InverseDynamics(scene).gravity_torque(gamma)
+    assert found.torque == pytest.approx(held, abs=1e-13)
+    # About O: base on the links, and the motors, against all weights; the same for the star alone.
+    frames = [at.rotation[None], *virtual_work.link_frames(at)]
+    centres = [np.atleast_2d(weight) for weight in mechanism.weights]
+    star, *links = (
+        np.cross(np.einsum("kij,kj->ki", frame, centre), mechanism.gravity).sum(axis=0)
+        for frame, centre in zip(frames, centres, strict=True)
+    )
+    total = found.actuated.sum(axis=0) + found.torque @ at.w
+    assert np.abs(star).max() > 0.1
+    assert total == pytest.approx(-(star + sum(links)), abs=1e-13)
+    assert found.prismatic.sum(axis=0) == pytest.approx(-star, abs=1e-13)
+    with pytest.raises(InputError, match="springs"):
+        spring = {"springs": [{"joint": "mu_1", "stiffness": 1.0, "rest": 0.0}]}
+        rates.of_motion(Mechanism.of(scene.with_values(spring)), at, np.zeros(3), np.zeros(3))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from mechanism.closed_chains import FOLDING, ISOTROPIC, random_geometry, random_pose
 from models import assembly_of
+from scipy.spatial.transform import Rotation
 
-from sst_ros.errors import SingularConfiguration
+from sst_ros.errors import AssemblyError, SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work, workspace
 from sst_ros.mechanism.geometry import zyz_angles
 
@@ -124,3 +125,35 @@ def test_the_picture_has_three_maps_a_row(isotropic, folding):
 
     figure = plot_workspace(isotropic, folding, titles=["isotropic", "general"])
     assert len(figure.axes) == 12  # six pictures, six colour bars
+
+
+def test_the_nearest_singularity_is_singular_and_no_ray_meets_one_before_it():
+    """Parallel: rows r_k x t_k that are dependent; serial: t_k on the line of w_k."""
+    rng, kinds = np.random.default_rng(6), set()
+    while len(kinds) < 2 or rng.random() < 0.9:
+        geometry = random_geometry(rng)
+        gamma = geometry.arc * rng.uniform(0.2, 0.8, 3)
+        try:
+            start = kinematics.admissible(geometry, gamma).rotation
+        except AssemblyError:
+            continue
+        found = workspace.distance_to_singularity(geometry, gamma)
+        kinds.add(found.kind)
+        turn = Rotation.from_rotvec(found.distance * found.axis)
+        np.testing.assert_allclose(found.rotation, start @ turn.as_matrix(), atol=1e-12)
+
+        def measure(rotation, geometry=geometry):
+            angles, _, _ = kinematics.inverse(geometry, rotation)
+            r = kinematics.carriage_directions(geometry, angles)
+            t = geometry.e @ np.swapaxes(rotation, -1, -2)
+            rows = np.cross(r, t)
+            return np.linalg.det(rows), np.linalg.norm(np.cross(t, geometry.w), axis=-1).min(-1)
+
+        dependent, sine = measure(found.rotation)
+        assert abs(dependent if found.kind == "parallel" else sine) < 1e-8
+        axes = rng.normal(size=(500, 3))
+        axes /= np.linalg.norm(axes, axis=1)[:, None]
+        lengths = np.linspace(0.0, 0.99, 100) * found.distance
+        rays = Rotation.from_rotvec((axes[:, None] * lengths[:, None]).reshape(-1, 3)).as_matrix()
+        dependent, sine = measure(start @ rays)
+        assert np.ptp(np.sign(dependent)) == 0.0 and sine.min() > 1e-3

@@ -13,12 +13,14 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib import image
 
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
-from sst_ros.plot import compare, pictures, style
+from sst_ros.host import figures
+from sst_ros.plot import compare, pictures
 from sst_ros.plot.compare import differences, draw_comparison
 from sst_ros.plot.pictures import PICTURES, draw_run
 from sst_ros.recording import recording
@@ -168,10 +170,10 @@ def test_the_list_names_all(capsys):
 def test_a_spike_of_one_sample_is_seen_and_a_gap_stays_a_gap(tmp_path):
     values = np.zeros(300_000)
     values[123_456], values[200_000:220_000] = 1.0, np.nan
-    figure, (axes,) = style.stack(["value [1]"])
+    figure, (axes,) = figures.stack(["value [1]"])
     axes.plot(np.arange(300_000), values, color="red")
     paths = [tmp_path / f"picture.{form}" for form in pictures.FORMATS]
-    style.save_figure(figure, *paths)
+    figures.save_figure(figure, *paths)
     red = image.imread(paths[1])[:, :, :3] @ [1.0, -1.0, -1.0] > 0.5
     assert red.any(axis=1).sum() > 200 and np.diff(np.flatnonzero(red.any(axis=0))).max() > 30
     assert paths[0].stat().st_size < 100_000
@@ -181,7 +183,7 @@ PROGRAM = """
 import resource, sys
 from pathlib import Path
 from matplotlib.figure import Figure
-from sst_ros.plot.style import save_figure
+from sst_ros.host.figures import save_figure
 
 figure = Figure()
 figure.subplots().plot(range(3000), [i * i % 97 for i in range(3000)])
@@ -234,13 +236,20 @@ def pair(tmp_path_factory, bags, example2):
 
 def test_the_differences_are_those_that_were_made(pair):
     found = differences(pair).loc["second"]
-    # 70 of the 141 samples are odd, and one of three angles is changed.
-    rms = 1e-3 * math.sqrt(70 / 141 / 3)
-    assert found.tolist() == pytest.approx([141, 141, 1e-3, rms, 0.0, 0.0, 0.02], rel=1e-9, abs=0.0)
+    assert (found[["samples", "of"]] == 141).all(axis=None)
+    angles = found[["max_rad", "rms_rad"]]
+    # 70 of the 141 samples are odd, in which one angle is changed.
+    assert angles.loc["gamma_1"].tolist() == pytest.approx([1e-3, 1e-3 * math.sqrt(70 / 141)])
+    assert angles.loc["star"].tolist() == pytest.approx([0.02, 0.02], rel=1e-9)
+    assert (angles.drop(["gamma_1", "star"]) == 0.0).all(axis=None)
+    rates = found[["rate_max_rad_per_s", "rate_rms_rad_per_s"]]
+    assert (rates.drop("star") == 0.0).all(axis=None) and rates.loc["star"].isna().all()
 
 
 def test_a_run_does_not_differ_from_itself(pair):
-    assert differences([pair[0], pair[0]]).iloc[0].tolist() == [151, 151, *[0.0] * 5]
+    found = differences([pair[0], pair[0]])
+    assert found.iloc[0].tolist() == [0.0, 0.0, 0.0, 0.0, 151, 151]
+    assert found.max_rad.tolist() == [0.0] * 10
 
 
 def test_samples_at_other_times_are_not_compared(pair, bags, example2, tmp_path):
@@ -252,16 +261,33 @@ def test_samples_at_other_times_are_not_compared(pair, bags, example2, tmp_path)
     ]
     other = read_signals(bags.write(tmp_path / "bag", late))
     assert other.start_ns == pair[0].start_ns
-    assert differences([pair[0], other]).iloc[0].tolist()[:2] == [1, 151]
+    assert differences([pair[0], other]).iloc[0].tolist()[-2:] == [1, 151]
+
+
+def test_the_panel_of_differences_says_which_runs_do_not_differ_and_which_share_nothing(pair):
+    late = dataclasses.replace(pair[0], start_ns=pair[0].start_ns - 1)
+    runs, names = [pair[0], pair[0], pair[1], late], ["first", "same", "changed", "late"]
+    drawn = list(zip(runs, names, figures.LINES, strict=False))
+    panel = compare.PICTURES["gamma"].make(drawn).axes[-1]
+    said = [line.get_label() for line in panel.lines]
+    assert said == ["same: no difference", "changed", "late: no samples in common"]
+    assert np.nanmax(panel.lines[1].get_ydata()) == pytest.approx(np.degrees(1e-3))
 
 
 def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
-    words = ["plot", "--compare", *(str(run.bag.path) for run in pair), "--out", str(tmp_path)]
-    assert cli.main(words) == 0
+    table = tmp_path / "table.csv"
+    words = [*(str(run.bag.path) for run in pair), "--out", str(tmp_path / "out")]
+    assert cli.main(["compare", *words, "--csv", str(table)]) == 0
     said = capsys.readouterr().out
+    assert cli.main(["plot", "--compare", *words, "--force"]) == 0
+    old = capsys.readouterr()
+    assert old.out.splitlines() == [line for line in said.splitlines() if line != str(table)]
+    assert "use sst-ros compare" in old.err
     assert "at samples that both have at the same time since the start of each run" in said
-    assert "141 of 141" in said and "1.000e-03" in said
-    drawn = {path.name for path in tmp_path.iterdir()}
+    assert "second: 141 of 141 samples\n" in said and "gamma_1 1.000e-03" in said
+    written = pd.read_csv(table, index_col=["run", "joint"])
+    pd.testing.assert_frame_equal(written, differences(pair), check_exact=True)
+    drawn = {path.name for path in (tmp_path / "out").iterdir()}
     names = [name for name in compare.PICTURES if name != "tracking_error"]
     assert drawn == {f"compare_{name}.{form}" for name in names for form in ("pdf", "png")}
     assert "tracking_error: not drawn: without first, second: no tracking_error there" in said
@@ -274,9 +300,10 @@ def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(pair, bags, exampl
     assert [path.stem for path in paths[::2]] == ["compare_gamma", "compare_torques"]
     assert missing == {"gamma": "without poor: no joint_states there"}
     found = differences(runs).loc["poor"]
-    assert found.tolist()[:2] == [0, 0] and found[2:].isna().all()
+    assert (found[["samples", "of"]] == 0).all(axis=None)
+    assert found.drop(columns=["samples", "of"]).isna().all(axis=None)
     last = compare.difference_text(runs).splitlines()[-1]
-    assert last.split() == ["poor", "0", "of", "0", *"-----"]
+    assert last.split() == ["star", *"----"]
 
 
 def test_runs_that_cannot_be_told_apart_are_refused(pair, tmp_path):

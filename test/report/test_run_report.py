@@ -133,7 +133,7 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
 def test_the_page_shows_text_as_text(whole):
     """The name of a scene is a stranger's: it must be no HTML."""
     summary = whole[0] | {"scene": "<script>", "unknown": ["<b>"]}
-    page = render("run.html", s=summary, table="<i>", overview="", pictures=[], made="")
+    page = render("run.html", s=summary, table="<i>", overview=whole[1] / "page.png", pictures=[])
     assert "&lt;script&gt;" in page and not re.search("<script>|<b>|<i>", page)
 
 

@@ -20,11 +20,9 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.report import accuracy
 from sst_ros.report.scene_summary import (
-    TERMS,
     WIDTH,
     costs,
     eigenvalues,
-    has,
     largest_stable_step,
     operations,
     stability_function,
@@ -33,7 +31,7 @@ from sst_ros.report.scene_summary import (
     without,
 )
 from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Moment
-from sst_ros.scene.scene import load, names
+from sst_ros.scene.scene import TERMS, has, load, names
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulate import simulate
 

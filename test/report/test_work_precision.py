@@ -12,7 +12,7 @@ import pytest
 from matplotlib import image
 
 from sst_ros.errors import InputError
-from sst_ros.plot.style import save_figure
+from sst_ros.host.figures import save_figure
 from sst_ros.report import accuracy
 from sst_ros.report.accuracy import (
     ABOVE_REFERENCE,

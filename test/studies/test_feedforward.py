@@ -117,8 +117,9 @@ def test_the_same_bits_on_any_number_of_workers():
 
 @pytest.mark.slow
 def test_what_it_writes_can_be_read_and_failures_stay_with_their_reason(small, tmp_path):
-    publish(tmp_path, "feedforward", csv=small.loops, document=document(small),
-            page=page(small), figures={"picture": draw_study(small, title(small))})  # fmt: skip
+    drawn = draw_study(small, title(small))
+    files = {".csv": small.loops, ".json": document(small), "picture.png": drawn}
+    publish(tmp_path, "feedforward", files)
     rows = list(csv.DictReader(io.StringIO((tmp_path / "feedforward.csv").read_text())))
     assert list(rows[0]) == list(COLUMNS) and len(rows) == 4 * len(MODES)
     written = json.loads((tmp_path / "feedforward.json").read_text())

@@ -9,9 +9,9 @@ import pytest
 from matplotlib import image
 
 from sst_ros.dynamics.traced_dynamics import ODE
+from sst_ros.host.figures import save_figure
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS
-from sst_ros.plot.style import save_figure
 from sst_ros.report.scene_summary import eigenvalues
 from sst_ros.simulation.simulation import Simulation
 from studies.extreme import draw_regions, evaluate_case, limits_of_theory, page

@@ -15,7 +15,9 @@ from contextlib import contextmanager
 import pytest
 
 from sst_ros import load_scene
-from sst_ros.sweeps.sweep import SweepFailed, connect, run_study
+from sst_ros.host import many_runs
+from sst_ros.host.many_runs import SweepFailed, connect
+from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from test.sweeps.test_sweep import same
 
@@ -23,7 +25,6 @@ for module in ("numba", "distributed", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a cluster needs it")
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.usefixtures("cache")]
-ENGINE = sys.modules[run_study.__module__]  # the package has a function of its name
 LIMIT_S = 60
 VARY = {"star.inertia": ("uniform", 0.9, 1.1, "relative"), "initial.gamma": ("uniform", 0.7, 0.85)}
 STUDY = SweepStudy(load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40, chunk=100)
@@ -174,7 +175,7 @@ def test_a_worker_that_stands_still_holds_no_study(processes, expected, tmp_path
 
 
 def test_a_study_resumes_after_its_scheduler_was_killed(processes, expected, tmp_path, monkeypatch):
-    monkeypatch.setattr(ENGINE, "NO_SCHEDULER", 3.0)
+    monkeypatch.setattr(many_runs, "NO_SCHEDULER", 3.0)
     processes.add_worker(SLOW)
     out = tmp_path / "out"
 
@@ -220,7 +221,7 @@ def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
 
 
 def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, monkeypatch):
-    monkeypatch.setattr(ENGINE, "NO_WORKER", 2.0)
+    monkeypatch.setattr(many_runs, "NO_WORKER", 2.0)
     processes.add_worker(OLD)
     with processes.client(1) as client, pytest.raises(SweepFailed, match=r"in place of"):
         run_study(STUDY, tmp_path / "out", client=client)

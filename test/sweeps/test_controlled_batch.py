@@ -10,6 +10,7 @@ from scipy import stats
 from sst_ros import load_scene, sweep
 from sst_ros.control.controller import Controller, Measurement
 from sst_ros.control.law import MODES, ControlChannel, ControllerSettings
+from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.sweeps.controlled_batch import NOISE
@@ -112,6 +113,16 @@ def test_a_closed_loop_tracks_as_that_of_the_simulation():
         for name, errors in (("rms", rms), ("max", np.abs(track.error).max(axis=0))):
             columns = [f"error_{name}_{k}" for k in (1, 2, 3)]
             assert found.loc[row, columns].tolist() == pytest.approx(errors, abs=1e-8)
+        torque, last = track.torque[:-1], TrackingMetrics(track)
+        for name, torques in (
+            ("rms", np.sqrt(np.mean(torque**2, axis=0))), ("max", np.abs(torque).max(axis=0)),
+        ):  # fmt: skip
+            columns = [f"torque_{name}_{k}" for k in (1, 2, 3)]
+            assert found.loc[row, columns].tolist() == pytest.approx(torques, rel=1e-6)
+        inside = np.abs(track.error).max(axis=1) <= last.band
+        since = len(inside) - np.argmin(inside[::-1]) if not inside.all() else 0
+        expected = since * 0.01 if inside[-1] else np.nan
+        assert found["settling_time"][row] == pytest.approx(expected, nan_ok=True)
         assert found["limited_samples"][row] == limited[:-1].sum()
 
 

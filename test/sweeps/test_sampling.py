@@ -97,7 +97,7 @@ REFUSED = [
     ({"vary": {"payload.mass": [1.0]}}, "the scene has no payload"),
     ({"vary": {"star.inertia": ("uniform", 0.8, 1.2)}}, "is a tensor: vary it with relative: true"),
     ({"vary": {"control.bandwidth": [20.0]}}, "acts with control only"),
-    ({"vary": {}}, "vary = None: must name at least one key"),
+    ({"vary": {}}, "vary = {}: must name at least one key"),
     ({"vary": 3}, "vary = 3: must be a mapping from keys"),
     ({"vary": {3: [1.0]}}, r"vary\.3 = .*: must name a number"),
     ({"vary": {KEY: ("uniform", 0.2, 0.3)}, "n": None}, "n = None: must be given"),

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One style for all figures: colours, lines, sizes, and how a figure is saved.
 
-A function that draws takes data and returns a `Figure`; `styled` gives it the style. Of a long
-curve matplotlib leaves out what no picture could show (its setting "path.simplify").
+A function that draws takes data and returns a `Figure`; `styled` gives it the style. Angles are
+drawn in degrees, their rates and errors in radians. Of a long curve matplotlib leaves out what no
+picture could show (its setting "path.simplify").
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
+from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.state import Array
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
@@ -55,6 +57,7 @@ STYLE: Any = {
     "axes.titlelocation": "left",
     "axes.grid": True,
     "axes.formatter.useoffset": False,
+    "axes.prop_cycle": cycler(color=[looks["color"] for looks in LINES]),
     "axes.spines.top": False,
     "axes.spines.right": False,
     "grid.alpha": 0.35,
@@ -62,6 +65,8 @@ STYLE: Any = {
     "lines.solid_capstyle": "butt",
     "agg.path.chunksize": 1000,  # long jagged curves in one piece take hundreds of megabytes
 }
+
+DEGREES = float(np.degrees(1.0))
 
 SMALLEST_SHOWN = 1e-17
 """Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
@@ -71,25 +76,23 @@ styled = mpl.rc_context(STYLE)
 
 
 @styled
+def encode(figure: Figure, form: str) -> bytes:
+    """Return the file of a figure in a format, such as svg."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format=form)
+    return drawn.getvalue()
+
+
 def save_figure(figure: Figure, *paths: Path) -> None:
     """Write a figure into files, whose suffixes name the formats; raises OSError if it cannot."""
     for path in paths:
         # Not straight into the file: on a full disk the PDF backend fails without an OSError.
-        drawn = io.BytesIO()
-        figure.savefig(drawn, format=path.suffix.removeprefix("."))
-        path.write_bytes(drawn.getvalue())
+        path.write_bytes(encode(figure, path.suffix.removeprefix(".")))
 
 
 def leg_names(letter: str) -> list[str]:
     """Name a quantity of each leg, as in γ₁, γ₂, γ₃."""
     return [f"{letter}{subscript}" for subscript in "₁₂₃"]
-
-
-def sides(geometry: Geometry, points: int) -> Array:
-    """Points on the three sides of the base triangle on the unit sphere, shape (3, points, 3)."""
-    angle = np.multiply.outer(geometry.arc, np.linspace(0.0, 1.0, points))[:, :, None]
-    across = np.cross(geometry.w, geometry.v)
-    return np.asarray(np.cos(angle) * geometry.v[:, None] + np.sin(angle) * across[:, None])
 
 
 def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes]]:
@@ -120,6 +123,17 @@ def lines(
     widen(axes, values, least_span)
     if len(names) > 1:
         legend(axes)
+
+
+@styled
+def draw_panels(
+    seconds: Array, panels: Sequence[tuple[str, Sequence[str], Array]], height: float = 2.2
+) -> Figure:
+    """Draw panels over time: label of the axis, names of the curves, and their values (n, k)."""
+    figure, grid = stack([label for label, _, _ in panels], height)
+    for axes, (_, names, values) in zip(grid, panels, strict=True):
+        lines(axes, seconds, values, names)
+    return figure
 
 
 def legend(axes: Axes, **given: Any) -> None:

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linear models of the manipulator near a state: A and B for the design of controllers.
+
+With the state y of the dynamics, D = dx/dy for the coordinates x, and R for which D R = 1,
+
+    A = (d x_dot / dy) R,    B = d x_dot / d torque,
+
+by derivatives of the traced program, exact to rounding. Under torques that are held for dt, A is
+D S(dt) R and B is D S(dt), of the sensitivities S of the motion itself, S' = (df/dy) S + df/du
+(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from sst_ros.control.controller import InverseDynamics
+from sst_ros.dynamics.initial_state import start_of
+from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
+from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
+from sst_ros.mechanism.generic_math import quaternion_rate, triple
+from sst_ros.scene.scene import Scene, scene_of, with_initial
+from sst_ros.state import ZERO, Array, State, finite_vector
+
+COORDINATES = {
+    "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
+    "star": [f"{name}_{axis}" for name in ("rotation", "body_rate") for axis in "xyz"],
+}
+_TOLERANCE, _MOST = 1e-12, 20_000
+"""Error of a step relative to 1, and evaluations for a period: without end in a singularity."""
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """Deviations x of a motion by deviations u of its torques: x' = A x + B u.
+
+    With `dt` they are those from one period to the next: x[k + 1] = A x[k] + B u[k].
+
+    Attributes:
+        A: shape (n, n), n = 6, or 9 where the actuators lag.
+        B: shape (n, 3).
+        states: names of the coordinates x, n of them.
+        dt: period for which the torques are held [s], or None.
+
+    """
+
+    A: Array
+    B: Array
+    states: tuple[str, ...]
+    dt: float | None
+
+    def to_control(self) -> Any:
+        """Return a `control.StateSpace` with the outputs x; needs the package control."""
+        x, commands = list(self.states), [f"command_{k}" for k in (1, 2, 3)]
+        given = self.A, self.B, np.eye(len(x)), np.zeros_like(self.B), self.dt or 0
+        return require("control").StateSpace(*given, states=x, outputs=x, inputs=commands)
+
+
+def equilibrium(scene: Scene | Mapping[str, Any] | str | Path, gamma: Any) -> State:
+    """Return the state at rest at gamma [rad], whose `torque` holds the manipulator there.
+
+    Raises:
+        InputError: gamma is not three angles in the stroke.
+        AssemblyError: gamma has no unique admissible assembly.
+        SingularConfiguration: no torques control the star there.
+
+    """
+    there = with_initial(scene_of(scene), (gamma, ZERO))
+    y = start_of(there)
+    torque = InverseDynamics(there).gravity_torque(y[:4])
+    return State.of(0, y, Dynamics.of(there).joints(*y), torque)
+
+
+@check_kinds
+def linearize(
+    scene: Scene | Mapping[str, Any] | str | Path,
+    state: Any,
+    torque: Any,
+    *,
+    dt: float | None = None,
+    coordinates: str = "gamma",
+) -> LinearModel:
+    """Linearize the dynamics of a scene, all its terms included, near a state and its torques.
+
+    Args:
+        scene: name or path of a scene, its document as a dict, or a `Scene`.
+        state: a `State`, as of `equilibrium` or `Simulation`; or an initial state as `simulate`
+            takes it, None for that of the scene. Where the actuators lag, a `State` has the torques
+            that they give; otherwise they give those commanded.
+        torque: torques that are commanded [N m], shape (3,).
+        dt: period for which they are held [s]. By default the model is continuous.
+        coordinates: "gamma" for deviations of gamma [rad] and gamma_dot [rad/s]; "star" for the
+            rotation vector from the motion's {E} to the deviating one, in {E} [rad], and the
+            deviation of the body rate [rad/s], also in a parallel singularity. The torques that
+            lagging actuators give [N m] follow.
+
+    Raises:
+        InputError: an argument is not allowed, or no motion lasts for `dt`.
+        AssemblyError: gamma has no unique admissible assembly.
+        SingularConfiguration: a serial singularity; with "gamma" a parallel one, too.
+
+    """
+    given, acting = scene_of(scene), finite_vector(torque)
+    limit, largest = given.torque_limit, max(map(abs, acting or ZERO))
+    beyond = f"must be at most {limit} N m, the torque limit: beyond it torques have no effect"
+    positive = isinstance(dt, (int, float)) and dt is not True and 0.0 < dt < math.inf
+    known = isinstance(coordinates, str) and coordinates in COORDINATES
+    refuse_unless(
+        "linearize",
+        ("torque", torque, acting is not None, "must be three finite torques [N m]"),
+        ("torque", torque, limit is None or largest <= limit, beyond),
+        ("dt", dt, dt is None or positive, "must be a number > 0 [s]"),
+        ("coordinates", coordinates, known, "must be gamma or star"),
+    )
+    assert acting is not None
+    if isinstance(state, State):
+        quaternion, rate, lagged = state.quaternion, state.body_rate, state.torque
+    else:
+        x, y, z, w, *body_rate = start_of(with_initial(given, state))
+        quaternion, rate, lagged = (x, y, z, w), triple(body_rate), acting
+    dynamics, by_gamma = Dynamics.of(given), coordinates == "gamma"
+    if by_gamma:
+        InverseDynamics(given).torque(quaternion, rate, ZERO)  # refuses singularities
+    now = np.array((*quaternion, *rate, *(lagged if given.lags else ())))
+    drive = (*acting, *(0.0 for _ in dynamics.drive[3:]))
+    try:
+        _, from_x, a, b = _differentiate(dynamics, now, drive, by_gamma)
+    except (ArithmeticError, ValueError):
+        raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
+    if dt is not None:
+        dt = float(dt)
+        end, flow = _propagate(dynamics, now, drive, from_x, dt)
+        found = _differentiate(dynamics, end, drive, by_gamma)[0] @ flow
+        a, b = found[:, :-3], found[:, -3:]
+    lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []
+    return LinearModel(a, b, (*COORDINATES[coordinates], *lag), dt)
+
+
+def _differentiate(
+    dynamics: Dynamics, y: Array, drive: Sequence[float], by_gamma: bool
+) -> tuple[Array, Array, Array, Array]:
+    """Return D = dx/dy and R of the state's own changes, D R = 1; A and B of the continuous model.
+
+    Shapes are (n, n + 1), (n + 1, n), (n, n) and (n, 3).
+    """
+    size, q = len(y), y[:4]
+    turn = np.array([quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]).T
+    from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)
+    from_star[:4, :3], to_star[:3, :4] = turn, 4.0 * turn.T / (q @ q)
+    if by_gamma:
+        found = np.array(dynamics.actuator_motion(*y.tolist(), *drive)).reshape(size + 4, -1)
+        x, x_dot = np.split(found[1:].T, 2)
+        from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
+        return x[:, :size], from_gamma, x_dot[:, :size] @ from_gamma, x_dot[:, size:]
+    found = np.array(recent_ode(dynamics).linearised_by_torque(0.0, *y.tolist(), *drive))
+    slopes = to_star @ found.reshape(size + 5, size)[2:].T
+    a = slopes[:, :size] @ from_star
+    a[:3, :3] = np.cross(y[4:7], np.eye(3))  # in the turning frame d' = dW - W x d
+    return to_star, from_star, a, slopes[:, size:]
+
+
+def _propagate(
+    dynamics: Dynamics, y: Array, drive: Sequence[float], begin: Array, dt: float
+) -> tuple[Array, Array]:
+    """Return the state after dt [s], and how it changes with that before, by `begin`, and torques.
+
+    Shapes are (n + 1,) and (n + 1, n + 3).
+    """
+    size, derivatives, left = len(y), recent_ode(dynamics).linearised_by_torque, iter(range(_MOST))
+
+    def rates(time: float, now: Array) -> Array:
+        if next(left, None) is None:
+            raise ArithmeticError
+        found = np.array(derivatives(time, *now[:size].tolist(), *drive)).reshape(-1, size)
+        flow = found[2 : 2 + size].T @ now[size:].reshape(size, -1)
+        flow[:, -3:] += found[2 + size :].T
+        return np.concatenate([found[0], flow.ravel()])
+
+    run: Any = None
+    together = np.concatenate([y, np.hstack([begin, np.zeros((size, 3))]).ravel()])
+    with contextlib.suppress(ArithmeticError, ValueError):
+        run = solve_ivp(rates, (0.0, dt), together, "DOP853", rtol=_TOLERANCE, atol=_TOLERANCE)
+    allowed = "must be a period for which the motion lasts: it meets a singularity or is too long"
+    refuse_unless("linearize", ("dt", dt, run is not None and run.status == 0, allowed))
+    return run.y[:size, -1], run.y[size:, -1].reshape(size, -1)

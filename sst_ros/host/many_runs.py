@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many runs of one function: in this thread, on threads, or on the workers of a Dask cluster.
+
+A result depends on its job alone. So a job may be computed again, which changes no bit: Dask does
+it where a worker dies or, by its `worker-ttl`, gives no sign of life. A worker that does not fit
+(another version, no space left) is retired.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import lru_cache, partial
+from typing import Any, TypeVar
+
+from sst_ros.errors import SstError, refuse_errors, require
+from sst_ros.host.compiled_module import numba_version
+from sst_ros.host.output import Bar
+from sst_ros.version import VERSION
+
+NO_WORKER, NO_SCHEDULER = 60.0, 15.0
+"""Longest wait for a worker, and for a scheduler that does not answer [s]."""
+
+GATHER = 60.0
+"""Longest wait for the outcome of a job that is done [s]: a busy worker answers late."""
+
+LOOK = 0.1
+"""Time between two looks for jobs that are done, and for workers [s]."""
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+_LOCK = threading.Lock()
+
+
+class SweepFailed(SstError):
+    """Runs could not be computed or their results not written; the others are complete."""
+
+
+class UnfitWorker(SstError):
+    """A worker cannot compute: its address, and why."""
+
+
+def run_many(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    workers: int = 1,
+    client: Any = None,
+    label: str = "",
+    name: str = "run",
+) -> Iterator[tuple[int, Result]]:
+    """Call a function for each job; yield the number of the job and the result when it is done.
+
+    Args:
+        function: what is called; what it raises ends all. A worker of a cluster unpickles it once.
+        jobs: its arguments.
+        workers: threads of this process, 0 for one a core; 1 for none, in the order of the jobs.
+        client: a dask.distributed client, whose workers are taken in place of threads.
+        label: of a bar that is drawn on a terminal; none is drawn without it.
+        name: what a job is called where it fails on a cluster.
+
+    Raises:
+        SweepFailed: on a cluster, an SstError of a job, no worker, or no scheduler; or, when all
+            others are done, a job that ended its workers.
+
+    """
+    workers, bar = min(workers or len(os.sched_getaffinity(0)), len(jobs)), Bar(label, bool(label))
+    results: Iterator[tuple[int, Result]] = ((k, function(job)) for k, job in enumerate(jobs))
+    if client is not None:
+        results = _on_cluster(client, function, jobs, name)
+    elif workers > 1:
+        results = _on_threads(function, jobs, workers)
+    for done, result in enumerate(results, start=1):
+        yield result
+        bar.draw(done / len(jobs))
+
+
+def _on_threads(
+    function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
+) -> Iterator[tuple[int, Result]]:
+    pool = ThreadPoolExecutor(workers)
+    futures = {pool.submit(function, job): number for number, job in enumerate(jobs)}
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def connect(address: str) -> Any:
+    """Return a client of the scheduler at an address; raises InputError if none answers there."""
+    distributed = require("distributed")
+    known = "--scheduler", address, "must be the address of a Dask scheduler, as tcp://host:8786"
+    with refuse_errors("sweep", *known, OSError, ValueError):
+        return distributed.Client(address, timeout=NO_SCHEDULER, set_as_default=False)
+
+
+def _on_cluster(
+    client: Any, function: Callable[[Job], Result], jobs: Sequence[Job], name: str
+) -> Iterator[tuple[int, Result]]:
+    """Print which workers are retired, and why."""
+    dask, sent, faults = require("distributed"), dict[Any, int](), dict[str, str]()
+    work = pickle.dumps((function, jobs))
+    ask = partial(client.map, _on_worker, work=work, versions=describe_versions(), pure=False)
+    # Before Python 3.11 asyncio's TimeoutError, which is Dask's, was another one.
+    late = TimeoutError, dask.TimeoutError
+
+    def compute(numbers: Iterable[int]) -> Generator[tuple[int, Result], None, dict[int, str]]:
+        """Return those whose workers died again and again, with Dask's error."""
+        died, seen = dict[int, str](), time.monotonic()
+        sent.update(zip(ask(numbers), numbers, strict=True))
+        pool = dask.as_completed(sent, loop=client.loop)
+        while sent:
+            batch = pool.next_batch(block=False)
+            if batch or client.nthreads():
+                seen = time.monotonic()
+            elif time.monotonic() - seen > NO_WORKER:
+                why = "; ".join(f"{worker}: {fault}" for worker, fault in faults.items())
+                raise SweepFailed(f"no worker for {NO_WORKER:g} s ({why or 'none is there'})")
+            if not batch:
+                time.sleep(LOOK)
+            for future in batch:
+                number = sent.pop(future)
+                try:
+                    yield number, future.result(timeout=GATHER)
+                except UnfitWorker as error:
+                    retire(*error.args)
+                    (again,) = ask([number])
+                    sent[again] = number
+                    pool.add(again)
+                except late:  # its worker is gone since: Dask computes it again
+                    sent[future] = number
+                    pool.add(future)
+                except dask.KilledWorker as error:
+                    died[number] = str(error)
+                except SstError as error:
+                    raise SweepFailed(f"{name} {jobs[number]}: {error}") from error
+        return died
+
+    def retire(worker: str, fault: str) -> None:
+        """Take a worker out of the cluster, and say so once: else job after job fails on it."""
+        if worker not in faults:
+            faults[worker] = fault
+            text = f"worker {worker} gets no more {name}s: {fault}"
+            print(text, file=sys.stderr, flush=True)
+            client.retire_workers([worker])
+
+    failed: dict[int, str] = {}
+    try:
+        # Dask blames all jobs that a worker had: the one that ends it shows itself alone.
+        for suspect in (yield from compute(range(len(jobs)))):
+            failed |= yield from compute([suspect])
+    except (OSError, *late, dask.CancelledError) as error:  # the connection is closed
+        text = f"the scheduler does not answer; continue with --resume ({error})"
+        raise SweepFailed(text) from error
+    finally:
+        if client.status == "running":
+            client.cancel(list(sent), force=True)
+    if failed:
+        raise SweepFailed("; ".join(f"{name} {jobs[k]}: {failed[k]}" for k in sorted(failed)))
+
+
+def _on_worker(number: int, work: bytes, versions: str) -> Any:
+    """Run a job; raises UnfitWorker where this worker has other versions or cannot write."""
+    try:
+        if (here := describe_versions()) != versions:
+            raise OSError(f"it has {here} in place of {versions}")
+        with _LOCK:  # prepared once, not by each thread
+            function, jobs = _unpickle(work)
+        return function(jobs[number])
+    except (OSError, ImportError) as error:
+        address = require("distributed").get_worker().address
+        raise UnfitWorker(str(address), str(error)) from None
+
+
+_unpickle = lru_cache(maxsize=1)(pickle.loads)  # where the versions are known to be the sender's
+
+
+def describe_versions() -> str:
+    """Versions on which the bits of results depend."""
+    numpy, scipy = (require(name).__version__ for name in ("numpy", "scipy"))
+    found = f"numpy {numpy}, scipy {scipy}, numba {numba_version()}, sst_ros {VERSION}"
+    return "python {}.{}, ".format(*sys.version_info) + found
