@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.errors import check_kinds, check_kinds_late, refusal
+from sst_ros.errors import check_kinds, refusal
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.mechanism.geometry import Geometry
@@ -204,9 +204,10 @@ class PreparedRun:
     def __init__(self, run: Callable[[bool], Trajectory]) -> None:
         self._run = run
 
-    @check_kinds_late
     def run(self, *, progress: bool = False) -> Trajectory:
         """Compute the motion; the trajectory has arrays of its own."""
+        if progress is not False and not isinstance(progress, (bool, np.bool_)):
+            _refuse("progress", progress, "must be True or False")
         return self._run(progress)
 
 

@@ -73,7 +73,8 @@ class CollocatedMotion:
         self._single = self._prepare(self._method, 1, self._iterations + 1)
         self._states = self.compute()
         self._met = self._find_limit()
-        self._whole = None if self._met else self._trajectory(self._grid, self._states)
+        whole = task.times is None and not self._met
+        self._repeat = self._trajectory(self._grid, self._states).repeater() if whole else None
 
     def compute(self) -> Array:
         """Compute the states at the ends of the steps, shape (steps + 1, numbers of the state)."""
@@ -83,11 +84,11 @@ class CollocatedMotion:
 
     def run(self, _progress: bool = False) -> Trajectory:
         """Compute the motion; it is too short for a bar."""
-        times = self._task.times
-        if times is None and self._whole is not None:
+        if self._repeat:
             y = self.compute()
             y.flags.writeable = False
-            return self._whole.with_states(y)
+            return self._repeat(y)
+        times = self._task.times
         t = self._grid if times is None else times
         if self._met:
             t = np.append(t[t < self._end], self._end)

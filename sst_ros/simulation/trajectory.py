@@ -107,6 +107,9 @@ class Trajectory(MotionTable):
 
     """
 
+    _states: Array
+    """Rows of quaternion, body rate and lagged torque, where a prepared run has made it."""
+
     def __init__(
         self,
         scene: Scene,
@@ -150,16 +153,33 @@ class Trajectory(MotionTable):
         self.law: TorqueProfile | None = None if law is None else profile_of(law)
         self.dense, self._parameters = dense, tuple(parameters)
 
-    def with_states(self, y: Array) -> Trajectory:
-        """Return the same run with other read-only states (n, 7 or 10), before anything is derived.
+    def repeater(self) -> Callable[[Array], Trajectory]:
+        """Return a function from read-only states (n, 7 or 10) to the same run with these states.
 
-        Nothing is checked again: a prepared run makes its results by it.
+        Nothing is checked again, and columns are views that are made where they are asked for: a
+        prepared run makes its results by it.
         """
-        again = object.__new__(type(self))
-        again.__dict__.update(self.__dict__, quaternion=y[:, :4], body_rate=y[:, 4:7])
-        if y.shape[1] > 7:
-            again.torque = y[:, 7:10]
-        return again
+        replaced = {"quaternion", "body_rate", *(("torque",) if self.scene.lags else ())}
+        about = {name: value for name, value in vars(self).items() if name not in replaced}
+
+        def repeat(y: Array) -> Trajectory:
+            again = object.__new__(Trajectory)
+            again.__dict__ = about | {"_states": y}
+            return again
+
+        return repeat
+
+    @cached_property
+    def quaternion(self) -> Array:  # type: ignore[override]
+        return self._states[:, :4]
+
+    @cached_property
+    def body_rate(self) -> Array:  # type: ignore[override]
+        return self._states[:, 4:7]
+
+    @cached_property
+    def torque(self) -> Array:
+        return self._states[:, 7:10]
 
     @property
     def success(self) -> bool:
