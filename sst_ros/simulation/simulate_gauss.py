@@ -80,13 +80,14 @@ class CollocatedMotion:
         """Compute the states at the ends of the steps, shape (steps + 1, numbers of the state)."""
         with self._lock:
             self._motion.run()
-            return np.array(self._motion.states)
+            y: Array = self._motion.states.copy()
+            return y
 
     def run(self, _progress: bool = False) -> Trajectory:
         """Compute the motion; it is too short for a bar."""
         if self._repeat:
             y = self.compute()
-            y.flags.writeable = False
+            y.setflags(write=False)
             return self._repeat(y)
         times = self._task.times
         t = self._grid if times is None else times

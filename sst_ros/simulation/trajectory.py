@@ -171,14 +171,17 @@ class Trajectory(MotionTable):
 
     @cached_property
     def quaternion(self) -> Array:  # type: ignore[override]
+        """Orientations (x, y, z, w) of {E} in {B}, shape (n, 4)."""
         return self._states[:, :4]
 
     @cached_property
     def body_rate(self) -> Array:  # type: ignore[override]
+        """Angular velocities of the star in {E} [rad/s], shape (n, 3)."""
         return self._states[:, 4:7]
 
     @cached_property
     def torque(self) -> Array:
+        """Torques that act at the actuators [N m], shape (n, 3)."""
         return self._states[:, 7:10]
 
     @property
