@@ -8,8 +8,9 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "sst_ros"
-VERSION_FILE = Path(__file__).parent / NAME / "version.py"
-(VERSION,) = re.findall(r'^VERSION = "(.+)"$', VERSION_FILE.read_text(encoding="utf-8"), re.M)
+HERE = Path(__file__).resolve().parent  # `colcon build --symlink-install` builds beside a link
+TEXT = (HERE / NAME / "version.py").read_text(encoding="utf-8")
+(VERSION,) = re.findall(r'^VERSION = "(.+)"$', TEXT, re.M)
 ROS_MESSAGES = (
     "std",
     "sensor",
@@ -86,7 +87,7 @@ setup(
     name=NAME,
     version=VERSION,
     description="Simulator of the 3-RRP spherical star-triangle manipulator, for Python and ROS 2",
-    long_description=(Path(__file__).parent / "README.md").read_text(encoding="utf-8"),
+    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     url="https://doi.org/10.1007/s10846-010-9469-9",
     keywords="parallel manipulator, spherical mechanism, direct dynamics, robotics, ROS 2",

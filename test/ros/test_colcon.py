@@ -17,22 +17,23 @@ PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 """Programs begin with `env python3`: a user starts them with his environment active."""
 
 
-@pytest.fixture(scope="module")
-def prefix(tmp_path_factory):
+@pytest.fixture(scope="module", params=["", "--symlink-install"])
+def prefix(request, tmp_path_factory):
     if shutil.which("colcon", path=Path(sys.executable).parent) is None:
         pytest.fail("colcon is missing: pip install .[test]")
     workspace = tmp_path_factory.mktemp("workspace")
     ignored = shutil.ignore_patterns(".*", "demo_out*", "__pycache__", "*.egg-info", "build")
     shutil.copytree(SOURCE, workspace / "src" / "sst_ros", ignore=ignored)
     words = ["colcon", "build", "--event-handlers", "console_direct-"]
-    python("-m", *words, cwd=workspace, env={"PATH": PATH}, timeout=110)
+    python("-m", *words, *request.param.split(), cwd=workspace, env={"PATH": PATH}, timeout=110)
     return workspace / "install" / "sst_ros"
 
 
 @pytest.fixture
 def overlay(prefix):
     packages = next(prefix.glob("lib/python*/site-packages"))
-    return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": str(packages), "PATH": PATH}
+    paths = f"{packages}:{prefix.parents[1] / 'build' / 'sst_ros'}"  # of links to the source
+    return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": paths, "PATH": PATH}
 
 
 def test_all_is_installed_where_ros_looks_for_it(prefix):
@@ -47,7 +48,7 @@ def test_all_is_installed_where_ros_looks_for_it(prefix):
         assert os.access(prefix / "lib" / "sst_ros" / name, os.X_OK)
 
 
-def test_the_installed_simulator_runs_from_its_own_prefix(prefix, overlay, nodes, observer):
+def test_the_installed_simulator_runs_from_its_own_workspace(prefix, overlay, nodes, observer):
     executable = [str(prefix / "lib" / "sst_ros" / "simulator")]
     words = ["--ros-args", "-p", "scene:=example1", "-p", "duration:=0.0"]
     process = nodes.start("", *words, executable=executable, env=overlay)
@@ -56,4 +57,5 @@ def test_the_installed_simulator_runs_from_its_own_prefix(prefix, overlay, nodes
     assert status == 0, err
     text = "from sst_ros.scene.scene import share_directory as s; print(s())"
     found = python(text, env=overlay, cwd=prefix).stdout
-    assert Path(found.strip()) == prefix / "share" / "sst_ros"
+    linked = prefix.parents[1] / "src" / "sst_ros"
+    assert Path(found.strip()) in (prefix / "share" / "sst_ros", linked)
