@@ -227,7 +227,7 @@ class AnsweringWorker(Worker[A]):
 
 
 def run(words: Sequence[str]) -> int:
-    """Run a node until SIGINT, SIGTERM, its end or the end of its parent.
+    """Run a node until a signal of `signals`, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker close. Words
     are a key of `arguments.COMMANDS` and the arguments behind it. The exit status is 0, 1 for a

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT and SIGTERM of a node, handled before what takes time to import."""
+"""SIGINT, SIGTERM and SIGHUP of a node, handled before what takes time to import."""
 
 from __future__ import annotations
 
 import signal
 
-_NUMBERS = (signal.SIGINT, signal.SIGTERM)
+_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 came: set[int] = set()
 """Signals that ask the node to end; no lock, on which the handler of a second would wait."""
 
 
 def handle() -> None:
-    """Have SIGINT and SIGTERM end the node in order, also while it starts.
+    """Have signals end the node in order, also while it starts.
 
-    A SIGINT that the executables have blocked until now is delivered.
+    A SIGINT that the executables have blocked until now is delivered; `nohup` keeps its meaning.
     """
     for number in _NUMBERS:
-        signal.signal(number, lambda number, _: came.add(number))
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda number, _: came.add(number))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
 
 

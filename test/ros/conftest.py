@@ -29,6 +29,7 @@ from std_srvs.srv import SetBool  # noqa: E402
 
 from sst_ros.__main__ import main  # noqa: E402
 from sst_ros.host import processes  # noqa: E402
+from sst_ros.nodes import signals  # noqa: E402
 from sst_ros.nodes.process import configure_middleware  # noqa: E402
 from sst_ros.state import IDLE_FRAME_ID, nanoseconds  # noqa: E402
 
@@ -140,7 +141,7 @@ def run_here(domain, capfd):
     """Run a node that ends by itself in this process: a new one takes a second to start."""
 
     def run(command, *words, **given):
-        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        handlers = {number: signal.getsignal(number) for number in signals._NUMBERS}
         try:
             options = ["--ros-args", *processes.words(given)] if given else []
             status = main([command, *words, *options])

@@ -140,6 +140,11 @@ def test_signals_are_handled_before_what_takes_time_to_import():
     assert not {"typing", "pathlib", "subprocess", "numpy", "rclpy"} & set(out.split())
 
 
+def test_a_node_under_nohup_keeps_it():
+    code = "import signal as s; s.signal(s.SIGHUP, s.SIG_IGN); from sst_ros.nodes import signals; "
+    python(f"{code}signals.handle(); assert s.getsignal(s.SIGHUP) is s.SIG_IGN")
+
+
 AMID = """
 import signal, sys
 from sst_ros.nodes import signals
