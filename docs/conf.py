@@ -3,6 +3,7 @@
 
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ from sphinx.writers.html5 import HTML5Translator
 from sphinx_gallery.scrapers import figure_rst
 
 from sst_ros import __version__
+
+sys.path.insert(0, str(Path(__file__).parent))
+from live_equations import live_scene, write_equations
 
 project = "sst_ros"
 copyright = "2026, the founders of sst_ros"
@@ -89,7 +93,11 @@ def _plain(_app, what: str, _name, _object, _options, lines: list[str]) -> None:
         lines[0] = lines[0].replace(": ", " - ")
 
 
-def _clean(_app, _error) -> None:
+def _finish(app: Sphinx, _error) -> None:
+    """Write the equations of the first page; remove the copy of the examples."""
+    path = Path(app.outdir) / "_static" / "live_equations.js"
+    if path.parent.is_dir():
+        path.write_text(write_equations(live_scene()), encoding="utf-8")
     shutil.rmtree(EXAMPLES.parent, ignore_errors=True)
 
 
@@ -97,4 +105,4 @@ def setup(app: Sphinx) -> None:
     """Write mathematics as MathML, which browsers draw without a script."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     app.connect("autodoc-process-docstring", _plain, priority=400)
-    app.connect("build-finished", _clean)
+    app.connect("build-finished", _finish)
