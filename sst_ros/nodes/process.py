@@ -122,8 +122,8 @@ def _declare(
         value = given.get(name, defaults[name])
         if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
             value = float(value)
-        elif isinstance(value, (array, tuple)):
-            value = [float(x) if type(x) is int else x for x in value]
+        elif value is None or isinstance(value, (array, tuple)):  # None is what rcl has for []
+            value = [float(x) if type(x) is int else x for x in value or ()]
         values[name], descriptor = value, _descriptor(name, spec)
         descriptor.read_only = name not in getattr(cls, "CHANGEABLE", ())
         try:

@@ -240,6 +240,10 @@ class RecorderParameters(Section):
         default=60.0,
     )
 
+    def rules(self) -> Rules:
+        """Refuse to record nothing."""
+        yield not any(self.topics), "topics", [*self.topics], "must name a topic"
+
 
 class ViewerParameters(Section):
     """Parameters of sst_viewer."""

@@ -5,13 +5,18 @@ import contextlib
 import math
 import os
 import sys
+from array import array
+from functools import reduce
 from pathlib import Path
 
 import pytest
+import rclpy
 import yaml
 from rcl_interfaces.srv import DescribeParameters
 from ros.conftest import NODE
 
+from sst_ros.nodes.arguments import COMMANDS
+from sst_ros.nodes.process import Worker
 from sst_ros.runtime.settings import SimulatorParameters
 
 pytestmark = pytest.mark.ros
@@ -126,6 +131,9 @@ def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
         ("torque_player", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"torque_limit": 0.5}, "exceeds the limit 0.5 N m"),
+        ("inverse_dynamics", {"stamped": "[]"}, "stamped = []: must be true or false"),
+        ("inverse_dynamics", {"stiffness": "[]"}, "stiffness = []: must be 3 finite numbers"),
+        ("recorder", {"topics": "[]"}, "topics = []: must name a topic"),
         ("recorder", {"output": "/"}, "must be a new folder"),
     ],
 )
@@ -147,3 +155,25 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     process = nodes.run("simulator", *told)
     observer.told("phase", "running")
     assert nodes.stop(process)[0] == 0
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_dump_of_the_parameters_loads_again(domain, tmp_path, command):
+    """As `ros2 param dump` writes it: parameters with dots in trees, an empty list as []."""
+    path, loaded = tmp_path / "dump.yaml", []
+    for options in ([], ["--params-file", str(path)]):
+        rclpy.init(args=[command, "--ros-args", *options])
+        try:
+            worker = Worker(f"sst_{command}", COMMANDS[command][1])
+            loaded.append(worker.parameters)
+            tree = {}
+            for name, one in worker.node._parameters.items():
+                *above, last = name.split(".")
+                at = reduce(lambda inner, key: inner.setdefault(key, {}), above, tree)
+                at[last] = [*one.value] if isinstance(one.value, (array, tuple)) else one.value
+            named = {worker.node.get_fully_qualified_name(): {"ros__parameters": tree}}
+            path.write_text(yaml.dump(named))
+            worker.node.destroy_node()
+        finally:
+            rclpy.try_shutdown()
+    assert loaded[0] == loaded[1]
