@@ -33,7 +33,7 @@ from scipy.linalg import solve_triangular
 from sst_ros.identification.parameters import STANDARD
 from sst_ros.mechanism.geometry import Array
 
-EXACT = 1e-12  # noise over RMS torque that is assumed at least: simulations have no other
+EXACT = 1e-12  # noise over RMS terms that is assumed at least: simulations have no other
 INTERIOR = 1e-3  # share of its size by which a parameter is lifted at the start
 BARRIERS = tuple(10.0**-k for k in range(0, 11))  # the last: chi^2 off by 1e-10 at each boundary
 CENTRED = 1e-2  # squared decrement over the barrier below which Newton converges quadratically
@@ -51,18 +51,19 @@ for _row, (_i, _j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def fit_weighted(
-    columns: Array, torque: Array, noise: Sequence[float] | None = None
+    columns: Array, torque: Array, noise: Sequence[float] | None = None, *, terms: float = 0.0
 ) -> tuple[Array, Array, Array]:
     """Fit torque = columns estimate, with b independent columns, shape (m, 3, b).
 
     Torques are measured less known ones [N m], shape (m, 3), and the noise their standard
-    deviations, three, by default estimated. Returns the estimates, shape (b,), R of the weighted
-    regressor, R^T R = covariance^-1, shape (b, b), and the noise, shape (3,).
+    deviations, three, by default estimated: at least EXACT of the torques, and of the RMS of the
+    `terms` that sum up to them [N m], which cancel in a free motion. Returns the estimates, shape
+    (b,), R of the weighted regressor, R^T R = covariance^-1, shape (b, b), and the noise, (3,).
     """
     if noise is not None:
         given = np.array(noise)
         return (*_solve(columns, torque, given)[:2], given)
-    floor = EXACT * float(np.sqrt(np.mean(torque**2))) + 1e-300
+    floor = EXACT * max(float(np.sqrt(np.mean(torque**2))), terms) + 1e-300
     found = np.ones(3)
     for _ in range(2):
         estimate, _, leverage = _solve(columns, torque, found)

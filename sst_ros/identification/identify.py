@@ -198,9 +198,12 @@ def fit_torques(
     base = parameters.find_independent(columns, names)
     allowed = "must determine something: no torque depends on these parameters here"
     refuse_unless("identify", ("parameters", list(names), bool(base.chosen), allowed))
-    estimate, root, deviations = fit_weighted(columns[..., base.chosen], torque, weights)
-    inverse = solve_triangular(root, np.eye(len(root)))
     given = parameters.values(scene, names)
+    terms = float(np.sqrt(np.mean((np.abs(columns) @ np.abs(given)) ** 2)))
+    estimate, root, deviations = fit_weighted(
+        columns[..., base.chosen], torque, weights, terms=terms
+    )
+    inverse = solve_triangular(root, np.eye(len(root)))
     reach = max(scene.base.radius, scene.star.radius)
     values, excess = find_consistent_values(names, given, base.transform, estimate, root, reach)
     whole = parameters.find_base_parameters(regressor)

@@ -63,6 +63,7 @@ def test_a_page_fetches_nothing_names_the_release_and_has_no_trace_of_the_tools(
         traces = r"do not edit|rather than edit|%\(default\)s|AUTOMATICALLY"
         assert not re.search(traces, shown(text), re.I), page.name
     assert "<math" in (site / "theory.html").read_text(encoding="utf-8")
+    assert "function derivative(" in (site / "_static/live_equations.js").read_text()
 
 
 @pytest.mark.parametrize(("word", "page"), FOUND.items())
