@@ -12,7 +12,6 @@ D S(dt) R and B is D S(dt), of the sensitivities S of the motion itself, S' = (d
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,22 +19,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.variational import VariationalEquations, trace_derivatives
 from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.scene.scene import Scene, scene_of, with_initial
+from sst_ros.scene.torque_profile import ConstantTorque
 from sst_ros.state import ZERO, Array, State, finite_vector
 
 COORDINATES = {
     "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
     "star": [f"{name}_{axis}" for name in ("rotation", "body_rate") for axis in "xyz"],
 }
-_TOLERANCE, _MOST = 1e-12, 20_000
-"""Error of a step relative to 1, and evaluations for a period: without end in a singularity."""
+_MOST = 20_000
+"""Evaluations for a period: without end in a singularity."""
 
 
 @dataclass(frozen=True)
@@ -126,26 +126,31 @@ def linearize(
     else:
         x, y, z, w, *body_rate = start_of(with_initial(given, state))
         quaternion, rate, lagged = (x, y, z, w), triple(body_rate), acting
-    dynamics, by_gamma = Dynamics.of(given), coordinates == "gamma"
+    by_gamma = coordinates == "gamma"
     if by_gamma:
         InverseDynamics(given).torque(quaternion, rate, ZERO)  # refuses singularities
     now = np.array((*quaternion, *rate, *(lagged if given.lags else ())))
-    drive = (*acting, *(0.0 for _ in dynamics.drive[3:]))
     try:
-        _, from_x, a, b = _differentiate(dynamics, now, drive, by_gamma)
+        _, from_x, a, b = _differentiate(given, now, acting, by_gamma)
     except (ArithmeticError, ValueError):
         raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
     if dt is not None:
         dt = float(dt)
-        end, flow = _propagate(dynamics, now, drive, from_x, dt)
-        found = _differentiate(dynamics, end, drive, by_gamma)[0] @ flow
+        equations = VariationalEquations(given, (), ConstantTorque(acting), by_torque=True)
+        begin = np.hstack([from_x, np.zeros((len(now), 3))])
+        run = equations.integrate(now, begin, np.array([dt]), most=_MOST)
+        lasts = "must be a period for which the motion lasts: it meets a singularity or is too long"
+        refuse_unless("linearize", ("dt", dt, run is not None, lasts))
+        assert run is not None
+        (end,), (flow,) = run
+        found = _differentiate(given, end, acting, by_gamma)[0] @ flow
         a, b = found[:, :-3], found[:, -3:]
     lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []
     return LinearModel(a, b, (*COORDINATES[coordinates], *lag), dt)
 
 
 def _differentiate(
-    dynamics: Dynamics, y: Array, drive: Sequence[float], by_gamma: bool
+    scene: Scene, y: Array, torque: Sequence[float], by_gamma: bool
 ) -> tuple[Array, Array, Array, Array]:
     """Return D = dx/dy and R of the state's own changes, D R = 1; A and B of the continuous model.
 
@@ -156,38 +161,14 @@ def _differentiate(
     from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)
     from_star[:4, :3], to_star[:3, :4] = turn, 4.0 * turn.T / (q @ q)
     if by_gamma:
+        dynamics = Dynamics.of(scene)
+        drive = (*torque, *(0.0 for _ in dynamics.drive[3:]))
         found = np.array(dynamics.actuator_motion(*y.tolist(), *drive)).reshape(size + 4, -1)
         x, x_dot = np.split(found[1:].T, 2)
         from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
         return x[:, :size], from_gamma, x_dot[:, :size] @ from_gamma, x_dot[:, size:]
-    found = np.array(recent_ode(dynamics).linearised_by_torque(0.0, *y.tolist(), *drive))
-    slopes = to_star @ found.reshape(size + 5, size)[2:].T
+    found = np.array(trace_derivatives(scene, (), by_torque=True)(*y.tolist(), *torque))
+    slopes = to_star @ found.reshape(size + 4, size)[1:].T
     a = slopes[:, :size] @ from_star
     a[:3, :3] = np.cross(y[4:7], np.eye(3))  # in the turning frame d' = dW - W x d
     return to_star, from_star, a, slopes[:, size:]
-
-
-def _propagate(
-    dynamics: Dynamics, y: Array, drive: Sequence[float], begin: Array, dt: float
-) -> tuple[Array, Array]:
-    """Return the state after dt [s], and how it changes with that before, by `begin`, and torques.
-
-    Shapes are (n + 1,) and (n + 1, n + 3).
-    """
-    size, derivatives, left = len(y), recent_ode(dynamics).linearised_by_torque, iter(range(_MOST))
-
-    def rates(time: float, now: Array) -> Array:
-        if next(left, None) is None:
-            raise ArithmeticError
-        found = np.array(derivatives(time, *now[:size].tolist(), *drive)).reshape(-1, size)
-        flow = found[2 : 2 + size].T @ now[size:].reshape(size, -1)
-        flow[:, -3:] += found[2 + size :].T
-        return np.concatenate([found[0], flow.ravel()])
-
-    run: Any = None
-    together = np.concatenate([y, np.hstack([begin, np.zeros((size, 3))]).ravel()])
-    with contextlib.suppress(ArithmeticError, ValueError):
-        run = solve_ivp(rates, (0.0, dt), together, "DOP853", rtol=_TOLERANCE, atol=_TOLERANCE)
-    allowed = "must be a period for which the motion lasts: it meets a singularity or is too long"
-    refuse_unless("linearize", ("dt", dt, run is not None and run.status == 0, allowed))
-    return run.y[:size, -1], run.y[size:, -1].reshape(size, -1)

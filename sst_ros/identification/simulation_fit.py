@@ -22,6 +22,7 @@ from scipy.optimize import least_squares
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_for_arrays, trace
 from sst_ros.dynamics.traced_dynamics import QUATERNION
+from sst_ros.dynamics.variational import VariationalEquations
 from sst_ros.errors import InputError, refuse_unless
 from sst_ros.identification import parameters
 from sst_ros.identification.measured_motion import Measured, Readings, take_readings
@@ -30,7 +31,6 @@ from sst_ros.mechanism.generic_math import atan2, rotation_rows, sqrt
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import find_number
-from sst_ros.simulation.sensitivities import VariationalEquations
 from sst_ros.state import ZERO
 
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such

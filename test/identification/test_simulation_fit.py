@@ -11,10 +11,10 @@ from symmetric_motion import drift_free_rate, inertia
 
 from sst_ros import load_scene, simulate
 from sst_ros.dynamics.model import damping_of
+from sst_ros.dynamics.variational import VariationalEquations, differentiate_damping
 from sst_ros.errors import InputError
 from sst_ros.identification.identify import identify
 from sst_ros.scene.yaml_document import find_number
-from sst_ros.simulation.sensitivities import VariationalEquations, differentiate_damping
 from tools.reading_figure import PANELS, determined
 
 

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Variational equations: a motion and its derivatives by parameters, integrated together.
+
+The sensitivities S = dy/dp of the motion y' = f(y, t, p) obey
+
+    S' = (df/dy) S + df/dp,  S(0) = dy(0)/dp
+
+(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14). Both
+derivatives are those of the traced equation of motion, exact to rounding, and one error control
+holds for S and the motion.
+
+Where f jumps across a surface that the motion meets, S jumps by the saltation matrix, which is one
+where f is continuous (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical
+Systems, Springer 2004, 7.2): so it is where an elastic stop is met or left. Torques that jump do so
+at times that no parameter moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import compile_for_arrays, compile_program, mark_present, trace
+from sst_ros.dynamics.initial_state import initial_state
+from sst_ros.dynamics.model import damping_of
+from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
+from sst_ros.errors import SingularConfiguration, refusal
+from sst_ros.mechanism.generic_math import quaternion_rate
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import build_unchecked
+from sst_ros.scene.torque_profile import SineTorque, TorqueProfile, TorqueTable, torque_at
+from sst_ros.scene.yaml_document import find_number, plain, replace_values
+from sst_ros.state import Array, clamp
+
+TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size of a parameter
+AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivatives loses its order
+MOST = 4_000_000
+"""Evaluations of a motion: minutes, where a stiff motion needs hours by an explicit method."""
+GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
+ACTUATORS = ("actuators.torque_limit", "actuators.idle_damping")
+OUTSIDE = ("torque", "motion", "duration", "initial.orientation", *ACTUATORS)
+RESTITUTION = "stroke.restitution"
+FIRST = np.zeros(1)
+
+
+class VariationalEquations:
+    """Motions of a scene under torques over time, and their derivatives by parameters.
+
+    Those are numbers of the scene by key, as "friction.gamma.smoothing", "initial.gamma_dot[0]" or
+    "actuators.time_constant", but not of its geometry; a list without index means all its entries.
+    With `by_torque` the numbers of the torques follow. InputError names what is no such key.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        names: Sequence[str],
+        torque: TorqueProfile,
+        *,
+        by_torque: bool = False,
+        caller: str = "simulate",
+    ) -> None:
+        self.scene, self.names = scene, tuple(names)
+        self._torque, self._geometry, self._caller = torque, Geometry.of(scene), caller
+        self._by_torque = by_torque
+        for name in self.names:
+            allowed = ""
+            if name.startswith(GEOMETRY):
+                allowed = "is geometry, which is taken as known"
+            elif name.startswith(OUTSIDE):
+                allowed = "is no number of the equations of motion"
+            elif find_number(scene, name) is None:
+                allowed = "must be the key of a number that the scene has"
+            if allowed:
+                raise refusal(caller, "parameters", name, allowed)
+
+    def run(self, values: Array, t: Array) -> tuple[Array, Array]:
+        """Integrate the motion and its sensitivities with values of the parameters, shape (p,).
+
+        Returns states (q, W and lagged torques) at times t [s], shape (n,), ascending from 0 on, of
+        shape (n, m), and their derivatives, (n, m, p), with those by the numbers of the torques
+        last; raises InputError where there is no motion.
+        """
+        # Inertias between iterations of a fit need not be those of bodies that can exist.
+        outer = zip(self.names, values.tolist(), strict=True)
+        scene = self.scene.with_values(
+            {name: value for name, value in outer if name.startswith(("initial", "stroke"))}
+        )
+        state, slopes = self._start(scene)
+        found = self.integrate(state, slopes, t, values, scene=scene)
+        if found is None:
+            allowed = "leave no motion to the last time"
+            raise refusal(self._caller, "parameters", values.tolist(), allowed)
+        return found
+
+    def integrate(
+        self,
+        state: Array,
+        slopes: Array,
+        t: Array,
+        values: Array | None = None,
+        *,
+        scene: Scene | None = None,
+        most: int = MOST,
+    ) -> tuple[Array, Array] | None:
+        """Integrate from a state, shape (m,), and its derivatives, shape (m, k), to times t [s].
+
+        The last of the k numbers are the parameters, with these values, and those of the torques;
+        of others the motion depends by its state alone. Returns as `run`, None where there is no
+        motion, or where it needs more than `most` evaluations.
+        """
+        from scipy.integrate import solve_ivp  # takes 0.3 s, which few runs need
+
+        scene, values = scene or self.scene, np.empty(0) if values is None else values
+        given, factor = values.tolist(), np.ones(len(values))
+        if RESTITUTION in self.names:
+            place = self.names.index(RESTITUTION)
+            factor[place], given[place] = differentiate_damping(scene), damping_of(scene.stroke)
+        own = np.append(values, _numbers(self._torque) if self._by_torque else [])
+        size, y = len(state), np.concatenate([state, slopes.ravel()])
+        limit, left, free = scene.torque_limit, iter(range(most)), slopes.shape[1] - len(own)
+        derivatives = trace_derivatives(self.scene, self.names, self._by_torque)
+        parts = np.cumsum([1, size, 3 * self._by_torque])
+
+        def rates(time: float, y: Array, acting: Any, forcing: Callable[[float], Array]) -> Array:
+            if next(left, None) is None:
+                raise ArithmeticError
+            torque = clamp(torque_at(acting, time), limit)
+            found = np.array(derivatives(*y[:size].tolist(), *torque, *given)).reshape(-1, size)
+            rate, by_state, by_torque, by_parameter = np.split(found, parts)
+            flow = by_state.T @ y[size:].reshape(size, -1)
+            flow[:, free:] += np.hstack([by_parameter.T * factor, by_torque.T @ forcing(time)])
+            return np.concatenate([rate[0], flow.ravel()])
+
+        tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
+        sizes = np.append(np.ones(free), np.abs(own))
+        least = np.append(np.ones(size), np.tile(1.0 / (sizes + (sizes == 0.0)), size))
+        end = max(float(t[-1]), 1e-9)
+        breaks = self._torque.kinks(limit, end)
+        inside = breaks[(breaks > 0.0) & (breaks < end)]
+        rows, begin = np.empty((len(t), len(y))), 0.0
+        rows[t <= 0.0] = y
+        for stop in np.append(np.unique(inside), end).tolist():
+            here = (t > begin) & (t <= stop)
+            law = self._torque.acting(begin, stop), self._forcing(begin, stop, limit)
+            try:
+                run = solve_ivp(
+                    rates, (begin, stop), y, "DOP853", np.union1d(t[here], stop),
+                    rtol=tolerance, atol=tolerance * least, args=law,
+                )  # fmt: skip
+            except (ArithmeticError, ValueError):
+                return None
+            if run.status != 0:
+                return None
+            rows[here], y, begin = run.y.T[: int(here.sum())], run.y[:, -1], stop
+        return rows[:, :size], rows[:, size:].reshape(len(t), size, -1)
+
+    def differentiate_joints(self, motion: Array) -> Array:
+        """Differentiate gamma and gamma_dot by quaternion and W, (7, n): shape (7, 6, n)."""
+        found = _trace_joints(self.scene)(*motion)
+        rows = np.stack([np.broadcast_to(row, motion.shape[1]) for row in found])
+        return rows.reshape(8, 6, -1)[1:]
+
+    def _start(self, scene: Scene) -> tuple[Array, Array]:
+        """Return the initial state, and its derivatives by parameters and torques, (m, p + q)."""
+        more = len(_numbers(self._torque)) if self._by_torque else 0
+        state = np.zeros(len(Dynamics.of(scene).state))
+        state[:7] = initial_state(scene, self._geometry)
+        slopes = np.zeros((len(state), len(self.names) + more))
+        own = [i for i, name in enumerate(self.names) if name.startswith("initial")]
+        if own:
+            # A rotation vector and W in {E} change gamma and gamma_dot: the inverse of that.
+            tangent = np.zeros((7, 6))
+            tangent[4:, 3:] = np.eye(3)
+            for i, axis in enumerate(np.eye(3)):
+                tangent[:4, i] = quaternion_rate(tuple(state[:4]), tuple(axis))
+            forward = self.differentiate_joints(state[:7, None])[..., 0].T @ tangent
+            try:
+                by_joints = tangent @ np.linalg.inv(forward)
+            except np.linalg.LinAlgError:
+                message = "no derivative by initial angles or rates: parallel singularity, det"
+                raise SingularConfiguration(message, 0.0) from None
+        for i in own:
+            name, first = self.names[i], 3 * self.names[i].startswith("initial.gamma_dot")
+            legs = [first + int(name[-2])] if name.endswith("]") else [first, first + 1, first + 2]
+            slopes[:7, i] = by_joints[:, legs].sum(axis=1)
+        return state, slopes
+
+    def _forcing(self, begin: float, end: float, limit: float | None) -> Callable[[float], Array]:
+        """Return the function of derivatives of the torques between two kinks by their numbers."""
+        if not self._by_torque:
+            return lambda time: np.empty((0, 0))
+        slopes, middle = _differentiate_torque(self._torque, begin, end), 0.5 * (begin + end)
+        acting = np.abs(torque_at(self._torque.acting(begin, end), middle))
+        free = (acting <= (np.inf if limit is None else limit))[:, None]
+        return lambda time: slopes(time) * free
+
+
+@lru_cache(maxsize=32)
+def trace_derivatives(
+    scene: Scene, names: tuple[str, ...], by_torque: bool
+) -> Callable[..., tuple[float, ...]]:
+    """Return y', then its derivatives by each component of y, torque if needed, and parameter."""
+    state, geometry = Dynamics.of(scene).state, Geometry.of(scene)
+    size, varied = len(state), tuple(f"p{i}" for i in range(len(names)))
+
+    def derivative(*inputs: Any) -> tuple[Any, ...]:
+        symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
+        if RESTITUTION in symbols:  # its number is that of the damping
+            symbols |= {"stroke.damping": symbols[RESTITUTION], RESTITUTION: None}
+        opened = build_unchecked(Scene, replace_values(plain(scene), symbols))
+        model = kernel.model_of(opened, geometry)
+        return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
+
+    by = (*state, *(TORQUE if by_torque else ()), *varied)
+    return compile_program(trace(derivative, (*state, *TORQUE, *varied), by))
+
+
+@lru_cache(maxsize=32)
+def _trace_joints(scene: Scene) -> Callable[..., tuple[Any, ...]]:
+    """Return gamma and gamma_dot of quaternion and W, then their derivatives by each of these."""
+    model = Dynamics.of(scene).model
+
+    def joints(*motion: Any) -> tuple[Any, ...]:
+        found = kernel.joints(model, motion)
+        return (*found.gamma, *found.gamma_dot)
+
+    return compile_for_arrays(trace(joints, MOTION, MOTION))
+
+
+def _numbers(torque: TorqueProfile) -> Array:
+    """Return the numbers of a profile that torques are differentiated by, shape (q,)."""
+    if isinstance(torque, SineTorque):
+        return np.array([*torque.amplitude, *torque.frequency, *torque.phase])
+    return np.ravel(torque.torques if isinstance(torque, TorqueTable) else torque.values(FIRST))
+
+
+def _differentiate_torque(
+    torque: TorqueProfile, begin: float, end: float
+) -> Callable[[float], Array]:
+    """Return the derivatives of the torques by `_numbers`, (3, q), between two kinks [s]."""
+    unit = np.eye(3)
+    if isinstance(torque, SineTorque):
+        size, f, phase = map(np.array, (torque.amplitude, torque.frequency, torque.phase))
+
+        def sine(time: float) -> Array:
+            turn = unit * size * np.cos(f * time + phase)
+            return np.hstack([unit * np.sin(f * time + phase), turn * time, turn])
+
+        return sine
+    if isinstance(torque, TorqueTable):
+        held, middle = np.zeros((3, len(torque.times), 3)), 0.5 * (begin + end)
+        held[:, np.searchsorted(torque.times, middle) - 1] = unit * (middle > torque.times[0])
+        return lambda time: held.reshape(3, -1)
+    return lambda time: unit
+
+
+def differentiate_damping(scene: Scene) -> float:
+    """Return the derivative of the damping of elastic stops by the restitution [s/rad].
+
+    By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de =
+    d / (1 - e - e d), which is -3 where e = 1.
+    """
+    e, v = scene.stroke.restitution, scene.stroke.impact_rate
+    assert e is not None and v is not None
+    d = float(damping_of(scene.stroke) * v)
+    change = d / (1.0 - e - e * d) if d else -3.0
+    return (change - d) / ((1.0 + e) * v)
