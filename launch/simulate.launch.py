@@ -35,7 +35,8 @@ def actions(given: Given) -> list[Action]:
     run = {name: given[name] for name in RUN}
     if play:
         run["wait_for_command"] = "true"
-        run["sync"] = run["sync"] or "lockstep"  # the same run on a busy machine
+        # By default the same run on a busy machine.
+        run["sync"] = run["sync"] or launch_parts.Default("lockstep")
     nodes = launch_parts.rviz(given, given["scene"]) if given["rviz"] == "true" else []
     if recorded:
         nodes.append(launch_parts.recorder(given))

@@ -29,11 +29,18 @@ from launch_ros.parameter_descriptions import ParameterValue
 from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import suggestion
 from sst_ros.host import processes
-from sst_ros.nodes import topics
+from sst_ros.nodes import arguments, topics
 from sst_ros.runtime.settings import default_topics
 from sst_ros.scene.scene import load, share_directory
 
 Given = Mapping[str, str]  # values of the launch arguments
+
+
+class Default(str):
+    """A value that nobody gave, before which params_file goes."""
+
+    __slots__ = ()
+
 
 _CHOICES = {"sync": ["", "free", "lockstep"], "bag": ["ros2", "sst"]}
 _FLAG = ["true", "false"]
@@ -64,13 +71,21 @@ def description(
     """
     every = {**arguments, **_SHARED}
 
+    given = set[str]()
+
     def perform(context: LaunchContext) -> list[Action]:
         ours = any(word.endswith(Path(file).name) for word in sys.argv)  # not one that is included
         for word in context.argv if ours else ():
             name, assigned, _ = word.partition(":=")
             if assigned and name not in every:
                 raise RuntimeError(f"{word}: no such argument{suggestion(name, every)}")
-        return actions({name: context.launch_configurations[name] for name in every})
+        values = context.launch_configurations
+        if (path := values["params_file"]) and not Path(path).is_file():
+            raise RuntimeError(f"params_file:={path}: no such file")
+        return actions({n: values[n] if n in given else Default(values[n]) for n in every})
+
+    def note(context: LaunchContext) -> None:
+        given.update(context.launch_configurations)
 
     declared = [
         DeclareLaunchArgument(
@@ -81,23 +96,27 @@ def description(
         )
         for name, (default, text) in every.items()
     ]
-    return LaunchDescription([*declared, OpaqueFunction(function=perform)])
+    named = OpaqueFunction(function=note)  # before the defaults are filled in
+    return LaunchDescription([named, *declared, OpaqueFunction(function=perform)])
 
 
 def node(given: Given, executable: str, parameters: Given, *, ends: bool = True) -> Node:
     """Describe a node of this package, which ends with the launch, however that ends.
 
-    Parameters that are empty are left to params_file or the default. Where it `ends`, its end is
-    that of the launch; its failure always is.
+    Parameters that are empty are left to params_file or the default; an InputError lists what the
+    node would refuse. Where it `ends`, its end is that of the launch; its failure always is.
     """
-    words = [f"--{key.replace('_', '-')}={text}" for key, text in parameters.items() if text != ""]
+    defaults = {k: str(v) for k, v in parameters.items() if v and isinstance(v, Default)}
+    set_here = {k: v for k, v in parameters.items() if v and k not in defaults}
+    words = [f"--{key.replace('_', '-')}={text}" for key, text in set_here.items()]
+    arguments.ros_arguments(executable, words)
     return _node(
         given,
         "sst_ros",
         executable,
         ends,
         arguments=words,
-        parameters=[given["params_file"]] if given["params_file"] else [],
+        parameters=[one for one in (defaults, given["params_file"]) if one],  # the later goes first
         ros_arguments=["--log-level", given["log_level"]],
         additional_env={processes.PARENT: str(os.getpid())},
         sigterm_timeout=_CLOSING_S,
