@@ -37,7 +37,7 @@ from sst_ros.control.actuator_space import Reference
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import Quadruple, Scalar, Triple, add, axpy, triple
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Rules, Section, coefficient, entry, positive
+from sst_ros.scene.schema import Rules, Section, choice, coefficient, entry, positive
 from sst_ros.state import ZERO, Array, Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
@@ -60,17 +60,14 @@ class ControllerSettings(Section):
     feedforward_pd have equal gains. computed_torque takes them over M_kk, as accelerations.
     """
 
-    mode: str = entry(
+    mode: str = choice(
         "feedforward: torque of the desired motion; feedforward_pd: and feedback; computed_torque: "
         "the model at the measured state, and feedback; pd: feedback alone; gravity_pd: and the "
         "weight at the measured position",
-        choices=MODES,
-        default="feedforward",
+        MODES,
     )
-    space: str = entry(
-        "where computed_torque is linear: the actuator angles, or the orientation",
-        choices=SPACES,
-        default="gamma",
+    space: str = choice(
+        "where computed_torque is linear: the actuator angles, or the orientation", SPACES
     )
     bandwidth: float = positive("natural frequency of the error", "rad/s", default=30.0, most=1e6)
     damping_ratio: float = positive("damping ratio of the error", "1", default=1.0, most=1e3)
@@ -86,10 +83,8 @@ class ControllerSettings(Section):
         "N m",
         most=1e9,
     )
-    feedforward_at: str = entry(
-        "instant of a control period whose feedforward is held over it",
-        choices=INSTANTS,
-        default="start",
+    feedforward_at: str = choice(
+        "instant of a control period whose feedforward is held over it", INSTANTS
     )
 
     def rules(self) -> Rules:

@@ -165,12 +165,10 @@ def has_code(
     constants: dict[str, Any],
     functions: Sequence[str],
     *,
-    rounding: bool = True,
     base: SharedFunctions = NOTHING_SHARED,
 ) -> bool:
     """Return whether machine code of these functions of the module is there to be loaded."""
-    more = "" if rounding else _FREE_ROUNDING
-    module = _name_of(_for_numba(texts, constants, more=more, base=base))
+    module = _name_of(_for_numba(texts, constants, base=base))
     try:
         cached = cache_folder() / "__pycache__"
     except OSError:
@@ -262,7 +260,10 @@ def import_text(name: str, text: str) -> ModuleType | None:
                 if file.lstat().st_uid != os.geteuid():
                     file.unlink()
         if not path.exists() or path.read_bytes() != data:
-            _write(path, data)
+            with replace_file(path) as own:
+                own.write_bytes(data)
+                # numba's stamp is this time: the same for all, as the text is.
+                os.utime(own, (0, 0))
         with tempfile.TemporaryFile(dir=path.parent):
             pass  # numba can write there, too
     except OSError:
@@ -307,12 +308,6 @@ def _bear_a_bad_cache(function: Any) -> None:
             cache.disable()
 
     cache.load_overload, cache.save_overload = load_or_none, save_or_warn
-
-
-def _write(path: Path, data: bytes) -> None:
-    with replace_file(path) as own:
-        own.write_bytes(data)
-        os.utime(own, (0, 0))  # numba's stamp is this time: the same for all, as the text is
 
 
 @lru_cache(maxsize=1)

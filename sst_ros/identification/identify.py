@@ -209,10 +209,9 @@ def fit_torques(
     whole = parameters.find_base_parameters(regressor)
     lost = [chosen not in base.chosen for chosen in whole.chosen]
     vague = np.linalg.norm(inverse, axis=1) > scales(names, given)[base.chosen]
+    note = f"identified from {samples} samples"
     return TorqueFit(
-        scene=parameters.with_parameters(
-            scene, names, values, f"identified from {samples} samples"
-        ),
+        scene=parameters.with_parameters(scene, names, values, note),
         names=names,
         values=values,
         labels=base.labels,
@@ -302,21 +301,13 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
         cutoff = min(MARGIN * find_bandwidth(period, gamma), 0.4 / period)
     settled = int(np.ceil(1.0 / (cutoff * period))) if cutoff > 0.0 else 0
     least = 4 * settled + 10
+    slow = f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz"
+    lasting = f"must last {least * period:g} s or more at {cutoff:g} Hz"
     refuse_unless(
         "identify",
         ("t", spacing, even, "must be evenly spaced (to 0.1 %) for angles to be filtered"),
-        (
-            "cutoff",
-            cutoff,
-            0.0 < cutoff < 0.5 / period,
-            f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz",
-        ),
-        (
-            "t",
-            float(t[-1] - t[0]),
-            len(t) >= least,
-            f"must last {least * period:g} s or more at {cutoff:g} Hz",
-        ),
+        ("cutoff", cutoff, 0.0 < cutoff < 0.5 / period, slow),
+        ("t", float(t[-1] - t[0]), len(t) >= least, lasting),
     )
     sections = butter(4, cutoff, fs=1.0 / period, output="sos")
     smooth = sosfiltfilt(sections, gamma, axis=0, padlen=min(3 * settled, len(t) - 1))

@@ -120,10 +120,7 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
     for run, label in zip(runs[1:], labels(runs)[1:], strict=True):
         here, there = _common(first, run)
         absent = {*first.missing, *run.missing}
-        angles, rates = (
-            DataFrame(columns=joints, dtype=float),
-            DataFrame(columns=joints, dtype=float),
-        )
+        angles, rates = (DataFrame(columns=joints, dtype=float) for _ in range(2))
         if JOINTS not in absent:
             angles, rates = (
                 DataFrame(run.take(*names)[there] - first.take(*names)[here], columns=joints)
@@ -167,10 +164,7 @@ def difference_text(runs: Sequence[Signals]) -> str:
     ]
     for label, table in differences(runs).groupby(level="run", sort=False):
         samples, of = table.pop("samples").iloc[0], table.pop("of").iloc[0]
-        text = (
-            table.droplevel("run")
-            .rename_axis(None)
-            .to_string(na_rep="-", float_format=lambda x: f"{x:.3e}")
-        )
+        shown = table.droplevel("run").rename_axis(None)
+        text = shown.to_string(na_rep="-", float_format="{:.3e}".format)
         said.append(f"{label}: {samples} of {of} samples\n{text}")
     return "\n\n".join(said) + "\n"

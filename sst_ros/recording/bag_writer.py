@@ -158,7 +158,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     writer: BagWriter | None = None
     connections: dict[tuple[str, str], Connection] = {}
     unknown = 0
-    try:
+    with refuse_errors(str(path), "bag", str(files[0]), "must be readable", OSError):
         for topic, kind, received_ns, data in file.messages():
             writer = writer or BagWriter(target)
             if not writer.knows(kind):
@@ -167,13 +167,9 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
             if (topic, kind) not in connections:
                 connections[topic, kind] = writer.connect(topic, kind)
             writer.write(connections[topic, kind], received_ns, data)
-    except OSError as problem:
-        raise refusal(path, "bag", str(files[0]), f"must be readable ({problem})") from None
     if writer is None:
         raise refusal(path, "bag", files[0].name, "holds no message, or is no MCAP file")
-    try:
+    with refuse_errors(str(target), "bag", str(target), "cannot be written", WriterError):
         writer.close()
-    except WriterError as problem:
-        raise refusal(target, "bag", str(target), f"cannot be written ({problem})") from None
     damage = [*file.describe(), *([f"{unknown} messages of unknown types"] if unknown else [])]
     return Recovered(target, writer.messages, file.lost + unknown, file.cut, tuple(damage))

@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
+from pandas import DataFrame, Series
 
 from sst_ros.errors import SstError
 from sst_ros.host.figures import INK, MARKERS, Looks, note, styled
@@ -40,9 +41,6 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import PreparedRun, prepare, simulate
 from sst_ros.simulation.simulate_gauss import GAUSS
 
-if TYPE_CHECKING:
-    from pandas import DataFrame, Series
-
 FIXED, TOLERANCE = "fixed steps", "tolerance"
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 _TOLERANCES = tuple(10.0**-n for n in range(4, 14))
@@ -53,9 +51,7 @@ ABOVE_REFERENCE = 100.0  # errors are reported if they are so many times the ref
 USELESS = 0.1  # an orientation error above this [rad] is a failure
 ROUNDING = 2e-14  # finer steps are not expected to give less than this [rad]
 LONGEST_RUN_S = 0.4  # no finer settings are tried after a run that took longer than this [s]
-LEAST_SETTINGS = 3
-"""So many settings of each method are tried even where they take longer: a busy machine slows one
-run, but must not empty the grid."""
+LEAST_SETTINGS = 3  # are tried even where they take longer: a busy machine must not empty the grid
 
 ERROR = "largest_orientation_rad"
 ERRORS = [
@@ -63,9 +59,7 @@ ERRORS = [
     for when in ("final", "largest")
     for quantity in ("orientation_rad", "gamma_rad", "gamma_dot_rad_per_s")
 ]
-COLUMNS = (
-    *("scene", "method", "kind", "setting", "evaluations", "wall_min_s", *ERRORS, "failure"),
-)
+COLUMNS = ("scene", "method", "kind", "setting", "evaluations", "wall_min_s", *ERRORS, "failure")
 """Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
 `evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
 for a failure, and `failure` for a success."""
@@ -187,11 +181,7 @@ def _list_tolerances(problem: InitialValueProblem, method: str) -> Iterator[Solv
 
 
 def _list_collocation(problem: InitialValueProblem, kind: str) -> Iterator[SolverSetting]:
-    """Yield settings of Gauss collocation, with the steps that each tolerance chooses.
-
-    A run of fixed steps is one of a motion that has been prepared. One for a tolerance searches
-    for its steps, which solves the motion several times.
-    """
+    """Yield settings of Gauss collocation, with the steps that each tolerance chooses."""
 
     def solve(make: Callable[[], PreparedRun]) -> Run:
         motion = make().run()

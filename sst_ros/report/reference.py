@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -30,9 +30,6 @@ from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.state import NANOSECONDS
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 Held: TypeAlias = tuple[Integers, Integers, Array]
 """Ticks: when each begins and ends, from the start of the run on [ns], shape (m,), and what is held
@@ -134,11 +131,11 @@ QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
 class Comparison(NamedTuple):
     """A recording against a reference."""
 
-    error: DataFrame
+    error: pd.DataFrame
     """Distance of the recording from the reference, a row a sample, nan where there is none: gamma
     and gamma_dot, the largest difference of the actuator angles [rad] and rates [rad/s];
     orientation, the angle between the orientations of {E} [rad]."""
-    own: DataFrame  # the reference's own error, in the same columns
+    own: pd.DataFrame  # the reference's own error, in the same columns
     energy: Array
     """Energy of each sample, less that of the first and the work of all torques on the reference
     [J], shape (n,), nan where it is not known; where ticks are lost, it goes on without them."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -28,6 +28,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+from pandas import DataFrame, Series
 
 from sst_ros.host import figures
 from sst_ros.host.figures import BLUE, GREY, LINES, Looks, hide_zeros
@@ -39,9 +40,6 @@ from sst_ros.report import reference, tracking
 from sst_ros.report.reference import QUANTITIES, Comparison
 from sst_ros.report.results import largest, made_on, provenance, publish, render
 from sst_ros.state import NANOSECONDS, Array
-
-if TYPE_CHECKING:
-    from pandas import DataFrame, Series
 
 DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 """Pictures of `plot` that the report has, too."""

@@ -16,10 +16,11 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
+from pandas import DataFrame
 from scipy.spatial.transform import Rotation
 
 from sst_ros.dynamics import kernel
@@ -36,9 +37,6 @@ from sst_ros.scene.schema import key_of, leaves
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 INSTANTS = 50  # at which the motion is linearised
 FINER, FACTOR, ROUNDING = 1e-2, 10.0, 1e-13

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from sst_ros.control.law import ControllerSettings
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
-from sst_ros.scene.schema import Rules, Section, entry
+from sst_ros.scene.schema import Rules, Section, choice, entry
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
 from sst_ros.state import NANOSECONDS
 
@@ -64,10 +64,9 @@ class SimulatorParameters(Section):
     subscriber_timeout: float = _number(
         "longest wait for them, after which the node ends with an error", "s", 10.0
     )
-    sync: str = entry(
+    sync: str = choice(
         "free: run by the clock; lockstep: wait for the command that answers each sample",
-        choices=("free", "lockstep"),
-        default="free",
+        ("free", "lockstep"),
     )
     lockstep_timeout: float = _number(
         "longest wait for the answer to a sample, then fault; 0 for no end", "s", 10.0
@@ -80,15 +79,14 @@ class SimulatorParameters(Section):
         "ros2_control sends it: zero torque; else such a command is refused",
         default=False,
     )
-    integrator: str = entry("method of integration", choices=INTEGRATORS, default="auto")
+    integrator: str = choice("method of integration", INTEGRATORS)
     tolerance: float = _positive(
         "largest local error of a step of the integrator", "rad, relative", 1e-10
     )
-    equations: str = entry(
+    equations: str = choice(
         "equations of motion: those in the quaternion and the body rate, or the paper's Eqs. 1 to "
         "92, which give the same motion by explicit methods in plain Python, about 20 times slower",
-        choices=EQUATIONS,
-        default="quaternion",
+        EQUATIONS,
     )
     compiled: bool = entry(
         "run machine code where numba is installed; the first run of a scene is plain Python, with "
@@ -175,11 +173,10 @@ class PlayerParameters(AnsweringParameters):
 
     scene: str = entry("scene whose torque is played, by name or by path", default="example2")
     csv: str = entry("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
-    hold: str = entry(
+    hold: str = choice(
         "instant whose torque is held from a sample until the next: the middle of the hold gives "
         "an error of second order in the period, its start one of first order",
-        choices=("middle", "start"),
-        default="middle",
+        ("middle", "start"),
     )
 
 
@@ -187,11 +184,10 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
     """Parameters of sst_inverse_dynamics: those of the control law and those of the node."""
 
     scene: str = entry("scene of the controller's model, by name or by path", default="reach")
-    motion: str = entry(
+    motion: str = choice(
         "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory and goals of "
         "~/follow_joint_trajectory, until it is stopped",
-        choices=("scene", "topic"),
-        default="scene",
+        ("scene", "topic"),
     )
     hold: float = _number("time for which the end of the scene's motion is held", "s", 0.0)
     start_tolerance: float = _positive(

@@ -401,9 +401,8 @@ class TickLoop:
             timeout = self._run.lockstep_timeout or math.inf
             timeout = timeout if paced else min(timeout, _STEP_ANSWER_S)
             if waited > timeout:
-                raise NoAnswer(
-                    f"no command answered the sample of {self._stamp_ns} ns within {timeout:g} s"
-                )
+                sample = f"the sample of {self._stamp_ns} ns"
+                raise NoAnswer(f"no command answered {sample} within {timeout:g} s")
             time.sleep(min(max(waited / 10, 2e-5), _POLL_S))
         self._pacer.excuse(self._ticks_left())  # to wait for an answer is no overrun
         return answer

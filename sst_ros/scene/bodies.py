@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.errors import Problem, check_kinds, refuse_unless
-from sst_ros.scene.schema import Rules, Section, amount, coefficient, entry
+from sst_ros.scene.schema import Rules, Section, amount, choice, coefficient, entry
 from sst_ros.state import ZERO, Array, Vector3
 
 RELATIVE_ROUNDING = 1e-9
@@ -124,9 +124,7 @@ class Link(Section):
     centre: Vector3 = entry(
         "centre of mass in the frame of the inertia", "m", default=ZERO, acts_on=("mass",)
     )
-    inertia_about: str = entry(
-        "point of the inertia; once read it is O", choices=(ABOUT_O, ABOUT_CENTRE), default=ABOUT_O
-    )
+    inertia_about: str = choice("point of the inertia; once read it is O", (ABOUT_O, ABOUT_CENTRE))
 
     @property
     def tensor(self) -> Array:
@@ -202,9 +200,7 @@ class Stroke(Section):
     damping is given as such, or by the restitution at one impact rate.
     """
 
-    at_end: str = entry(
-        "what happens at its ends", choices=("stop", "ignore", "elastic"), default="stop"
-    )
+    at_end: str = choice("what happens at its ends", ("stop", "ignore", "elastic"))
     stiffness: float | None = amount("stiffness of elastic stops", "N m/rad")
     damping: float = coefficient(
         "damping: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
@@ -217,10 +213,8 @@ class Stroke(Section):
     def rules(self) -> Rules:
         """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
         elastic, damped = self.at_end == "elastic", np.not_equal(self.damping, 0.0)
-        bounces, only = (
-            self.restitution is not None,
-            "is given with at_end: elastic, and only there",
-        )
+        bounces = self.restitution is not None
+        only = "is given with at_end: elastic, and only there"
         yield (self.stiffness is not None) != elastic, "stiffness", self.stiffness, only
         yield bounces and not elastic, "restitution", self.restitution, only
         both = bounces == (self.impact_rate is not None)
@@ -235,9 +229,7 @@ class Workspace(Section):
     beta_max_deg: float = amount(
         "largest angle between E and the intermediate link", "deg", default=90.0, most=180.0
     )
-    at_edge: str = entry(
-        "what happens at the edge of the workspace", choices=("stop", "ignore"), default="stop"
-    )
+    at_edge: str = choice("what happens at the edge of the workspace", ("stop", "ignore"))
 
 
 PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

@@ -281,9 +281,8 @@ class Scenarios:
         rows = np.asarray(value, dtype=float)
         if rows.shape != (self.count or max(1, len(np.atleast_1d(rows))), *shape):
             words = ", ".join(map(str, (self.count or "N", *shape))) + ("" if shape else ",")
-            raise ValueError(
-                f"must have the shape ({words}), a row a scenario; it has {rows.shape}"
-            )
+            allowed = f"must have the shape ({words}), a row a scenario"
+            raise ValueError(f"{allowed}; it has {rows.shape}")
         return rows
 
     def scene(self, row: int) -> Scene:

@@ -118,6 +118,11 @@ amount = partial(entry, least=1e-12)
 coefficient = partial(entry, least=0.0, default=0.0)
 
 
+def choice(doc: str, words: tuple[str, ...]) -> Any:
+    """Declare a field that is one of some words, by default the first."""
+    return entry(doc, choices=words, default=words[0])
+
+
 def anything(doc: str, **default: Any) -> Any:
     """Declare what `Section.rules` check; it may be given by its place, too."""
     return field(metadata={"spec": Spec("anything", doc)}, **default)
@@ -180,17 +185,13 @@ class Section:
 
     def _find_idle(self) -> Iterator[Problem]:
         """Yield what has no effect, and what is not one of several."""
-
-        def has_any(names: tuple[str, ...]) -> bool:
-            return not names or has_effect([getattr(self, name) for name in names])
-
-        if not has_any(self.EFFECTS):
+        if not _acts(vars(self), self.EFFECTS):
             names = " or ".join(self.EFFECTS)
             yield Problem("", None, f"has no effect without {names}: leave it out")
             return
         for name, spec in self.SPECS.items():
             value = getattr(self, name)
-            if not has_any(spec.acts_on) and value != spec.default:
+            if not _acts(vars(self), spec.acts_on) and value != spec.default:
                 yield Problem(name, value, f"acts on {' or '.join(spec.acts_on)}: give it")
         chosen = [name for name in self.ONE_OF if getattr(self, name)]
         if self.ONE_OF and len(chosen) != 1:
@@ -366,6 +367,11 @@ def has_effect(value: Any) -> bool:
     return any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
 
 
+def _acts(values: Mapping[str, Any], names: tuple[str, ...]) -> bool:
+    """Whether any of these values has an effect, or there are no names."""
+    return not names or has_effect([values.get(name) for name in names])
+
+
 def drop_idle(cls: type[Section] | None, value: Any) -> Any:
     """Return a document of a section without what has no effect in it; None if nothing has.
 
@@ -377,12 +383,9 @@ def drop_idle(cls: type[Section] | None, value: Any) -> Any:
         return value
     known = cls.SPECS
     given = {name: drop_idle(known[name].section, x) for name, x in value.items()}
-
-    def acts(names: tuple[str, ...]) -> bool:
-        return not names or has_effect([given.get(name) for name in names])
-
-    kept = {name: x for name, x in given.items() if x is not None and acts(known[name].acts_on)}
-    return kept if acts(cls.EFFECTS) else None
+    of = {name: known[name].acts_on for name, x in given.items() if x is not None}
+    kept = {name: given[name] for name, others in of.items() if _acts(given, others)}
+    return kept if _acts(given, cls.EFFECTS) else None
 
 
 # The tree: sections and tuples, whose leaves are numbers or columns, words and None.

@@ -295,9 +295,8 @@ class ControlledBatch:
             for k in range(3)
         }
         settled = result.success & (np.abs(final).max(axis=1) <= self._band)
-        columns["settling_time"] = np.where(
-            settled, blocks["unsettled"][0] * control.period, np.nan
-        )
+        since = blocks["unsettled"][0] * control.period
+        columns["settling_time"] = np.where(settled, since, np.nan)
         return result, columns | {"limited_samples": blocks["limited"][0]}
 
     @cached_property

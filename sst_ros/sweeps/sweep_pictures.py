@@ -6,18 +6,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sst_ros.host.figures import BLUE, GREY, VERMILION, styled
 from sst_ros.report.results import publish
 from sst_ros.sweeps.results import correlate, list_outputs
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 COLUMNS, MOST_INPUTS, MOST_RUNS = 4, 6, 200
 

@@ -23,7 +23,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, refuse_errors, refuse_unless
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.schema import Rules, Section, anything, build, entry, positive
+from sst_ros.scene.schema import Rules, Section, anything, build, choice, entry, positive
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import plain
 from sst_ros.state import QUANTITIES, finite_vector
@@ -70,7 +70,7 @@ class SweepStudy(Section):
         "number of runs; by default that of the grid or of the table", most=2**53
     )
     seed: int = entry("of the random numbers", default=0, least=0, most=2**64 - 1)
-    sampling: str = entry("of random numbers", choices=SAMPLINGS, default="random")
+    sampling: str = choice("of random numbers", SAMPLINGS)
     table: Any = anything(
         "values by column in place of distributions: DataFrame, mapping or file", default=None
     )
@@ -190,9 +190,8 @@ class SweepStudy(Section):
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
         if not (found or problems):
-            problems.append(
-                Problem("vary", dict(self.vary), "must name at least one key of the scene")
-            )
+            allowed = "must name at least one key of the scene"
+            problems.append(Problem("vary", dict(self.vary), allowed))
         if problems:
             raise InputError("sweep", problems)
         return tuple(found)
