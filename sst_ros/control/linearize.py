@@ -22,10 +22,12 @@ import numpy as np
 
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics.initial_state import start_of
+from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.variational import VariationalEquations, trace_derivatives
 from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
+from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, scene_of, with_initial
 from sst_ros.scene.torque_profile import ConstantTorque
 from sst_ros.state import ZERO, Array, State, finite_vector
@@ -34,8 +36,8 @@ COORDINATES = {
     "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
     "star": [f"{name}_{axis}" for name in ("rotation", "body_rate") for axis in "xyz"],
 }
-_MOST = 20_000
-"""Evaluations for a period: without end in a singularity."""
+_MOST, _CHECKS = 20_000, 8
+"""Evaluations for a period: without end in a singularity; parts after which limits are checked."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +140,20 @@ def linearize(
         dt = float(dt)
         equations = VariationalEquations(given, (), ConstantTorque(acting), by_torque=True)
         begin = np.hstack([from_x, np.zeros((len(now), 3))])
-        run = equations.integrate(now, begin, np.array([dt]), most=_MOST)
+        run = equations.integrate(now, begin, np.linspace(0.0, dt, _CHECKS + 1), most=_MOST)
         lasts = "must be a period for which the motion lasts: it meets a singularity or is too long"
-        refuse_unless("linearize", ("dt", dt, run is not None, lasts))
+        if run is not None:
+            angles = [Dynamics.of(given).joints(*y[:7]) for y in run[0]]
+            limits = limits_of(given, Geometry.of(given))
+            passed = (
+                one
+                for one in limits
+                if min(map(one.distance, angles)) < 0.0 <= one.distance(angles[0])
+            )
+            lasts = next((f"must end before a limit: {one.reason}" for one in passed), "")
+        refuse_unless("linearize", ("dt", dt, not lasts, lasts))
         assert run is not None
-        (end,), (flow,) = run
+        end, flow = (part[-1] for part in run)
         found = _differentiate(given, end, acting, by_gamma)[0] @ flow
         a, b = found[:, :-3], found[:, -3:]
     lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []

@@ -9,7 +9,7 @@ from mechanism.test_loads import loaded
 from models import folding_star, seeded_samples
 from mpmath import mp, mpf
 
-from sst_ros import InputError, SingularConfiguration, equilibrium, linearize, load_scene
+from sst_ros import InputError, SingularConfiguration, equilibrium, linearize, load_scene, simulate
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
@@ -93,6 +93,36 @@ def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):
         expected = differences(scene, y, command, coordinates, dt)
     for matrix, truth in zip((found.A, found.B), expected, strict=True):
         assert np.abs(matrix - truth).max() <= 1e-10 * np.abs(truth).max()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_period_across_a_contact_has_the_model_of_differences(seed):
+    scene = load_scene("elastic_stops").with_values({"torque": None})
+    rng = np.random.default_rng(seed)
+    start = np.array([1.4995, 0.8019, 0.9342, 1.885, -1.97, 1.288]) + rng.normal(0.0, 0.01, 6)
+    x, dt = np.array([*start, *rng.normal(0.0, 1.0, 3)]), 0.1
+    given = (x[:3], x[3:6])
+
+    def move(x, **options):
+        return simulate(scene, x[6:].tolist(), dt, initial=(x[:3], x[3:6]), **options)
+
+    assert move(x).gamma[:, 0].max() > np.pi / 2
+    found = linearize(scene, given, x[6:], dt=dt)
+    columns = []
+    for row in 1e-5 * np.eye(9):
+        ends = [move(x + step, tolerance=1e-12, t_eval=[dt]) for step in (row, -row)]
+        high, low = (np.hstack([end.gamma[-1], end.gamma_dot[-1]]) for end in ends)
+        columns.append((high - low) / 2e-5)
+    truth = np.transpose(columns)
+    error = np.abs(np.hstack([found.A, found.B]) - truth).max()
+    assert error <= 1e-5 * np.abs(truth).max()
+
+
+def test_a_period_across_a_limit_has_no_model():
+    given = ((1.45, 0.8, 0.7), (2.0, -0.5, 0.3))
+    linearize("elastic_stops", given, (0.0, 0.0, 0.0), dt=0.01)
+    with pytest.raises(InputError, match=r"dt = 0\.1: must end before a limit: beta_2 < 0"):
+        linearize("elastic_stops", given, (0.0, 0.0, 0.0), dt=0.1)
 
 
 @pytest.mark.parametrize("name", ["gravity_payload", "example2_stroke", "stiff"])

@@ -90,7 +90,8 @@ def test_the_summary_is_written_whole_and_finite(whole):
 
 def test_the_table_says_it_all_in_line(whole):
     summary, _ = whole
-    text = summary_table(summary)
+    bag = summary["bag"]
+    text = summary_table(summary).replace(bag, "BAG")  # its folder may be long
     for word in ("ticks done", "ticks missed", "real-time factor", "samples lost", "(a)", "(b)"):
         assert word in text
     assert f"{summary['integration_error_gamma_rad']:.2e}" in text
