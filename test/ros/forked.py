@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor, TimeoutError
 from multiprocessing import forkserver, resource_tracker
 
@@ -29,6 +30,7 @@ class ForkedNode:
     def __init__(self, words, env):
         with pytest.MonkeyPatch.context() as patch:  # for the server, which this starts if need be
             patch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
+            patch.setattr(tempfile, "tempdir", "/tmp")  # a socket's path has at most 107 letters
             resource_tracker.ensure_running()
             forkserver.ensure_running()
         pipes = [os.pipe(), os.pipe()]
