@@ -26,8 +26,7 @@ SINGULAR = 1.5e-5
 NO_ASSEMBLY, NO_RATE = -1, -2
 """Codes of runs that cannot start: no unique admissible assembly; gamma_dot is no motion there."""
 
-_BLOCK = 2000
-"""Starts solved at once: their arrays fit the cache."""
+_BLOCK = 2000  # starts solved at once: their arrays fit the cache
 
 
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:

@@ -16,11 +16,8 @@ from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
 from sst_ros.state import ZERO
 
-SINGULAR_MU = 1e-6
-"""Distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning."""
-
-CONTACT_BAND = 1e-9
-"""Farther beyond than this [rad], an actuator has not just reached the contact."""
+SINGULAR_MU = 1e-6  # distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
+CONTACT_BAND = 1e-9  # farther beyond than this [rad], an actuator has not just reached the contact
 
 
 class JointSpring(NamedTuple):

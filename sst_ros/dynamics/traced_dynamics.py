@@ -229,8 +229,7 @@ class ODE:
         return (*slope, *work)
 
 
-recent_ode = lru_cache(maxsize=64)(ODE)
-"""Traced once for all runs of the same dynamics."""
+recent_ode = lru_cache(maxsize=64)(ODE)  # traced once for all runs of the same dynamics
 
 
 def limit_distances(

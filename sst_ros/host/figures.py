@@ -35,8 +35,7 @@ MARKERS = {
 }
 """Colour and marker of each method of integration."""
 
-Looks: TypeAlias = "dict[str, Any]"
-"""Arguments of matplotlib that say how something looks."""
+Looks: TypeAlias = "dict[str, Any]"  # arguments of matplotlib that say how something looks
 
 LINES: tuple[Looks, ...] = (
     {"color": BLUE, "linestyle": "-", "linewidth": 2.6},
@@ -71,8 +70,7 @@ DEGREES = float(np.degrees(1.0))
 SMALLEST_SHOWN = 1e-17
 """Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
 
-styled = mpl.rc_context(STYLE)
-"""Gives a function that makes a figure the style, as a decorator."""
+styled = mpl.rc_context(STYLE)  # gives a function that makes a figure the style, as a decorator
 
 
 @styled

@@ -26,12 +26,8 @@ from sst_ros.version import VERSION
 NO_WORKER, NO_SCHEDULER = 60.0, 15.0
 """Longest wait for a worker, and for a scheduler that does not answer [s]."""
 
-GATHER = 60.0
-"""Longest wait for the outcome of a job that is done [s]: a busy worker answers late."""
-
-LOOK = 0.1
-"""Time between two looks for jobs that are done, and for workers [s]."""
-
+GATHER = 60.0  # longest wait for the outcome of a job that is done [s]: a busy worker answers late
+LOOK = 0.1  # time between two looks for jobs that are done, and for workers [s]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 

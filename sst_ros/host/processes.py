@@ -23,9 +23,7 @@ from typing import Any, BinaryIO
 
 from sst_ros.errors import SstError
 
-PARENT = "SST_ROS_PARENT"
-"""Variable with the number of the process without which a node is to end."""
-
+PARENT = "SST_ROS_PARENT"  # variable with the number of the process without which a node is to end
 NO_LIMIT = "no limit"
 _SWITCH_INTERVAL_S = 1e-4
 _END_S = 10.0

@@ -23,12 +23,8 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen
 from sst_ros.mechanism.kinematics import ROUNDING, rotate
 
-SAFE = 0.18
-"""Largest step in gamma [rad] over sigma^2 that cannot leave the branch."""
-
-SINGULAR = 1e-5
-"""Least sigma at which a branch is followed."""
-
+SAFE = 0.18  # largest step in gamma [rad] over sigma^2 that cannot leave the branch
+SINGULAR = 1e-5  # least sigma at which a branch is followed
 _NEWTON_STEPS = 20
 _BUDGET = 20_000
 _SQRT2 = 2.0**0.5

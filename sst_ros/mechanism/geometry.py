@@ -16,12 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.state import Array as Array
 
-_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
-"""What a geometry is made from."""
-
-_SMALL = 1000
-"""Numbers of an array below which `take` is faster than slices."""
-
+_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")  # what a geometry is made from
+_SMALL = 1000  # numbers of an array below which `take` is faster than slices
 _AHEAD, _BEHIND = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 

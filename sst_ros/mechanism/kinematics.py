@@ -44,13 +44,8 @@ from sst_ros.state import Assembly
 
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-
-NEAR = 0.1
-"""How near an assembly must be to the rotation that names it [rad]."""
-
-ROUNDING = 1e-15
-"""Largest abs(r_k . t_k) that is rounding and not a residual."""
-
+NEAR = 0.1  # how near an assembly must be to the rotation that names it [rad]
+ROUNDING = 1e-15  # largest abs(r_k . t_k) that is rounding and not a residual
 _NOT_ISOLATED, _NEAR_REAL, _SAME, _MISFIT = 1e-13, 1e-3, 1e-3, 1e-2
 _STEPS, _LONGEST_TURN, _LAST_STEP, _REGULAR = 40, 0.3, 1e-9, 1e-5
 

@@ -21,11 +21,8 @@ from sst_ros.mechanism.geometry import Array, Geometry, cross
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
-Three: TypeAlias = ArrayLike
-"""Three numbers, one a leg or an axis."""
-
-SINGULAR = 1e-12
-"""Smallest abs(det J2) and abs(c_k) for which the velocity analysis is done."""
+Three: TypeAlias = ArrayLike  # three numbers, one a leg or an axis
+SINGULAR = 1e-12  # smallest abs(det J2) and abs(c_k) for which the velocity analysis is done
 
 
 @dataclass(frozen=True)

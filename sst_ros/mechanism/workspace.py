@@ -30,8 +30,7 @@ _BLOCK, _BISECTIONS = 20_000, 55
 _RAYS, _RAY, _REFINED = 400, 64, 6
 """Rays from a pose, points of each, and the nearest changes of sign that are refined."""
 
-_MOST = 20_000_000
-"""Poses of a map: 4 GB."""
+_MOST = 20_000_000  # poses of a map: 4 GB
 
 
 @dataclass(frozen=True)

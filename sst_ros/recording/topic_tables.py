@@ -280,9 +280,7 @@ TABLES: dict[str, tuple[TopicTable, ...]] = {
 }
 """The tables of a run, and the topics in each: samples have a row at each stamp of their topics."""
 
-STAMPED = (*TABLES["samples"], TICKS)
-"""Topics whose rows are ordered by stamps, one at each."""
-
+STAMPED = (*TABLES["samples"], TICKS)  # topics whose rows are ordered by stamps, one at each
 TOPIC_TABLES = tuple(table for tables in TABLES.values() for table in tables)
 
 TIMES = (

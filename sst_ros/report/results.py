@@ -27,8 +27,7 @@ from sst_ros.version import VERSION
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-WHOLE_RUN_S = 1.0
-"""Length of a run [s] where the scene names no duration."""
+WHOLE_RUN_S = 1.0  # length of a run [s] where the scene names no duration
 
 
 def data_frame(

@@ -21,8 +21,7 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import ZERO, Vector3
 
 _LONGEST_SLEEP_S = 0.05
-_TOGETHER_NS = 2_000_000
-"""Bounds the ticks that one sleep ends in, so that few commands wait."""
+_TOGETHER_NS = 2_000_000  # bounds the ticks that one sleep ends in, so that few commands wait
 _POLL_S = 0.001
 _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""

@@ -35,10 +35,8 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
-NO_TOLERANCE = -1.0
-"""Of a message: the default does not hold either."""
-_NUMBERS = 256 * 19
-"""Numbers of samples, 19 each, that are added to the tracking metrics at once."""
+NO_TOLERANCE = -1.0  # in a message: the default does not hold either
+_NUMBERS = 256 * 19  # numbers of samples, 19 each, that are added to the tracking metrics at once
 
 
 def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:

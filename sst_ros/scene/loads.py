@@ -18,10 +18,7 @@ from sst_ros.state import ZERO, Quaternion, Vector3
 
 JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
 MOMENTS = ("moment_x", "moment_y", "moment_z")  # beside the torques of a tick
-
-NANOSECOND = 1e-9
-"""Resolution of time [s]."""
-
+NANOSECOND = 1e-9  # resolution of time [s]
 _duration = partial(entry, "time that it takes", "s", least=NANOSECOND)
 
 

@@ -36,14 +36,9 @@ _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """What a terminal obeys, and halves of characters."""
 
-TURN = 2.0 * math.pi
-"""No initial or desired angle of an actuator [rad] is larger: it is in degrees."""
-
-REQUIRED: Any = object()
-"""Default of a field that must be given."""
-
-Place = tuple[str | int, ...]
-"""Names and indices of a part of a tree from the root on."""
+TURN = 2.0 * math.pi  # no initial or desired angle of an actuator [rad] is larger: it is in degrees
+REQUIRED: Any = object()  # default of a field that must be given
+Place = tuple[str | int, ...]  # names and indices of a part of a tree from the root on
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,7 @@ from sst_ros.state import ZERO, Array, State, Vector3, finite_vector
 
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
-
-_MOST_CROSSINGS = 1e5
-"""Radians of a sine beyond which its clamping is not computed in advance."""
+_MOST_CROSSINGS = 1e5  # radians of a sine beyond which its clamping is not computed in advance
 
 
 def ascend(times: Array) -> bool:

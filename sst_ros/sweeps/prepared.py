@@ -24,8 +24,7 @@ from sst_ros.version import VERSION
 if TYPE_CHECKING:
     import pyarrow as pa
 
-PARTS = 64
-"""Extremes are those of the states at the ends of at most so many equal parts of a run."""
+PARTS = 64  # extremes are those of the states at the ends of at most so many equal parts of a run
 
 PILOT = 256
 """Rows by which the number of steps is chosen; drawn apart, so that no number of rows matters."""

@@ -23,10 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 METADATA = b"sst_ros"
-
-_SHOWN = 8
-"""Causes of early ends in a summary."""
-
+_SHOWN = 8  # causes of early ends in a summary
 _NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
 
 

@@ -17,9 +17,7 @@ from sst_ros.report.results import publish
 from sst_ros.sweeps.results import correlate, list_outputs
 
 COLUMNS, MOST_INPUTS, MOST_RUNS = 4, 6, 200
-
-MOST_POINTS = 2000
-"""Of all runs in a scatter plot; the worst are drawn over them."""
+MOST_POINTS = 2000  # of all runs in a scatter plot; the worst are drawn over them
 
 
 def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
