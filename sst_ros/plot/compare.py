@@ -83,9 +83,7 @@ def draw_comparison(
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the pictures of several runs into `out`, as `pictures.draw_run` does of one.
 
-    Raises:
-        InputError: there are too many runs, a name is unknown, or `out` cannot be written.
-
+    Raises InputError where there are too many runs, too.
     """
     allowed = f"must be 2 to {len(LINES)} bags, which can be distinguished"
     refuse_unless("compare", ("bags", len(runs), 2 <= len(runs) <= len(LINES), allowed))

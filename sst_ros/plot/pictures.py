@@ -369,11 +369,8 @@ def draw_run(
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the pictures of a run, those that `only` names or all, into the folder `out`.
 
-    Returns the paths written, and for each picture that could not be drawn what is missing.
-
-    Raises:
-        InputError: a name is none of PICTURES, or `out` cannot be written.
-
+    Returns the paths written, and for each picture that could not be drawn what is missing. Raises
+    InputError where a name is none of PICTURES, or `out` cannot be written.
     """
     paths: list[Path] = []
     missing: dict[str, str] = {}

@@ -249,11 +249,8 @@ def _measure(
 def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision]:
     """Study scenes one after another; print each, and write all finished results into `out`.
 
-    Files: accuracy.csv, .json, .md, and accuracy_SCENE.png.
-
-    Raises:
-        SstError: a scene is refused or cannot start, or `out` cannot be written.
-
+    Files: accuracy.csv, .json, .md, and accuracy_SCENE.png. Raises SstError where a scene is
+    refused or cannot start, or `out` cannot be written.
     """
     studies: list[WorkPrecision] = []
     for each in [scenes.load(name) for name in names]:

@@ -60,10 +60,8 @@ class StateError(NamedTuple):
 class InitialValueProblem:
     """A scene as an initial value problem.
 
-    Raises:
-        AssemblyError: the initial gamma has no unique admissible assembly.
-        InputError: the scene cannot start, or stops at once.
-
+    Raises AssemblyError where the initial gamma has no unique admissible assembly, InputError where
+    the scene cannot start, or stops at once.
     """
 
     def __init__(self, scene: Scene) -> None:

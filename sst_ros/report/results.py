@@ -77,11 +77,8 @@ def render(template: str | Path, **values: Any) -> str:
 def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
     """Write files of a report into `out`: tables, documents (JSON), pages and figures.
 
-    The name of a file that begins with a point follows that of the report.
-
-    Raises:
-        InputError: `out` cannot be written; it names the report.
-
+    The name of a file that begins with a point follows that of the report. Raises InputError, which
+    names the report, where `out` cannot be written.
     """
     with write_into(out, name):
         for file, content in files.items():

@@ -105,11 +105,8 @@ def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str
     """Evaluate a recorded run; write summary.json, the page and the pictures into `out`.
 
     Of a `damaged` recording what is intact is evaluated. The summary is returned; `summary_text`
-    makes a short text of it, `summary_table` the whole.
-
-    Raises:
-        InputError: the bag is no whole recording of a run, or `out` cannot be written.
-
+    makes a short text of it, `summary_table` the whole. Raises InputError where the bag is no whole
+    recording of a run, or `out` cannot be written.
     """
     run = recording.read(bag, damaged=damaged)
     with write_into(out, "report"):

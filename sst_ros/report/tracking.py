@@ -66,9 +66,7 @@ class TrackedRun:
 def read_tracking(path: Path) -> TrackedRun:
     """Read a rosbag2 recording of a run with the topics of the inverse-dynamics controller.
 
-    Raises:
-        InputError: it is no recording of a run that followed a reference, or a damaged one.
-
+    Raises InputError where it is no recording of a run that followed a reference, or a damaged one.
     """
     run = recording.read(path)
     missing = run.signals.bag.absent

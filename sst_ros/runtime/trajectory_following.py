@@ -175,14 +175,13 @@ class Stage(Enum):
 class TrajectoryFollower:
     """Follows the scene's motion once, or one trajectory after the other.
 
+    Raises InputError, AssemblyError or SingularConfiguration where the scene's motion is refused.
+
     Attributes:
         stage: present stage.
         samples: samples answered.
         irregular: those of them that came at another period.
         limited: samples of the motion in which a torque was limited.
-
-    Raises:
-        InputError, AssemblyError, SingularConfiguration: the scene's motion is refused.
 
     """
 

@@ -211,10 +211,7 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
 
 
 def load(name_or_path: str | Path) -> Scene:
-    """Read a scene by its path (ends in .yaml) or by the name of one that comes with sst_ros.
-
-    InputError is raised where there is no such scene, or its document is refused.
-    """
+    """Read a scene by its path or name; see `scene_of`."""
     return read(Scene, *text_of(name_or_path))
 
 

@@ -48,9 +48,7 @@ _PANEL: Any = _templates.get_template("panel.html").module
 class Page:
     """One source on one page, at `url`, which has the access token; `close` ends it.
 
-    Raises:
-        InputError: the host is no address of this machine, or no port is free.
-
+    Raises as `PageServer`.
     """
 
     def __init__(self, source: RunControl | Replay, host: str = LOCAL, port: int = PORT) -> None:

@@ -100,9 +100,7 @@ class AccessCheck:
 class PageServer(ViserServer):
     """viser's server at `url` with the check, a bounded search for a port, and no public share.
 
-    Raises:
-        InputError: the host is no address of this machine, or no port is free.
-
+    Raises InputError where the host is no address of this machine, or no port is free.
     """
 
     def __init__(self, host: str = LOCAL, port: int = PORT) -> None:

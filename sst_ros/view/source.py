@@ -74,11 +74,7 @@ class RunControl(Protocol):
 class Replay:
     """Plays a bag of `length` [s]; has `scene`, `states` and `status` as a run.
 
-    It is used from two threads of the page.
-
-    Raises:
-        InputError: the bag is no whole recording of a run.
-
+    It is used from two threads of the page. Raises InputError where the bag is no whole recording.
     """
 
     def __init__(self, bag: Path) -> None:
