@@ -15,9 +15,8 @@ from numbers import Integral, Real
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from sst_ros.state import Array
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
 SHOWN, LONGEST_PATH = 80, 4096  # characters of a value in a message, and of a path

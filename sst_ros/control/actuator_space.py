@@ -22,13 +22,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import compile_for_arrays, compile_program, trace
-from sst_ros.errors import (
-    SingularConfiguration,
-    SstError,
-    check_kinds,
-    check_kinds_late,
-    refuse_unless,
-)
+from sst_ros.errors import SingularConfiguration, check_kinds, check_kinds_late, refuse_unless
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
@@ -87,7 +81,7 @@ class ReferenceMotion(Explained):
     def _facts(self) -> dict[str, object]:
         pieces = len(self.pieces) - 1
         facts: dict[str, object] = {"duration [s]": self.duration, "smooth pieces": pieces}
-        with contextlib.suppress(SstError):  # an end is singular
+        with contextlib.suppress(SingularConfiguration):  # of an end
             facts["begins at gamma [rad]"] = self.at(0.0).gamma
             facts["ends at gamma [rad]"] = self.at(self.duration).gamma
         return facts

@@ -190,7 +190,6 @@ class SingularPoses:
     determinant: Array  #: det J2 or c_k that was found, shape (m,): 0 up to rounding
 
     def __len__(self) -> int:
-        """Count the poses."""
         return len(self.rotation)
 
 

@@ -277,7 +277,6 @@ def name_fastest(study: WorkPrecision) -> str:
 
 
 def _setting(row: Series[Any]) -> str:
-    """Return method, setting and time in words."""
     fixed, wall_ms = f"{1e3 * row.setting:.4g} ms steps", 1e3 * row.wall_min_s
     setting = f"tolerance {row.setting:.0e}" if row.kind == TOLERANCE else fixed
     return f"{row.method}, {setting}, {wall_ms:{'.2g' if wall_ms < 99.5 else '.0f'}} ms"

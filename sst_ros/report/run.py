@@ -344,7 +344,6 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     grid = iter(figure.subplots(3, 2).ravel())
 
     def panel(title: str, values: Any, xlabel: str = "time t [s]") -> Axes:
-        """Begin the next panel, which shows values."""
         axes: Axes = next(grid)
         axes.set_title(title)
         axes.set_xlabel(xlabel)

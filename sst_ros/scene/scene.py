@@ -17,18 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import InputError, Problem, check_kinds, refusal, suggestion
-from sst_ros.scene import loads, schema
+from sst_ros.scene import loads, schema, yaml_document
 from sst_ros.scene.bodies import Base, Link, Payload, Star, Stroke, Workspace
 from sst_ros.scene.schema import Place, Section, Spec, amount, entry, key_of
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.scene.yaml_document import (
-    NO_NUMBER,
-    find_fields,
-    plain,
-    read,
-    replace_values,
-    values_at,
-)
+from sst_ros.scene.yaml_document import find_fields, plain, read, replace_values, values_at
 from sst_ros.state import Array, Explained
 
 LARGEST = 1e9
@@ -263,7 +256,7 @@ class Scenarios:
             try:
                 for place, _, spec in find_fields(scene, key):
                     if spec.kind != "number":
-                        raise ValueError(NO_NUMBER)
+                        raise ValueError(yaml_document.NO_NUMBER)
                     if place in self._places:
                         raise ValueError("is given twice")
                     self._places[place], self._specs[key] = key, spec

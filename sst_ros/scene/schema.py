@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 
-from sst_ros.errors import Array, InputError, Problem, refusal, refuse_unless, suggestion
-from sst_ros.state import Explained
+from sst_ros.errors import InputError, Problem, refusal, refuse_unless, suggestion
+from sst_ros.state import Array, Explained
 
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
