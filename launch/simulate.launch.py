@@ -45,7 +45,7 @@ def actions(given: Given) -> list[Action]:
         played = {
             "scene": given["scene"],
             "rate": given["publish_rate"],
-            "stamped": "true" if run["sync"] == "lockstep" else "",
+            "stamped": "" if run["sync"] == "lockstep" else "false",
             "min_subscribers": "2" if recorded else "",  # the recorder reads them, too
         }
         endless = bool(given["duration"]) and float(given["duration"]) == 0.0

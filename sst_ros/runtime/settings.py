@@ -172,6 +172,10 @@ class PlayerParameters(AnsweringParameters):
     """Parameters of sst_torque_player."""
 
     scene: str = entry("scene whose torque is played, by name or by path", default="example2")
+    stamped: bool = entry(
+        "answer on commands_stamped, which each simulator takes, one in lockstep no other",
+        default=True,
+    )
     csv: str = entry("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
     hold: str = choice(
         "instant whose torque is held from a sample until the next: the middle of the hold gives "

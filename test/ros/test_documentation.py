@@ -81,7 +81,7 @@ def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, 
     observer.phase("waiting")
     recorder = nodes.run("recorder", output=tmp_path / "bag")
     assert nodes.line(recorder).startswith("ready")
-    nodes.run("torque_player", min_subscribers=100)
+    nodes.run("torque_player", min_subscribers=100, stamped=False)
     nodes.run("inverse_dynamics", min_subscribers=100)
     nodes.run("viewer")
     for node in NODES:

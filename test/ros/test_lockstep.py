@@ -76,7 +76,7 @@ def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
     given = {"scene": name, "equations": "virtual_work", "duration": 0.05}
     simulator = nodes.run("simulator", **given, **AT_ONCE)
     observer.preview()
-    nodes.run("torque_player", scene=name, stamped=True)
+    nodes.run("torque_player", scene=name)
     observer.until(lambda: len(observer.samples()) >= 26, "samples")
     samples = observer.samples()
     assert nodes.ended(simulator)[0] == 0 and len(samples) == 26

@@ -21,7 +21,7 @@ def sample(nanosec):
 def begin(nodes, observer, stamp=0, kind=Float64MultiArray, topic=COMMANDS, **given):
     """Start a player that has answered a state; return it, the publisher and the answers."""
     heard = observer.listen(kind, topic)
-    player = nodes.run("torque_player", **given)
+    player = nodes.run("torque_player", stamped=kind is JointState, **given)
     states = observer.publisher(JointState, "/joint_states")
     observer.publish_until(states, sample(stamp), lambda: heard, "torque")
     return player, states, heard
@@ -41,7 +41,7 @@ def test_plays_a_table_against_the_stamps_it_hears(nodes, observer, profile):
 
 def test_answers_with_the_torque_of_the_middle_of_the_hold(nodes, observer):
     """At the rate given; the last hold ends with the profile. Other periods are reported."""
-    given = {"scene": "example1", "rate": 250, "stamped": True}
+    given = {"scene": "example1", "rate": 250}
     player, states, heard = begin(nodes, observer, kind=JointState, topic=STAMPED, **given)
     end_ns = 523_598_776
     stamps = [500 + passed for passed in (0, 4_000_000, 10_000_000, 522_000_000, end_ns)]
