@@ -15,8 +15,9 @@ from numbers import Integral, Real
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sst_ros.state import Array
+Array = NDArray[np.float64]  # that of state.py; an import would lengthen every chain of imports
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
 SHOWN, LONGEST_PATH = 80, 4096  # characters of a value in a message, and of a path

@@ -37,7 +37,7 @@ Given = Mapping[str, str]  # values of the launch arguments
 
 
 class Default(str):
-    """A value that nobody gave, before which params_file goes."""
+    """A value that was not given, before which params_file goes."""
 
     __slots__ = ()
 
