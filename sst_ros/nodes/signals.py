@@ -13,7 +13,8 @@ came: set[int] = set()
 def handle() -> None:
     """Have signals end the node in order, also while it starts.
 
-    A SIGINT that the executables have blocked until now is delivered; `nohup` keeps its meaning.
+    A SIGINT that the executables have blocked until now is delivered; a SIGHUP that is ignored, as
+    by nohup, stays so.
     """
     for number in _NUMBERS:
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:

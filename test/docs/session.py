@@ -130,7 +130,7 @@ class Session:
                 installed.check(line)
             except (AssertionError, InputError, KeyError, ValueError, OSError) as error:
                 raise AssertionError(f"{block}: {line}: {error!r}") from error
-        elif words[0] in PYTHONS and _stays(words):
+        elif words[0] in PYTHONS and self._stays(words):
             self._start(line, words)
         else:
             self.settle()
@@ -140,6 +140,12 @@ class Session:
         given = {"cwd": self.folder, "env": self.environment, "timeout": LIMIT_S}
         done = subprocess.run(argv, capture_output=True, text=True, **given)
         assert done.returncode == 0, f"{block}: {argv[-1]}\n{done.stdout}{done.stderr}"
+
+    def _stays(self, words):
+        """Tell whether a command runs until it is stopped, as nodes do."""
+        if words[1] == "-m":
+            return words[2] == "sst_ros" and words[3] in (*NODES, "view")
+        return "rclpy.spin" in (self.folder / words[1]).read_text(encoding="utf-8")
 
     def _start(self, line, words):
         assert self._domain is not None, "nodes need a ROS domain"
@@ -163,13 +169,6 @@ def _value(words, parameter):
         return words[words.index(f"--{parameter}") + 1]
     (value,) = (w.partition(":=")[2] for w in words if w.startswith(f"{parameter}:="))
     return value
-
-
-def _stays(words):
-    """Tell whether a command runs until it is stopped, as nodes do."""
-    if words[1] == "-m":
-        return words[2] == "sst_ros" and words[3] in (*NODES, "view")
-    return "rclpy.spin" in (ROOT / words[1]).read_text(encoding="utf-8")
 
 
 def _ends_by_itself(words):

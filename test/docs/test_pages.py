@@ -2,6 +2,7 @@
 """Every block of every page runs, or is checked where it needs a ROS installation."""
 
 import contextlib
+import json
 import re
 import shlex
 from pathlib import Path
@@ -15,7 +16,7 @@ from sst_ros.cli.commands import NODES, parser
 PAGES = pages()
 LONG = (
     "README batch controller evaluate fast faults follow geometry identify lockstep look many plot "
-    "record simulate sweep torque"
+    "record simulate sweep torque twelve_tasks"
 )
 """Pages that start nodes or whole runs, which other tests do as well, or that compile."""
 WITH_BLOCKS = [
@@ -38,6 +39,17 @@ def test_every_block_of_a_page_runs(page, tmp_path):
         for block in blocks(page):
             session.run(block)
         session.settle()
+
+
+def test_each_of_the_twelve_tasks_is_a_short_block_or_a_link():
+    page, shown = "docs/howto/twelve_tasks.md", ROOT / "docs" / "tutorial" / "first_steps.ipynb"
+    text = (ROOT / page).read_text(encoding="utf-8")
+    tasks = re.split(r"^## \d+\. ", text, flags=re.M)[1:]
+    assert len(tasks) == 12 and all("```" in task or "](" in task for task in tasks)
+    linked = [f"docs/howto/{name}.md" for name in ("sweep", "linearize")]
+    lines = [block.text.count("\n") for name in (page, *linked) for block in blocks(name)]
+    cells = json.loads(shown.read_text(encoding="utf-8"))["cells"]
+    assert max(lines + [len(cell["source"]) for cell in cells]) <= 25
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -8,6 +8,7 @@ The server has one thread, no node and no connection; what it forks differs from
 import atexit
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -92,6 +93,7 @@ class _Call:
         return {**vars(self), "_streams": [duplicate(stream) for stream in self._streams]}
 
     def __call__(self):
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as in a terminal, also under nohup
         for number, stream in enumerate(self._streams, start=1):
             os.dup2(stream.detach(), number)
         # The server ends with the tests, however they end, and this node then ends without it.

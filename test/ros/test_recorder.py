@@ -42,15 +42,9 @@ def whole(bag, more_than):
     return run
 
 
-NO_TERMINAL = pytest.param(
-    signal.SIGHUP,
-    marks=pytest.mark.skipif(signal.getsignal(signal.SIGHUP) == signal.SIG_IGN, reason="nohup"),
-)
-
-
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), NO_TERMINAL],
+    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGHUP],
 )
 def test_signals_leave_a_readable_bag_with_all_samples(nodes, observer, tmp_path, number):
     recorder, simulator = recorded(nodes, observer, tmp_path / "bag", duration=0.3)
