@@ -202,8 +202,12 @@ class Recording(Explained):
             relative to it.
         time_ns, received_ns: instant of each sample, and when the recorder got it by its own
             clock [ns], shape (n,).
-        gamma, mu, beta: joint angles of actuators, carriages and star [rad], shape (n, 3).
-        gamma_dot, mu_dot, beta_dot: their rates [rad/s], shape (n, 3).
+        gamma: joint angles of the actuators [rad], shape (n, 3).
+        mu: joint angles of the carriages.
+        beta: joint angles of the star.
+        gamma_dot: joint rates of the actuators [rad/s], shape (n, 3).
+        mu_dot: joint rates of the carriages.
+        beta_dot: joint rates of the star.
         effort: actuator torques of the tick that ends at the sample [N m], shape (n, 3).
         quaternion: orientation of {E} in {B}, (x, y, z, w), shape (n, 4); nan where it was lost.
         euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where they were lost.
