@@ -44,7 +44,7 @@ MOST = 4_000_000
 GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
 ACTUATORS = ("actuators.torque_limit", "actuators.idle_damping")
 OUTSIDE = ("torque", "motion", "duration", "initial.orientation", *ACTUATORS)
-RESTITUTION = "stroke.restitution"
+REBOUND = ("stroke.restitution", "stroke.impact_rate")  # known to the equations as one damping
 FIRST = np.zeros(1)
 
 
@@ -118,9 +118,12 @@ class VariationalEquations:
 
         scene, values = scene or self.scene, np.empty(0) if values is None else values
         given, factor = values.tolist(), np.ones(len(values))
-        if RESTITUTION in self.names:
-            place = self.names.index(RESTITUTION)
-            factor[place], given[place] = differentiate_damping(scene), damping_of(scene.stroke)
+        rebound = [i for i, name in enumerate(self.names) if name in REBOUND]
+        if rebound:
+            by = dict(zip(REBOUND, differentiate_damping(scene), strict=True))
+            for i in rebound:
+                factor[i], given[i] = by[self.names[i]], 0.0
+            given[rebound[0]] = damping_of(scene.stroke)
         own = np.append(values, _numbers(self._torque) if self._by_torque else [])
         size, y = len(state), np.concatenate([state, slopes.ravel()])
         limit, left, free = scene.torque_limit, iter(range(most)), slopes.shape[1] - len(own)
@@ -211,8 +214,10 @@ def trace_derivatives(
 
     def derivative(*inputs: Any) -> tuple[Any, ...]:
         symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
-        if RESTITUTION in symbols:  # its number is that of the damping
-            symbols |= {"stroke.damping": symbols[RESTITUTION], RESTITUTION: None}
+        rebound = [symbols.pop(name) for name in names if name in REBOUND]
+        if rebound:  # their numbers add up to the damping
+            damping = mark_present(sum(rebound[1:], rebound[0]))
+            symbols |= {"stroke.damping": damping, **dict.fromkeys(REBOUND)}
         opened = build_unchecked(Scene, replace_values(plain(scene), symbols))
         model = kernel.model_of(opened, geometry)
         return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
@@ -260,14 +265,14 @@ def _differentiate_torque(
     return lambda time: unit
 
 
-def differentiate_damping(scene: Scene) -> float:
-    """Return the derivative of the damping of elastic stops by the restitution [s/rad].
+def differentiate_damping(scene: Scene) -> tuple[float, float]:
+    """Return the derivatives of the damping by restitution [s/rad] and impact rate [s^2/rad^2].
 
     By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de =
-    d / (1 - e - e d), which is -3 where e = 1.
+    d / (1 - e - e d), which is -3 where e = 1. The damping is d / v.
     """
     e, v = scene.stroke.restitution, scene.stroke.impact_rate
     assert e is not None and v is not None
     d = float(damping_of(scene.stroke) * v)
     change = d / (1.0 - e - e * d) if d else -3.0
-    return (change - d) / ((1.0 + e) * v)
+    return (change - d) / ((1.0 + e) * v), -d / v**2

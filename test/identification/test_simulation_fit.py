@@ -11,7 +11,7 @@ from symmetric_motion import drift_free_rate, inertia
 
 from sst_ros import load_scene, simulate
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.variational import VariationalEquations, differentiate_damping
+from sst_ros.dynamics.variational import REBOUND, VariationalEquations, differentiate_damping
 from sst_ros.errors import InputError
 from sst_ros.identification.identify import identify
 from sst_ros.scene.yaml_document import find_number
@@ -76,6 +76,7 @@ def slow(*case):
         slow(bouncing, 0.05, "stroke.stiffness"),
         slow(bouncing, 0.05, "stroke.damping"),
         (rebounding, 1.0, "stroke.restitution"),
+        (rebounding, 1.0, "stroke.impact_rate"),
     ],
 )
 def test_sensitivities_are_derivatives_of_what_simulate_finds(build, end, name):
@@ -95,15 +96,27 @@ def test_sensitivities_are_derivatives_of_what_simulate_finds(build, end, name):
     assert np.abs(slopes[0, :7, 0] - expected).max() < 1e-10 * np.abs(expected).max()
 
 
-def test_the_slope_of_the_damping_by_the_restitution():
+def test_restitution_and_impact_rate_together_have_the_slopes_of_each():
+    scene, t = rebounding(), np.array([1.0])
+    names = ("stroke.impact_rate", "stroke.restitution")
+    values = np.array([find_number(scene, name) for name in names])
+    _, both = VariationalEquations(scene, names, scene.torque).run(values, t)
+    for k in range(2):
+        _, one = VariationalEquations(scene, names[k : k + 1], scene.torque).run(values[[k]], t)
+        assert both[0, :, k] == pytest.approx(one[0, :, 0], rel=1e-9, abs=1e-9)
+        assert np.abs(one).max() > 1e-3
+
+
+def test_the_slopes_of_the_damping_by_restitution_and_impact_rate():
     elastic = {"at_end": "elastic", "stiffness": 2000.0, "impact_rate": 0.7}
     for e in (0.05, 0.3, 0.8, 0.97):
         scene = load_scene("swing").with_values({"stroke": elastic | {"restitution": e}})
-        high, low = (
-            damping_of(scene.with_values({"stroke.restitution": e + h}).stroke)
-            for h in (1e-6, -1e-6)
-        )
-        assert differentiate_damping(scene) == pytest.approx((high - low) / 2e-6, rel=1e-7)
+        for name, slope in zip(REBOUND, differentiate_damping(scene), strict=True):
+            high, low = (
+                damping_of(scene.with_values({name: find_number(scene, name) + h}).stroke)
+                for h in (1e-6, -1e-6)
+            )
+            assert slope == pytest.approx((high - low) / 2e-6, rel=1e-7)
 
 
 @pytest.mark.slow
