@@ -26,6 +26,7 @@ from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.variational import VariationalEquations, trace_derivatives
 from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
+from sst_ros.integration.events import GRAZING
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, scene_of, with_initial
@@ -148,7 +149,7 @@ def linearize(
             passed = (
                 one
                 for one in limits
-                if min(map(one.distance, angles)) < 0.0 <= one.distance(angles[0])
+                if min(map(one.distance, angles)) < -GRAZING <= one.distance(angles[0])
             )
             lasts = next((f"must end before a limit: {one.reason}" for one in passed), "")
         refuse_unless("linearize", ("dt", dt, not lasts, lasts))

@@ -126,6 +126,15 @@ def test_a_period_across_a_limit_has_no_model():
         linearize("elastic_stops", given, still, dt=1.01 * end)
 
 
+def test_a_start_on_a_stop_is_there_also_after_rounding():
+    """The assembly of gamma_1 = 0 has an angle of -1e-17 rad."""
+    scene = load_scene("swing").with_values({"stroke": {"at_end": "stop"}})
+    there, still = (0.0, 0.45, 0.75), (0.0, 0.0, 0.0)
+    linearize(scene, (there, (0.5, 0.0, 0.0)), still, dt=0.005)
+    with pytest.raises(InputError, match=r"dt = .*: must end before a limit: gamma_1 < 0"):
+        linearize(scene, (there, (-0.5, 0.0, 0.0)), still, dt=0.005)
+
+
 @pytest.mark.parametrize("name", ["gravity_payload", "example2_stroke", "stiff"])
 def test_at_an_equilibrium_nothing_accelerates(name):
     scene = load_scene(name)
