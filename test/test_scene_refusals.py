@@ -82,7 +82,7 @@ REFUSED = [
      r"stroke\.at_end = 'bounce': must be one of stop, ignore"),
     ("duration: 1 ", "stroke: {at_end: [stop]}\nduration: 1 ", r"at_end = .*must be one of"),
     ("duration: 1 ", "workspace: {beta_max_deg: 181}\nduration: 1 ",
-     r"workspace\.beta_max_deg = '181': must be a finite number >= 1e-12 <= 180 \[deg\]"),
+     r"workspace\.beta_max_deg = '181': must be a finite number >= 1e-12 and <= 180 \[deg\]"),
     ("duration: 1 ", "workspace: {beta_max_deg: 0}\nduration: 1 ", r"max_deg = '0': .*>= 1e-12"),
     ("frequency: [18, 12, 24]", "frequency: [18, -12, 24]", r"frequency = .*: must be .*>= 0"),
     ("name: example2_heavy", "name: ''", r"name = '': must be text"),

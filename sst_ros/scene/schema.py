@@ -75,7 +75,7 @@ class Spec:
         size = " x ".join(map(str, self.shape))
         what = f"{size} finite numbers" if size else "a finite number"
         ends = (">", self.above), (">=", self.least), ("<=", self.most)
-        bounds = "".join(f" {sign} {end:g}" for sign, end in ends if math.isfinite(end))
+        bounds = " and".join(f" {sign} {end:g}" for sign, end in ends if math.isfinite(end))
         row = ", ".join(map(str, ("n", *self.shape))) + "," * (not self.shape)
         counts = " or ".join(map(str, self.lengths)) + " " if self.lengths else ""
         keys = ", ".join(self.section.SPECS) if self.section else ""

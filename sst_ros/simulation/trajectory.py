@@ -335,7 +335,7 @@ class Trajectory(MotionTable):
             MissingDependency: pyarrow (.parquet) is not installed.
 
         """
-        allowed = "must be a trajectory that `Trajectory.save` has written"
+        allowed = "must be a trajectory that `Trajectory.save` has written as Parquet or NPZ"
         try:
             columns, texts = load_table(Path(path), list(UNITS), [_KEY])
             about = json.loads(texts[_KEY])
