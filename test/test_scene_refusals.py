@@ -181,7 +181,7 @@ SECTIONS_REFUSED = [
     ("stroke: {stiffness: 10}", r"stroke\.stiffness = 10\.0: is given with at_end: e"),
     ("stroke: {damping: 1}", r"stroke\.damping = 1\.0: is given with at_end: elast"),
     ("stroke: {at_end: elastic, stiffness: 1, restitution: 1.1, impact_rate: 1}",
-     r"restitution = '1\.1': .* >= 0\.01 <= 1 \[1\]"),
+     r"restitution = '1\.1': .* >= 0\.01 and <= 1 \[1\]"),
     ("stroke: {at_end: elastic, stiffness: 1, restitution: 0.5}",
      r"impact_rate = None: is given with restitution, both or none"),
     ("stroke: {at_end: elastic, stiffness: 1, damping: 1, restitution: 0.5, impact_rate: 1}",
