@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The messages of a rosbag2 recording in one pass; every fault of it becomes an InputError.
 
-rosbags reads sqlite3, and what rosbag2 has compressed by file or by message. mcap reads MCAP and
-checks each chunk by its CRC-32. What mcap leaves to its caller is here: the checksums of the index
+mcap reads MCAP and checks each chunk by its CRC-32; rosbags knows the types of the messages. A
+database is read as such: rosbags refuses one with an action, whose definitions rosbag2 leaves
+empty, and none is needed here. What mcap leaves to its caller is here: the checksums of the index
 (summary) and of the data section, the number of messages, and to go on behind a damaged chunk,
 which needs the place of the next one from the index, or a damaged chunk whose length is whole.
 """
@@ -12,6 +13,8 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import sqlite3
+import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,12 +23,12 @@ from pathlib import Path, PurePath
 from typing import IO, Any, TypeAlias
 
 import yaml
+import zstandard
 from mcap import records
 from mcap.reader import FOOTER_SIZE
 from mcap.records import Chunk, ChunkIndex, McapRecord
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
-from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, Problem, refusal
@@ -78,9 +81,8 @@ class Bag:
         Raises InputError where the recording is damaged, which is known at the end at the latest,
         where it is empty, and where two topics match one that is requested.
         """
-        files, store, empty = self._mcap_files(), message_types(), True
-        stored = self._read_mcap(files) if files else self._read_by_rosbags()
-        for name, message_type, received_ns, data in stored:
+        store, empty = message_types(), True
+        for name, message_type, received_ns, data in self._stored():
             empty = False
             if (topic := self._topic(name, message_type)) is None:
                 continue
@@ -102,50 +104,63 @@ class Bag:
             found[topic.key] = Problem(topic.key, ", ".join(sorted(others)) or None, allowed)
         return found
 
-    def _mcap_files(self) -> list[Path]:
-        """Files that are read as they are; none where rosbags reads them."""
+    def _stored(self) -> Iterator[RawMessage]:
+        """Yield the messages of all files; of a database those of requested topics alone."""
+        files, compressed = self._files()
+        with tempfile.TemporaryDirectory() as folder:
+            for path in files:
+                try:
+                    file = _decompress(path, Path(folder)) if compressed == "file" else path
+                    stored = self._read_mcap if file.suffix == ".mcap" else self._read_database
+                    for name, message_type, received_ns, data in stored(file):
+                        if compressed == "message":
+                            data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+                        yield name, message_type, received_ns, data
+                except (OSError, zstandard.ZstdError) as error:
+                    raise self._not_whole(error) from None
+
+    def _files(self) -> tuple[list[Path], str]:
+        """Return the files in their order, and what of them is compressed: file, message or ""."""
         if not self.path.is_dir():
-            return [self.path] if self.path.suffix == ".mcap" else []
+            return [self.path], ""
+        files, compressed = [], ""
         try:
             text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
             found = yaml.safe_load(text)["rosbag2_bagfile_information"]
-            names = [PurePath(name).name for name in found["relative_file_paths"]]
-            plain = not found["compression_mode"] and all(name.endswith(".mcap") for name in names)
-            files = [self.path / name for name in names] if plain else []
-        except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
-            files = []
-        if self._damaged and not all(map(Path.exists, files or [self.path / "metadata.yaml"])):
+            files = [self.path / PurePath(name).name for name in found["relative_file_paths"]]
+            compressed = str(found.get("compression_mode") or "").lower()
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
+            if not self._damaged:
+                raise self._not_whole(f"metadata.yaml: {error}") from None
+        if self._damaged and not (files and all(map(Path.exists, files))):
             files = sorted(self.path.glob("*.mcap"))
-        return files
+        return files, compressed
 
-    def _read_mcap(self, paths: Sequence[Path]) -> Iterator[RawMessage]:
-        damage: list[str] = []
-        for file in map(McapFile, paths):
-            try:
-                yield from file.messages()
-            except OSError as error:
-                raise self._not_whole(error) from None
-            for channel in file.channels.values():
-                self._topic(*channel)
-            lines = file.describe()
-            if lines and not self._damaged:
-                raise self._not_whole("; ".join(lines), advice=", --damaged reads it here")
-            damage += lines
-            self.unverified += file.unverified
-        self.damage = tuple(damage)
+    def _read_mcap(self, path: Path) -> Iterator[RawMessage]:
+        file = McapFile(path)
+        yield from file.messages()
+        for channel in file.channels.values():
+            self._topic(*channel)
+        lines = file.describe()
+        if lines and not self._damaged:
+            raise self._not_whole("; ".join(lines), advice=", --damaged reads it here")
+        self.damage += tuple(lines)
+        self.unverified += file.unverified
 
-    def _read_by_rosbags(self) -> Iterator[RawMessage]:
+    def _read_database(self, path: Path) -> Iterator[RawMessage]:
         count = 0
         try:
-            with Reader(self.path) as reader:
-                chosen = [one for one in reader.connections if self._topic(one.topic, one.msgtype)]
-                # With no connection chosen, rosbags reads all of them.
-                for connection, received_ns, data in reader.messages(chosen) if chosen else ():
-                    yield connection.topic, connection.msgtype, int(received_ns), data
+            # Not written to, nor is a journal made beside it.
+            address = f"{path.absolute().as_uri()}?immutable=1"
+            with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
+                topics = database.execute("SELECT id, name, type FROM topics")
+                chosen = {key: channel for key, *channel in topics if self._topic(*channel)}
+                rows = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
+                rows += f"({','.join('?' * len(chosen))}) ORDER BY timestamp"
+                for key, received_ns, data in database.execute(rows, [*chosen]):
+                    yield *chosen[key], int(received_ns), data
                     count += 1
-        except InputError:
-            raise
-        except Exception as error:  # rosbags and what it is built on raise anything on bad bytes
+        except (sqlite3.Error, ValueError, TypeError) as error:
             raise self._not_whole(error, f" after {count} messages") from None
 
     def _topic(self, name: str, message_type: str) -> Topic | None:
@@ -162,9 +177,12 @@ class Bag:
         return self._channels[channel]
 
     def _not_whole(self, reason: object, where: str = "", advice: str = "") -> InputError:
+        is_database = self.path.suffix == ".db3" or any(self.path.glob("*.db3"))
+        by_sqlite = "sqlite3 FILE .recover | sqlite3 NEW"
+        recovery = by_sqlite if is_database else "python -m sst_ros recover BAG"
         allowed = "must be a whole rosbag2 recording, MCAP or sqlite3; "
         allowed += f"reading failed{where}: {_one_line(reason)}; "
-        allowed += "python -m sst_ros recover BAG makes a whole one of what is intact"
+        allowed += f"{recovery} makes a whole one of what is intact"
         return refusal(self.path, "bag", self.path.name, allowed + advice)
 
 
@@ -325,6 +343,13 @@ def _records(source: bytes | IO[bytes], *, chunks: bool = False) -> Iterator[Mca
 def message_types() -> Any:
     """Return the message types of ROS 2 with their compiled (de)serializers."""
     return get_typestore(Stores.ROS2_KILTED)
+
+
+def _decompress(path: Path, folder: Path) -> Path:
+    """Write a file that is compressed as a whole into a folder, under the name that it had."""
+    with path.open("rb") as source, (folder / path.stem).open("wb") as target:
+        zstandard.ZstdDecompressor().copy_stream(source, target)
+    return folder / path.stem
 
 
 def _one_line(error: object) -> str:

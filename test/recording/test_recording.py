@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a whole bag gives, as a motion to follow too, and that every broken one is refused."""
 
+import contextlib
 import copy
 import dataclasses
+import sqlite3
 
 import lz4.frame
 import numpy as np
@@ -155,10 +157,28 @@ def test_bags_of_every_kind_hold_the_same_run(read, tmp_path, bags, example2):
     bags.same(recording.read(tmp_path / "own" / "own.mcap"), expected)
     modes = (CompressionMode.STORAGE, CompressionMode.MESSAGE, CompressionMode.FILE)
     kinds = [{}, {"sqlite": True}, {"chunks": ("lz4", lz4.frame.compress)}]
+    kinds += [{"mode": mode, "sqlite": True} for mode in modes[1:]]
     for kind in (*kinds, *({"mode": mode} for mode in modes)):
         run = read(example2, namespace="/cell_7", **kind)
         bags.same(run, expected)
         assert run.signals.bag.topics["joint_states"] == "/cell_7/joint_states"
+
+
+@pytest.mark.parametrize("encoding", ["", "unknown"])
+def test_a_database_with_an_action_is_whole(written, bags, example2, encoding):
+    """`ros2 bag record -a -s sqlite3` leaves the definition of an action's types empty."""
+    path, name = written(example2, sqlite=True), "/fibonacci/_action/feedback"
+    kind = "example_interfaces/action/Fibonacci_FeedbackMessage"
+    (file,) = path.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as database, database:
+        topic = "INSERT INTO topics VALUES (?, ?, ?, 'cdr', '', '')"
+        database.execute(topic, (99, name, kind))
+        definition = "INSERT INTO message_definitions VALUES (?, ?, ?, '', '')"
+        database.execute(definition, (99, kind, encoding))
+        message = "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)"
+        database.execute(message, (99, bags.START_NS, bytes(32)))
+    bags.same(recording.read(path), recording.read(written(example2)))
+    bags.same(recording.read(file), recording.read(path))
 
 
 def test_idle_states_are_no_samples(read, bags, example2):
