@@ -88,7 +88,7 @@ def run_controlled(
 
     fast = compiled and numba_version() is not None
     simulation = Simulation(scene, method, tolerance=TOLERANCE, compiled=fast)
-    ticks = math.ceil(seconds * rate - 1e-6)
+    ticks = math.floor(seconds * rate + 1e-6)
     states, times = run_in_loop(simulation, torque, period_ns, ticks, warm=True)
     times_ns = np.array([state.time_ns for state in states])
     rows = np.array([(*state.quaternion, *state.body_rate) for state in states])
@@ -145,7 +145,7 @@ def control_study(
 ) -> ControlStudy:
     """Run the grid, one point after another: processor times are those of a core that is free.
 
-    Rates whose period does not divide the spacing of the reference are left out.
+    Errors are taken at every tick, so that the rates [Hz], divisors of 1e9, have a common tick.
 
     Raises:
         InputError: the scene has no torques of its own, or cannot start.
@@ -154,11 +154,11 @@ def control_study(
     """
     if scene.torque is None:
         raise InputError(scene.name, [Problem("torque", None, "must be given")])
-    problem = InitialValueProblem(scene)
+    tick_ns = math.gcd(*(NANOSECONDS // rate for rate in rates))
+    problem = InitialValueProblem(scene, tick_ns)
     reference = solve_reference(problem)
 
-    whole = [rate for rate in rates if problem.interval_ns % (NANOSECONDS // rate) == 0]
-    points, rows = list(itertools.product(whole, methods, HOLDS)), []
+    points, rows = list(itertools.product(rates, methods, HOLDS)), []
 
     def run_one(point: tuple[int, str, str]) -> Run:
         return run_controlled(scene, problem.seconds, *point, compiled=compiled)
@@ -166,8 +166,7 @@ def control_study(
     for number, found in run_many(run_one, points, label=f"{scene.name:<16}" * shown):
         rate, method, hold = points[number]
         times_ns, states, estimate, tick = found
-        chosen = np.isin(times_ns, problem.interval_ns * np.arange(problem.count + 1))
-        final, largest = problem.errors(states[chosen], reference.states)
+        final, largest = problem.errors(states, reference.states[times_ns // tick_ns])
         errors = final.orientation, largest.orientation
         rows.append((scene.name, rate, method, hold, *errors, estimate, 1e6 * tick, tick * rate))
     return ControlStudy(

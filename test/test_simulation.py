@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from loaded_scenes import IGNORE, REST
 from models import seeded_samples
+from programs import python
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import kinetic_energy
@@ -241,3 +243,28 @@ def test_a_torque_moves_as_its_function_does(scene, torque, within):
     middle = one.time_ns - 4 * MILLISECOND
     expected = other.within(middle).quaternion
     assert one.within(middle).quaternion == pytest.approx(expected, abs=within or 1e-12, rel=0.0)
+
+
+BITS = """
+import json, sys
+from sst_ros import Simulation
+found = {}
+for name in ("example2", "gravity_payload", "fast_spin"):
+    simulation = Simulation(name, "dopri5", compiled=%s)
+    states = [simulation.step((0.1, -0.05, 0.02), 1_000_000) for _ in range(100)]
+    found[name] = [*states[-1].quaternion, *states[-1].body_rate]
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+def test_bits_depend_on_the_c_library_only_as_the_page_on_lockstep_says():
+    """glibc chooses sin, cos and atan2 by FMA and AVX2; LLVM's target changes nothing."""
+    if numba_version() is None:
+        pytest.skip("needs numba: pip install .[fast]")
+    without = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
+    generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    plain, other = (json.loads(python(BITS % False, env=env).stdout) for env in ({}, without))
+    assert json.loads(python(BITS % True, env=generic).stdout) == plain
+    for name, row in plain.items():
+        np.testing.assert_allclose(other[name], row, rtol=1e-11, atol=1e-13)

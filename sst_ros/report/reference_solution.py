@@ -61,10 +61,11 @@ class InitialValueProblem:
     """A scene as an initial value problem.
 
     Raises AssemblyError where the initial gamma has no unique admissible assembly, InputError where
-    the scene cannot start, or stops at once.
+    the scene cannot start, or stops at once. Solutions are compared at instants `interval_ns`
+    apart, by default at INTERVALS of them or more.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, interval_ns: int | None = None) -> None:
         self.scene, self.dynamics = scene, Dynamics.of(scene)
         self.torque = scene.torque or (0.0, 0.0, 0.0)  # [N m]
         self.system = ODE(self.dynamics, scene.torque, work=True)
@@ -83,7 +84,7 @@ class InitialValueProblem:
         # Instants of comparison lie 1, 2 or 5 times a power of ten apart.
         whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)  # may be a little less than it is called
         lengths = (f * 10**n for n in range(18) for f in (1, 2, 5))
-        self.interval_ns = max(x for x in lengths if x * INTERVALS <= whole_ns)
+        self.interval_ns = interval_ns or max(x for x in lengths if x * INTERVALS <= whole_ns)
         self.interval = self.interval_ns / NANOSECONDS  # [s]
         self.count = math.floor(whole_ns / self.interval_ns)
         self.times: Array = self.interval_ns * np.arange(self.count + 1) / NANOSECONDS  # [s]
@@ -167,7 +168,8 @@ def _halve_steps(problem: InitialValueProblem) -> tuple[LongArray, LongArray, in
     """
     steps, change = 1, math.inf
     before = after = run_extended(problem, 1)
-    while 4 * steps * problem.count <= _MOST_STEPS and not change < 1e-17:  # all of them together
+    most = max(_MOST_STEPS, 4 * problem.count)  # all of them together; halved at least once
+    while 4 * steps * problem.count <= most and not change < 1e-17:
         before, last, steps = after, change, 2 * steps
         after = run_extended(problem, steps)
         change = problem.errors(before, after)[1].orientation

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from sst_ros.errors import InputError
+from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene import scene
+from sst_ros.simulation.simulate import simulate
+from sst_ros.state import NANOSECONDS
 from studies.control_rate import (
     EXACT,
     HOLDS,
@@ -18,6 +21,7 @@ from studies.control_rate import (
     figure,
     grid,
     page,
+    run_controlled,
 )
 
 BRIEF = dataclasses.replace(scene.load("example2"), duration=0.2)
@@ -37,6 +41,12 @@ def test_the_orders_are_those_of_the_theory_and_the_method_does_not_matter(brief
     exact = brief.rows[(brief.rows.hold == EXACT) & (brief.rows.method == "dop853")]
     assert exact.largest_rad.max() < 1e-12
     rows = brief.rows
+    times_ns, states, *_ = run_controlled(BRIEF, 0.2, 500, "rk4", EXACT, compiled=False)
+    truth = simulate(BRIEF, tolerance=1e-12, t_eval=times_ns / NANOSECONDS)
+    at_ticks = angle_between(states[:, :4], truth.quaternion)
+    row = rows[(rows.rate_Hz == 500) & (rows.method == "rk4") & (rows.hold == EXACT)]
+    assert row.largest_rad.item() == pytest.approx(at_ticks.max(), rel=1e-4)
+    assert at_ticks[::10].max() < 0.999 * at_ticks.max()  # fewer instants would show less
     assert len(rows) == len(RATES) * len(METHODS) * len(HOLDS)
     assert (rows.tick_us > 0.0).all() and (rows.estimate_rad < 2e-7).all()
     assert (rows.final_rad <= rows.largest_rad).all()
