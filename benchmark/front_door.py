@@ -16,6 +16,8 @@ from collections.abc import Callable
 from functools import partial
 from statistics import median
 
+import numpy as np
+
 from benchmark.measure import divide, time_in_turn
 from sst_ros import load_scene, prepare, simulate
 from sst_ros.scene.torque_profile import profile_of
@@ -40,7 +42,7 @@ def used_by_children() -> float:
 def main() -> None:
     scene = load_scene("example2_heavy")
     profile = profile_of(scene.torque)
-    task = Task(scene, profile, (0.0, 1.0), None, "gauss", 1e-9)
+    task = Task(scene, profile, (0.0, 1.0), np.array([0.0, 1.0]), "gauss", 1e-9)
     whole = partial(simulate, scene, method="gauss", tolerance=1e-9)
     calls: dict[str, Callable[[], object]] = {
         "integration": CollocatedMotion(task).compute,

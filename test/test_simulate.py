@@ -132,6 +132,32 @@ def test_a_prepared_run_is_simulate_each_time(arguments):
 
 
 @pytest.mark.parametrize("arguments", RUNS.values(), ids=RUNS)
+def test_samples_are_even_and_accurate_and_the_motion_does_not_depend_on_them(arguments):
+    run = simulate(**arguments)
+    np.testing.assert_allclose(run.t, np.linspace(0.0, run.t[-1], 201), rtol=0, atol=1e-9)
+    few, end = simulate(**arguments, samples=4), simulate(**arguments, t_eval=run.t[-1])
+    assert few.t.tolist() == run.t[::50].tolist()
+    for name in ARRAYS:
+        assert getattr(few, name)[-1].tobytes() == getattr(run, name)[-1].tobytes()
+        assert getattr(end, name)[-1].tobytes() == getattr(run, name)[-1].tobytes()
+    assert few.error_estimate == run.error_estimate and few.evaluations <= run.evaluations
+    truth = simulate(**arguments, method="dop853", tolerance=1e-13)
+    apart = angle_between(run.quaternion, truth.quaternion)
+    assert apart.max() < 1e-9  # rad, the tolerance
+    np.testing.assert_allclose(few.gamma, truth.gamma[::50], rtol=0, atol=1e-9)
+
+
+def test_samples_are_even_up_to_a_limit_and_the_periods_of_a_control_unless_a_number_is_given():
+    stopped = simulate(EXAMPLE2, (5.0, 0.0, 0.0), 0.4)
+    assert stopped.t[:-1].tolist() == (np.arange(len(stopped) - 1) * 0.4 / 200).round(9).tolist()
+    assert 0.0 < stopped.t[-1] - stopped.t[-2] <= 0.002
+    control = {"torque": spring, "duration": 0.1, "control_period": 0.03}
+    assert simulate(EXAMPLE2, **control).t.tolist() == [0.0, 0.03, 0.06, 0.09, 0.1]
+    assert simulate(EXAMPLE2, **control, samples=2).t.tolist() == [0.0, 0.05, 0.1]
+    assert simulate(EXAMPLE2, duration=1e-9).t.tolist() == [0.0, 1e-9]
+
+
+@pytest.mark.parametrize("arguments", RUNS.values(), ids=RUNS)
 def test_threads_get_their_own_motions(arguments):
     run = prepare(**arguments)
     one = run.run()
@@ -203,6 +229,10 @@ def test_another_start():
         ({"duration": float("inf")}, "duration(.|\n)*from 1e-9"),
         ({"t_eval": [0.2, 0.1]}, "ascending"),
         ({"t_eval": [0.1, 3.0]}, "ascending"),
+        ({"samples": 0}, "samples = 0: must be a whole number from 1 to 10000000"),
+        ({"samples": 10**5000}, "samples(.|\n)*must be a whole number"),
+        ({"samples": True}, "samples = True: must be a whole number"),
+        ({"samples": 3, "t_eval": [0.1]}, "samples = 3: must be None where t_eval"),
         ({"method": "euler"}, "must be one of auto, rk4, dopri5, dop853, rodas5p, gauss"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"control_period": 0.001}, "control_period(.|\n)*is for a function"),

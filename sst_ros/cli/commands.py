@@ -79,7 +79,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _number("--duration", "length [s]; default: that of the scene"),
         Arg("--method", "integrator; default: auto", default="auto"),
         _number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
-        _count("--samples", 10_000_000, "even intervals in time; default: ends of steps"),
+        _count("--samples", 10_000_000, "even intervals in time; default: 200"),
         _path("--out", "trajectory, .parquet, .csv or .npz", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
         _flag("--force", "overwrite earlier results"),

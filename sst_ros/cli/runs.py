@@ -13,8 +13,6 @@ import signal
 import threading
 from pathlib import Path
 
-import numpy as np
-
 from sst_ros.cli.commands import free_out, function
 from sst_ros.errors import InputError, Problem, SstError, refuse_unless, require
 from sst_ros.host import compiled_module, processes
@@ -119,7 +117,7 @@ def map_workspace(options: argparse.Namespace) -> None:
 
 def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
-    out, picture, count = options.out, None, options.samples
+    out, picture = options.out, None
     ends = f"must end in {' or '.join(SUFFIXES)}"
     refuse_unless("simulate", ("--out", str(out), out is None or out.suffix in SUFFIXES, ends))
     if out is not None:
@@ -130,10 +128,9 @@ def run_simulation(options: argparse.Namespace) -> int:
         picture = (out or Path(Path(options.scene).name)).with_suffix(".png")
         require_free(picture, "simulate", force=options.force)
         require("matplotlib")
-    given = {name: getattr(options, name) for name in ("duration", "method", "tolerance")}
+    names = ("duration", "method", "tolerance", "samples")
+    given = {name: getattr(options, name) for name in names}
     trajectory = simulate(options.scene, progress=True, **given)
-    if count is not None:
-        trajectory = trajectory.at(np.linspace(trajectory.t[0], trajectory.t[-1], count + 1))
     print(render("motion.txt", motion=trajectory), end="")
     if out is not None:
         trajectory.save(out, overwrite=options.force)

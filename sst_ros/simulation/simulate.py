@@ -42,6 +42,9 @@ METHODS = (*INTEGRATORS, GAUSS)
 _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
 """Control periods that the budget of a motion reaches: a step and its check are three steps."""
 
+_SAMPLES, _MOST_SAMPLES = 200, 10_000_000
+"""Even intervals of a motion by default, and the most."""
+
 _ATTEMPTS, _FINEST = 4, 1e-14
 """Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
 
@@ -62,6 +65,7 @@ def simulate(
     duration: float | None = None,
     *,
     initial: InitialInput = None,
+    samples: int | None = None,
     t_eval: ArrayLike | None = None,
     method: str = "auto",
     tolerance: float = 1e-9,
@@ -86,9 +90,10 @@ def simulate(
         duration: length of the motion [s]; by default that of the scene.
         initial: initial state in place of the scene's: (gamma [rad], gamma_dot [rad/s]), or a
             mapping or `Initial` with gamma, gamma_dot, orientation.
-        t_eval: times at which samples are returned [s], ascending, in whole nanoseconds (others
-            are rounded). By default the ends of the steps of Gauss collocation, the control
-            periods, or 200 even intervals. The steps do not depend on them.
+        samples: number of even intervals of time, at whose ends samples are returned; by default
+            200, or the control periods where there are some. The steps do not depend on them.
+        t_eval: the times of the samples instead [s], ascending, in whole nanoseconds (others are
+            rounded).
         method: "gauss" (Gauss collocation), "dopri5", "dop853", "rk4" (explicit Runge-Kutta of
             order 5, 8, 4), "rodas5p" (Rosenbrock, order 5, for stiff scenes) or "auto".
         tolerance: error of the orientation at the end that is allowed [rad]. A motion whose
@@ -122,6 +127,7 @@ def simulate(
         torque,
         duration,
         initial=initial,
+        samples=samples,
         t_eval=t_eval,
         method=method,
         tolerance=tolerance,
@@ -140,6 +146,7 @@ def prepare(
     duration: float | None = None,
     *,
     initial: InitialInput = None,
+    samples: int | None = None,
     t_eval: ArrayLike | None = None,
     method: str = "auto",
     tolerance: float = 1e-9,
@@ -179,7 +186,7 @@ def prepare(
         _refuse("breaks", breaks, "must be ascending times [s]")
     period, end = _check_period(control_period, profile, span_ns), span_ns / NANOSECONDS
     inside = jumps[(jumps > 0.0) & (jumps < end)]
-    times = _times(t_eval, span_ns)
+    times = _times(samples, t_eval, span_ns, period)
     task = Task(
         given, profile, (0.0, end), times, method, tolerance, period, memoryless, inside,
         float(longest), _check_parameters(sensitivities, given, profile),
@@ -284,10 +291,21 @@ def _check_parameters(
     return found
 
 
-def _times(t_eval: ArrayLike | None, span_ns: int) -> Array | None:
-    """Return the times of the samples [s], rounded to nanoseconds."""
+def _times(
+    samples: int | None, t_eval: ArrayLike | None, span_ns: int, period: int | None
+) -> Array:
+    """Return the times of the samples [s], in whole nanoseconds."""
     if t_eval is None:
-        return None
+        if samples is None and period is not None:
+            found = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
+        else:
+            count = _SAMPLES if samples is None else samples
+            if not 1 <= count <= _MOST_SAMPLES:
+                _refuse("samples", samples, f"must be a whole number from 1 to {_MOST_SAMPLES}")
+            found = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
+        return np.asarray(found / NANOSECONDS)
+    if samples is not None:
+        _refuse("samples", samples, "must be None where t_eval gives their times")
     rounded = np.rint(np.atleast_1d(np.array(t_eval, dtype=float)) * NANOSECONDS)
     if not (rounded.size and ascend(rounded) and rounded[0] >= 0.0 and rounded[-1] <= span_ns):
         end = span_ns / NANOSECONDS

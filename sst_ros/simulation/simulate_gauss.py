@@ -72,9 +72,10 @@ class CollocatedMotion:
         self._motion = self._prepare(self._method, self._count, self._iterations)
         self._single = self._prepare(self._method, 1, self._iterations + 1)
         self._states = self.compute()
-        self._met = self._find_limit()
-        whole = task.times is None and not self._met
-        self._repeat = self._trajectory(self._grid, self._states).repeater() if whole else None
+        self._met, times = self._find_limit(), task.times
+        if self._met:
+            times = np.append(times[times < self._end], self._end)
+        self._repeat = self._trajectory(times).repeater()
 
     def compute(self) -> Array:
         """Compute the states at the ends of the steps, shape (steps + 1, numbers of the state)."""
@@ -84,27 +85,23 @@ class CollocatedMotion:
             return y
 
     def run(self, _progress: bool = False) -> Trajectory:
-        """Compute the motion; it is too short for a bar."""
-        if self._repeat:
-            y = self.compute()
-            y.setflags(write=False)
-            return self._repeat(y)
-        times = self._task.times
-        t = self._grid if times is None else times
-        if self._met:
-            t = np.append(t[t < self._end], self._end)
-        return self._trajectory(t, self.at(t))
+        """Compute the motion, too short for a bar; its samples when they are first asked for."""
+        return self._repeat(partial(self.at, self.compute()))
 
-    def at(self, times: Array) -> Array:
-        """States at times [s], each by one step from the beginning of its step: (m, numbers)."""
+    def at(self, ends: Array, times: Array) -> Array:
+        """States at times [s], each by one step from the beginning of its step: (m, numbers).
+
+        `ends` are the states at the ends of the steps.
+        """
         steps = np.searchsorted(self._grid, times, side="right") - 1
         pairs = zip(steps.tolist(), (times - self._grid[steps]).tolist(), strict=True)
         with self._lock:  # all of them use the same arrays
-            return np.array([self._inside(k, x) for k, x in pairs]).reshape(len(times), -1)
+            rows = [self._inside(ends, k, x) for k, x in pairs]
+        return np.array(rows).reshape(len(times), -1)
 
-    def _inside(self, k: int, x: float) -> list[float]:
+    def _inside(self, ends: Array, k: int, x: float) -> list[float]:
         """State x [s] after step k began; that of the run itself where it begins, or all end."""
-        begin: list[float] = self._states[k].tolist()
+        begin: list[float] = ends[k].tolist()
         if x == 0.0:
             return begin
         self._single.begin(float(self._grid[k]), x, begin, self._drive)
@@ -116,7 +113,7 @@ class CollocatedMotion:
         """Return the first limit that is met, if there is one; the motion ends there."""
 
         def joints(k: int, x: float) -> tuple[float, ...]:
-            return self._dynamics.joints(*self._inside(k, x)[:7])
+            return self._dynamics.joints(*self._inside(self._states, k, x)[:7])
 
         if self._limits and self._motion.least.min() <= _NEAR:
             for k, begin in enumerate(self._grid[:-1].tolist()):
@@ -125,18 +122,14 @@ class CollocatedMotion:
                     return met[1]
         return None
 
-    def _trajectory(self, t: Array, y: Array) -> Trajectory:
+    def _trajectory(self, t: Array) -> Trajectory:
         task, status, message = self._task, 0, "reached the end"
         if self._met:
             status, message = 1, f"stopped at t = {self._end:.12f} s: {self._met.reason}"
         status, message = check_error(self._error, task.tolerance, status, message)
-        most = task.scene.torque_limit or math.inf
         return Trajectory(
             task.scene,
             t,
-            y[:, :4],
-            y[:, 4:7],
-            y[:, 7:10] if task.scene.lags else np.clip(task.torque.values(t), -most, most),
             status=status,
             message=message,
             method=f"gauss, order {2 * NODES}: {self._count} steps of {self._h:.3g} s, "
@@ -147,7 +140,7 @@ class CollocatedMotion:
             evaluations=self._count * self._iterations * NODES,
             step=self._h,
             law=task.torque,
-            dense=self.at,
+            dense=partial(self.at, self._states),
             parameters=task.parameters,
         )
 
@@ -156,7 +149,8 @@ class CollocatedMotion:
         method = Collocation(ODE(self._dynamics, self._sine, work=True), NODES, compiled=False)
         motion = self._prepare(method, self._count, self._iterations)
         motion.run()
-        energy, end = self._dynamics.total_energy, self.at(np.array([self._end]))[0].tolist()
+        end = self.at(self._states, np.array([self._end]))[0].tolist()
+        energy = self._dynamics.total_energy
         return energy(end) - energy(self._start) - float(motion.states[-1, -1])
 
     def _choose_steps(self, tolerance: float) -> tuple[int, int, float]:

@@ -34,9 +34,6 @@ _WARN_AFTER, _HOPELESS = WHOLE_MOTION_BUDGET // 100, 3.0
 """Evaluations, a second of work, after which a motion is looked at that will not reach its end by
 three times its budget: a warning then, and not a stop after half a minute."""
 
-_SAMPLES = 200
-"""Intervals of a motion without times of samples."""
-
 _MANY, _WORST = 8, 0.07
 """Samples in a step from which on a polynomial costs less than a step for each; the share of the
 step at which its error is largest."""
@@ -49,7 +46,7 @@ class Task:
     scene: Scene
     torque: TorqueProfile
     span: tuple[float, float]  # begin and end
-    times: Array | None  # of the samples, ascending; None for those that suit the method
+    times: Array  # of the samples, ascending
     method: str  # name, or auto
     tolerance: float  # largest error estimate at the end [rad]
     period: int | None = None  # of control [ns], from time zero; None where torques are not held
@@ -57,17 +54,6 @@ class Task:
     breaks: Sequence[float] | Array = ()  # further times at which the torques jump, ascending
     max_step: float = math.inf  # longest step
     parameters: tuple[str, ...] = ()  # by which the motion is differentiated
-
-    def sample_times(self) -> Array:
-        """Return the times of the samples of a motion by steps."""
-        if self.times is not None:
-            return self.times
-        last = round(self.span[1] * NANOSECONDS)
-        if self.period is not None:
-            found = np.append(np.arange(0, last, self.period, dtype=np.int64), last)
-        else:
-            found = np.unique(np.rint(np.linspace(0, last, _SAMPLES + 1)))
-        return np.asarray(found / NANOSECONDS)
 
 
 class SteppedMotion:
@@ -109,7 +95,7 @@ class SteppedMotion:
         self.time, self.status, self.message = task.span[0], 0, "reached the end"
         self.held: list[tuple[float, Vector3]] = []
         self.rows: list[tuple[float, ...]] = []
-        self._wanted: list[float] = task.sample_times()[::-1].tolist()
+        self._wanted: list[float] = task.times[::-1].tolist()
         self._torque: Torque = (0.0, 0.0, 0.0)
         self._other: Vector3 | None = None  # on the second solution, where they differ
         self._segment = task.span

@@ -58,9 +58,6 @@ _FIGURES = (
 )  # fmt: skip
 """What a run says of itself, in its files and in xarray."""
 
-_FEW = 300
-"""Samples below which a picture asks for more."""
-
 _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
@@ -85,7 +82,8 @@ class Trajectory(MotionTable):
         t: times [s], shape (n,), strictly ascending.
         quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
         body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
-        torque: torques that act at the actuators [N m], shape (n, 3), as in `State.torque`.
+        torque: torques that act at the actuators [N m], shape (n, 3), as in `State.torque`. All
+            three are computed by `dense` when they are first asked for, where none is given.
         joints: angles and rates of the joints where they are known already, shape (n, 18): gamma,
             mu, beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default they are computed.
         status: 0 where the motion reached its end, 1 where a limit ended it, 2 where it reached its
@@ -107,16 +105,13 @@ class Trajectory(MotionTable):
 
     """
 
-    _states: Array
-    """Rows of quaternion, body rate and lagged torque, where a prepared run has made it."""
-
     def __init__(
         self,
         scene: Scene,
         t: ArrayLike,
-        quaternion: ArrayLike,
-        body_rate: ArrayLike,
-        torque: ArrayLike,
+        quaternion: ArrayLike | None = None,
+        body_rate: ArrayLike | None = None,
+        torque: ArrayLike | None = None,
         *,
         joints: ArrayLike | None = None,
         status: int = 0,
@@ -130,16 +125,16 @@ class Trajectory(MotionTable):
         dense: Callable[[Array], Array] | None = None,
         parameters: Sequence[str] = (),
     ) -> None:
-        self.scene = scene
-        self.t, self.quaternion, self.body_rate = _own(t), _own(quaternion), _own(body_rate)
-        self.torque = _own(torque)
-        if joints is not None:
-            self._joints = _own(joints)
+        self.scene, self.t = scene, _own(t)
         n, problems = self.t.size, []
         if not isinstance(scene, Scene):
             problems.append(Problem("scene", scene, "must be a Scene"))
         if not ascend(self.t):
             problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
+        given: dict[str, Any] = {"quaternion": quaternion, "body_rate": body_rate, "torque": torque}
+        given |= {} if joints is None else {"_joints": joints}
+        if dense is None or any(array is not None for array in given.values()):
+            vars(self).update({name: _own(array) for name, array in given.items()})
         for name, size in (("quaternion", 4), ("body_rate", 3), ("torque", 3), ("_joints", 18)):
             array = vars(self).get(name)
             if array is not None and array.shape != (n, size):
@@ -153,21 +148,24 @@ class Trajectory(MotionTable):
         self.law: TorqueProfile | None = None if law is None else profile_of(law)
         self.dense, self._parameters = dense, tuple(parameters)
 
-    def repeater(self) -> Callable[[Array], Trajectory]:
-        """Return a function from read-only states (n, 7 or 10) to the same run with these states.
+    def repeater(self) -> Callable[[Callable[[Array], Array]], Trajectory]:
+        """Return a function from another `dense` to the same run by it: nothing is checked again.
 
-        Nothing is checked again, and columns are views that are made where they are asked for: a
-        prepared run makes its results by it.
+        A prepared run makes its results by it.
         """
-        replaced = {"quaternion", "body_rate", *(("torque",) if self.scene.lags else ())}
-        about = {name: value for name, value in vars(self).items() if name not in replaced}
+        about = dict(vars(self))
 
-        def repeat(y: Array) -> Trajectory:
+        def repeat(dense: Callable[[Array], Array]) -> Trajectory:
             again = object.__new__(Trajectory)
-            again.__dict__ = about | {"_states": y}
+            again.__dict__ = about | {"dense": dense}
             return again
 
         return repeat
+
+    @cached_property
+    def _states(self) -> Array:
+        """Rows of quaternion, body rate and torque at the samples, by `dense`."""
+        return _own(_propagate(self, self.t))
 
     @cached_property
     def quaternion(self) -> Array:  # type: ignore[override]
@@ -361,20 +359,17 @@ class Trajectory(MotionTable):
         return {name: getattr(self, name) for name in _FIGURES}
 
     def plot(self) -> Figure:
-        """Draw actuator angles, rates, torques and the energy over time; needs matplotlib."""
+        """Draw actuator angles, rates, torques and the energy of the samples; needs matplotlib."""
         require("matplotlib")
         from sst_ros.host.figures import DEGREES, draw_panels, leg_names
 
-        shown = self
-        if 2 <= len(self.t) < _FEW and not isinstance(self.law, LostTorque):
-            shown = self.at(np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _FEW)))
         panels = (
-            ("γ [deg]", leg_names("γ"), DEGREES * shown.gamma),
-            ("γ̇ [rad/s]", leg_names("γ̇"), shown.gamma_dot),
-            ("τ [N m]", leg_names("τ"), shown.torque),
-            ("energy [J]", ["energy"], shown.energy[:, None]),
+            ("γ [deg]", leg_names("γ"), DEGREES * self.gamma),
+            ("γ̇ [rad/s]", leg_names("γ̇"), self.gamma_dot),
+            ("τ [N m]", leg_names("τ"), self.torque),
+            ("energy [J]", ["energy"], self.energy[:, None]),
         )
-        figure = draw_panels(shown.t, panels)
+        figure = draw_panels(self.t, panels)
         figure.suptitle(f"{self.scene.name}: {self.message}")
         return figure
 
