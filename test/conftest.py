@@ -20,7 +20,7 @@ from sst_ros.integration import batch, batch_source
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
-pytest_plugins = ["pytester", "unexpected_skips"]
+pytest_plugins = ["pytester", "unexpected_skips", "repeat_failures"]
 __all__ = ["bags", "browser", "example2", "example2_bag", "read", "written", "wrong_kernel"]
 
 

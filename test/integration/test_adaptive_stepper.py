@@ -86,7 +86,13 @@ TOO_FAST = {
 }
 
 
-@pytest.mark.parametrize(("scene", "torque", "compiled"), TOO_FAST.values(), ids=TOO_FAST)
+@pytest.mark.parametrize(
+    ("scene", "torque", "compiled"),
+    [
+        pytest.param(*given, id=name, marks=(pytest.mark.slow,) * given[2])
+        for name, given in TOO_FAST.items()
+    ],
+)
 def test_a_step_that_takes_too_much_ends_with_the_last_valid_state(scene, torque, compiled):
     """These steps took 73, 10 and 2.7 s before there was a budget."""
     if compiled and numba_version() is None:

@@ -36,7 +36,7 @@ from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulate import simulate
 
 EXAMPLE2 = load("example2_heavy")
-QUICK = ("elastic_stops", "friction", "general")
+QUICK = ("elastic_stops", "general")
 every_scene = pytest.mark.parametrize(
     "name",
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in names()],
@@ -127,7 +127,10 @@ def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
     assert "bad.yaml: line 2: friction = None: has no effect" in capsys.readouterr().out
 
 
-SHIPPED = ("example2", "stiff", "friction", "elastic_stops", "gravity_payload", "fast_spin")
+SHIPPED = {
+    **dict.fromkeys(("example2", "stiff", "friction", "gravity_payload"), ()),
+    **dict.fromkeys(("elastic_stops", "fast_spin"), (pytest.mark.slow,)),
+}
 
 
 def random_scenes():
@@ -146,7 +149,7 @@ def random_scenes():
 
 
 SCENES = [
-    *(pytest.param(load(name), id=name) for name in SHIPPED),
+    *(pytest.param(load(name), id=name, marks=marks) for name, marks in SHIPPED.items()),
     *(pytest.param(scene, id=f"random {k}") for k, scene in enumerate(random_scenes())),
 ]
 

@@ -184,6 +184,7 @@ def test_failures_stay_in_sight(tmp_path):
     save_figure(draw_accuracy(found), tmp_path / "picture.png")
 
 
+@pytest.mark.slow
 def test_a_run_that_stops_is_compared_up_to_its_end():
     problem = InitialValueProblem(scene.load("example2_stroke"))
     assert problem.seconds == pytest.approx(0.9) and "gamma_1 >" in problem.ends

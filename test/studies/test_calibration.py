@@ -12,7 +12,10 @@ from studies.estimate import CLASSES, measure
 from studies.orders import MOTIONS, ORDER, measure_steps, measure_tolerance, order_table, truth
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(c, marks=pytest.mark.slow) if c == "sharp_friction" else c for c in CLASSES],
+)
 def test_the_estimate_holds_in_a_case_of_each_class(name):
     row = next(
         row for row in (measure((name, 5, k)) for k in range(6)) if row["state"] == "resolved"
@@ -26,7 +29,9 @@ def test_a_case_depends_on_its_seed_and_number_alone():
     assert one == other
 
 
-@pytest.mark.parametrize("method", ["rk4", "dopri5", "dop853", "gauss"])
+@pytest.mark.parametrize(
+    "method", ["rk4", "dopri5", "dop853", pytest.param("gauss", marks=pytest.mark.slow)]
+)
 def test_a_method_has_its_order_on_a_smooth_motion(method):
     table = order_table(data_frame(row._asdict() for row in measure_steps(("lag", method))))
     found = float(table["order, shortest steps"][0])

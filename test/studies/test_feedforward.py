@@ -96,6 +96,7 @@ def test_the_whole_motion_is_followed_near_the_limit_and_lost_beyond(delay):
     assert beyond[2]
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_lost_says_so():
     loop = dataclasses.replace(held(SHORT, 5), lost=0.01, offset=1e-3)
     track, limited, failure = run_loop(by_bandwidth(loop, 400.0))
