@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,20 +16,33 @@ from benchmark.peers.pinocchio_peer import Model
 from benchmark.peers.task import KINDS, Task
 from sst_ros import demo
 from sst_ros.errors import MissingDependency, require
-from sst_ros.host.figures import BLUE, VERMILION, hide_zeros, stack, styled
+from sst_ros.host.figures import (
+    BLUE,
+    LINES,
+    VERMILION,
+    Looks,
+    hide_zeros,
+    legend,
+    stack,
+    styled,
+    widen,
+)
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import Array, angle_between, quaternion_of, rotation_matrix
 from sst_ros.plot.pictures import (
     ASSUMPTION,
+    LEAST_ANGLE_DEG,
+    LEAST_POSITION_M,
     NUMBERS,
     PICTURES,
-    Solutions,
+    POSITION,
+    ZYZ,
     caption,
-    draw_angle,
     draw_path,
-    draw_position,
+    position_of_e,
     save,
+    zyz_degrees,
 )
 from sst_ros.recording import recording
 from sst_ros.report.results import publish, render
@@ -44,6 +56,10 @@ NODES_LIMIT, ENGINE_LIMIT, TORQUE_LIMIT = 5e-5, 1e-9, 1e-8
 
 STEP = 1e-3
 """Spacing of the samples in the check by inverse dynamics, whole nanoseconds [s]."""
+
+
+Solutions: TypeAlias = Mapping[str, Array]
+"""Solutions of one motion by name: quaternions (n, 4), all at the same times."""
 
 
 class LargestDifference(NamedTuple):
@@ -162,14 +178,52 @@ def _difference(
 
 def _draw(scene: Scene, times: Array, solutions: Solutions, out: Path) -> list[Path]:
     """Draw the paper's figures of a scene."""
-    angles = {name: partial(draw_angle, which=i) for i, name in enumerate(("theta", "phi", "psi"))}
-    drawn: dict[str, Callable[..., Figure]] = {"path_of_E": draw_path, **angles}
-    drawn["position_of_E"] = draw_position
     paths: list[Path] = []
     for name in NUMBERS[scene.name]:
         stem, title = caption(name, PICTURES[name].title, scene.name)
-        paths += save(drawn[name](scene, times, solutions), title, out, stem, ["png"])
+        if name == "path_of_E":
+            figure = draw_path(scene, solutions)
+        elif name == "position_of_E":
+            values = [position_of_e(scene, each) for each in solutions.values()]
+            figure = _compare(times, [*solutions], values, "xyz", POSITION, LEAST_POSITION_M)
+        else:
+            which = ("theta", "phi", "psi").index(name)
+            values = [zyz_degrees(each, which) for each in solutions.values()]
+            label = f"{ZYZ[which]} [deg]"
+            figure = _compare(times, [*solutions], values, ZYZ[which], label, LEAST_ANGLE_DEG)
+        paths += save(figure, title, out, stem, ["png"])
     return paths
+
+
+def _compare(
+    seconds: Array,
+    names: Sequence[str],
+    values: Sequence[Array],
+    letters: str,
+    label: str,
+    least: float,
+) -> Figure:
+    """Draw columns of several solutions over time, and below how far they are from the first."""
+    unit = label.split("[")[1].rstrip("]")
+    figure, (above, below) = stack([label, f"difference from\n{names[0]} [{unit}]"], 2.7)
+    for name, columns, looks in zip(names, values, LINES, strict=False):
+        above.plot(seconds, columns, **looks)[0].set_label(name)
+        if columns is not values[0]:
+            apart = np.abs(columns - values[0]).max(axis=1)
+            largest = f"{name}: at most {np.nanmax(apart):.1e} {unit}"
+            below.plot(seconds, hide_zeros(apart), label=largest, **looks)
+    widen(above, values[0], least)
+    if len(letters) > 1:  # beside the last value, those that lie there together on one line
+        beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
+        last, apart = values[0][-1], 0.06 * np.ptp(above.get_ylim())
+        order = np.argsort(last, kind="stable")
+        for near in np.split(order, np.flatnonzero(np.diff(last[order]) > apart) + 1):
+            text = ", ".join(letters[k] for k in sorted(near))
+            above.annotate(text, (seconds[-1], last[near].mean()), (4, 0), **beside)
+    legend(above)
+    below.set_yscale("log")
+    legend(below)
+    return figure
 
 
 def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]:

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pictures of a recorded run: what each shows, what it needs, how it is drawn.
 
-The motion of the star, Figs. 8 to 14 of the paper, takes any number of solutions: a run, the
-continuous solution, an independent engine. Several are drawn over each other, with their
-differences from the first below, on a logarithmic axis.
+The motion of the star is that of Figs. 8 to 14 of the paper.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from scipy.interpolate import CubicHermiteSpline
 from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
 from sst_ros.errors import refuse_unless
 from sst_ros.host import figures
-from sst_ros.host.figures import BLUE, DEGREES, GREY, LINES, VERMILION, Looks, leg_names, stack
+from sst_ros.host.figures import BLUE, DEGREES, GREY, LINES, VERMILION, leg_names, stack
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
 from sst_ros.mechanism.kinematics import body_rates
@@ -42,6 +40,7 @@ NUMBERS = {
 ASSUMPTION = "assumed inertias: the paper's are lost"
 LEAST_POSITION_M, LEAST_ANGLE_DEG = 0.05, 1.0
 """An axis never shows less than this, so that rounding is a flat line."""
+POSITION, ZYZ = "position of E in {B} [m]", "θφψ"
 
 
 class Picture(NamedTuple):
@@ -87,10 +86,6 @@ def draw_legs(
     return figure
 
 
-Solutions: TypeAlias = Mapping[str, Array]
-"""Solutions of one motion by name: quaternions (n, 4), all at the same times."""
-
-
 def position_of_e(scene: Scene, quaternion: Array) -> Array:
     """Position of E in {B} [m], shape (n, 3)."""
     return scene.star.radius * rotation_matrix(quaternion)[:, :, 2]
@@ -108,61 +103,35 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
     return f"fig{number:02d}_{name}", f"{title}\nFig. {number} of the paper; {ASSUMPTION}"
 
 
-def draw_position(scene: Scene, seconds: Array, solutions: Solutions) -> Figure:
+def zyz_degrees(quaternion: Array, which: int) -> Array:
+    """One of the ZYZ angles (0 theta, 1 phi, 2 psi) without jumps [deg], shape (n, 1)."""
+    angle = zyz_angles(rotation_matrix(quaternion))[:, which : which + 1]
+    known = np.isfinite(angle)
+    angle[known] = np.unwrap(angle[known])  # over lost samples too
+    return np.degrees(angle)
+
+
+def _position(run: Signals, scene: Scene) -> Figure:
     """Draw the coordinates of E over time."""
-    values = [position_of_e(scene, each) for each in solutions.values()]
-    label = "position of E in {B} [m]"
-    return _over_time(seconds, [*solutions], values, "xyz", label, LEAST_POSITION_M)
-
-
-def draw_angle(_: Scene | None, seconds: Array, solutions: Solutions, which: int) -> Figure:
-    """Draw one of the ZYZ angles over time: 0 theta, 1 phi, 2 psi."""
-    values, letter = [], "θφψ"[which]
-    for quaternion in solutions.values():
-        angle = zyz_angles(rotation_matrix(quaternion))[:, which : which + 1]
-        known = np.isfinite(angle)
-        angle[known] = np.unwrap(angle[known])  # over lost samples too
-        values.append(np.degrees(angle))
-    return _over_time(seconds, [*solutions], values, letter, f"{letter} [deg]", LEAST_ANGLE_DEG)
-
-
-def _over_time(
-    seconds: Array,
-    names: Sequence[str],
-    values: Sequence[Array],
-    letters: str,
-    label: str,
-    least: float,
-) -> Figure:
-    """Draw columns over time; differences from the first solution below where there are several."""
-    if len(names) == 1:
-        figure, (axes,) = stack([label], 3.2)
-        figures.lines(axes, seconds, values[0], list(letters), least_span=least)
-        return figure
-    unit = label.split("[")[1].rstrip("]")
-    figure, (above, below) = stack([label, f"difference from\n{names[0]} [{unit}]"], 2.7)
-    for name, columns, looks in zip(names, values, LINES, strict=False):
-        above.plot(seconds, columns, **looks)[0].set_label(name)
-        if columns is not values[0]:
-            apart = np.abs(columns - values[0]).max(axis=1)
-            largest = f"{name}: at most {np.nanmax(apart):.1e} {unit}"
-            below.plot(seconds, figures.hide_zeros(apart), label=largest, **looks)
-    figures.widen(above, values[0], least)
-    if len(letters) > 1:  # beside the last value, those that lie there together on one line
-        beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
-        last, apart = values[0][-1], 0.06 * np.ptp(above.get_ylim())
-        order = np.argsort(last, kind="stable")
-        for near in np.split(order, np.flatnonzero(np.diff(last[order]) > apart) + 1):
-            text = ", ".join(letters[k] for k in sorted(near))
-            above.annotate(text, (seconds[-1], last[near].mean()), (4, 0), **beside)
-    figures.legend(above)
-    below.set_yscale("log")
-    figures.legend(below)
+    figure, (axes,) = stack([POSITION], 3.2)
+    values = position_of_e(scene, run.take(*QUATERNION))
+    figures.lines(axes, run.seconds(), values, "xyz", least_span=LEAST_POSITION_M)
     return figure
 
 
-def draw_path(scene: Scene, _: Array, solutions: Solutions) -> Figure:
-    """Draw E over the base triangle, both at their own radius, and the triangle's image at E's."""
+def _angle(run: Signals, _: Scene | None, which: int) -> Figure:
+    """Draw one of the ZYZ angles over time."""
+    figure, (axes,) = stack([f"{ZYZ[which]} [deg]"], 3.2)
+    values = zyz_degrees(run.take(*QUATERNION), which)
+    figures.lines(axes, run.seconds(), values, ZYZ[which], least_span=LEAST_ANGLE_DEG)
+    return figure
+
+
+def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
+    """Draw E over the base triangle, both at their own radius, and the triangle's image at E's.
+
+    Paths are quaternions (n, 4) by name.
+    """
     figure = Figure(figsize=(6.4, 6.4))
     axes = figure.add_subplot(projection="3d")
     geometry = Geometry.of(scene)
@@ -176,10 +145,10 @@ def draw_path(scene: Scene, _: Array, solutions: Solutions) -> Figure:
     inside = geometry.v + 0.22 * (middle - geometry.v)  # outside are the numbers of the axes
     for name, point in zip(leg_names("P"), base * inside, strict=True):
         axes.text(*point, name, ha="center", va="center")
-    paths = [position_of_e(scene, each).T for each in solutions.values()]
-    for name, path, looks in zip(solutions, paths, LINES, strict=False):
+    drawn = [position_of_e(scene, each).T for each in paths.values()]
+    for name, path, looks in zip(paths, drawn, LINES, strict=False):
         axes.plot(*path, label=name, **looks)
-    figures.mark_ends(axes, *paths[0])
+    figures.mark_ends(axes, *drawn[0])
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.zaxis.set_rotate_label(False)  # by itself it stands on its head
     axes.set_zlabel("z [m]", rotation=90.0)
@@ -193,9 +162,9 @@ def draw_path(scene: Scene, _: Array, solutions: Solutions) -> Figure:
     return figure
 
 
-def _star(draw: Callable[[Scene, Array, Solutions], Figure]) -> Callable[..., Figure]:
-    """Return what draws the recorded motion of the star."""
-    return lambda run, scene: draw(scene, run.seconds(), {"path of E": run.take(*QUATERNION)})
+def _path(run: Signals, scene: Scene) -> Figure:
+    """Draw the recorded path of E."""
+    return draw_path(scene, {"path of E": run.take(*QUATERNION)})
 
 
 def _tracking(run: Signals, _: Scene) -> Figure:
@@ -343,11 +312,11 @@ _ANGLES = curves(*(legs(f"{k} [deg]", name, k, DEGREES) for name, k in KINDS.ite
 _RATES = curves(*(legs(f"{k}̇ [rad/s]", f"{name}_dot", f"{k}̇") for name, k in KINDS.items()))
 _WORK = curves(("work [J]", ACTUATORS, work), height=3.2)
 PICTURES = {
-    "path_of_E": Picture("Path of point E", (ORIENTATION, S), _star(draw_path)),
-    "position_of_E": Picture("Position of point E", (ORIENTATION, S), _star(draw_position)),
+    "path_of_E": Picture("Path of point E", (ORIENTATION, S), _path),
+    "position_of_E": Picture("Position of point E", (ORIENTATION, S), _position),
     **{
-        name: Picture(f"The angle {letter}", (ORIENTATION,), _star(partial(draw_angle, which=k)))
-        for k, (name, letter) in enumerate({"theta": "θ", "phi": "φ", "psi": "ψ"}.items())
+        name: Picture(f"The angle {letter}", (ORIENTATION,), partial(_angle, which=k))
+        for k, (name, letter) in enumerate(zip(("theta", "phi", "psi"), ZYZ, strict=True))
     },
     "tracking": Picture("Desired and measured angles", (JOINTS, REFERENCE), _tracking),
     "tracking_error": Picture("Tracking error", (ERROR,), _ERRORS),
