@@ -23,11 +23,11 @@ the joints of its tag only: passive joints, which have no command, must not be i
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
-from typing import NamedTuple, TypeAlias
+from itertools import chain, pairwise
+from typing import Any, NamedTuple, TypeAlias
 
+import jinja2
 import numpy as np
 
 from sst_ros.dynamics.model import limits_of, ranges_of
@@ -57,16 +57,8 @@ STEP = np.radians(6.0)  # arcs are drawn as chords of this length or less: 0.14 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
 TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
 """Of commands and states, by which ros2_control drives a simulator."""
-EVERY_CYCLE = "-1"
-"""Threshold of the change of a command below which the plug-in sends none: the simulator drops a
-command that is not repeated within command_timeout."""
 
-_NOTE = """ Made by sst_ros from the scene {name}. Joints have the names and angles of joint_states.
-     star_from_2 and star_from_3 are the star's frame as legs 2 and 3 see it: in closed loops they
-     and star are one. """
-
-_ASSUMED = """ The scene has no masses for {bodies}. Theirs are trace / (2 radius^2), with
-     the centre at O, about which all turns: they change no motion. The tensors are the scene's. """
+_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class Joint(NamedTuple):
@@ -205,70 +197,31 @@ def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
     without it joint_trajectory_controller, activated before, holds nan, and no command starts the
     run.
     """
-    root = _robot(scene)
-    if topics:
-        _add_ros2_control(root, scene, topics)
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _add_ros2_control(root: ET.Element, scene: Scene, topics: Sequence[str]) -> None:
-    tag = ET.SubElement(root, "ros2_control", name="sst_ros", type="system")
-    hardware = ET.SubElement(tag, "hardware")
-    ET.SubElement(hardware, "plugin").text = PLUGIN
-    names = "joint_commands_topic", "joint_states_topic", "trigger_joint_command_threshold"
-    for name, value in zip(names, (*topics, EVERY_CYCLE), strict=True):
-        ET.SubElement(hardware, "param", name=name).text = value
-    starts = zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)
-    for name, gamma, gamma_dot in starts:
-        joint = ET.SubElement(tag, "joint", name=name)
-        ET.SubElement(joint, "command_interface", name="effort")
-        for state, start in (("position", gamma), ("velocity", gamma_dot), ("effort", 0.0)):
-            interface = ET.SubElement(joint, "state_interface", name=state)
-            ET.SubElement(interface, "param", name="initial_value").text = repr(start)
-
-
-def _robot(scene: Scene) -> ET.Element:
-    geometry = Geometry.of(scene)
-    joints, drawn = joints_of(geometry), shapes(scene)
-    bodies = {body.name: body for body in _bodies(scene)}
-    # An XML name has no spaces.
-    name = "".join(letter if letter.isalnum() else "_" for letter in scene.name)
-    root = ET.Element("robot", name=name)
-    root.append(ET.Comment(_NOTE.format(name=name)))
-    if assumed := ", ".join(body.name for body in bodies.values() if body.assumed):
-        root.append(ET.Comment(_ASSUMED.format(bodies=assumed)))
-    for name in dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies)):
-        link = ET.SubElement(root, "link", name=name)
-        if (body := bodies.get(name)) is not None:
-            inertial = ET.SubElement(link, "inertial")
-            ET.SubElement(inertial, "origin", xyz=_exact(*body.centre))
-            ET.SubElement(inertial, "mass", value=_exact(body.mass))
-            entries = map(_exact, body.tensor[np.triu_indices(3)])
-            inertia = dict(zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), entries, strict=True))
-            ET.SubElement(inertial, "inertia", inertia)
-        for shape in drawn.get(name, ()):
-            _add_shape(link, shape)
-    ranges = {joint: (low, high) for joint, low, high in ranges_of([*limits_of(scene, geometry)])}
+    geometry, drawn = Geometry.of(scene), shapes(scene)
+    joints, bodies = joints_of(geometry), {body.name: body for body in _bodies(scene)}
+    ranges = {joint: ends for joint, *ends in ranges_of([*limits_of(scene, geometry)])}
+    limited = []
     for joint in joints:
         ends = ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf))
-        limited = bool(np.all(np.isfinite(ends)))
-        kind = "revolute" if limited else "continuous"
-        element = _add_joint(root, joint.name, kind, joint.parent, joint.child)
-        ET.SubElement(element, "origin", xyz="0 0 0", rpy=_exact(*roll_pitch_yaw(joint.origin)))
-        ET.SubElement(element, "axis", xyz=_exact(*joint.axis))
-        motor = scene.actuators if joint.name.startswith("gamma") else None
-        bounds = {"lower": _exact(ends[0]), "upper": _exact(ends[1])} if limited else {}
+        limits = dict(zip(("lower", "upper"), ends, strict=True)) if np.isfinite(ends).all() else {}
+        kind = joint.name.split("_")[0]
+        motor = scene.actuators if kind == "gamma" else None
         for key, limit in (("effort", "torque_limit"), ("velocity", "velocity_limit")):
-            bounds[key] = _exact(getattr(motor, limit, None) or LARGEST)
-        ET.SubElement(element, "limit", bounds)
-        if friction := getattr(scene.friction, joint.name.split("_")[0], None):
-            damping, coulomb = _exact(friction.viscous), _exact(friction.coulomb)
-            ET.SubElement(element, "dynamics", damping=damping, friction=coulomb)
-    for body in bodies.values():
-        if body.name != body.link:
-            _add_joint(root, f"{body.name}_fixed", "fixed", body.link, body.name)
-    return root
+            limits[key] = getattr(motor, limit, None) or LARGEST
+        limited.append((joint, limits, getattr(scene.friction, kind, None)))
+    return _templates.get_template("urdf.xml").render(
+        # An XML name has no spaces.
+        name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
+        assumed=[body.name for body in bodies.values() if body.assumed],
+        links=list(dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))),
+        bodies=bodies,
+        visuals={link: [*chain(*map(_solids, some))] for link, some in drawn.items()},
+        joints=limited,
+        starts=list(zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)),
+        topics=topics,
+        plugin=PLUGIN,
+        roll_pitch_yaw=roll_pitch_yaw,
+    )
 
 
 class _Body(NamedTuple):
@@ -280,6 +233,11 @@ class _Body(NamedTuple):
     centre: Array  # of mass [m], shape (3,)
     tensor: Array  # about the centre of mass [kg m^2], shape (3, 3)
     assumed: bool = False  # the scene has no mass for it
+
+    @property
+    def inertia(self) -> dict[str, float]:
+        """Entries of the tensor by their names in URDF."""
+        return dict(zip(_INERTIA, self.tensor[np.triu_indices(3)].tolist(), strict=True))
 
 
 def _bodies(scene: Scene) -> Iterator[_Body]:
@@ -323,30 +281,13 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     return np.array([roll, pitch, yaw])
 
 
-def _add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
-    joint = ET.SubElement(root, "joint", name=name, type=kind)
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-    return joint
-
-
-def _add_shape(link: ET.Element, shape: Shape) -> None:
-    rgba = (*shape.colour, getattr(shape, "opacity", 1.0))
-    name = "_".join(f"{round(255 * part):02x}" for part in rgba)
-    for kind, size, at, turn in _solids(shape):
-        visual = ET.SubElement(link, "visual")
-        ET.SubElement(visual, "origin", xyz=_short(*at), rpy=_short(*turn))
-        ET.SubElement(ET.SubElement(visual, "geometry"), kind, size)
-        material = ET.SubElement(visual, "material", name=f"rgba_{name}")
-        ET.SubElement(material, "color", rgba=_short(*rgba))
-
-
-def _solids(shape: Shape) -> Iterator[tuple[str, dict[str, str], Array, Array]]:
-    """Yield kind, size, centre, and roll, pitch, yaw of what a shape is in URDF."""
+def _solids(shape: Shape) -> Iterator[tuple[Any, ...]]:
+    """Yield kind, sizes, centre, roll, pitch, yaw, and colour of what a shape is in URDF."""
+    colour = (*shape.colour, getattr(shape, "opacity", 1.0))
     if isinstance(shape, Ball):
-        yield "sphere", {"radius": _short(shape.radius)}, shape.centre, np.zeros(3)
+        yield "sphere", {"radius": [shape.radius]}, shape.centre, np.zeros(3), colour
     elif isinstance(shape, Box):
-        yield "box", {"size": _short(*shape.size)}, shape.centre, np.zeros(3)
+        yield "box", {"size": shape.size}, shape.centre, np.zeros(3), colour
     else:
         ends = shape.points() if isinstance(shape, Arc) else (shape.begin, shape.end)
         for begin, end in pairwise(ends):
@@ -354,13 +295,23 @@ def _solids(shape: Shape) -> Iterator[tuple[str, dict[str, str], Array, Array]]:
             # The cylinder's axis is z; it ends a little late, so that no gap shows at the bends.
             turn = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
             length = float(np.linalg.norm(end - begin)) + 0.1 * shape.thickness
-            size = {"radius": _short(shape.thickness), "length": _short(length)}
-            yield "cylinder", size, (begin + end) / 2.0, turn
+            size = {"radius": [shape.thickness], "length": [length]}
+            yield "cylinder", size, (begin + end) / 2.0, turn, colour
 
 
-def _exact(*values: float) -> str:
+def _exact(values: Iterable[float]) -> str:
     return " ".join(repr(float(x) + 0.0) for x in values)
 
 
-def _short(*values: float) -> str:
+def _short(values: Iterable[float]) -> str:
     return " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)
+
+
+_templates = jinja2.Environment(
+    loader=jinja2.PackageLoader("sst_ros.description"),
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+_templates.filters |= {"exact": _exact, "short": _short}
