@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sst_ros.errors import SingularConfiguration, refuse_unless
 from sst_ros.mechanism import kinematics, virtual_work
@@ -102,25 +102,6 @@ def start_of(scene: Scene) -> tuple[float, ...]:
     return initial_state(scene, geometry)
 
 
-def accelerate_by_paper(
-    mechanism: virtual_work.Mechanism, state: ArrayLike, torque: ArrayLike, moment: ArrayLike = ZERO
-) -> tuple[Array, Array]:
-    """Return W_dot in {E} [rad/s^2] and gamma_dot [rad/s], each shape (3,), by Eqs. 1 to 92.
-
-    The state is quaternion (x, y, z, w) and W in {E} [rad/s]; torques and the external moment on
-    the star in {B} are in N m. In a singular posture SingularConfiguration is raised.
-    """
-    numbers = np.asarray(state, dtype=float)
-    rotation = rotation_matrix(numbers[:4])
-    gamma = kinematics.inverse(mechanism.geometry, rotation)[0]
-    at = virtual_work.posture(mechanism.geometry, gamma, rotation)
-    gamma_dot = np.linalg.solve(at.j, rotation @ numbers[4:])
-    gamma_ddot = virtual_work.direct_dynamics(mechanism, at, gamma_dot, torque, moment)
-    # Eq. 40; R W_dot = omega_dot, because W x W = 0.
-    omega_dot = at.j @ gamma_ddot + virtual_work.bias(at, gamma_dot).omega_dot
-    return np.asarray(rotation.T @ omega_dot), np.asarray(gamma_dot)
-
-
 def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
     """Return the derivative of a scene's state by Eqs. 1 to 92, as integrators take it.
 
@@ -145,12 +126,17 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
     def derivative(_: float, *inputs: float) -> tuple[float, ...]:
         (x, y, z, w, *rate), torque = inputs[:7], np.array(inputs[8:11])
         moment = constant + inputs[11:14] if len(inputs) > 11 else constant
+        rotation = rotation_matrix(inputs[:4])
+        gamma, omega = kinematics.inverse(mechanism.geometry, rotation)[0], rotation @ rate
         try:
-            acceleration, gamma_dot = accelerate_by_paper(mechanism, inputs[:7], torque, moment)
+            at = virtual_work.posture(mechanism.geometry, gamma, rotation)
         except SingularConfiguration as error:
             raise ArithmeticError(str(error)) from None
-        turning = quaternion_rate((x, y, z, w), triple(rate))
-        omega = rotation_matrix(inputs[:4]) @ rate
+        gamma_dot = np.linalg.solve(at.j, omega)
+        gamma_ddot = virtual_work.direct_dynamics(mechanism, at, gamma_dot, torque, moment)
+        # Eq. 40; R W_dot = omega_dot, because W x W = 0.
+        omega_dot = at.j @ gamma_ddot + virtual_work.bias(at, gamma_dot).omega_dot
+        acceleration, turning = rotation.T @ omega_dot, quaternion_rate((x, y, z, w), triple(rate))
         return (*turning, *acceleration.tolist(), float(torque @ gamma_dot + moment @ omega))
 
     return derivative

@@ -149,14 +149,9 @@ TERMS = {
 """Key of each term in a scene."""
 
 
-def has(scene: Scene, term: str) -> bool:
-    """Return whether a scene has one of TERMS."""
-    return schema.has_effect(values_at(scene, TERMS[term]))
-
-
 def terms(scene: Scene) -> list[str]:
     """Return those of TERMS that a scene has."""
-    return [term for term in TERMS if has(scene, term)]
+    return [term for term, key in TERMS.items() if schema.has_effect(values_at(scene, key))]
 
 
 def _has_key(cls: type[Section], key: str) -> bool:

@@ -31,7 +31,7 @@ from sst_ros.report.scene_summary import (
     without,
 )
 from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Moment
-from sst_ros.scene.scene import TERMS, has, load, names
+from sst_ros.scene.scene import TERMS, load, names
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulate import simulate
 
@@ -63,7 +63,7 @@ def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operati
     scene = loaded()
     for term in TERMS:
         if term not in ("actuated links", "intermediate links"):
-            assert has(scene, term), term
+            assert term in terms(scene), term
             scene = without(scene, term)
     assert ODE(Dynamics.of(scene)).program == ODE(Dynamics.of(load("general"))).program
 
@@ -90,12 +90,12 @@ def test_a_summary_has_all_parts_and_every_term_adds_operations_or_folds(name):
     assert said.startswith(f"{name}: {scene.description}\n")
     assert f"right-hand side: 7 states, {operations(scene)} operations" in said
     found = costs(scene)
-    assert [cost.name for cost in found] == [term for term in TERMS if has(scene, term)]
+    assert [cost.name for cost in found] == terms(scene)
     for cost in found:
         row = rf"^  {cost.name} +{cost.adds} +{cost.without}$"
         assert cost.adds >= 0 and re.search(row, said, re.MULTILINE)
     listed = " ".join(said[said.index("terms absent") : said.index("\nends")].split())
-    assert all((term in listed) != has(scene, term) for term in TERMS)
+    assert all((term in listed) != (term in terms(scene)) for term in TERMS)
     for key, reason in scene.provenance:
         assert re.search(rf"^  {key} +{re.escape(reason[:20])}", said, re.MULTILINE)
     assert step_advice(scene).text in " ".join(said.split())
