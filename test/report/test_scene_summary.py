@@ -31,7 +31,7 @@ from sst_ros.report.scene_summary import (
     without,
 )
 from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Moment
-from sst_ros.scene.scene import TERMS, load, names
+from sst_ros.scene.scene import TERMS, load, names, terms
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulate import simulate
 
