@@ -14,7 +14,7 @@ import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -126,13 +126,23 @@ class ActuatorSpaceMap:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         rows = zip(geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True)
-        self._legs = [kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1]) for w, v, e in rows]
-        self._actuators = compile_program(trace(self._of_star, _STAR))
-        # W and W_dot in {E}, six numbers, of a quaternion, gamma_dot and gamma_ddot.
-        self.star_motion = compile_program(trace(self.star_accelerations, _MOVING))
-        # sin(mu) and beta [rad] of the legs, six numbers, and det J2, of a quaternion.
-        self.posture = compile_program(trace(self._of_posture, _STAR[:4]))
-        self._newton = compile_program(trace(self.newton_step, _POSE))
+        legs = (kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1]) for w, v, e in rows)
+        self._legs = tuple(legs)
+        # star_motion: W and W_dot in {E}, six numbers, of a quaternion, gamma_dot and gamma_ddot.
+        # posture: sin(mu) and beta [rad] of the legs, six numbers, and det J2, of a quaternion.
+        self._actuators, self.star_motion, self.posture, self._newton = _compile(self)
+
+    def __eq__(self, other: object) -> bool:
+        """Compare legs, from which all programs follow."""
+        return isinstance(other, ActuatorSpaceMap) and self._legs == other._legs
+
+    def __hash__(self) -> int:
+        """Agree with equality."""
+        return hash(self._legs)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the geometry alone."""
+        return ActuatorSpaceMap, (self.geometry,)
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad]."""
@@ -250,6 +260,17 @@ class ActuatorSpaceMap:
         moved = gm.quaternion_product(inputs[:4], (*turn, 1.0))
         length = gm.sqrt(sum(part * part for part in moved))
         return (*(part / length for part in moved), *residual)
+
+
+@lru_cache(maxsize=16)
+def _compile(space: ActuatorSpaceMap) -> tuple[Callable[..., Any], ...]:
+    """Compile the programs of a map once for all that are equal: that takes 20 ms."""
+    return (
+        compile_program(trace(space._of_star, _STAR)),
+        compile_program(trace(space.star_accelerations, _MOVING)),
+        compile_program(trace(space._of_posture, _STAR[:4])),
+        compile_program(trace(space.newton_step, _POSE)),
+    )
 
 
 def _solve(rows: list[Any], right: Any) -> Any:

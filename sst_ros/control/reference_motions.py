@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, TypeAlias
 
@@ -209,15 +210,24 @@ def move_actuators(
     turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
     signs = np.cumprod(np.where(turns < 0.0, -1.0, 1.0))
     known = list(map(tuple, (signs[:, None] * quaternions).tolist()))
+    return ReferenceMotion(partial(_on_path, space, path, times, known, gammas, sigma), pieces)
 
-    def inside(time: float) -> Reference:
-        gamma, gamma_dot, gamma_ddot = path(time)
-        index = max(bisect_right(times, time) - 1, 0)
-        q = space.follow(known[index], gammas[index], gamma, sigma[index])
-        star: Any = space.star_motion(*q, *gamma_dot, *gamma_ddot)
-        return Reference(q, star[:3], star[3:], gamma, gamma_dot, gamma_ddot)
 
-    return ReferenceMotion(inside, pieces)
+def _on_path(
+    space: ActuatorSpaceMap,
+    path: ActuatorPath,
+    times: list[float],
+    known: list[Any],
+    gammas: list[Vector3],
+    sigma: list[float],
+    time: float,
+) -> Reference:
+    """Reference of a motion of the actuators: a function of a module, which pickle takes."""
+    gamma, gamma_dot, gamma_ddot = path(time)
+    index = max(bisect_right(times, time) - 1, 0)
+    q = space.follow(known[index], gammas[index], gamma, sigma[index])
+    star: Any = space.star_motion(*q, *gamma_dot, *gamma_ddot)
+    return Reference(q, star[:3], star[3:], gamma, gamma_dot, gamma_ddot)
 
 
 def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
@@ -352,8 +362,11 @@ def _check_points(at: Array, rates: Array) -> Iterator[Check]:
 
 
 def _quintic_path(times: Array, *nodes: Array) -> ActuatorPath:
-    curve = quintic(times, *nodes)
-    return lambda time: triple(map(triple, curve(time).tolist()))
+    return partial(_on_curve, quintic(times, *nodes))
+
+
+def _on_curve(curve: PPoly, time: float) -> tuple[Vector3, Vector3, Vector3]:
+    return triple(map(triple, curve(time).tolist()))
 
 
 _UNIT = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))
