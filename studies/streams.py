@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from subprocess import DEVNULL
 from typing import Any
 
@@ -35,6 +37,9 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--scene", default="reach")
     parser.add_argument("--mode", default="computed_torque")
+    parser.add_argument(
+        "--realtime", action="store_true", help="SCHED_FIFO for the nodes, beside other work"
+    )
     given = parser.parse_args(words)
     keep_domain()
     rclpy.init()
@@ -58,24 +63,37 @@ def stream(given: argparse.Namespace, rate: float) -> tuple[str, ...]:
     node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
     run = {"scene": given.scene, "duration": 0.0, "wait_for_command": True}
     control = {"scene": given.scene, "mode": given.mode, "motion": "topic"}
-    with run_beside("simulator", run, stdout=DEVNULL):
-        with run_beside("inverse_dynamics", control, stdout=DEVNULL) as controller:
-            end = time.monotonic() + WAIT_S
-            while said.get("control", {}).get("stage") != "waiting for a trajectory":
-                rclpy.spin_once(node, timeout_sec=0.1)
-                assert time.monotonic() < end and controller.poll() is None
-            begin, sent = time.monotonic(), 0
-            while (passed := time.monotonic() - begin) < given.seconds:
-                if sent <= passed * rate:
-                    publisher.publish(_message(scene.load(given.scene).initial.gamma, passed))
-                    sent += 1
-                rclpy.spin_once(node, timeout_sec=0.5 / rate)
-            assert controller.poll() is None, "the controller has ended"
-            found, counts = said["control"], said["run"]
+    with (
+        run_beside("simulator", run, stdout=DEVNULL),
+        run_beside("inverse_dynamics", control, stdout=DEVNULL) as controller,
+    ):
+        end = time.monotonic() + WAIT_S
+        while said.get("control", {}).get("stage") != "waiting for a trajectory":
+            rclpy.spin_once(node, timeout_sec=0.1)
+            assert time.monotonic() < end and controller.poll() is None
+        if given.realtime:
+            _schedule(controller.pid)
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(5))
+        begin, sent = time.monotonic(), 0
+        while (passed := time.monotonic() - begin) < given.seconds:
+            if sent <= passed * rate:
+                publisher.publish(_message(scene.load(given.scene).initial.gamma, passed))
+                sent += 1
+            rclpy.spin_once(node, timeout_sec=0.5 / rate)
+        assert controller.poll() is None, "the controller has ended"
+        found, counts = said["control"], said["run"]
     node.destroy_node()
     assert counts["phase"] == "running", counts["fault"]
     keys = "trajectories_refused", "samples", "samples_irregular", "error_max_rad"
     return str(sent), *(found[key] for key in keys), counts["ticks_missed"]
+
+
+def _schedule(process: int) -> None:
+    """Give a process a priority below that of the simulator, and a lower one to its children."""
+    tasks = [int(task.name) for task in Path(f"/proc/{process}/task").iterdir()]
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    for number, priority in [*((task, 9) for task in tasks), *((int(one), 5) for one in children)]:
+        os.sched_setscheduler(number, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def _message(start: Any, passed: float) -> JointTrajectory:

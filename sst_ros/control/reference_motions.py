@@ -222,7 +222,7 @@ def _on_path(
     sigma: list[float],
     time: float,
 ) -> Reference:
-    """Reference of a motion of the actuators: a function of a module, which pickle takes."""
+    """Return the reference at a time [s]; a function of a module, which pickle takes."""
     gamma, gamma_dot, gamma_ddot = path(time)
     index = max(bisect_right(times, time) - 1, 0)
     q = space.follow(known[index], gammas[index], gamma, sigma[index])

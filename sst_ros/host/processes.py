@@ -15,8 +15,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from subprocess import Popen
 from typing import Any, BinaryIO
@@ -84,6 +85,68 @@ def words(given: dict[str, object]) -> list[str]:
     """Give parameters as --ros-args takes them."""
     shown = {key: str(x).lower() if isinstance(x, bool) else x for key, x in given.items()}
     return [word for key, value in shown.items() for word in ("-p", f"{key}:={value}")]
+
+
+class Assistant:
+    """A process of low priority that calls one function, which pickle takes; it ends with this one.
+
+    What takes longer than a control period is computed there: a thread would share the
+    interpreter's lock with the control.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._begin()
+
+    def _begin(self) -> None:
+        self._connection, theirs = Pipe()
+        number = theirs.fileno()
+        code = f"from sst_ros.host.processes import assist; assist({number})"
+        self._process = Popen(
+            [sys.executable, "-c", code],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[number],
+            start_new_session=True,  # no Ctrl-C comes there
+        )
+        theirs.close()
+        self._connection.send(self._function)
+
+    def call(self, *given: Any) -> None:
+        """Have the function called; not before the result of the last call is there."""
+        with contextlib.suppress(OSError):  # it has ended: `result` says so
+            self._connection.send(given)
+
+    def result(self) -> Any:
+        """Return the result of the call or the exception that it raised; None until it is there.
+
+        Where the process has ended, that is an SstError, and another process is begun.
+        """
+        try:
+            return self._connection.recv() if self._connection.poll() else None
+        except (EOFError, OSError):
+            status = self._process.wait()
+            self._begin()
+            return SstError(f"the process beside this one has ended with status {status}")
+
+    def close(self) -> None:
+        """End the process."""
+        self._connection.close()
+        self._process.kill()
+        self._process.wait()
+
+
+def assist(number: int) -> None:
+    """Be the process of an `Assistant` at the other end of the connection of this descriptor."""
+    os.nice(10)
+    with contextlib.suppress(EOFError, OSError), Connection(number) as connection:
+        function = connection.recv()
+        while True:
+            given = connection.recv()
+            try:
+                result = function(*given)
+            except Exception as error:
+                result = error
+            connection.send(result)
 
 
 def is_orphan() -> bool:

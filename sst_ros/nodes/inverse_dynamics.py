@@ -7,13 +7,16 @@ of which there is one at a time.
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import time
 from array import array
 from typing import Any
 
 from rclpy.action.server import CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -26,6 +29,7 @@ from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker, every
 from sst_ros.nodes.topics import ActionGoal
 from sst_ros.report.results import render
+from sst_ros.runtime.planning import Order, Superseded
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
@@ -35,7 +39,7 @@ from sst_ros.runtime.trajectory_following import (
     TrajectoryGoal,
 )
 from sst_ros.scene import scene
-from sst_ros.state import NANOSECONDS, Vector3
+from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 
 try:
     from control_msgs.action import FollowJointTrajectory
@@ -55,6 +59,8 @@ KEYS = {
 }
 """Keys of the controller's /diagnostics, in order."""
 _FEEDBACK_PERIOD_S = 0.05
+_LOG_PERIOD_S = 1.0
+"""Trajectories of a stream are not logged more often."""
 _SPINS_AT_END = 20
 _SPIN_S = 0.01
 """Least time to deliver the result of a goal that the end of the node aborts: 0.2 s."""
@@ -72,17 +78,28 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             own[name].publisher(self.node) for name in names
         )
         self._seen: Measurement | None = None
+        self._seen_ns = 0
         self._refused, self._last_refusal = 0, ""
         self._finished = self._has_heard = False
         self._active: ActionGoal | None = None
-        self._goal: TrajectoryGoal | None = None
+        self._goal: tuple[TrajectoryGoal, Order] | None = (
+            None  # of the active one, or accepted last
+        )
+        render("tracking.txt", found=TrackingMetrics())  # later it would delay the control
         self._feedback: Any = None
         self.connect(own, joint_trajectory=self._replace)
         every(self.node, 1.0, self._report)
         if FollowJointTrajectory is not None:
             name = own["follow_joint_trajectory"].name
-            callbacks = {"goal_callback": self._check, "cancel_callback": self._cancel}
-            ActionGoal.serve(self.node, FollowJointTrajectory, name, self._begin, **callbacks)
+            ActionGoal.serve(
+                self.node,
+                FollowJointTrajectory,
+                name,
+                self._begin,
+                goal_callback=self._check,
+                cancel_callback=self._cancel,
+                callback_group=ReentrantCallbackGroup(),  # samples come while a goal is checked
+            )
             every(self.node, _FEEDBACK_PERIOD_S, self._report_goal)
 
     def close(self) -> None:
@@ -94,6 +111,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
                 with contextlib.suppress(SstError):  # of other callbacks: the node ends already
                     executor.spin_once(timeout_sec=_SPIN_S)
         super().close()
+        self.follower.close()
         self._report()
         _print(self.follower.tracking())
 
@@ -115,8 +133,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def receive(self, state: JointState) -> None:
         """Answer a state where there is a motion; trajectories begin at the last one."""
-        self._seen = _measure(state)
+        self._seen, self._seen_ns = _measure(state), nanoseconds(state.header.stamp)
         super().receive(state)
+        self.follower.proceed()
 
     def may_begin(self) -> bool:
         """Whether all have subscribed who are to hear the whole run."""
@@ -136,6 +155,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self.send(command.torque)
         self._publish(state, command)
         self._judge(state, self._seen, command)
+        if self.follower.finished is not None:
+            _print(self.follower.finished)
+            self.follower.finished = None
         if self.follower.stage is Stage.ENDED:
             self.done.set()
 
@@ -152,24 +174,34 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def _replace(self, trajectory: JointTrajectory) -> None:
         """Follow a trajectory of the topic, and no goal any more."""
-        if self._take(trajectory):
-            self._interrupt("replaced by a trajectory of ~/joint_trajectory")
 
-    def _take(self, trajectory: JointTrajectory) -> bool:
-        """Follow a trajectory, or log why not; return whether it is followed."""
-        tracking = self.follower.tracking()
+        def settle(outcome: concurrent.futures.Future[None]) -> None:
+            if self._is_accepted(outcome):
+                self._interrupt("replaced by a trajectory of ~/joint_trajectory")
+
+        if (order := self._take(trajectory)) is not None:
+            order.outcome.add_done_callback(settle)
+
+    def _take(self, trajectory: JointTrajectory) -> Order | None:
+        """Have a trajectory checked and followed; None, with the reason logged, where it is bad."""
         try:
-            self.follower.take(trajectory, self._seen)
+            return self.follower.take(trajectory, self._seen, self._seen_ns)
         except SstError as error:
             self._refuse(error)
-            return False
+            return None
         finally:
-            self.heard_s = time.monotonic()  # no message could be received during the check
-        _print(tracking)
-        self.node.get_logger().info(f"trajectory of {len(trajectory.points)} points taken")
-        return True
+            self.heard_s = time.monotonic()  # in lockstep no message was received meanwhile
 
-    def _refuse(self, error: SstError) -> None:
+    def _is_accepted(self, outcome: concurrent.futures.Future[None]) -> bool:
+        """Whether a trajectory is followed; else count, log and publish the refusal."""
+        if (error := outcome.exception()) is None:
+            log = self.node.get_logger()
+            log.info("trajectory taken", throttle_duration_sec=_LOG_PERIOD_S)
+        elif not isinstance(error, Superseded):
+            self._refuse(error)
+        return error is None
+
+    def _refuse(self, error: BaseException) -> None:
         """Count, log and publish a refusal."""
         self._refused, self._last_refusal = self._refused + 1, str(error)
         self.node.get_logger().error(f"trajectory refused: {error}")
@@ -177,6 +209,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def watch(self) -> None:
         """End after the run, when its last samples have been answered."""
+        self.follower.proceed()
         if self._finished:
             self.done.set()
         else:
@@ -202,9 +235,12 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         """Test the tolerances of the active goal at a sample of the run that was answered."""
         if self._goal is None or not self._is_active():
             return
-        time = self.follower.time
-        self._feedback = state.header.stamp, self._goal.index(time), time, measured, command
-        outcome = self._goal.outcome(time, command.error, command.error_rate)
+        goal, order = self._goal
+        if order is not self.follower.order:  # the motion before it is followed still
+            return
+        time = self.follower.time + order.passed
+        self._feedback = state.header.stamp, goal.index(time), time, measured, command
+        outcome = goal.outcome(time, command.error, command.error_rate)
         if outcome is None:
             return
         self._report_goal()
@@ -217,20 +253,27 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         if self._is_active():
             self._end(ErrorCode.INVALID_GOAL, reason)
 
-    def _check(self, request: Any) -> GoalResponse:
+    async def _check(self, request: Any) -> GoalResponse:
         try:
             goal = TrajectoryGoal(request, self.parameters)
         except SstError as error:
             self._refuse(error)
             return GoalResponse.REJECT
-        if not self._take(request.trajectory):
+        if (order := self._take(request.trajectory)) is None:
             return GoalResponse.REJECT
-        self._goal = goal
+        checked: Future[None] = Future()
+        order.outcome.add_done_callback(lambda _: checked.set_result(None))
+        await checked
+        if not self._is_accepted(order.outcome):
+            return GoalResponse.REJECT
+        self._interrupt("preempted by a new goal")
+        self._goal = goal, order
         return GoalResponse.ACCEPT
 
     def _begin(self, handle: Any) -> None:
-        self._interrupt("preempted by a new goal")
         self._active, self._feedback = ActionGoal(handle), None
+        if self._goal is not None and not self.follower.has(self._goal[1]):
+            self._interrupt("replaced by a newer trajectory")
 
     def _cancel(self, handle: Any) -> CancelResponse:
         """Stop; the goal ends after this call, when its handle has changed to canceling."""

@@ -104,8 +104,8 @@ subscribes joint_states sensor_msgs/msg/JointState 1
 subscribes {simulator}/phase std_msgs/msg/String 10 latched
     begins anew at a reset, ends at a fault and at the end of the run
 subscribes ~/joint_trajectory trajectory_msgs/msg/JointTrajectory 10
-    motion to follow, from now on and in place of the present one; refused as a whole where it
-    cannot be followed, and where motion is not topic
+    motion to follow, from its stamp on or at once and in place of the present one; refused as a
+    whole where it cannot be followed, and where motion is not topic
 executes ~/follow_joint_trajectory control_msgs/action/FollowJointTrajectory
     the same with tolerances, feedback and a result
     if control_msgs is installed

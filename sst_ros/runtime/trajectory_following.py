@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectory following: the motion, when it began, its commands and its tracking error.
 
-A JointTrajectory becomes a motion, or is refused with the reason. The rules of goals are those of
-ros2_controllers' joint_trajectory_controller: tolerances of the path hold until the time of the
-last point, those of the goal from then on.
+The rules of goals are those of ros2_controllers' joint_trajectory_controller: tolerances of the
+path hold until the time of the last point, those of the goal from then on.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import math
 from array import array
 from bisect import bisect_right
 from enum import Enum, IntEnum
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -22,12 +22,14 @@ from sst_ros.control.actuator_space import Reference, ReferenceMotion, slow_down
 from sst_ros.control.controller import Controller, Measurement
 from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
-from sst_ros.control.reference_motions import reference_motion, through_points
+from sst_ros.control.reference_motions import reference_motion
 from sst_ros.control.tracking import TrackingMetrics, track_of
-from sst_ros.errors import Check, refusal, refuse_unless
+from sst_ros.errors import Check, SstError, refusal, refuse_unless
+from sst_ros.host.processes import Assistant
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
+from sst_ros.runtime.planning import Order, Superseded, plan, read_points
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import Actuators
@@ -36,41 +38,11 @@ from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
 NO_TOLERANCE = -1.0  # in a message: the default does not hold either
+_SUPERSEDED = "a newer trajectory came before it was checked"
+_FIRST_PERIODS_AHEAD = 25
+"""Control periods that the first check may take where the reference moves; then twice the last."""
+_MOST_CHECKS = 5
 _NUMBERS = 256 * 19  # numbers of samples, 19 each, that are added to the tracking metrics at once
-
-
-def motion_of(message: Any, geometry: Geometry, begin: Reference) -> ReferenceMotion:
-    """Take over a trajectory_msgs/JointTrajectory; its joints may come in any order.
-
-    It begins immediately and continues the reference `begin`, which may be moving. Positions are
-    needed, velocities and accelerations may be left out. An InputError lists every fault;
-    SingularConfiguration says that the path crosses a parallel singularity.
-    """
-    names, stamp = list(message.joint_names), nanoseconds(message.header.stamp)
-    times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points]
-    first, moving = times[0] if times else math.inf, any(begin.gamma_dot)
-    late = "must be > 0 s while the reference is moving"
-    one_each = f"must be {', '.join(ACTUATORS)}, each once"
-    refuse_unless(
-        "joint_trajectory",
-        ("joint_names", names, sorted(names) == list(ACTUATORS), one_each),
-        ("header.stamp", stamp, stamp == 0, "must be zero: a trajectory begins immediately"),
-        *(
-            (f"points[{i}].effort", [*at.effort], not at.effort, "must be left out: it is computed")
-            for i, at in enumerate(message.points)
-        ),
-        ("points[0].time_from_start", first, first > 0.0 or not moving, late),
-    )
-    places = [names.index(name) for name in ACTUATORS]
-
-    def by_leg(quantity: str) -> list[list[float]]:
-        """Sort by leg what is whole; what is not is refused as it is."""
-        rows = [list(map(float, getattr(point, quantity))) for point in message.points]
-        return [[row[k] for k in places] if len(row) == len(places) else row for row in rows]
-
-    rows = by_leg("positions"), by_leg("velocities"), by_leg("accelerations")
-    going = begin.gamma_dot, begin.gamma_ddot
-    return through_points(geometry, begin.quaternion, times, *rows, going)
 
 
 class ErrorCode(IntEnum):
@@ -175,10 +147,14 @@ class Stage(Enum):
 class TrajectoryFollower:
     """Follows the scene's motion once, or one trajectory after the other.
 
+    A trajectory replaces what is followed, from a reference a little ahead, where it will have been
+    checked by a process beside the control; in lockstep, where the plant waits, at once.
     Raises InputError, AssemblyError or SingularConfiguration where the scene's motion is refused.
 
     Attributes:
         stage: present stage.
+        order: that of the trajectory that is followed.
+        finished: tracking errors of the motion before this one, if it came to rest.
         samples: samples answered.
         irregular: those of them that came at another period.
         limited: samples of the motion in which a torque was limited.
@@ -196,50 +172,157 @@ class TrajectoryFollower:
         if settings.motion == "scene":
             self._planned = reference_motion(model, _read_motion)
             check_motion(self._planned, self._model)
+        self._plan, self._assistant = partial(plan, self._model), None
+        self._ahead_ns = 0  # from a sample to the instant from which a trajectory is planned
+        if settings.motion == "topic" and not settings.stamped:
+            self._assistant = Assistant(self._plan)
+            self._ahead_ns = _FIRST_PERIODS_AHEAD * settings.period_ns
+        self._checked: Order | None = None
+        self._waiting: Order | None = None
         self.samples = self.irregular = self.limited = 0
         self._start_ns: int | None = None
+        self._record_ns = 0
         self.restart()
+
+    def close(self) -> None:
+        """End the process that checks trajectories."""
+        if self._assistant is not None:
+            self._assistant.close()
 
     def restart(self) -> None:
         """Forget the run, as after a reset of the simulator, and all trajectories."""
-        self.stage, self._last_ns = Stage.WAITING, 0
+        for order in filter(None, (self._checked, self._waiting)):
+            order.refuse(SstError("the run began anew"))
+        self.stage, self._last_ns, self._waiting = Stage.WAITING, 0, None
         self._rows, self._metrics = array("d"), TrackingMetrics()
         self._last: Command | None = None
+        self.order: Order | None = None
+        self.finished: TrackingMetrics | None = None
+        self._upcoming: list[tuple[int, ReferenceMotion, Order]] = []  # by the stamps they begin at
         if self._planned is not None:
             self._prepare(self._planned)
 
-    def take(self, message: Any, seen: Measurement | None) -> None:
+    def take(self, message: Any, seen: Measurement | None, seen_ns: int = 0) -> Order:
         """Take a trajectory_msgs/JointTrajectory in place of what is followed now.
 
-        It goes on from the reference of the last sample; before there was one, from where the
-        manipulator is, at rest. A reference that moves is replaced in lockstep only. Where an error
-        is raised, nothing has changed.
+        It goes on from the reference that is followed then; before the first sample from where the
+        manipulator was `seen` last, at rest. Where it is refused, nothing changes.
         """
-        origin, given, last = "joint_trajectory", self._settings, self._last
-        allowed = "must be topic, for trajectories to be taken"
-        refuse_unless(origin, ("motion", given.motion, given.motion == "topic", allowed))
-        begin = last.desired if last else self._reference_at_rest(seen)
-        moving = any((*begin.gamma_dot, *begin.gamma_ddot))
-        # The check takes longer than a control period; in lockstep the plant waits.
-        allowed = "must come when the motion has ended, outside lockstep"
-        refuse_unless(origin, ("points", "", given.stamped or not moving, allowed))
-        motion = motion_of(message, self._geometry, begin)
-        check_motion(motion, self._model)
-        if last is None:
-            self._prepare(motion)
+        motion, allowed = self._settings.motion, "must be topic, for trajectories to be taken"
+        refuse_unless("joint_trajectory", ("motion", motion, motion == "topic", allowed))
+        order = Order(read_points(message), seen, seen_ns)
+        if self._waiting is not None:
+            self._waiting.refuse(Superseded(_SUPERSEDED))
+        self._waiting = order
+        self.proceed()
+        return order
+
+    def proceed(self) -> None:
+        """Have the newest trajectory checked, and follow it once it has been."""
+        while self._checked or self._waiting:
+            if self._checked is None:
+                order, self._waiting = self._waiting, None
+                assert order is not None
+                try:
+                    given = order.points, *self._place(order)
+                    if self._assistant is None:
+                        self._follow(order, self._plan(*given))
+                        continue
+                except SstError as error:
+                    order.refuse(error)
+                    continue
+                self._assistant.call(*given)
+                self._checked = order
+            assert self._assistant is not None
+            if (result := self._assistant.result()) is None:
+                return
+            order, self._checked = self._checked, None
+            self._settle(order, result)
+
+    def _place(self, order: Order) -> tuple[Reference, float]:
+        """Find the reference from which to plan, and the time of the trajectory then [s]."""
+        stamp_ns, order.begin_ns, order.asked_ns = order.points.stamp_ns, None, self._last_ns
+        now_ns = self._last_ns + self._settings.period_ns
+        if self._last is None:
+            order.begin, now_ns = self._reference_at_rest(order.seen), order.seen_ns
+        elif stamp_ns == 0 and self._rests():
+            order.begin = self._motion.at(math.inf)
+        else:
+            now_ns = order.begin_ns = max(self._last_ns + self._ahead_ns, stamp_ns)
+            order.begin = self._reference_at(now_ns)
+        order.passed = max(0, now_ns - stamp_ns) / NANOSECONDS if stamp_ns else 0.0
+        return order.begin, order.passed
+
+    def _settle(self, order: Order, result: Any) -> None:
+        """Follow what was checked if it still goes on from the reference, else have it repeated."""
+        order.asked += 1
+        if order.outcome.done():  # by a reset
             return
-        self._controller.follow(motion)
-        self._begin(motion, self._last_ns if moving else None)
-        self.stage = Stage.FOLLOWING
+        if order.asked_ns:
+            took_ns, period_ns = self._last_ns - order.asked_ns, self._settings.period_ns
+            self._ahead_ns = max(2 * (took_ns + period_ns), self._ahead_ns - period_ns)
+        if isinstance(result, ReferenceMotion) and self._is_timely(order):
+            self._follow(order, result)
+        elif isinstance(result, SstError):
+            order.refuse(result)
+        elif isinstance(result, Exception):
+            order.refuse(SstError(f"internal error: {type(result).__name__}: {result}"))
+        elif self._waiting is not None:
+            order.refuse(Superseded(_SUPERSEDED))
+        elif order.asked == _MOST_CHECKS:
+            order.refuse(SstError(f"checked too late {_MOST_CHECKS} times, on a busy machine"))
+        else:
+            self._waiting = order
+
+    def _is_timely(self, order: Order) -> bool:
+        if self._last is None or order.begin is None:
+            return self._last is None and order.asked_ns == 0
+        if order.begin_ns is None:
+            return self._rests() and order.begin == self._motion.at(math.inf)
+        late = order.begin_ns < self._last_ns
+        return not late and order.begin == self._reference_at(order.begin_ns)
+
+    def has(self, order: Order) -> bool:
+        """Whether the trajectory is followed, or will be at its stamp."""
+        return order is self.order or any(order is one for _, _, one in self._upcoming)
+
+    def _rests(self) -> bool:
+        """Whether the reference stands still from now on."""
+        return not self._upcoming and self.time >= self._motion.duration
+
+    def _reference_at(self, stamp_ns: int) -> Reference:
+        """Return the reference at a stamp that has not come yet."""
+        motion, start_ns = self._motion, self._start_ns or self._last_ns
+        for begin_ns, upcoming, _ in self._upcoming:
+            if begin_ns <= stamp_ns:
+                motion, start_ns = upcoming, begin_ns
+        return motion.at((stamp_ns - start_ns) / NANOSECONDS)
+
+    def _follow(self, order: Order, motion: ReferenceMotion) -> None:
+        """Follow a motion from its stamp on, and until then what is followed now."""
+        stamp_ns, start = order.points.stamp_ns, motion.at(0.0)
+        if self._last is None:
+            self._upcoming = [(stamp_ns, motion, order)] if stamp_ns > order.seen_ns else []
+            if self._upcoming:
+                self._prepare(ReferenceMotion(lambda _: start, (0.0,)))
+            else:
+                self._prepare(motion, order)
+        else:
+            start_ns = order.begin_ns or self._last_ns + self._settings.period_ns
+            self._upcoming = [one for one in self._upcoming if one[0] < start_ns]
+            self._upcoming.append((start_ns, motion, order))
+        order.outcome.set_result(None)
 
     def stop(self) -> None:
         """Come to rest on the path in `stop_time`, and hold; before the run, forget the motion."""
         if self.stage is Stage.READY:
             self.restart()
-        elif self.stage is Stage.FOLLOWING and self._start_ns is not None:
-            motion = slow_down(self._motion, self.time, self._settings.stop_time)
-            self._controller.follow(motion)
-            self._begin(motion, self._last_ns)
+        elif self._start_ns is not None:
+            self._upcoming.clear()
+            if self.stage is Stage.FOLLOWING:
+                motion = slow_down(self._motion, self.time, self._settings.stop_time)
+                self._controller.follow(motion)
+                self._begin(motion, self._last_ns)
 
     def preview(self, measured: Measurement) -> Command | None:
         """Answer a sample before the run; None as long as there is nothing to follow."""
@@ -264,8 +347,13 @@ class TrajectoryFollower:
             self.stage = Stage.FOLLOWING
         else:
             self.irregular += stamp_ns - self._last_ns != self._settings.period_ns
+        while self._upcoming and self._upcoming[0][0] <= stamp_ns:
+            begin_ns, motion, order = self._upcoming.pop(0)
+            self._controller.follow(motion)
+            self._begin(motion, begin_ns, order)
+            self.stage = Stage.FOLLOWING
         if self._start_ns is None:
-            self._start_ns = stamp_ns
+            self._start_ns = self._record_ns = stamp_ns
         passed_ns = stamp_ns - self._start_ns
         time = passed_ns / NANOSECONDS
         command = self._controller.command(time, measured)
@@ -279,7 +367,7 @@ class TrajectoryFollower:
         if passed_ns <= end_ns:
             angles = *command.desired.gamma, *command.desired.gamma_dot, *command.error
             torques = *command.feedforward, *command.feedback, *command.torque
-            self._rows.extend((time, *angles, *torques))
+            self._rows.extend(((stamp_ns - self._record_ns) / NANOSECONDS, *angles, *torques))
             if len(self._rows) >= _NUMBERS:
                 self._add_rows()
         self.samples += 1
@@ -304,17 +392,24 @@ class TrajectoryFollower:
         rms, largest = self._metrics.rms, self._metrics.largest
         return float(np.sqrt(np.mean(rms**2))), float(largest.max())
 
-    def _prepare(self, motion: ReferenceMotion) -> None:
+    def _prepare(self, motion: ReferenceMotion, order: Order | None = None) -> None:
         period = self._settings.period_ns / NANOSECONDS
         self._controller = Controller(self._model, motion, self._settings, period)
-        self._begin(motion, None)
+        self._begin(motion, None, order)
         self.stage = Stage.READY
 
-    def _begin(self, motion: ReferenceMotion, start_ns: int | None) -> None:
-        """Follow a motion from an instant on; None for the next sample."""
-        self._motion, self._start_ns = motion, start_ns
-        self._rows, self._metrics = array("d"), TrackingMetrics()
-        self.limited = 0
+    def _begin(
+        self, motion: ReferenceMotion, start_ns: int | None, order: Order | None = None
+    ) -> None:
+        """Follow a motion from an instant on, None for the next sample.
+
+        The record of the tracking errors goes on where the reference was moving.
+        """
+        self._motion, self._start_ns, self.order = motion, start_ns, order
+        if self.stage is not Stage.FOLLOWING:
+            self.finished = self.tracking()
+            self._rows, self._metrics, self.limited = array("d"), TrackingMetrics(), 0
+            self._record_ns = start_ns or 0
 
     def _add_rows(self) -> None:
         """Add the samples since the last call to the metrics."""

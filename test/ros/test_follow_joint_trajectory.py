@@ -2,12 +2,14 @@
 """The action ~/follow_joint_trajectory with a real client, a real controller and simulator."""
 
 import signal
+from contextlib import closing
 
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from programs import own_domain
 from rclpy.action import ActionClient
-from ros.conftest import NAMES, foreign_types
+from ros.conftest import NAMES, Nodes, Observer, foreign_types
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -31,16 +33,19 @@ def types():
 class Client:
     """A client of the action, and the controller and the simulator that it moves."""
 
-    def __init__(self, nodes, observer, folder, env):
+    def __init__(self, nodes, observer, folder, env, sync):
         from control_msgs.action import FollowJointTrajectory
         from control_msgs.msg import JointTolerance
 
-        self.kind, self.tolerance, self.observer = FollowJointTrajectory, JointTolerance, observer
+        self.kind, self.tolerance = FollowJointTrajectory, JointTolerance
+        self.observer, self.nodes = observer, nodes
         self.reference = observer.listen(JointState, f"{NODE}/reference")
         path = written(folder, motion=None)
-        # A check of a goal takes long on a busy machine.
-        nodes.run("simulator", scene=path, sync="lockstep", lockstep_timeout=0.0)
-        given = {"mode": "computed_torque", "stamped": True, "motion": "topic", "scene": path}
+        # A check of a goal takes long on a busy machine, and so do the samples of a free run.
+        run = {"lockstep_timeout": 0.0} if sync == "lockstep" else {"real_time_factor": 0.25}
+        nodes.run("simulator", scene=path, sync=sync, wait_for_command=True, **run)
+        given = {"mode": "computed_torque", "motion": "topic", "scene": path}
+        given["stamped"] = sync == "lockstep"
         self.controller = nodes.start("inverse_dynamics", env=env, **given)
         self.client = ActionClient(
             observer.node, FollowJointTrajectory, f"{NODE}/follow_joint_trajectory"
@@ -81,9 +86,11 @@ class Client:
         return [self.tolerance(name=joint, position=position)]
 
 
-@pytest.fixture(scope="module")
-def client(types, tmp_path_factory, nodes_of_module, observer_of_module):
-    return Client(nodes_of_module, observer_of_module, tmp_path_factory.mktemp("goals"), types)
+@pytest.fixture(scope="module", params=["lockstep", "free"])
+def client(types, tmp_path_factory, request):
+    """Clients of two runs, each in a domain of its own."""
+    with own_domain() as domain, closing(Nodes()) as nodes, closing(Observer(domain)) as observer:
+        yield Client(nodes, observer, tmp_path_factory.mktemp("goals"), types, request.param)
 
 
 def test_a_goal_is_followed_with_feedback_and_succeeds(client):
@@ -164,10 +171,10 @@ def test_a_new_goal_and_a_trajectory_of_the_topic_preempt_a_goal(client):
     assert client.rest() == pytest.approx(HOME, abs=1e-12)
 
 
-def test_the_end_of_the_controller_delivers_a_result(client, nodes_of_module):
+def test_the_end_of_the_controller_delivers_a_result(client):
     client.rest()
     handle = client.send((20.0, AWAY))
     client.moving()
     client.controller.send_signal(signal.SIGINT)
     assert client.result(handle) == (PREEMPTED, "the controller ends")
-    assert nodes_of_module.ended(client.controller)[0] == 0
+    assert client.nodes.ended(client.controller)[0] == 0

@@ -2,8 +2,10 @@
 """The controller against the simulator, in lockstep and running free, and against bad input."""
 
 import dataclasses
+import math
 import re
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -83,11 +85,11 @@ def test_a_run_in_lockstep_is_repeated_exactly(twice):
 def trajectory(*points, names=NAMES, **given):
     """Rows of time [s], positions, velocities."""
     message = JointTrajectory(joint_names=list(names))
-    for time, positions, *velocities in points:
+    for seconds, positions, *velocities in points:
         point = JointTrajectoryPoint(positions=list(map(float, positions)))
         if velocities:
             point.velocities = list(map(float, velocities[0]))
-        point.time_from_start = Duration(seconds=time).to_msg()
+        point.time_from_start = Duration(seconds=seconds).to_msg()
         message.points.append(point)
     for name, value in given.items():
         setattr(message.points[0], name, value)
@@ -117,9 +119,9 @@ def idle(stamp_ns=0):
 def test_a_bad_trajectory_is_refused_and_changes_nothing(case):
     message, reason = BAD[case]
     model = dataclasses.replace(PLANT, motion=None, actuators=Actuators(torque_limit=8.0))
-    follower = TrajectoryFollower(model, ControllerNodeParameters(motion="topic"))
+    follower = TrajectoryFollower(model, ControllerNodeParameters(motion="topic", stamped=True))
     with pytest.raises(SstError, match=re.escape(reason)):
-        follower.take(message, Measurement(HOME, (0.0, 0.0, 0.0)))
+        follower.take(message, Measurement(HOME, (0.0, 0.0, 0.0))).outcome.result()
     assert follower.stage is Stage.WAITING
 
 
@@ -166,7 +168,41 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     slope = np.diff(gamma, axis=0) / 0.002
     assert np.abs(slope - 0.5 * (rate[1:] + rate[:-1])).max() < 1e-3
     errors = [line.split()[-3:] for line in out.splitlines() if line.startswith("error, largest")]
-    assert len(errors) >= 2 and np.array(errors, dtype=float).max() < 1e-4
+    assert errors and np.array(errors, dtype=float).max() < 1e-4
+
+
+def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(nodes, observer, tmp_path):
+    """Ten points a second, each a second ahead; on a busy machine, so at a quarter of the speed."""
+    path = written(tmp_path, motion=None)
+    reference = observer.listen(JointState, f"{NODE}/reference")
+    nodes.run("simulator", scene=path, wait_for_command=True, real_time_factor=0.25)
+    controller = nodes.run("inverse_dynamics", scene=path, mode="computed_torque", motion="topic")
+    publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
+    observer.told("stage", "waiting for a trajectory")
+    begin, sent = time.monotonic(), 0
+    while sent < 80:
+        passed = time.monotonic() - begin
+        if passed >= 0.1 * sent:
+            goal = np.add(HOME, np.multiply(math.sin(passed), (0.1, -0.05, 0.0)))
+            publisher.publish(trajectory((0.25, goal)))
+            sent += 1
+        observer.executor.spin_once(timeout_sec=0.01)
+    observer.until(
+        lambda: np.abs(np.subtract(reference[-1].position, goal)).max() < 1e-9, "the end"
+    )
+    said = observer.told("trajectories_refused", 0)
+    assert said["level"] == b"\x00" or said["said"].endswith("samples do not come at rate")
+    assert observer.phase("running") and controller.poll() is None
+    stamps, gamma, rate = (
+        np.array(row)
+        for row in ([observer.stamp(m) for m in reference], [m.position for m in reference],
+                    [m.velocity for m in reference])
+    )  # fmt: skip
+    dt = 1e-9 * np.diff(stamps)[:, None]
+    # The largest acceleration of a quintic of 0.25 s is below 6 * 0.2 / 0.25^2 = 20 rad/s^2.
+    assert np.abs(np.diff(rate, axis=0) / dt).max() < 20.0
+    off = np.diff(gamma, axis=0) - 0.5 * dt * (rate[1:] + rate[:-1])
+    assert np.abs(off / dt**2).max() < 4.0 and np.ptp(gamma[:, 0]) > 0.1
 
 
 def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(

@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller without its node: when it begins, goes on, ends, and what it refuses; goals."""
 
+import contextlib
 import dataclasses
+import math
+import os
+import signal
+import time
 import tracemalloc
 
 import numpy as np
@@ -12,6 +17,9 @@ from sst_ros.control import tracking
 from sst_ros.control.controller import ControlStopped, Measurement
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, SstError
+from sst_ros.host import processes
+from sst_ros.runtime import trajectory_following
+from sst_ros.runtime.planning import Superseded
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import (
     ErrorCode,
@@ -165,6 +173,195 @@ def test_a_stop_comes_to_rest_on_the_path_and_holds():
     assert (np.abs(np.diff(rates[:, 2])) < 0.2 * abs(rates[0, 2])).all()  # without a jump
     assert np.array(state.joints.gamma) == pytest.approx(rest.gamma, abs=1e-4)
     assert len(references) == 40 and stages[-1] is Stage.HOLDING
+
+
+class Assistant:
+    """Checks at once, and has the result when it was asked for so many times."""
+
+    def __init__(self, function):
+        self.function, self.takes, self.calls, self.left = function, 0, 0, 0
+
+    def call(self, *given):
+        self.given, self.left, self.calls = given, self.takes, self.calls + 1
+
+    def result(self):
+        if self.left:
+            self.left -= 1
+            return None
+        try:
+            return self.function(*self.given)
+        except SstError as error:
+            return error
+
+    def close(self):
+        pass
+
+
+class Stream:
+    """A run on trajectories, sample by sample, measured where it is desired."""
+
+    def __init__(self, monkeypatch, takes, **settings):
+        monkeypatch.setattr(trajectory_following, "Assistant", Assistant)
+        self.follower = TrajectoryFollower(
+            dataclasses.replace(MODEL, motion=None),
+            ControllerNodeParameters(motion="topic", **settings),
+        )
+        self.measured, self.references, self.stamp_ns = HERE, [], START_NS
+        self.assistant = self.follower._assistant
+        if self.assistant is not None:
+            self.assistant.takes = takes
+
+    def send(self, time, off, stamp_ns=0):
+        """A point at a time [s], so far [rad] from where the run begins."""
+        point = Message(
+            positions=list(np.add(HERE.gamma, off)), velocities=[], accelerations=[], effort=[],
+            time_from_start=duration(time * 1e9),
+        )  # fmt: skip
+        header = Message(stamp=duration(stamp_ns))
+        given = Message(
+            header=header, joint_names=["gamma_1", "gamma_2", "gamma_3"], points=[point]
+        )
+        return self.follower.take(given, self.measured, self.stamp_ns - PERIOD_NS)
+
+    def samples(self, count):
+        for _ in range(count):
+            if command := self.follower.answer(self.stamp_ns, self.measured):
+                desired = command.desired
+                self.measured = Measurement(desired.gamma, desired.gamma_dot)
+                self.references.append(desired)
+            self.follower.proceed()
+            self.stamp_ns += PERIOD_NS
+
+    def jumps(self):
+        """Largest steps of position, velocity and acceleration beside what the others explain."""
+        names = "gamma", "gamma_dot", "gamma_ddot"
+        p, v, a = (np.array([getattr(one, name) for one in self.references]) for name in names)
+        dt = 1e-9 * PERIOD_NS
+        mean = 0.5 * (v[1:] + v[:-1]) - dt / 12.0 * np.diff(a, axis=0)
+        off = np.diff(p, axis=0) - dt * mean, np.diff(v, axis=0) - 0.5 * dt * (a[1:] + a[:-1])
+        return [float(np.abs(one).max()) for one in (*off, np.diff(a, axis=0))]
+
+
+@pytest.mark.parametrize("takes", [0, 3, 40], ids=lambda takes: f"{takes} samples")
+@pytest.mark.parametrize("every", [10, 50, 167])
+def test_a_stream_is_followed_without_a_jump_however_long_its_checks_take(
+    monkeypatch, takes, every
+):
+    stream, orders = Stream(monkeypatch, takes, mode="computed_torque"), []
+    for k in range(1000 // every):
+        off = 0.1 * np.sin(0.02 * every * k) * np.array([1.0, -0.5, 0.0])
+        orders.append(stream.send(0.5, off))
+        stream.samples(every)
+    stream.samples(500)
+    assert stream.follower.irregular == 0 and stream.follower.stage is Stage.HOLDING
+    assert np.abs(np.subtract(stream.references[-1].gamma, HERE.gamma) - off).max() < 1e-12
+    # Of a quintic of 0.5 s the jerk is below 60 * 0.2 / 0.5^3 = 96 rad/s^3, its change in 2 ms 0.2.
+    position, velocity, acceleration = stream.jumps()
+    assert position < 1e-9 and velocity < 1e-6 and acceleration < 0.25
+    errors = [order.outcome.exception() for order in orders if order.outcome.done()]
+    assert all(error is None or isinstance(error, Superseded) for error in errors)
+    assert errors.count(None) >= (len(orders) if takes < every else len(orders) // 9)
+
+
+def test_control_goes_on_beside_the_check_of_a_trajectory():
+    """With the process that does it: a check takes several milliseconds, a sample less than two."""
+    with pytest.MonkeyPatch.context() as patch:
+        stream = Stream(patch, 0, mode="computed_torque")
+    stream.send(1.0, (0.05, 0.0, 0.0))
+    stream.samples(100)
+    follower = stream.follower
+    with contextlib.closing(processes.Assistant(follower._plan)) as follower._assistant:
+        for number in range(3):  # what is imported and traced first is not a check
+            order, took = stream.send(1.0, (0.05 + 0.01 * number, 0.0, 0.0)), []
+            while not order.outcome.done():
+                assert len(took) < 30_000 and stream.stamp_ns < START_NS + 60 * 10**9
+                began = time.thread_time()
+                stream.samples(1)
+                took.append(time.thread_time() - began)
+                time.sleep(0.002)
+            assert order.outcome.exception() is None
+            stream.samples(50)
+        follower.proceed()
+    assert len(took) > 1 and sorted(took)[len(took) // 2] < 0.002
+    assert max(stream.jumps()[:2]) < 1e-6
+
+
+def test_the_process_that_checks_ends_with_its_reason_and_another_begins():
+    with contextlib.closing(processes.Assistant(math.sqrt)) as assistant:
+
+        def result(*given):
+            assistant.call(*given)
+            end = time.monotonic() + 60.0
+            while (found := assistant.result()) is None:
+                assert time.monotonic() < end
+                time.sleep(0.01)
+            return found
+
+        assert result(4.0) == 2.0
+        assert isinstance(result(-1.0), ValueError)
+        os.kill(assistant._process.pid, signal.SIGKILL)
+        assert "has ended with status -9" in str(result(9.0))
+        assert result(9.0) == 3.0
+
+
+def test_a_trajectory_begins_at_its_stamp_and_another_takes_its_place(monkeypatch):
+    stream = Stream(monkeypatch, 2)
+    first = stream.send(0.1, (0.02, 0.0, 0.0), START_NS + 10 * PERIOD_NS)
+    stream.samples(10)
+    before = len(stream.references)
+    off = np.array([np.subtract(one.gamma, HERE.gamma) for one in stream.references])
+    assert before > 5 and np.abs(off).max() < 1e-15
+    stream.samples(1 + 50 + 1)
+    gammas = np.array([one.gamma for one in stream.references])[before:, 0] - HERE.gamma[0]
+    assert (np.diff(gammas[:51]) > 0.0).all() and gammas[50:] == pytest.approx(0.02)
+    # While it moves: one in the future, and before that comes one for now, which replaces it.
+    begin = stream.stamp_ns
+    second = stream.send(0.2, (0.0, 0.0, 0.0))
+    stream.samples(40)
+    third = stream.send(0.1, (0.05, 0.0, 0.0), begin + 60 * PERIOD_NS)
+    stream.samples(10)
+    assert third.outcome.done() and stream.follower.has(third)
+    assert stream.follower.order is second
+    fourth = stream.send(0.1, (0.01, 0.0, 0.0))
+    stream.samples(100)
+    assert stream.follower.order is fourth and not stream.follower.has(third)
+    assert stream.references[-1].gamma[0] - HERE.gamma[0] == pytest.approx(0.01)
+    assert first.outcome.exception() is fourth.outcome.exception() is None
+    assert max(stream.jumps()[:2]) < 1e-3  # in 0.1 s it accelerates to 4 rad/s^2
+
+
+def test_points_whose_time_has_passed_are_left_out(monkeypatch):
+    stream = Stream(monkeypatch, 0)
+    stream.send(0.2, (0.02, 0.0, 0.0))
+    stream.samples(50)
+    old = stream.send(0.1, (0.05, 0.0, 0.0), stream.stamp_ns - 150_000_000)
+    assert "all points have passed" in str(old.outcome.exception())
+    late = stream.send(0.3, (0.05, 0.0, 0.0), stream.stamp_ns - 200_000_000)
+    stream.samples(47)
+    assert stream.references[-1].gamma_dot[0] > 0.0
+    stream.samples(4)  # 0.3 s after the stamp
+    assert late.passed >= 0.2 and stream.references[-1].gamma_dot == REST
+    assert stream.references[-1].gamma[0] - HERE.gamma[0] == pytest.approx(0.05)
+
+
+def test_a_check_whose_beginning_has_changed_is_repeated(monkeypatch):
+    stream = Stream(monkeypatch, 30, stop_time=0.02)
+    stream.send(1.0, (0.1, 0.0, 0.0))
+    stream.samples(200)
+    order, calls = stream.send(0.5, (0.0, 0.0, 0.0)), stream.assistant.calls
+    stream.samples(10)
+    stream.follower.stop()
+    stream.samples(300)
+    assert order.outcome.exception() is None and stream.assistant.calls > calls
+    assert stream.references[-1].gamma == pytest.approx(HERE.gamma)
+    assert (
+        max(stream.jumps()[:2]) < 1e-3
+    )  # its rate is 0.2 rad/s when the stop of ten samples begins
+    stopped = stream.send(0.5, (0.1, 0.0, 0.0))
+    stream.follower.restart()
+    stream.samples(100)
+    assert "began anew" in str(stopped.outcome.exception())
+    assert stream.follower.stage is Stage.WAITING
 
 
 DEFAULTS = ControllerNodeParameters(motion="topic", path_tolerance=0.1, goal_tolerance=0.01)
