@@ -264,6 +264,8 @@ EXTRAS = {
 }
 """Extra of this package that installs a module."""
 
+_APT = ("lz4", "matplotlib", "numba", "pandas", "xarray", "zstandard")
+_PIP = {**dict.fromkeys(("mcap", "rosbags"), "mcap rosbags"), "distributed": "dask[distributed]"}
 _ROS = ("ament_index_python", "rclpy", "rcl_interfaces", "builtin_interfaces", "launch")
 
 
@@ -288,4 +290,7 @@ def explanation(error: ModuleNotFoundError) -> str | None:
     extra = "ros" if ros else EXTRAS.get(module)
     how = f"pip install 'sst_ros[{extra}]' (in the source folder: pip install '.[{extra}]')"
     more = "source a ROS 2 installation, or " * ros
+    if os.environ.get("ROS_DISTRO") and not ros:  # beside a ROS installation, of a workspace there
+        apt, pip = f"apt install python3-{module}", f"pip install {_PIP.get(module, module)}"
+        more = f"{apt if module in _APT else pip}, or "
     return f"{module} is not installed: {more}{how}" if extra else None

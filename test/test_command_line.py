@@ -194,6 +194,22 @@ def test_what_needs_an_extra_says_which(line, modules, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("line", "how"),
+    [
+        ("recover bag", "rosbags is not installed: pip install mcap rosbags, or pip install 'sst_"),
+        ("simulate example2 --plot", "matplotlib is not installed: apt install python3-matplotlib"),
+        ("view bag", "viser is not installed: pip install viser"),
+        ("recorder", "rclpy is not installed: source a ROS 2 installation"),
+    ],
+)
+def test_beside_a_ros_installation_the_package_of_apt_or_pip_is_named(line, how):
+    """Of a workspace there, `pip install sst_ros` would be a second one."""
+    program = BLOCKED.format(names=OPTIONAL, commands=[line.split()])
+    said = python(program, status=1, env={**os.environ, "ROS_DISTRO": "kilted"}).stderr
+    assert how in said and said.count("\n") == 1, said
+
+
 def test_what_needs_no_extra_runs_without_any():
     commands = [["scene", "list"], ["scene", "show", "reach"], ["plan", "check", "spiral"],
                 ["describe"], [], ["--version"]]  # fmt: skip

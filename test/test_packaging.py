@@ -25,15 +25,16 @@ MARKDOWN = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 RST = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
 _SAME = "argcomplete hypothesis jinja2 jsonschema matplotlib numba numpy pandas pytest scipy"
 PYTHON_KEYS = {name: f"python3-{name}" for name in (*_SAME.split(), "pytest-timeout")} | {
-    "mcap": "mcap-ros2-support",  # which needs mcap
     "mpmath": "python3-sympy",  # which needs mpmath
     "PyYAML": "python3-yaml",
-    "rosbags": "python3-rosbags-pip",
 }
-"""Keys of rosdep/python.yaml of github.com/ros/rosdistro, commit 8468e88c of 2026-08-22."""
+"""Keys of rosdep/python.yaml of github.com/ros/rosdistro, commit 8468e88c of 2026-08-22.
 
-WITHOUT_KEY = {"control", "dask", "pyarrow", "viser", "xarray"}
-"""Python packages of setup.py that have no key there: `pip install sst_ros[all]`."""
+Each is a package of apt on Ubuntu and on Debian, as bloom needs it: it refuses keys of pip.
+"""
+
+WITHOUT_KEY = {"control", "dask", "mcap", "pyarrow", "rosbags", "viser", "xarray"}
+"""Python packages of setup.py that have none, or one of pip: `pip install sst_ros[all]`."""
 
 ROS_KEYS = {
     *("ament_copyright", "ament_flake8", "ament_index_python", "ament_pep257", "ament_xmllint"),
@@ -42,7 +43,7 @@ ROS_KEYS = {
     *("ros2bag", "ros2launch", "rosbag2_storage_mcap", "rosgraph_msgs", "rviz2", "sensor_msgs"),
     *("simulation_interfaces", "std_msgs", "std_srvs", "trajectory_msgs"),
 }
-"""Packages of both jazzy/ and kilted/distribution.yaml of the same commit."""
+"""Packages that are released in both jazzy/ and kilted/distribution.yaml of the same commit."""
 
 
 def test_the_version_is_the_same_everywhere():
