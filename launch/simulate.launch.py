@@ -33,6 +33,7 @@ def actions(given: Given) -> list[Action]:
     """Describe the nodes."""
     play, recorded = given["play"] == "true", given["record"] == "true"
     run = {name: given[name] for name in RUN}
+    run["publish_description"] = "false" if given["rviz"] == "true" else ""
     if play:
         run["wait_for_command"] = "true"
         # By default the same run on a busy machine.

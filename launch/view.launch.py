@@ -21,6 +21,7 @@ def actions(given: Given) -> list[Action]:
     """Describe the nodes."""
     shown = launch_parts.rviz(given, given["scene"]) if given["rviz"] == "true" else []
     run = {name: given[name] for name in ("scene", "publish_rate", "duration")}
+    run["publish_description"] = "false" if given["rviz"] == "true" else ""
     nodes = [launch_parts.simulator(given, run, recorded=False)]
     if given["browser"] == "true":
         nodes.append(launch_parts.node(given, "viewer", {"port": given["port"]}))

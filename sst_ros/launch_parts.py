@@ -19,12 +19,13 @@ from typing import Any
 import yaml
 from ament_index_python.packages import get_packages_with_prefixes
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
-from launch.events.process import ProcessExited
+from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction
+from launch.events.process import ProcessExited, ShutdownProcess
 from launch.launch_context import LaunchContext
 from launch.launch_description import LaunchDescription
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import suggestion
@@ -33,7 +34,17 @@ from sst_ros.nodes import arguments, topics
 from sst_ros.runtime.settings import default_topics
 from sst_ros.scene.scene import load, share_directory
 
-Given = Mapping[str, str]  # values of the launch arguments
+
+class Given(dict[str, str]):
+    """Values of the launch arguments of one launch file, and the actions that are made of them.
+
+    Those end together, and nothing else of a launch that includes this one does.
+    """
+
+    def __init__(self, values: Mapping[str, str]) -> None:
+        super().__init__(values)
+        self.partners: list[Action] = []
+        self.ending = False
 
 
 class Default(str):
@@ -49,7 +60,11 @@ _SHARED = {
     "params_file": ("", "YAML file of parameters; arguments that are given here go before it"),
     "log_level": ("info", "log level of the nodes: debug, info, warn, error or fatal"),
 }
-_CLOSING_S = "60"  # time that a recorder has to write its index before it is terminated
+_SIGNAL_AGAIN_S = "10"
+"""Wait for the end after SIGINT, before SIGTERM asks for the same: `ros2 bag record` can lose the
+first signal while it starts, when the handler of rclcpp is there and its own is not yet."""
+_CLOSING_S = "60"  # time that a recorder has to write its index before it is killed
+_ENDS = {"sigterm_timeout": _SIGNAL_AGAIN_S, "sigkill_timeout": _CLOSING_S}
 _WAIT_S = "60"  # that a simulator waits for its recorder; on a busy machine one starts in 20 s
 
 
@@ -82,7 +97,16 @@ def description(
         values = context.launch_configurations
         if (path := values["params_file"]) and not Path(path).is_file():
             raise RuntimeError(f"params_file:={path}: no such file")
-        return actions({n: values[n] if n in given else Default(values[n]) for n in every})
+        chosen = Given({n: values[n] if n in given else Default(values[n]) for n in every})
+        pushed = prefix_namespace(values.get("ros_namespace"), values["namespace"])
+        chosen["namespace"] = make_namespace_absolute(pushed) or ""
+        if "output" in every and "output" not in given:  # not that of another robot's recording
+            words = [*filter(None, chosen["namespace"].split("/")), chosen["output"]]
+            chosen["output"] = Default("_".join(words))
+        for name in every.keys() - given:
+            del values[name]  # the next file that is included has defaults of its own
+        chosen.partners = actions(chosen)
+        return chosen.partners
 
     def note(context: LaunchContext) -> None:
         given.update(context.launch_configurations)
@@ -100,11 +124,13 @@ def description(
     return LaunchDescription([named, *declared, OpaqueFunction(function=perform)])
 
 
-def node(given: Given, executable: str, parameters: Given, *, ends: bool = True) -> Node:
+def node(
+    given: Given, executable: str, parameters: Mapping[str, str], *, ends: bool = True
+) -> Node:
     """Describe a node of this package, which ends with the launch, however that ends.
 
     Parameters that are empty are left to params_file or the default; an InputError lists what the
-    node would refuse. Where it `ends`, its end is that of the launch; its failure always is.
+    node would refuse. Where it `ends`, its end is that of its partners; its failure always is.
     """
     defaults = {k: str(v) for k, v in parameters.items() if v and isinstance(v, Default)}
     set_here = {k: v for k, v in parameters.items() if v and k not in defaults}
@@ -119,18 +145,18 @@ def node(given: Given, executable: str, parameters: Given, *, ends: bool = True)
         parameters=[one for one in (defaults, given["params_file"]) if one],  # the later goes first
         ros_arguments=["--log-level", given["log_level"]],
         additional_env={processes.PARENT: str(os.getpid())},
-        sigterm_timeout=_CLOSING_S,
     )
 
 
 def _node(given: Given, package: str, executable: str = "", ends: bool = True, **more: Any) -> Node:
-    """Describe a node of a package, by default of the same name; its end may be the launch's."""
+    """Describe a node of a package, by default of the same name; its end may be its partners'."""
     return Node(
         package=package,
         executable=executable or package,
         namespace=given["namespace"],
         output="screen",
-        on_exit=_exit_handler(executable or package, ends),
+        on_exit=_exit_handler(given, executable or package, ends),
+        **_ENDS,
         **more,
     )
 
@@ -139,7 +165,7 @@ def _in_namespace(given: Given, topic: str) -> str:
     return ("/" + given["namespace"].strip("/")).rstrip("/") + topic
 
 
-def simulator(given: Given, parameters: Given, *, recorded: bool) -> Node:
+def simulator(given: Given, parameters: Mapping[str, str], *, recorded: bool) -> Node:
     """Describe a simulator, which does not start its run before it is recorded."""
     waits = {"wait_for_subscribers": ",".join(topics.SAMPLED), "subscriber_timeout": _WAIT_S}
     return node(given, "simulator", {**parameters, **waits} if recorded else parameters)
@@ -154,28 +180,41 @@ def recorder(given: Given) -> Action:
         return node(given, "recorder", recorded)
     require("ros2bag", "rosbag2_storage_mcap")
     profiles = yaml.safe_load((share_directory() / "config" / "rosbag2_qos.yaml").read_text())
-    with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
-        yaml.safe_dump({names[topic]: profile for topic, profile in profiles.items()}, file)
-    atexit.register(Path(file.name).unlink, missing_ok=True)
+    profiles = {names[topic]: profile for topic, profile in profiles.items()}
     return ExecuteProcess(
         cmd=[
             *("ros2", "bag", "record", "--storage", "mcap", "--output", given["output"]),
-            *("--disable-keyboard-controls", "--qos-profile-overrides-path", file.name),
+            *("--disable-keyboard-controls", "--qos-profile-overrides-path"),
+            _temporary_file(yaml.safe_dump(profiles)),
             *("--topics", *names.values()),
         ],
         output="screen",
-        sigterm_timeout=_CLOSING_S,
-        on_exit=_exit_handler("ros2 bag record", True),
+        on_exit=_exit_handler(given, "ros2 bag record", True),
+        **_ENDS,
     )
 
 
+def _temporary_file(text: str) -> str:
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
+        file.write(text)
+    atexit.register(Path(file.name).unlink, missing_ok=True)
+    return file.name
+
+
 def rviz(given: Given, scene_name: str) -> list[Action]:
-    """Describe robot_state_publisher with the URDF of a scene, and RViz with our layout."""
+    """Describe robot_state_publisher with the URDF of a scene, and RViz with our layout.
+
+    In a namespace its frames have that as a prefix.
+    """
     require("robot_state_publisher", "rviz2")
-    layout = str(share_directory() / "config" / "sst_ros.rviz")
+    layout, prefix = share_directory() / "config" / "sst_ros.rviz", _frame_prefix(given)
+    path = str(layout)
+    if prefix:
+        text = layout.read_text(encoding="utf-8").replace("base_link", f"{prefix}base_link")
+        path = _temporary_file(text.replace('TF Prefix: ""', f"TF Prefix: {prefix[:-1]}"))
     return [
         _state_publisher(given, urdf(load(scene_name))),
-        _node(given, "rviz2", arguments=["-d", layout]),
+        _node(given, "rviz2", arguments=["-d", path]),
     ]
 
 
@@ -185,39 +224,65 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
     Beside joint_state_broadcaster it starts the controller of this name, by the file of parameters
     `controllers`, config/controllers.yaml where empty.
     """
-    hardware = "joint_state_topic_hardware_interface"
-    require("robot_state_publisher", "controller_manager", "joint_state_broadcaster", hardware)
-    names = [_in_namespace(given, topic) for topic in TOPICS]
     path = controllers or str(share_directory() / "config" / "controllers.yaml")
-    spawned = ["joint_state_broadcaster", controller, "--param-file", path]
+    if not Path(path).is_file():
+        raise RuntimeError(f"controllers:={path}: no such file")
+    names = ["controller_manager", "joint_state_topic_hardware_interface", "robot_state_publisher"]
+    spawned = ["joint_state_broadcaster", controller]
+    for listed in yaml.safe_load(Path(path).read_text(encoding="utf-8")).values():
+        given_there = listed.get("ros__parameters", {})
+        types = [given_there[name].get("type", "") for name in spawned if name in given_there]
+        names += [plugin.partition("/")[0] for plugin in types if plugin]
+    require(*names)
+    topics_there = [_in_namespace(given, topic) for topic in TOPICS]
+    words = [*spawned, "--param-file", path]
     return [
-        _state_publisher(given, urdf(load(given["scene"]), names)),
+        _state_publisher(given, urdf(load(given["scene"]), topics_there)),
         _node(given, "controller_manager", "ros2_control_node", parameters=[path]),
-        _node(given, "controller_manager", "spawner", ends=False, arguments=spawned),
+        _node(given, "controller_manager", "spawner", ends=False, arguments=words),
     ]
 
 
 def _state_publisher(given: Given, document: str) -> Node:
-    described = {"robot_description": ParameterValue(document, value_type=str)}
-    return _node(given, "robot_state_publisher", parameters=[described])
+    description = ParameterValue(document, value_type=str)
+    parameters = {"robot_description": description, "frame_prefix": _frame_prefix(given)}
+    return _node(given, "robot_state_publisher", parameters=[parameters])
+
+
+def _frame_prefix(given: Given) -> str:
+    return f"{given['namespace']}/".lstrip("/")
 
 
 def require(*packages: str) -> None:
-    """Refuse a launch for which a ROS package is missing, before anything is started."""
+    """Refuse a launch for which ROS packages are missing, all of them, before any start."""
     installed = get_packages_with_prefixes()
     if missing := [package for package in packages if package not in installed]:
-        raise RuntimeError(f"this needs the ROS package(s) {', '.join(missing)}: not installed")
+        distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
+        apt = " ".join(f"ros-{distribution}-{name.replace('_', '-')}" for name in missing)
+        text = f"this needs the ROS package(s) {', '.join(missing)}: apt install {apt}"
+        raise RuntimeError(text)
 
 
 def _exit_handler(
-    name: str, ends: bool
+    given: Given, name: str, ends: bool
 ) -> Callable[[ProcessExited, LaunchContext], list[Action] | None]:
-    """Return what is done when a process exits: an exception gives the launch the status 1."""
+    """Return what is done when a process exits: it ends its partners, also those that yet start.
+
+    If it has failed, the launch goes on with what else it includes, and its status will be 1.
+    """
 
     def handle(event: ProcessExited, context: LaunchContext) -> list[Action] | None:
-        interrupted = context.is_shutdown and event.returncode == -signal.SIGINT
-        if event.returncode and not interrupted:
-            raise RuntimeError(f"{name} failed with exit status {event.returncode}")
-        return [Shutdown(reason=f"{name} has ended")] if ends and not context.is_shutdown else None
+        over = given.ending or context.is_shutdown
+        failed = event.returncode and not (over and event.returncode == -signal.SIGINT)
+        if (
+            failed
+        ):  # launch takes its status from this handler, or from an exception, which ends all
+            text = f"{name} failed with exit status {event.returncode}"
+            context.asyncio_loop.call_exception_handler({"message": text})
+        if over or not (failed or ends):
+            return None
+        given.ending = True
+        partners = [one for one in given.partners if one is not event.action]
+        return [EmitEvent(event=ShutdownProcess(process_matcher=lambda one: one in partners))]
 
     return handle

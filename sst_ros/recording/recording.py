@@ -86,6 +86,15 @@ class Signals:
         missing = [key for key, series in self.topic_series.items() if not len(series)]
         return (*missing, *([] if self.scene else [topics.SCENE.key]))
 
+    def statuses_of(self, part: str, key: str) -> list[Status]:
+        """Diagnostics of a part of the node that publishes a topic: other nodes send theirs, too.
+
+        All of that part where none has the name of the node.
+        """
+        name = f"{self.bag.topics.get(key, '').rpartition('/')[0]}: {part}"
+        named = [one for one in self.statuses if one.name.endswith(f": {part}")]
+        return [one for one in named if one.name == name] or named
+
     def time_ns(self, table: str) -> Integers:
         """Time of each row since the start of the run [ns].
 
@@ -236,11 +245,8 @@ class Recording(Explained):
             raise refusal(self.path, topics.SCENE.key, 0, "the recording must hold one scene")
         self.scene, self.idle_states = found.scene, found.idle_states
         self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
-        self.reports = tuple(
-            (one.received_ns, one.values)
-            for one in found.statuses
-            if one.name.endswith("run") and "phase" in one.values
-        )
+        runs = found.statuses_of("run", topics.SCENE.key)
+        self.reports = tuple((one.received_ns, one.values) for one in runs if "phase" in one.values)
         self.diagnostics: dict[str, str] = self.reports[-1][1] if self.reports else {}
         joints, orientation, euler, ticks = (
             _finite_rows(found, table)

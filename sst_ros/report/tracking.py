@@ -40,8 +40,7 @@ class TrackedRun:
         """Metrics; how often a torque was limited is in the last diagnostics of the controller."""
         counts = (
             status.values.get("samples_limited", "")
-            for status in reversed(self.recording.signals.statuses)
-            if status.name.endswith(": control")
+            for status in reversed(self.recording.signals.statuses_of("control", REFERENCE.key))
         )
         limited = next((int(count) for count in counts if count.isdecimal()), None)
         return TrackingMetrics(self.track, limited)

@@ -164,6 +164,16 @@ def test_bags_of_every_kind_hold_the_same_run(read, tmp_path, bags, example2):
         assert run.signals.bag.topics["joint_states"] == "/cell_7/joint_states"
 
 
+def test_diagnostics_of_another_simulator_are_not_those_of_the_run(read, bags, example2):
+    """/diagnostics is one topic for all; the other one ends later."""
+    other = bags.diagnostics_entry(example2[-1].received_ns + 1, phase="running", ticks=7)
+    (status,) = other.content.status
+    renamed = dataclasses.replace(status, name="/right/sst_simulator: run")
+    content = dataclasses.replace(other.content, status=[renamed])
+    run = read([*example2, dataclasses.replace(other, content=content)])
+    assert run.reports == read(example2).reports and run.diagnostics["phase"] == "finished"
+
+
 @pytest.mark.parametrize("encoding", ["", "unknown"])
 def test_a_database_with_an_action_is_whole(written, bags, example2, encoding):
     """`ros2 bag record -a -s sqlite3` leaves the definition of an action's types empty."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch files by `ros2 launch`: each ends when its work has, with the right status."""
 
+import contextlib
 import json
 import os
 import re
@@ -117,6 +118,7 @@ def without(package):
 
 
 NEEDS = r"this needs the ROS package\(s\) .*"
+DISTRIBUTION = os.environ.get("ROS_DISTRO")
 UNPLAYED = r"(?s)(?=.*must have torque and duration).*torque_player failed with exit status 1"
 
 
@@ -128,8 +130,10 @@ UNPLAYED = r"(?s)(?=.*must have torque and duration).*torque_player failed with 
         ("simulate", "scene:=swing play:=true", 1, UNPLAYED),
         pytest.param("view", "rviz:=true", 1, f"{NEEDS}rviz2", marks=without("rviz2")),
         pytest.param("simulate", "rviz:=true", 1, f"{NEEDS}rviz2", marks=without("rviz2")),
-        pytest.param("ros2_control", "", 1, f"{NEEDS}controller_manager",
+        pytest.param("ros2_control", "", 1, f"{NEEDS}controller_manager, .*joint_trajectory_contr.*"
+                     f"apt install ros-{DISTRIBUTION}-controller-manager .*ros-",
                      marks=without("controller_manager")),
+        ("ros2_control", "controllers:=nowhere.yaml", 1, "controllers:=nowhere.yaml: no such file"),
         ("simulate", "scen:=swing", 1, "scen:=swing: no such argument; did you mean 'scene'?"),
         ("simulate", "params_file:=nowhere.yaml", 1, "params_file:=nowhere.yaml: no such file"),
         ("simulate", "duration:=x play:=true", 1, "--duration = 'x': must be a finite number"),
@@ -202,6 +206,45 @@ def test_ctrl_c_ends_a_run_in_order(launch, name, words):
     assert "process has died" not in run.text
 
 
+TWO_ROBOTS = """
+from launch import LaunchDescription
+from launch.actions import GroupAction, IncludeLaunchDescription
+from launch_ros.actions import PushRosNamespace
+from ament_index_python.packages import get_package_share_directory
+FILE = get_package_share_directory("sst_ros") + "/launch/simulate.launch.py"
+def robot(name, duration):
+    given = {"scene": "swing", "duration": duration, "record": "true", "bag": "sst"}
+    included = IncludeLaunchDescription(FILE, launch_arguments=given.items())
+    return GroupAction([PushRosNamespace(name), included], scoped=SCOPED)
+def generate_launch_description():
+    return LaunchDescription([robot("left", "LEFT"), robot("/right", "0.0")])
+"""
+
+
+@pytest.mark.parametrize("ending", ["its end", "a kill"])
+def test_the_end_of_one_of_two_robots_does_not_end_the_other(domain, tmp_path, ending):
+    """A file is included twice, in scopes of their own or not; each has its recorder and folder."""
+    left = "0.5" if ending == "its end" else "0.0"
+    text = TWO_ROBOTS.replace("LEFT", left).replace("SCOPED", str(ending == "its end"))
+    (tmp_path / "two.launch.py").write_text(text)
+    with contextlib.closing(Launch(tmp_path, "launch", "two.launch.py")) as run:
+        for robot in ("left", "right"):
+            run.until(rf"\[{robot}.sst_simulator\]: running")
+        if ending == "a kill":
+            pid = run.until(r"\[simulator-2\]: process started with pid \[(\d+)\]")[1]
+            os.kill(int(pid), signal.SIGKILL)
+        run.until(r"\[recorder-1\]: process has (finished|died)")
+        assert "sending signal 'SIGINT' to process[recorder-3]" not in run.text
+        run.interrupt()
+        run.ended(0 if ending == "its end" else 1)
+    assert ("simulator failed with exit status -9" in run.text) == (ending == "a kill")
+    for robot in ("left", "right"):
+        (bag,) = tmp_path.glob(f"{robot}_sst_bag_*")
+        read = recording.read(bag)
+        assert read.signals.bag.topics["joint_states"] == f"/{robot}/joint_states"
+        assert len(read.time_ns) > 1 and read.ticks.gaps == 0
+
+
 CONTROLLER_MANAGER = """#!/usr/bin/env python3
 import rclpy
 from sensor_msgs.msg import JointState
@@ -223,6 +266,7 @@ STAND_INS = {
     "controller_manager": {"ros2_control_node": CONTROLLER_MANAGER, "spawner": "#!/bin/true\n"},
     "robot_state_publisher": {"robot_state_publisher": "#!/bin/sh\nexec sleep 60\n"},
     "joint_state_broadcaster": {},
+    "joint_trajectory_controller": {},
     "joint_state_topic_hardware_interface": {},
 }
 """Programs of the packages that ros2_control.launch.py needs."""
