@@ -33,7 +33,7 @@ import numpy as np
 from sst_ros.dynamics.model import limits_of, ranges_of
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import JOINTS
-from sst_ros.scene.scene import LARGEST, Scene
+from sst_ros.scene.scene import Scene
 from sst_ros.state import BASE_FRAME, Vector3
 
 BASE, STAR, PAYLOAD = BASE_FRAME, "star", "payload"
@@ -53,6 +53,10 @@ LEG_COLOURS: tuple[Colour, ...] = ((0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00
 """Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
 
 STEP = np.radians(6.0)  # arcs are drawn as chords of this length or less: 0.14 % of the radius off
+
+SERVO_TORQUE, SERVO_RATE = 10.6, np.pi
+"""Limits of an actuator whose scene has none [N m], [rad/s]: stall torque and speed without load
+(30 rev/min) of a geared servo for arms of this size, ROBOTIS XM540-W270 at 12 V."""
 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
 TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
@@ -206,8 +210,10 @@ def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
         limits = dict(zip(("lower", "upper"), ends, strict=True)) if np.isfinite(ends).all() else {}
         kind = joint.name.split("_")[0]
         motor = scene.actuators if kind == "gamma" else None
-        for key, limit in (("effort", "torque_limit"), ("velocity", "velocity_limit")):
-            limits[key] = getattr(motor, limit, None) or LARGEST
+        # The passive joints have no motor; their rates are of the order of the actuators'.
+        torque, rate = (getattr(motor, f"{what}_limit", None) for what in ("torque", "velocity"))
+        limits["effort"] = (torque or SERVO_TORQUE) if kind == "gamma" else 0.0
+        limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
         limited.append((joint, limits, getattr(scene.friction, kind, None)))
     return _templates.get_template("urdf.xml").render(
         # An XML name has no spaces.

@@ -28,7 +28,7 @@ from sst_ros.mechanism.geometry import angle_between, quaternion_of, rotation_ma
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import ActionGoal
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
-from sst_ros.state import BASE_FRAME, ZERO, Quaternion, Vector3
+from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Quaternion, Vector3
 
 try:
     from simulation_interfaces import action, srv
@@ -226,6 +226,8 @@ class SimulationInterfaces:
 
     def _fill(self, message: Any) -> Any:
         state = self._loop.simulation.state
+        stamp = divmod(self._loop.stamp_ns(state), NANOSECONDS)
+        message.header.stamp.sec, message.header.stamp.nanosec = stamp
         message.header.frame_id = BASE_FRAME
         at, turning = message.pose.orientation, message.twist.angular
         at.x, at.y, at.z, at.w = state.quaternion

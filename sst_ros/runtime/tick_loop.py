@@ -18,7 +18,7 @@ from sst_ros.mechanism.generic_math import add, axpy
 from sst_ros.runtime.torque_input import RunSettings, TorqueInput
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import ZERO, Vector3
+from sst_ros.state import ZERO, State, Vector3
 
 _LONGEST_SLEEP_S = 0.05
 _TOGETHER_NS = 2_000_000  # bounds the ticks that one sleep ends in, so that few commands wait
@@ -293,6 +293,10 @@ class TickLoop:
         self.refresh()
         self.counters.resume()
         self._pacer.start()
+
+    def stamp_ns(self, state: State) -> int:
+        """ROS time at which a state of the run holds [ns]; before it, of the last idle state."""
+        return self._start_ns + state.time_ns if self.begun else self._idle_ns
 
     @property
     def complete(self) -> bool:

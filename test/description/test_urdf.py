@@ -245,6 +245,28 @@ def test_ends_limits_and_friction_are_in_it():
     assert float(effort) == 4.0
 
 
+@pytest.mark.parametrize("name", names())
+def test_limits_are_those_of_a_drive_and_shapes_can_be_hit(name):
+    """As Pinocchio reads them: finite, above the scene's own start; no drive, no torque."""
+    scene, read = load(name), Read(load(name))
+    motor = scene.actuators or Actuators(torque_limit=10.6)
+    for joint, effort, rate in zip(
+        read.model.names[1:], read.model.effortLimit, read.model.velocityLimit, strict=True
+    ):
+        driven = joint.startswith("gamma")
+        assert effort == (motor.torque_limit if driven else 0.0)
+        assert max(np.abs(scene.initial.gamma_dot)) <= rate <= 120.0
+        assert rate == (motor.velocity_limit if driven else 0.0) or rate >= np.pi
+    kinds = read.pin.GeometryType.VISUAL, read.pin.GeometryType.COLLISION
+    document = urdf(scene)
+    seen, hit = (read.pin.buildGeomFromUrdfString(read.model, document, kind) for kind in kinds)
+    assert len(hit.geometryObjects) == len(seen.geometryObjects) > 50
+    for one, other in zip(hit.geometryObjects, seen.geometryObjects, strict=True):
+        assert one.parentJoint == other.parentJoint and one.placement == other.placement
+        one.geometry.computeLocalAABB()
+        assert 0.0 < one.geometry.aabb_radius < 0.5  # of the radii of the scenes, 0.35 and 0.4 m
+
+
 def test_an_arc_begins_ends_and_stays_on_its_sphere():
     begin, axis = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
     points = Arc(begin, axis, 1.234, 0.35, 0.01, (1.0, 0.0, 0.0)).points()

@@ -12,6 +12,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.mechanism.virtual_work import posture
 from sst_ros.nodes.simulation_interfaces import FEATURES
+from sst_ros.state import nanoseconds
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 SCENE = "gravity_payload"
@@ -118,6 +119,28 @@ def test_steps_by_count_and_by_the_action(client):
     status, reply = result(send(3))
     assert (status, reply.result) == (GoalStatus.STATUS_ABORTED, FAILED)
     assert "running" in reply.error_message
+
+
+def test_an_entity_state_has_the_time_at_which_it_holds(client):
+    """Between two samples of a run, on a step; before it as joint_states, which is idle."""
+    until, stamps = client.observer.until, client.observer.stamps
+
+    def stamp():
+        state = client.call("GetEntityState", entity="star").state
+        (listed,) = client.call("GetEntitiesStates").states
+        assert nanoseconds(listed.header.stamp) >= nanoseconds(state.header.stamp)
+        return nanoseconds(state.header.stamp)
+
+    client.to(STOPPED)
+    before = stamp()
+    assert before > max(stamps(), default=0)
+    count = len(stamps())
+    client.to(PLAYING)
+    until(lambda: len(stamps()) > count, "a sample of the run")
+    sample = stamps()[-1]
+    at = stamp()
+    assert sample <= at and (at - sample) % 1_000_000 == 0
+    until(lambda: stamps()[-1] >= at, "a later sample")
 
 
 def test_the_star_is_read_and_set_with_its_joints(client):
