@@ -8,7 +8,7 @@ import pytest
 from loaded_scenes import loaded
 from scipy.spatial.transform import Rotation
 
-from sst_ros import SineTorque, TorqueTable, load_scene, simulate
+from sst_ros import PolynomialTorque, SineTorque, TorqueTable, load_scene, simulate
 from sst_ros.errors import InputError
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.yaml_document import find_number
@@ -16,6 +16,7 @@ from sst_ros.scene.yaml_document import find_number
 CONSTANT = (0.3, -0.2, 0.1)
 SINE = ((0.3, 0.5, 5.0), (5.0, 7.0, 9.0), (0.0, 1.0, 2.0))  # the limit cuts the third
 TABLE = ((0.0, 0.04, 0.06), ((1.0, 0.0, -1.0), (0.0, 2.0, 9.0), (-1.0, 0.5, 0.0)))
+PIECES = (((9.0, -5.0, 2.0), (-3.0, 0.0, 8.0)), ((0.3, 0.5, 1.0), (1.0, -0.2, 0.1)))
 TORQUES = {
     "constant": (CONSTANT, lambda x: tuple(x)),
     "sine": (
@@ -23,6 +24,7 @@ TORQUES = {
         lambda x: SineTorque(**dict(zip(SineTorque.SPECS, x.reshape(3, 3).tolist(), strict=True))),
     ),
     "table": (TABLE[1], lambda x: TorqueTable(TABLE[0], x.reshape(3, 3))),
+    "polynomial": (PIECES, lambda x: PolynomialTorque(x.reshape(2, 2, 3), (0.0, 0.04, 0.06))),
 }
 TERMS = (
     "star.inertia.zz", "star.centre[2]", "payload.mass", "actuated_links[0].inertia.zz",
@@ -52,7 +54,9 @@ def slow(*case):
     ("kind", "at_stops"),
     [
         ("constant", True),
+        ("polynomial", True),
         ("table", False),
+        slow("polynomial", False),
         slow("constant", False),
         slow("sine", False),
         slow("sine", True),
@@ -108,7 +112,7 @@ def test_a_key_of_several_numbers_means_each_of_them():
         (CONSTANT, "base.radius", "is geometry"),
         (CONSTANT, "duration", "is no number of the equations of motion"),
         (CONSTANT, "star.inertia", "must be the key of a number"),
-        (lambda t: CONSTANT, "torque", "three numbers, a SineTorque or a TorqueTable"),
+        (lambda t: CONSTANT, "torque", "three numbers or a profile, not a function"),
         (lambda t, state: CONSTANT, "star.inertia.zz", "not a function of the state"),
     ],
 )

@@ -33,7 +33,13 @@ from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import build_unchecked
-from sst_ros.scene.torque_profile import SineTorque, TorqueProfile, TorqueTable, torque_at
+from sst_ros.scene.torque_profile import (
+    PolynomialTorque,
+    SineTorque,
+    TorqueProfile,
+    TorqueTable,
+    torque_at,
+)
 from sst_ros.scene.yaml_document import find_number, plain, replace_values
 from sst_ros.state import Array, clamp
 
@@ -242,6 +248,8 @@ def _numbers(torque: TorqueProfile) -> Array:
     """Return the numbers of a profile that torques are differentiated by, shape (q,)."""
     if isinstance(torque, SineTorque):
         return np.array([*torque.amplitude, *torque.frequency, *torque.phase])
+    if isinstance(torque, PolynomialTorque):
+        return torque.c.ravel()
     return np.ravel(torque.torques if isinstance(torque, TorqueTable) else torque.values(FIRST))
 
 
@@ -262,6 +270,16 @@ def _differentiate_torque(
         held, middle = np.zeros((3, len(torque.times), 3)), 0.5 * (begin + end)
         held[:, np.searchsorted(torque.times, middle) - 1] = unit * (middle > torque.times[0])
         return lambda time: held.reshape(3, -1)
+    if isinstance(torque, PolynomialTorque):
+        here = int(np.searchsorted(torque.x, 0.5 * (begin + end))) - 1
+        acting = np.multiply.outer(unit, np.arange(torque.c.shape[1]) == here)
+
+        def polynomial(time: float) -> Array:
+            powers = (time - torque.x[here]) ** np.arange(len(torque.c))[::-1]
+            # By torque; power, piece and component of a coefficient.
+            return np.asarray(np.einsum("p,tci->tpic", powers, acting)).reshape(3, -1)
+
+        return polynomial
     return lambda time: unit
 
 

@@ -15,11 +15,9 @@ from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import key_of
 from sst_ros.scene.torque_profile import (
-    ConstantTorque,
+    FunctionTorque,
     LostTorque,
-    SineTorque,
     TorqueProfile,
-    TorqueTable,
 )
 from sst_ros.scene.yaml_document import find_fields, find_number
 from sst_ros.state import Array
@@ -52,9 +50,9 @@ class Sensitivities:
     """Derivatives of a motion by parameters as `simulate` takes them: each may be several numbers.
 
     A vector means each of its components, a list each of its entries, in their order, and "torque"
-    the numbers of the profile: the three torques, `torques` of a `TorqueTable`, or amplitudes,
-    frequencies and phases of a `SineTorque`. InputError is raised where one is no such number, or
-    where the torques are a function of the state.
+    the numbers of the profile: the three torques, `torques` of a `TorqueTable`, coefficients of a
+    `PolynomialTorque`, or amplitudes, frequencies and phases of a `SineTorque`. InputError: one
+    is no such number, or the torques are a function of the state.
     """
 
     def __init__(self, scene: Scene, names: Iterable[str], torque: TorqueProfile) -> None:
@@ -67,8 +65,8 @@ class Sensitivities:
         by_torque, allowed = OWN_TORQUE in keys, ""
         if torque.feedback or isinstance(torque, LostTorque):
             allowed = "need torques that are known over time, not a function of the state"
-        elif by_torque and not isinstance(torque, (ConstantTorque, SineTorque, TorqueTable)):
-            allowed = "torque needs three numbers, a SineTorque or a TorqueTable"
+        elif by_torque and isinstance(torque, FunctionTorque):
+            allowed = "torque needs three numbers or a profile, not a function"
         if allowed:
             raise refusal("simulate", "sensitivities", list(keys), allowed)
         self._equations = VariationalEquations(scene, flat, torque, by_torque=by_torque)
