@@ -8,6 +8,7 @@ import difflib
 import functools
 import importlib
 import inspect
+import math
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,8 +43,10 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
-        text, half = f"a {type(self.value).__name__} without a text", SHOWN // 2 - 2
-        with contextlib.suppress(Exception):  # as of an integer of 5,000 digits
+        text, half = f"{type(self.value).__name__} without a text", SHOWN // 2 - 2
+        if isinstance(self.value, int) and self.value:  # of 5,000 digits has no text
+            text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
+        with contextlib.suppress(Exception):
             text = repr(self.value)
         path = isinstance(self.value, str) and os.sep in text  # is whole: it can be copied
         if len(text) > (LONGEST_PATH if path else SHOWN):
@@ -132,7 +135,7 @@ def check_kinds(function: F, *, late: bool = False) -> F:
             return allowed if wrong else ""
         try:
             return "" if good(value) else allowed
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, OverflowError, MemoryError):
             return allowed
 
     def check(args: tuple[Any, ...], options: dict[str, Any]) -> None:

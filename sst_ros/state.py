@@ -40,11 +40,11 @@ def finite_vector(value: Any) -> Vector3 | None:
     if isinstance(value, (str, bytes)):
         return None
     try:
-        first, second, third = map(float, value)
+        first, second, third = value
+        finite = math.isfinite(first) and math.isfinite(second) and math.isfinite(third)
     except (TypeError, ValueError, OverflowError):
         return None
-    finite = math.isfinite(first) and math.isfinite(second) and math.isfinite(third)
-    return (first, second, third) if finite else None
+    return (float(first), float(second), float(third)) if finite else None
 
 
 class Explained:

@@ -3,14 +3,19 @@
 
 import inspect
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
+import yaml
 from programs import python
 
 import sst_ros
+from sst_ros.host.compiled_module import numba_version
+from sst_ros.scene.yaml_document import dump
 
 PAGES = Path(__file__).parents[1] / "docs" / "api"
+needs_numba = pytest.mark.skipif(numba_version() is None, reason="needs numba")
 NAMES = [name for name in sst_ros.__all__ if name != "__version__"]
 SCRIPT = """
 import numpy as np
@@ -38,6 +43,23 @@ def test_each_name_has_a_docstring_and_one_entry_in_the_reference(name):
     entries = re.findall(rf"^\.\. auto\w+:: sst_ros\.{name}$", text, re.M)
     assert len(entries) == 1
     assert f"`{name}`" in (PAGES / "index.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        sst_ros.InverseDynamics,
+        sst_ros.Simulation,
+        sst_ros.reference_motion,
+        partial(sst_ros.distance_to_singularity, gamma=[0.8, 0.7, 0.8]),
+        partial(sst_ros.equilibrium, gamma=[0.8, 0.7, 0.8]),
+        pytest.param(sst_ros.Batch, marks=needs_numba),
+    ],
+)
+def test_a_scene_is_its_name_its_document_or_a_scene(make):
+    scene = sst_ros.load_scene("reach")
+    said = [repr(make(given)) for given in ("reach", yaml.safe_load(dump(scene)), scene)]
+    assert said == [said[0]] * 3
 
 
 def test_dir_shows_the_public_names_and_nothing_else():

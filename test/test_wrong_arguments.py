@@ -22,6 +22,7 @@ LIST, DICT = [], {}
 LIST.append(LIST)
 DICT["star"] = DICT
 NAN, INF = float("nan"), float("inf")
+SCENE, MOVING, REST = load_scene("example2"), load_scene("spiral"), (0.0, 0.0, 0.0)
 WRONG = [
     *(NAN, INF, -INF, 1e308, 10**400, 10**5001, 2**64, True, 0, -1, 1, 2, 7, 1.5, -0.0, 0.1),
     *(
@@ -39,11 +40,12 @@ WRONG = [
     *(np.array("1"), np.array([None, 1]), np.datetime64("2026-01-01"), range(3), slice(1)),
     *("", "1", "x", "\0", "\ud800", b"1", "a/b.yaml", Path("/"), Path("x.npz"), "example2"),
     *(lambda: 0, lambda t: 0, lambda t: "abc", lambda t: (1, 2), lambda state, t: 0),
+    *(["1", "2", "3"], [1, 2, 3, 4, 5, 6, 7], bytearray(b"12"), type(SCENE), pytest, "a" * 5000),
     *(None, object(), Ellipsis, set(), {}, {"star": {}}, {1: 2}, {"a": [1]}, LIST, DICT),
 ]
-SCENE, MOVING, REST = load_scene("example2"), load_scene("spiral"), (0.0, 0.0, 0.0)
 TASK = {"scene": SCENE, "torque": REST, "duration": 0.01, "initial": None, "t_eval": None}
 TASK |= {
+    "samples": None,
     "method": "auto",
     "tolerance": 1e-9,
     "control_period": None,

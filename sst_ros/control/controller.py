@@ -29,7 +29,7 @@ from sst_ros.errors import (
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.scene.scene import Scene, terms
+from sst_ros.scene.scene import SceneInput, scene_of, terms
 from sst_ros.state import ZERO, Explained, Quaternion, State, Vector3, finite_vector
 
 SINGULAR = 1e-10  # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
@@ -44,9 +44,9 @@ class InverseDynamics(Explained):
     """
 
     @check_kinds
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        dynamics = Dynamics.of(scene)
+    def __init__(self, scene: SceneInput) -> None:
+        self.scene = scene_of(scene)
+        dynamics = Dynamics.of(self.scene)
         self._has_moment_topic, self._program = dynamics.has_moment_topic, dynamics.inverse
         self._model = dynamics.model
 
@@ -121,8 +121,9 @@ class InverseDynamics(Explained):
         three = finite_vector(moment) is not None
         refuse_unless("inverse dynamics", ("moment", moment, three, "must be three numbers [N m]"))
         q = self._orientation(at)
+        _, reach = self._reduce(q)
         acting = rotation_matrix(q).T @ np.asarray(moment, dtype=float)
-        return triple(np.linalg.solve(self._reduce(q)[1].T, acting).tolist())
+        return triple(np.linalg.solve(reach.T, acting).tolist())
 
     def _orientation(self, at: State | Sequence[float]) -> Quaternion:
         """Quaternion of {E} in {B} of a state, of angles gamma or of itself."""
@@ -155,7 +156,8 @@ class InverseDynamics(Explained):
         """Return why there is no torque; raises InputError where numbers are wrong."""
         finite = False
         with contextlib.suppress(TypeError, ValueError, OverflowError):
-            finite = len(given) in (10, 13) and all(map(math.isfinite, given))
+            sizes = len(given), len(quaternion)
+            finite = sizes in ((10, 4), (13, 4)) and all(map(math.isfinite, given))
         short = finite and math.hypot(*quaternion) < 1e-100
         refuse_unless(
             "inverse dynamics",
@@ -201,8 +203,13 @@ class Controller:
 
     @check_kinds
     def __init__(
-        self, model: Scene, motion: ReferenceMotion, settings: ControllerSettings, period_s: float
+        self,
+        model: SceneInput,
+        motion: ReferenceMotion,
+        settings: ControllerSettings,
+        period_s: float,
     ) -> None:
+        model = scene_of(model)
         self._motion, self._settings, self._period_s = motion, settings, period_s
         geometry, start = Geometry.of(model), motion.at(0.0)
         self._inverse, self._space = InverseDynamics(model), ActuatorSpaceMap(geometry)

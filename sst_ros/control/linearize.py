@@ -13,9 +13,8 @@ D S(dt) R and B is D S(dt), of the sensitivities S of the motion itself, S' = (d
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, re
 from sst_ros.integration.events import GRAZING
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.scene.scene import Scene, scene_of, with_initial
+from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import ConstantTorque
 from sst_ros.state import ZERO, Array, State, finite_vector
 
@@ -67,7 +66,7 @@ class LinearModel:
         return require("control").StateSpace(*given, states=x, outputs=x, inputs=commands)
 
 
-def equilibrium(scene: Scene | Mapping[str, Any] | str | Path, gamma: Any) -> State:
+def equilibrium(scene: SceneInput, gamma: Any) -> State:
     """Return the state at rest at gamma [rad], whose `torque` holds the manipulator there.
 
     Raises:
@@ -84,7 +83,7 @@ def equilibrium(scene: Scene | Mapping[str, Any] | str | Path, gamma: Any) -> St
 
 @check_kinds
 def linearize(
-    scene: Scene | Mapping[str, Any] | str | Path,
+    scene: SceneInput,
     state: Any,
     torque: Any,
     *,

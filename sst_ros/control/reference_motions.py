@@ -44,7 +44,7 @@ from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.generic_math import axpy, multiply, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.loads import Spiral, Sweep
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import ZERO, Quaternion, Vector3
 
 PIECES = 8  # pieces of a minimum-jerk motion, and of a quarter of a turn
@@ -63,7 +63,7 @@ OpenPoints: TypeAlias = Sequence[Sequence[float] | None]
 
 @check_kinds
 def reference_motion(
-    scene: Scene, read_motion: Callable[[str], Any] | None = None
+    scene: SceneInput, read_motion: Callable[[str], Any] | None = None
 ) -> ReferenceMotion:
     """Return the reference motion of a scene.
 
@@ -72,6 +72,7 @@ def reference_motion(
     AssemblyError where the initial gamma has no unique admissible assembly; SingularConfiguration
     where the motion meets a parallel singularity.
     """
+    scene = scene_of(scene)
     motion, geometry = scene.motion, Geometry.of(scene)
     if motion is None:
         raise refusal(scene.name, "motion", None, "the scene has no desired motion")

@@ -24,10 +24,9 @@ docs/howto/identify.md has the bias with and without them, measured.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from itertools import compress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,7 @@ from sst_ros.identification.parameters import BaseParameters, Identification, Re
 from sst_ros.identification.simulation_fit import fit_simulation
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.scene.scene import Scene, scene_of
+from sst_ros.scene.scene import Scene, SceneInput, scene_of
 from sst_ros.state import finite_vector
 
 STILL = 1e-6  # range of gamma [rad] below which a motion is none
@@ -103,7 +102,7 @@ class TorqueFit(Identification):
 @check_kinds
 def identify(
     data: Measured,
-    scene: Scene | Mapping[str, Any] | str | Path | None = None,
+    scene: SceneInput | None = None,
     parameters: Collection[str] | None = None,
     method: str = "inverse_dynamics",
     *,

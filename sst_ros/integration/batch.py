@@ -28,7 +28,7 @@ from sst_ros.host.output import slices
 from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.scene import Scenarios, Scene
+from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import TURN
 from sst_ros.state import Explained
 
@@ -88,12 +88,13 @@ class Batch(Explained):
     @check_kinds
     def __init__(
         self,
-        scene: Scene,
+        scene: SceneInput,
         method: Tableau = DOP853,
         *,
         profile: bool = False,
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> None:
+        scene = scene_of(scene)
         if compiled_module.numba_version() is None:
             require("numba")
             refuse_unless(scene.name, ("SST_ROS_NUMBA", "0", False, "must not be set to 0"))
@@ -106,8 +107,7 @@ class Batch(Explained):
             ("torque", None, torque, "must be given in the scene for its profile"),
         )
         self.scene, self._method = scene, method
-        own = {key: copy.copy(values) for key, values in (parameters or {}).items()}
-        self._scenarios = Scenarios(scene, own)
+        self._scenarios = Scenarios(scene, parameters or {})
         self._scenarios.check()
         self.model = ParametricModel(self._scenarios, profile=profile)
         self.columns = self.model.columns(self._scenarios)
@@ -403,5 +403,5 @@ class BatchResult(MotionTable):
             "scene": self.scene.name,
             "scenarios": len(self),
             "ended early": np.count_nonzero(self.status),
-            "time [s]": f"{self.t.min(initial=np.inf):g} to {self.t.max(initial=-np.inf):g}",
+            "time [s]": f"{self.t.min():g} to {self.t.max():g}" if self.t.size else "none",
         }

@@ -46,7 +46,7 @@ class Geometry:
     @classmethod
     def of(cls, scene: Any) -> Geometry:
         """Derive the geometry of a `Scene`."""
-        if not hasattr(scene, "workspace"):
+        if not hasattr(scene, "star"):  # nor has its class
             refuse_unless("geometry", ("scene", scene, False, "must be a Scene"))
         return _recent(scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg)
 

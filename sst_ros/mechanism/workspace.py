@@ -24,7 +24,7 @@ from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.host.output import slices
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.scene import SceneInput, scene_of
 
 _BLOCK, _BISECTIONS = 20_000, 55
 _RAYS, _RAY, _REFINED = 400, 64, 6
@@ -258,7 +258,7 @@ class NearestSingularity:
 
 
 @check_kinds
-def distance_to_singularity(where: Scene | Geometry, gamma: ArrayLike) -> NearestSingularity:
+def distance_to_singularity(where: SceneInput | Geometry, gamma: ArrayLike) -> NearestSingularity:
     """Find the singular pose that is nearest to a pose: by the least turn of the star.
 
     Limits of strokes and arcs are not looked at. To a serial one the distance is closed: that of
@@ -267,7 +267,7 @@ def distance_to_singularity(where: Scene | Geometry, gamma: ArrayLike) -> Neares
     overlooked only where it comes nearer than that between all rays.
 
     Args:
-        where: a scene or its geometry.
+        where: a scene, as `simulate` takes it, or its geometry.
         gamma: angles of the actuators in the one admissible assembly [rad], shape (3,).
 
     Raises:
@@ -277,7 +277,7 @@ def distance_to_singularity(where: Scene | Geometry, gamma: ArrayLike) -> Neares
     from scipy.optimize import minimize
     from scipy.spatial.transform import Rotation
 
-    geometry = where if isinstance(where, Geometry) else Geometry.of(where)
+    geometry = where if isinstance(where, Geometry) else Geometry.of(scene_of(where))
     start = kinematics.admissible(geometry, gamma).rotation
     t = start.T @ geometry.w.T  # columns: w_k in {E}
     cosines = np.sum(geometry.e.T * t, axis=0)

@@ -66,7 +66,11 @@ class Bag:
     """
 
     def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
-        if not path.exists():
+        try:
+            there = path.exists()
+        except OSError:  # as of a name that is too long
+            there = False
+        if not there:
             raise refusal(path, "bag", str(path), "does not exist")
         self.path = path
         self.topics: dict[str, str] = {}  # full names of the topics found, by key

@@ -383,6 +383,8 @@ def read(path: str | Path, *, damaged: bool = False) -> Recording:
     """
     if not isinstance(path, (str, Path)):
         raise refusal(Path(), "path", path, "must be a path")
+    if not isinstance(damaged, (bool, np.bool_)):
+        raise refusal(path, "damaged", damaged, "must be True or False")
     return Recording(read_signals(path, damaged=damaged))
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -163,7 +163,11 @@ def _has_key(cls: type[Section], key: str) -> bool:
     return spec.section is not None and _has_key(spec.section, rest)
 
 
-def scene_of(scene: Scene | Mapping[str, Any] | str | Path) -> Scene:
+SceneInput: TypeAlias = Scene | Mapping[str, Any] | str | Path
+"""What `scene_of` takes wherever a scene is asked for."""
+
+
+def scene_of(scene: SceneInput) -> Scene:
     """Return a scene by its path (ends in .yaml) or by the name of one that comes with sst_ros.
 
     It may also be its document as a dict, or a `Scene`, which is returned as it is. InputError is
@@ -257,13 +261,13 @@ class Scenarios:
                     self._places[place], self._specs[key] = key, spec
                 self.rows[key] = self._rows_of(value, spec.shape)
                 self.count = len(self.rows[key])
-            except (TypeError, ValueError, OverflowError) as error:
+            except (TypeError, ValueError, OverflowError, MemoryError) as error:
                 problems.append(Problem(key, value, str(error)))
         if problems:
             raise InputError(scene.name, problems)
 
     def _rows_of(self, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-        rows = np.asarray(value, dtype=float)
+        rows = np.array(value, dtype=float)
         if rows.shape != (self.count or max(1, len(np.atleast_1d(rows))), *shape):
             words = ", ".join(map(str, (self.count or "N", *shape))) + ("" if shape else ",")
             allowed = f"must have the shape ({words}), a row a scenario"

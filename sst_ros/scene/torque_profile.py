@@ -248,7 +248,10 @@ class TorqueTable(TorqueProfile):
             problems = [Problem("header", names or None, "must be " + ", ".join(header), 1)]
         last, rows = -math.inf, []
         for line, row in lines:
-            begin, torque = finite_vector(row[:3]), finite_vector(row[1:])
+            numbers: list[float] = []
+            with contextlib.suppress(ValueError):
+                numbers = [float(text) for text in row]
+            begin, torque = finite_vector(numbers[:3]), finite_vector(numbers[1:])
             if begin is None or torque is None:
                 problems.append(Problem("row", row, "must be four finite numbers", line))
             elif begin[0] <= last:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
@@ -19,7 +18,7 @@ from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Initial
-from sst_ros.scene.scene import Scene, scene_of, with_initial
+from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
@@ -60,7 +59,7 @@ InitialInput: TypeAlias = Initial | Mapping[str, Any] | tuple[ArrayLike, ArrayLi
 
 @check_kinds
 def simulate(
-    scene: Scene | Mapping[str, Any] | str | Path,
+    scene: SceneInput,
     torque: TorqueInput = None,
     duration: float | None = None,
     *,
@@ -141,7 +140,7 @@ def simulate(
 
 @check_kinds
 def prepare(
-    scene: Scene | Mapping[str, Any] | str | Path,
+    scene: SceneInput,
     torque: TorqueInput = None,
     duration: float | None = None,
     *,
@@ -306,7 +305,8 @@ def _times(
         return np.asarray(found / NANOSECONDS)
     if samples is not None:
         _refuse("samples", samples, "must be None where t_eval gives their times")
-    rounded = np.rint(np.atleast_1d(np.array(t_eval, dtype=float)) * NANOSECONDS)
+    with np.errstate(over="ignore"):
+        rounded = np.rint(np.atleast_1d(np.array(t_eval, dtype=float)) * NANOSECONDS)
     if not (rounded.size and ascend(rounded) and rounded[0] >= 0.0 and rounded[-1] <= span_ns):
         end = span_ns / NANOSECONDS
         _refuse(

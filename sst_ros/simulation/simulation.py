@@ -7,7 +7,6 @@ import operator
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
-from sst_ros.scene.scene import Scene, scene_of
+from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.scene.torque_profile import SineTorque, Torque, count_arguments
 from sst_ros.state import NANOSECONDS, Explained, State, Vector3, finite_vector
 
@@ -113,7 +112,7 @@ class Simulation(Explained):
     @check_kinds
     def __init__(
         self,
-        scene: Scene | str | Path | dict[str, Any],
+        scene: SceneInput,
         integrator: str = AUTO,
         *,
         tolerance: float = 1e-10,

@@ -397,7 +397,7 @@ def _own(value: ArrayLike) -> Array:
     """Return an array that nothing can change: a copy, unless it is one already."""
     try:
         array: Array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, MemoryError):
         raise InputError("trajectory", [Problem("array", value, "must be numbers")]) from None
     if array is value and (array.flags.writeable or not array.flags.owndata):
         array = array.copy()

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ EXPECTED = {"uniform": "low, high", "normal": "mean, standard deviation[, low, h
 SAMPLINGS = ("random", "sobol")
 
 TINY = 2.0**-53
+MOST_VALUES = 10_000_000  # of a grid
 
 
 class Target(NamedTuple):
@@ -145,7 +147,7 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
     elif isinstance(given, tuple) and given and isinstance(given[0], str):
         kind, relative = given[0], isinstance(given[-1], str) and given[-1] == "relative"
         numbers = given[1 : len(given) - relative]
-    listed = np.iterable(numbers) and not isinstance(numbers, str)
+    listed = np.iterable(numbers) and not isinstance(numbers, (str, bytes, bytearray))
     if kind not in KINDS or not isinstance(relative, bool) or not listed:
         raise ValueError(f"must be a list of values, or one of {', '.join(KINDS)} with its numbers")
     factor = _scales_tensor(key, targets)
@@ -153,10 +155,11 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
         raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
     nominal = np.ones(()) if factor else targets[0].nominal
     if kind == "linspace":
-        if len(numbers) != 3:
-            raise ValueError("linspace takes low, high, count")
+        count = numbers[2] if len(numbers) == 3 else 0
+        if not (isinstance(count, Integral) and 0 < int(count) <= MOST_VALUES):
+            raise ValueError(f"linspace takes low, high, count (whole, 1 to {MOST_VALUES})")
         low, high = (np.broadcast_to(np.array(x, float), nominal.shape) for x in numbers[:2])
-        kind, numbers = "grid", np.linspace(low, high, int(numbers[2]))
+        kind, numbers = "grid", np.linspace(low, high, int(count))
     if kind == "normal" and len(numbers) == 2:
         numbers = (*numbers, -np.inf, np.inf)
     expected = EXPECTED.get(kind, "")

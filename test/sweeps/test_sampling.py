@@ -67,6 +67,12 @@ def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
     found = study.draw(0, 6)
     assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
     assert found["initial.gamma"][:, 1].tolist() == [0.7, 0.8, 0.9] * 2
+    even = {KEY: ("linspace", 0.2, 0.3, 2), "initial.gamma": ("linspace", 0.7, [0.9, 0.7, 1.1], 3)}
+    found = SweepStudy(SCENE, even).draw(0, 6)
+    assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
+    np.testing.assert_allclose(
+        found["initial.gamma"][:3], [[0.7] * 3, [0.8, 0.7, 0.9], [0.9, 0.7, 1.1]]
+    )
 
 
 def test_one_factor_scales_a_whole_tensor():
@@ -86,6 +92,8 @@ REFUSED = [
     ({"vary": {KEY: ("gauss", 0.3, 0.2)}}, "must be a list of values, or one of uniform, normal"),
     ({"vary": {KEY: ("normal", 0.3, -0.2)}}, "the standard deviation must be > 0"),
     ({"vary": {KEY: ("uniform", np.nan, 1.0)}}, "must be finite numbers"),
+    ({"vary": {KEY: ("linspace", 0.2, 0.3, 2.5)}}, "linspace takes low, high, count .whole, 1 to"),
+    ({"vary": {KEY: bytearray(b"12")}}, "must be a list of values, or one of uniform, normal"),
     ({"vary": {"star.mass": ("uniform", -1.0, 1.0)}}, r">= 0 \[kg\]; it reaches from -1.0 to 1.0"),
     ({"table": [1.0, 2.0]}, "table = .*: must be columns of numbers, or a .csv"),
     ({"table": [1, 2]}, "table = .*: must be columns of numbers, or a .csv"),
