@@ -104,7 +104,7 @@ setup(
     maintainer_email="sst-ros@example.org",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "nodes/*.xml", "*/templates/*"]},
+    package_data={NAME: ["py.typed", "nodes/*.xml", "host/*.mplstyle", "*/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

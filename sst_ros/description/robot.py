@@ -27,10 +27,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise
 from typing import Any, NamedTuple, TypeAlias
 
-import jinja2
 import numpy as np
 
 from sst_ros.dynamics.model import limits_of, ranges_of
+from sst_ros.host.output import load_templates
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
@@ -313,11 +313,5 @@ def _short(values: Iterable[float]) -> str:
     return " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)
 
 
-_templates = jinja2.Environment(
-    loader=jinja2.PackageLoader("sst_ros.description"),
-    autoescape=True,
-    trim_blocks=True,
-    lstrip_blocks=True,
-    keep_trailing_newline=True,
-)
+_templates = load_templates("description")
 _templates.filters |= {"exact": _exact, "short": _short}

@@ -16,7 +16,6 @@ from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -47,29 +46,14 @@ LINES: tuple[Looks, ...] = (
 )
 """Curves that may coincide: each is thinner than the one below it, so that all can be seen."""
 
-STYLE: Any = {
-    "figure.dpi": 150,
-    "savefig.dpi": 150,
-    "figure.constrained_layout.use": True,
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.titlelocation": "left",
-    "axes.grid": True,
-    "axes.formatter.useoffset": False,
-    "axes.prop_cycle": cycler(color=[looks["color"] for looks in LINES]),
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.alpha": 0.35,
-    "legend.framealpha": 0.85,
-    "lines.solid_capstyle": "butt",
-    "agg.path.chunksize": 1000,  # long jagged curves in one piece take hundreds of megabytes
-}
-
 DEGREES = float(np.degrees(1.0))
 
 SMALLEST_SHOWN = 1e-17
 """Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
 
+STYLE: Any = mpl.rc_params_from_file(
+    Path(__file__).with_suffix(".mplstyle"), use_default_template=False
+)
 styled = mpl.rc_context(STYLE)  # gives a function that makes a figure the style, as a decorator
 
 

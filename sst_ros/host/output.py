@@ -103,6 +103,20 @@ def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
         bar.draw(done / total)
 
 
+def load_templates(room: str) -> Any:
+    """Return the Jinja templates in the folder of a room; HTML and XML are escaped."""
+    import jinja2  # what only reads and writes files needs none
+
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader(f"sst_ros.{room}"),
+        autoescape=jinja2.select_autoescape(["html", "xml"], default_for_string=False),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+
+
 def write_table(
     columns: Mapping[str, NDArray[Any]],
     path: Path,

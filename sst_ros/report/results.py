@@ -15,12 +15,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jinja2
 import numpy as np
 
 from sst_ros.errors import require
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.host.output import write_into
+from sst_ros.host.output import load_templates, write_into
 from sst_ros.state import Array
 from sst_ros.version import VERSION
 
@@ -129,13 +128,7 @@ def processor() -> str:
     return named[1] if named else platform.machine()
 
 
-_templates = jinja2.Environment(
-    loader=jinja2.PackageLoader("sst_ros.report"),
-    autoescape=jinja2.select_autoescape(["html"], default_for_string=False),
-    undefined=jinja2.StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
+_templates = load_templates("report")
 _templates.globals |= {
     "base64": lambda path: b64encode(path.read_bytes()).decode("ascii"),
     "markdown": markdown,

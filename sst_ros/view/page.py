@@ -12,11 +12,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import jinja2
 import numpy as np
 from viser import GuiButtonHandle, GuiSliderHandle, GuiUplotHandle, Icon, uplot
 
 from sst_ros.description.robot import LEG_COLOURS
+from sst_ros.host.output import load_templates
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
@@ -36,13 +36,7 @@ _COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in 
 _BRAND = (0, 114, 178)
 _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
 
-_templates = jinja2.Environment(
-    loader=jinja2.PackageLoader("sst_ros.view"),
-    autoescape=True,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
-_PANEL: Any = _templates.get_template("panel.html").module
+_PANEL: Any = load_templates("view").get_template("panel.html").module
 
 
 class Page:
