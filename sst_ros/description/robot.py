@@ -215,7 +215,7 @@ def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
         limits["effort"] = (torque or SERVO_TORQUE) if kind == "gamma" else 0.0
         limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
         limited.append((joint, limits, getattr(scene.friction, kind, None)))
-    return _templates.get_template("urdf.xml").render(
+    document: str = _templates.get_template("urdf.xml").render(
         # An XML name has no spaces.
         name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
         assumed=[body.name for body in bodies.values() if body.assumed],
@@ -228,6 +228,7 @@ def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
         plugin=PLUGIN,
         roll_pitch_yaw=roll_pitch_yaw,
     )
+    return document
 
 
 class _Body(NamedTuple):
