@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectory: derived quantities against the states of Simulation, files to the bit, at(t)."""
 
+import copy
+import pickle
 import random
 import threading
 from dataclasses import replace
@@ -73,6 +75,15 @@ def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, path):
     with pytest.raises(InputError, match=r"exists"):
         run.save(path)
     run.save(path, overwrite=True)
+
+
+def test_a_copy_and_another_process_get_every_bit_of_the_samples():
+    run = simulate("example2", duration=0.2)
+    for again in (copy.deepcopy(run), pickle.loads(pickle.dumps(run))):
+        for name in ARRAYS:
+            assert getattr(again, name).tobytes() == getattr(run, name).tobytes(), name
+        assert again.energy_residual == run.energy_residual and repr(again) == repr(run)
+        np.testing.assert_allclose(again.at(0.1234).gamma, run.at(0.1234).gamma, rtol=0, atol=1e-9)
 
 
 def test_a_csv_is_the_table_and_other_suffixes_are_refused(run, tmp_path):

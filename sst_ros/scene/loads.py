@@ -121,6 +121,7 @@ class Initial(Section):
         "quaternion (x, y, z, w) of {E} in {B}, within 0.1 rad, that selects the assembly mode "
         "where gamma has several admissible ones",
         "1",
+        nonzero=True,
     )
 
 
@@ -138,14 +139,9 @@ class ToOrientation(Section):
     """The star turns about one axis from its initial orientation to another, with minimum jerk."""
 
     orientation: Quaternion = entry(
-        "quaternion (x, y, z, w) of {E} in {B} at the end, of any length", "1"
+        "quaternion (x, y, z, w) of {E} in {B} at the end, of any length", "1", nonzero=True
     )
     duration: float = _duration()
-
-    def rules(self) -> Rules:
-        """Refuse a quaternion without direction."""
-        square = sum(part * part for part in self.orientation)
-        yield np.equal(square, 0.0), "orientation", self.orientation, "must not be zero"
 
 
 class Sweep(Section):

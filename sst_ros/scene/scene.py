@@ -110,9 +110,6 @@ class Scene(Explained, Section):
         allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
         for place, value in schema.leaves(self).items():
             yield abs(value) > LARGEST, key_of(place), value, allowed
-        if (q := self.initial.orientation) is not None:
-            zero = np.equal(sum(part * part for part in q), 0.0)
-            yield zero, "initial.orientation", q, "must not be zero"
         reach = np.maximum(self.base.radius, self.star.radius)
         bodies = {"star": self.star}
         for name in LINKS:

@@ -60,10 +60,12 @@ class Spec:
     lengths: tuple[int, ...] = ()
     acts_on: tuple[str, ...] = ()
     default: Any = None
+    nonzero: bool = False  # nor may the squares be, as of a quaternion with a direction
 
     def allows(self, x: Any) -> Any:
-        """Whether numbers keep the bounds; a nan does not."""
-        return (x > self.above) & (x >= self.least) & (x <= self.most)
+        """Whether numbers keep the bounds, and directions are not zero; a nan does not."""
+        within = (x > self.above) & (x >= self.least) & (x <= self.most)
+        return within & np.any(x * x, axis=-1, keepdims=True) if self.nonzero else within
 
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
@@ -80,7 +82,7 @@ class Spec:
         counts = " or ".join(map(str, self.lengths)) + " " if self.lengths else ""
         keys = ", ".join(self.section.SPECS) if self.section else ""
         return {
-            "number": f"must be {what}{bounds}{unit}",
+            "number": f"must be {what}{bounds}{unit}" + ", not all zero" * self.nonzero,
             "samples": f"must be finite numbers, shape ({row}){unit}",
             "integer": f"must be a whole number from {self.least} to {self.most}{unit}",
             "flag": "must be true or false",
@@ -332,7 +334,11 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if shape:
         if isinstance(value, (str, dict, set)) or len(value) != shape[0]:
             raise ValueError
-        return tuple(_freeze_numbers(spec, entry, shape[1:]) for entry in value)
+        each = replace(spec, nonzero=False)
+        found = tuple(_freeze_numbers(each, entry, shape[1:]) for entry in value)
+        if spec.nonzero and not any(x * x for x in found):
+            raise ValueError
+        return found
     if isinstance(value, bool) or (isinstance(value, str) and not _NUMBER.fullmatch(value)):
         raise ValueError
     result = float(value)

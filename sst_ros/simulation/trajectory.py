@@ -148,6 +148,11 @@ class Trajectory(MotionTable):
         self.law: TorqueProfile | None = None if law is None else profile_of(law)
         self.dense, self._parameters = dense, tuple(parameters)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or another process gets: `at` integrates there from the samples."""
+        arrays = {name: getattr(self, name) for name in ("quaternion", "body_rate", "torque")}
+        return vars(self) | arrays | {"dense": None, "_residual": self.energy_residual}
+
     def repeater(self) -> Callable[[Callable[[Array], Array]], Trajectory]:
         """Return a function from another `dense` to the same run by it: nothing is checked again.
 

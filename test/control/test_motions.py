@@ -297,7 +297,7 @@ def test_points_that_make_no_motion_are_refused_with_the_reason(named, arguments
     [
         ("give one of", lambda: DesiredMotion()),
         ("give one of", lambda: DesiredMotion(sweep=SWEEP, spiral=KINDS["spiral"])),
-        ("must not be zero", lambda: ToOrientation(orientation=(0.0,) * 4, duration=1.0)),
+        ("not all zero", lambda: ToOrientation(orientation=(0.0,) * 4, duration=1.0)),
         ("must not exceed half", lambda: replace(SWEEP, fade=1.1)),
     ],
 )
