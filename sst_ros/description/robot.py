@@ -215,7 +215,9 @@ def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
         limits["effort"] = (torque or SERVO_TORQUE) if kind == "gamma" else 0.0
         limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
         limited.append((joint, limits, getattr(scene.friction, kind, None)))
-    document: str = _templates.get_template("urdf.xml").render(
+    templates = load_templates("description")
+    templates.filters |= {"exact": _exact, "short": _short}
+    document: str = templates.get_template("urdf.xml").render(
         # An XML name has no spaces.
         name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
         assumed=[body.name for body in bodies.values() if body.assumed],
@@ -312,7 +314,3 @@ def _exact(values: Iterable[float]) -> str:
 
 def _short(values: Iterable[float]) -> str:
     return " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)
-
-
-_templates = load_templates("description")
-_templates.filters |= {"exact": _exact, "short": _short}
