@@ -40,6 +40,7 @@ EXTRAS = {
     "cluster": ["dask[distributed]>=2024.5", "numba>=0.57", "pandas>=2", "pyarrow>=14"],
     "view": ["viser>=1.1,<2"],
     "control": ["control>=0.9.4"],
+    "proof": ["python-flint>=0.8"],
 }
 EXTRAS["all"] = ["argcomplete", "xarray", *chain.from_iterable(EXTRAS.values())]
 EXTRAS |= {
@@ -69,6 +70,7 @@ EXTRAS |= {
         "pytest",
         "pytest-timeout",
         "pytest-xdist",
+        "python-flint>=0.8",
         "ruff",
         "selenium",
         "twine",

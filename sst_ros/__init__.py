@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from sst_ros.mechanism.workspace import distance_to_singularity as distance_to_singularity
     from sst_ros.mechanism.workspace import workspace as workspace
     from sst_ros.plot.workspace import plot_workspace as plot_workspace
+    from sst_ros.proof.certify import ProvenMotion as ProvenMotion
+    from sst_ros.proof.certify import certify as certify
     from sst_ros.recording import recording as _recording
     from sst_ros.recording.recording import Recording as Recording
     from sst_ros.scene import scene as _scene
@@ -70,6 +72,7 @@ _MODULES = {
     "mechanism.kinematics": "direct_kinematics:direct inverse_kinematics:inverse",
     "mechanism.workspace": "distance_to_singularity workspace",
     "plot.workspace": "plot_workspace",
+    "proof.certify": "ProvenMotion certify",
     "recording.recording": "Recording read_bag:read",
     "scene.bodies": "arc_inertia",
     "scene.scene": "Scene load_scene:scene_of",

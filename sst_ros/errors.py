@@ -263,7 +263,13 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 _RECORD = ("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard")
 EXTRAS = {
     **{"distributed": "cluster", "matplotlib": "plot", "numba": "fast", "pinocchio": "engines"},
-    **{"control": "control", "viser": "view", "xarray": "all", **dict.fromkeys(_RECORD, "record")},
+    **{
+        "control": "control",
+        "flint": "proof",
+        "viser": "view",
+        "xarray": "all",
+        **dict.fromkeys(_RECORD, "record"),
+    },
 }
 """Extra of this package that installs a module."""
 

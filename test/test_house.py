@@ -23,7 +23,7 @@ FLOORS = (
     {"dynamics"},
     {"integration"},
     {"simulation"},
-    {"control", "description"},
+    {"control", "description", "proof"},
     {"recording"},
     {"plot", "view"},
     {"report"},

@@ -86,6 +86,19 @@ COMMANDS: dict[str, Subcommand | str] = {
         more="Simulate a scene under its own torques. Exit status 1 if the motion ended "
         "before the duration, at a limit of the scene for example.",
     ),
+    "certify": Subcommand(
+        "enclose the true motion of a scene: a proven bound of the error of simulate",
+        "cli.runs:certify_scene",
+        SCENE,
+        _number("--duration", "length [s]; default: that of the scene"),
+        _number("--bound", "angle to be proven [rad]; default: 1e-9", default=1e-9),
+        Arg("--digits", "keys of numbers known to their last digit", nargs="+", default=[]),
+        _path("--out", "table, .csv", metavar="FILE"),
+        _flag("--force", "overwrite the file of --out"),
+        needs="flint",
+        more="Enclose the true motion of a scene under its own torques, with proof. Exit status 1 "
+        "if it is not proven to its end, within the bound.",
+    ),
     "workspace": Subcommand(
         "map the workspace of a scene: reach, condition, singular poses",
         "cli.runs:map_workspace",

@@ -141,6 +141,21 @@ def run_simulation(options: argparse.Namespace) -> int:
     return 0 if trajectory.success else 1
 
 
+def certify_scene(options: argparse.Namespace) -> int:
+    """Print what is proven of the motion of a scene."""
+    if options.out is not None:
+        free_out(options, options.out)
+    given = {name: getattr(options, name) for name in ("duration", "bound")}
+    digits = dict.fromkeys(options.digits, "digits")
+    certify = function("proof.certify:certify")
+    proven = certify(options.scene, ranges=digits, progress=True, **given)
+    print(proven)
+    if options.out is not None:
+        proven.to_pandas().to_csv(options.out, index=False)
+        print(options.out)
+    return 0 if proven.success else 1
+
+
 def view(options: argparse.Namespace) -> int:
     """Serve the page of a bag, of a running simulator, or of one that is started for it."""
     if options.bag is not None:

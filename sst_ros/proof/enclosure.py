@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Enclosures of the solution of y' = f(t, y), step by step, in ball arithmetic.
+
+In a step p is a polynomial, d = p' - f(t, p) its defect, and e = y - p. With J between p and y
+
+    e' = J(s) e - d,    so    e(s) = V(s) e(0) + w(s),    w' = J w + (J V - V') e(0) - d,
+
+where the polynomial matrix V is nearly a fundamental matrix. The logarithmic norm of J bounds w.
+All holds while e stays inside of a box, which is checked afterwards: what e cannot leave, it never
+leaves. Sets are e(0) = C a + B b with boxes a, what the motion began with, and b, all later errors.
+B follows V; where it becomes skew its axes are made orthogonal (Lohner 1987). p, V, B, the norm and
+the steps may be any numbers: they are found in whatever arithmetic, and then taken as exact. All
+that is proven is computed in Arb's balls, whose rounding is outward.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from operator import methodcaller
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sst_ros.dynamics.expression import FUNCTIONS, Program
+from sst_ros.errors import require
+
+_flint = require("flint")
+arb, arb_mat, arb_poly, arb_series, ctx = (
+    getattr(_flint, name) for name in ("arb", "arb_mat", "arb_poly", "arb_series", "ctx")
+)
+Function = Callable[..., Sequence[Any]]
+
+PRECISION, LONGEST = 128, 100  # bits; coefficients of a series
+V_ORDER = 8
+SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogonal
+GROWTH = 0.05  # of a set by the remainder of V, largest in a step
+LEAST = 1e-9  # of a step, relative to the usual length: the proof ends
+
+
+class Refused(ArithmeticError):
+    """A step is not proven: how much shorter, or in what wider tube, it may be."""
+
+    def __init__(self, reason: str, shorter: float = 0.5, wider: list[Any] | None = None) -> None:
+        super().__init__(reason)
+        self.shorter, self.wider = shorter, wider
+
+
+@contextlib.contextmanager
+def precision() -> Iterator[None]:
+    """Compute with PRECISION bits, and long series."""
+    before, ctx.prec, ctx.cap = (ctx.prec, ctx.cap), PRECISION, LONGEST
+    try:
+        yield
+    finally:
+        ctx.prec, ctx.cap = before
+
+
+def upper(x: Any) -> float:
+    """Return a float that is not less than a ball."""
+    value = arb(x).upper()
+    found = float(value)
+    return found if value <= found else math.nextafter(found, math.inf)
+
+
+def between(low: Any, high: Any) -> Any:
+    """Return a ball of all numbers between two."""
+    return arb(low).union(arb(high))
+
+
+def norm(numbers: Sequence[Any]) -> Any:
+    """Return the root of the sum of squares."""
+    return sum((x * x for x in numbers), arb(0)).sqrt()
+
+
+def column(numbers: Sequence[Any]) -> Any:
+    """Return a matrix of one column."""
+    return arb_mat([[x] for x in numbers])
+
+
+def magnitude(matrix: Any) -> Any:
+    """Return upper bounds of the absolute values of the entries, as exact numbers."""
+    return arb_mat([[x.abs_upper() for x in row] for row in matrix.tolist()])
+
+
+def entries(matrix: Any) -> list[Any]:
+    """Return the numbers of a matrix, row by row."""
+    return [x for row in matrix.tolist() for x in row]
+
+
+def _middles(matrix: Any) -> np.ndarray[Any, Any]:
+    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
+
+
+# Functions of balls and of series of balls, and programs on them.
+
+
+def _first(x: Any) -> Any:
+    return x[0] if isinstance(x, arb_series) else x
+
+
+def _tanh(x: Any) -> Any:
+    return 1 - 2 / ((2 * x).exp() + 1)
+
+
+def _atan2(y: Any, x: Any) -> Any:
+    angle = arb.atan2(arb(_first(y)), arb(_first(x)))
+    if not isinstance(y, arb_series) and not isinstance(x, arb_series):
+        return angle
+    y, x = arb_series(y), arb_series(x)
+    return ((y.derivative() * x - x.derivative() * y) / (x * x + y * y)).integral() + angle
+
+
+def _step(x: Any) -> int:
+    if not (value := _first(x)) > 0 and not value < 0:
+        raise Refused("a kink: a contact begins or ends, or a torque meets its limit")
+    return int(bool(value > 0))
+
+
+def positive(x: Any, _zero: float = 0.0) -> Any:
+    """Return x where x > 0 and 0 elsewhere; Refused: it may be both."""
+    return x * _step(x)
+
+
+_ON_BALLS: dict[str, Callable[..., Any]] = {name: methodcaller(name) for name in FUNCTIONS}
+_ON_BALLS |= {"tanh": _tanh, "atan2": _atan2, "max": positive, "step": _step}
+
+
+def compile_on_balls(program: Program, constants: Sequence[Any]) -> Function:
+    """Turn a program into a function of balls or series, with these values of its last inputs."""
+    count = len(program.inputs) - len(constants)
+    before, after, results = program.split(range(count))
+    names = _ON_BALLS | dict(zip(program.inputs[count:], constants, strict=True))
+    before, after = (
+        [re.sub(r"\(1\.0 if (.+) > 0\.0 else 0\.0\)", r"step(\1)", line) for line in lines]
+        for lines in (before, after)
+    )
+    exec("\n".join(before), names)
+    lines = [f"def function({', '.join(program.inputs[:count])}):", *after]
+    exec("\n    ".join([*lines, f"return ({', '.join(results)},)"]), names)
+    function: Function = names["function"]
+    return function
+
+
+def _series(polynomial: Any, size: int) -> Any:
+    return arb_series(polynomial.coeffs()[:size], size)
+
+
+def _coefficients(x: Any, size: int) -> list[Any]:
+    found = x.coeffs() if isinstance(x, arb_series) else [arb(x)]
+    return [*found, *[arb(0)] * size][:size]
+
+
+# Sets, and what a step proves.
+
+
+class Region(NamedTuple):
+    """Where the solution is at a time: centre + C a + B b with |a_i| and |b_i| bounded."""
+
+    time: float
+    centre: list[Any]  # exact
+    c: Any
+    a: Any
+    axes: Any  # B
+    b: Any
+
+    @classmethod
+    def box(cls, time: float, balls: Sequence[Any]) -> Region:
+        """Return the region of all that lies in balls."""
+        n = len(balls)
+        one, zero = arb_mat(n, n, [0] * (n * n)) + 1, column([0] * n)
+        return cls(time, [x.mid() for x in balls], one, column([x.rad() for x in balls]), one, zero)
+
+    def spread(self, by: Any = 1) -> Any:
+        """Bound each number of by e."""
+        return magnitude(by * self.c) * self.a + magnitude(by * self.axes) * self.b
+
+
+class Advance(NamedTuple):
+    """A step: the solution is p(s) + V(s) e(0) + w, with |w_i| bounded, from begin to end."""
+
+    begin: Region
+    end: float
+    p: list[Any]  # polynomials
+    tube: list[Any]  # balls of e in the whole step
+    defect: float = 0.0  # largest integral of |d_i|, not rounded outward
+    v: Sequence[Any] = ()  # coefficients of V
+    w: Any = None
+    weights: Sequence[Any] = ()  # of a norm in which the numbers of e are alike
+
+    @property
+    def length(self) -> Any:
+        """Length [s], exact."""
+        return arb(self.end) - arb(self.begin.time)
+
+    def flow(self, s: Any) -> Any:
+        """Return V(s)."""
+        return sum((v * s**k for k, v in enumerate(self.v[1:], 1)), self.v[0])
+
+    def at(self, time: float, by: Any = 1) -> tuple[list[Any], list[Any]]:
+        """Return p at a time [s], and bounds of the numbers of by e."""
+        s = arb(time) - arb(self.begin.time)
+        w = magnitude(by * self.v[0]) * self.w
+        return [p(s) for p in self.p], entries(magnitude(self.begin.spread(by * self.flow(s)) + w))
+
+    def expand(self, function: Function, where: Any, size: int, tube: Sequence[Any]) -> list[Any]:
+        """Coefficients below `size` of a function of t and y = p + e at s = where, e in `tube`."""
+        rows = (p(arb_poly([where, 1])) + e for p, e in zip(self.p, tube, strict=True))
+        time = arb_series([arb(self.begin.time) + where, 1], size)
+        found = function(time, *(_series(row, size) for row in rows))
+        return [_coefficients(x, size) for x in found]
+
+    def enclose(self, function: Function, order: int) -> list[list[Any]]:
+        """Coefficients, the last one in the whole step, of polynomials that enclose a function."""
+        low = self.expand(function, arb(0), order, self.tube)
+        last = self.expand(function, between(0, self.length), order + 1, self.tube)
+        return [[*row, end[order]] for row, end in zip(low, last, strict=True)]
+
+
+def expand(f: Function, at: Region, order: int) -> tuple[list[list[Any]], list[list[Any]]]:
+    """Return the coefficients of p, and bounds of those of its defect below `order`: rounding."""
+    p, defects = [[x] for x in at.centre], [list[Any]() for _ in at.centre]
+    for k in range(order):
+        slopes = f(arb_series([at.time, 1], k + 1), *(arb_series(row, k + 1) for row in p))
+        for row, defect, slope in zip(p, defects, slopes, strict=True):
+            here = _coefficients(slope, k + 1)[k]
+            row.append((here / (k + 1)).mid())
+            defect.append((row[-1] * (k + 1) - here).abs_upper())
+    return p, defects
+
+
+def prove(
+    f: Function, jacobian: Function, step: Advance, defects: list[list[Any]], tolerance: float
+) -> Advance:
+    """Prove a step with e in its tube, or raise Refused."""
+    n, h, s = len(step.p), step.length, between(0, step.length)
+    order, zero = len(defects[0]), arb_mat(n, n, [0] * (n * n))
+    # |d(s)| <= sum |d_k| s^k + |d_N| s^N, the last coefficient anywhere in the step
+    last = step.expand(f, s, order + 1, [arb(0)] * n)
+    d = [[*low, row[order].abs_upper()] for low, row in zip(defects, last, strict=True)]
+    step = step._replace(defect=max(float(arb_poly(row).integral()(h)) for row in d))
+    if not (excess := step.defect / tolerance) <= 1.0:
+        shorter = 0.9 * excess ** (-1.0 / order) if excess < math.inf else 0.5
+        raise Refused("the defect is too large", max(shorter, 0.2))
+    flat = step.enclose(jacobian, V_ORDER)
+    of_order = range(V_ORDER + 1)
+    j = [arb_mat([[flat[n + n * c + r][k] for c in range(n)] for r in range(n)]) for k in of_order]
+    middles, v = list(map(_middles, j)), [np.eye(n)]
+    for k in range(V_ORDER):
+        v.append(np.sum([middles[i] @ v[k - i] for i in range(k + 1)], axis=0) / (k + 1))
+    step = step._replace(v=[arb_mat(matrix.tolist()) for matrix in v])
+    rest = zero  # J V - V' in the whole step
+    for k in range(2 * V_ORDER + 1):
+        some = range(max(0, k - V_ORDER), min(k, V_ORDER) + 1)
+        term = sum((j[i] * step.v[k - i] for i in some), zero)
+        rest = rest + (term - step.v[k + 1] * (k + 1) if k < V_ORDER else term) * s**k
+    source = entries(step.begin.spread(rest))
+    whole = sum((matrix * s**k for k, matrix in enumerate(j)), zero)
+    size, weights = magnitude(whole), _weights(whole)
+    growth, largest = arb(0), arb(0)  # logarithmic norm of J; norm of (J V - V') e(0)
+    for i in range(n):
+        others = sum((size[i, k] * weights[k] for k in range(n) if k != i), arb(0))
+        growth = growth.max((whole[i, i] + others / weights[i]).upper())
+        largest = largest.max((source[i] / weights[i]).upper())
+    most = largest * h  # integral of the norm of both, which is no less than the norm of it
+    for k in range(order + 1):
+        sizes = [(row[k] / x).upper() for row, x in zip(d, weights, strict=True)]
+        most += max(sizes) * h ** (k + 1) / (k + 1)
+    w = [((growth * h).exp() * most * x).upper() for x in weights]
+    step = step._replace(w=column(w), weights=weights)
+    reached = entries(step.begin.spread(step.flow(s)) + step.w)
+    if all(x.is_finite() and x < e.rad() for x, e in zip(reached, step.tube, strict=True)):
+        return step
+    widest, grows = max(map(float, entries(step.begin.spread()))), max(map(float, w))
+    slow = grows < 10.0 * tolerance + GROWTH * widest
+    wider = [arb(0, (2 * x).upper()) for x in reached] if slow else None
+    raise Refused("the error may leave the tube: it grows too fast", 0.6, wider)
+
+
+def _weights(jacobian: Any) -> list[Any]:
+    """Return weights of a norm in which |J| is small: nearly its Perron vector."""
+    size, found = np.abs(_middles(jacobian)), np.ones(len(jacobian.tolist()))
+    if not np.all(np.isfinite(size)):
+        raise Refused("the Jacobian is not bounded")
+    for _ in range(20):
+        found = size @ found + 1e-3 * found
+        found = np.maximum(found / found.max(), 1e-9)
+    return [arb(x) for x in found.tolist()]
+
+
+def region_at_end(step: Advance) -> Region:
+    """Return where the solution is at the end of a step, in axes that fit it."""
+    h, here = step.length, step.begin
+    flow, reached = step.flow(h), [p(h) for p in step.p]
+    moved, c = flow * here.axes, flow * here.c
+    error = magnitude(c - c.mid()) * here.a + step.w + column([x.rad() for x in reached])
+    scale = np.array([[float(x)] for x in step.weights])
+    guide = _middles(moved) / scale
+    guide /= np.linalg.norm(guide, axis=0)
+    if not np.linalg.cond(guide) < SKEW:
+        guide = _middles(moved) / scale * np.array([list(map(float, entries(here.b)))])
+        guide = np.linalg.qr(guide[:, np.argsort(-np.linalg.norm(guide, axis=0))])[0]
+    axes = arb_mat((scale * guide).tolist())
+    back = axes.inv()
+    b = magnitude(magnitude(back * moved) * here.b + magnitude(back) * error)
+    return Region(step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b)
+
+
+def enclose(
+    f: Function, jacobian: Function, here: Region, end: float, tolerance: float, order: int
+) -> Iterator[Advance]:
+    """Yield proven steps from a region to a time [s]; Refused says why one cannot be proven.
+
+    Args:
+        f: derivative of the time and each number of the state, as series.
+        jacobian: f, then its derivatives by each number of the state.
+        here: where the solution begins.
+        end: time [s].
+        tolerance: what the defect may add to an error in a step; `order` is that of p.
+        order: degree of p.
+
+    """
+    factor, usual, most = 0.4, end - here.time, math.inf
+    while here.time < end:
+        p, defects = expand(f, here, order)
+        sizes = [(k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)]
+        longest = min([(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=usual)
+        h, tries = min(factor * longest, 2.0 * usual, most), 0
+        narrow = tube = [arb(0, (3 * (x + tolerance)).upper()) for x in entries(here.spread())]
+        while True:
+            target = end if here.time + 1.01 * h > end else here.time + h
+            try:
+                step = Advance(here, target, list(map(arb_poly, p)), tube)
+                step = prove(f, jacobian, step, defects, tolerance)
+                break
+            except (ArithmeticError, ValueError) as error:
+                why = error if isinstance(error, Refused) else Refused(str(error))
+                if why.wider is not None and tries < 4:
+                    tube, tries = why.wider, tries + 1
+                    continue
+                h, tube, tries, most = why.shorter * (target - here.time), narrow, 0, 0.0
+                if h < LEAST * usual or here.time + h == here.time:
+                    raise why from None
+        yield step
+        taken = target - here.time
+        if target < end:
+            usual, most = max(taken, 0.1 * usual), 1.1 * taken if most < math.inf else most
+            ratio = (0.5 * tolerance / step.defect) ** (1.0 / order) if step.defect else 1.3
+            factor = taken / longest * min(max(ratio, 0.7), 1.3)
+        here = region_at_end(step)

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is proven holds for solutions of 60 digits, and no longer where a part breaks."""
+
+import math
+
+import pytest
+from mpmath import mp, mpf
+from sixty_digits import Motion, angle
+
+from sst_ros import InputError, SineTorque, TorqueTable, certify, load_scene, simulate
+from sst_ros.__main__ import main
+from sst_ros.dynamics.motion_table import JOINTS
+from sst_ros.proof import enclosure
+from sst_ros.proof.enclosure import Region, arb
+
+FREE = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore"}
+SINE = SineTorque(amplitude=(1.0, -0.5, 2.0), frequency=(15.0, 12.0, 20.0), phase=(0.0, 1.0, 0.5))
+CASES = {
+    "general": ("general", {}, None),
+    "gravity_payload": ("gravity_payload", {"initial.gamma_dot": (0.5, -0.5, 0.2)}, SINE),
+    "lag": ("example2_heavy", {"actuators": {"time_constant": 0.02, "rotor_inertia": 1e-3}}, SINE),
+    "friction": ("friction", {"friction.gamma.smoothing": 0.3, "friction.mu.smoothing": 0.3}, None),
+}
+NAMES = [f"{joint}_{leg}" for joint in JOINTS for leg in (1, 2, 3)]
+
+
+def worst(columns, motion, row, time):
+    """Largest true error over its bound at an instant."""
+    y = motion.at(time)
+    q = [columns[f"quaternion_{part}"][row] for part in "xyzw"]
+    ratios = [angle(y[:4], q) / mpf(columns["angle"][row])]
+    names = ["body_rate_x", "body_rate_y", "body_rate_z", *NAMES]
+    for name, x in zip(names, [*y[4:7], *motion.joints(y)], strict=True):
+        ratios.append(abs(x - mpf(columns[name][row])) / mpf(columns[f"{name}_bound"][row]))
+    return float(max(ratios))
+
+
+def case(name):
+    scene, values, torque = CASES[name]
+    return load_scene(scene).with_values({**FREE, **values}), torque
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_solution_of_60_digits_lies_inside(name):
+    scene, torque = case(name)
+    given = {"t_eval": [0.05], "method": "rk4", "tolerance": 1e-6}
+    proven, motion = certify(scene, torque, 0.05, **given), Motion(scene, torque)
+    assert proven.success and proven.until == 0.05 and proven.largest < 1e-12
+    assert worst(proven.columns, motion, 0, 0.05) < 1.0
+    true = angle(motion.at(0.05)[:4], proven.trajectory.quaternion[0])
+    most = proven.columns["distance"][0]
+    assert 1e-13 < true <= most < 1.1 * true
+
+
+def test_all_motions_of_ranges_lie_inside():
+    scene, _ = case("general")
+    ranges = {"initial.gamma_dot": 1e-4, "initial.gamma[0]": 1e-5, "star.inertia.zz": 5e-4}
+    proven = certify(scene, SINE, 0.1, ranges=ranges, t_eval=[0.1])
+    assert not proven.reason and proven.until == 0.1
+    found = []
+    for signs in ((1, 1, 1, 1, 1), (-1, 1, -1, 1, -1), (1, -1, -1, -1, 1), (-1, -1, 1, 1, 1)):
+        values = {
+            "initial.gamma_dot": tuple(
+                x + 1e-4 * sign for x, sign in zip(scene.initial.gamma_dot, signs, strict=False)
+            ),
+            "initial.gamma": (0.75 + 1e-5 * signs[3], 0.7, 0.75),
+            "star.inertia.zz": 0.22 + 5e-4 * signs[4],
+        }
+        found.append(worst(proven.columns, Motion(scene.with_values(values), SINE), 0, 0.1))
+    assert max(found) < 1.0
+    assert max(found) > 0.3  # not wider than needed by much
+
+
+def test_digits_are_half_a_unit_of_the_last_one():
+    scene, _ = case("general")
+    times = {"t_eval": [0.05]}
+    digits = certify(scene, SINE, 0.05, ranges={"star.inertia.zz": "digits"}, **times)
+    half = certify(scene, SINE, 0.05, ranges={"star.inertia.zz": 0.005}, **times)
+    assert digits.columns["angle"] == half.columns["angle"]
+
+
+def oscillator(radius=0.0):
+    """y'' = -y from (1, 0)."""
+    box = Region.box(0.0, [arb(1, radius), arb(0, radius)])
+    return (lambda t, x, v: (v, -x)), (lambda t, x, v: (v, -x, 0, -1, 1, 0)), box
+
+
+def last(f, jacobian, box, end, tolerance=1e-20, order=24):
+    *_, step = enclosure.enclose(f, jacobian, box, end, tolerance, order)
+    return step
+
+
+def test_an_oscillator_is_not_wrapped():
+    with enclosure.precision():
+        step = last(*oscillator(1e-3), 20.0)
+        p, e = step.at(20.0)
+    with mp.workdps(40):
+        assert abs(mpf(p[0].str(40, radius=False)) - mp.cos(20)) < 1e-17
+    exactly = 1e-3 * (abs(math.cos(20.0)) + abs(math.sin(20.0)))
+    assert exactly <= float(e[0]) < 1.1 * exactly
+
+
+def test_a_halved_defect_misses_the_solution(monkeypatch):
+    # y' = 3 t^2 by p of order 2: the defect is all of it, and its integral is the error, t^3.
+    def f(t, y):
+        return (3 * t * t,)
+
+    def miss():
+        with enclosure.precision():
+            box = Region.box(0.0, [arb(0)])
+            step = last(f, lambda t, y: (3 * t * t, 0 * t), box, 0.125, 1.0, 2)
+            p, e = step.at(0.125)
+            return float(abs(p[0] - arb(0.125) ** 3)) / float(e[0])
+
+    assert 0.999 < miss() <= 1.0
+    expand = enclosure.Advance.expand
+    monkeypatch.setattr(
+        enclosure.Advance, "expand", lambda *given: [
+            [x / 2 if k else x for k, x in enumerate(row)] for row in expand(*given)
+        ],
+    )  # fmt: skip
+    assert miss() > 1.9
+
+
+def test_the_norm_of_an_integral_is_no_bound(monkeypatch):
+    # x' = 100 (y - x) + .., y' = 0 by p = (0, -t): the defect of y acts all the time, that of x
+    # at the end, and x has both; each has the integral h.
+    h, order = 0.125, 30
+    monkeypatch.setattr(enclosure, "_weights", lambda _: [arb(1), arb(1)])
+
+    def f(t, x, y):
+        return 100 * (y - x) + 100 * t + (order + 1) * (t * (1 / h)) ** order, 0 * t
+
+    with enclosure.precision():
+        p = [enclosure.arb_poly([0]), enclosure.arb_poly([0, -1])]
+        defects = [[arb(0)] * order, [arb(1), *[arb(0)] * (order - 1)]]
+        step = enclosure.Advance(Region.box(0.0, [arb(0)] * 2), h, p, [arb(0, 1e3)] * 2)
+        given = (lambda *y: (*f(*y), -100, 0, 100, 0)), step, defects, 1.0
+        bound = float(enclosure.prove(f, *given).at(h)[1][0])
+    error = mp.quad(
+        lambda s: mp.exp(100 * (s - h)) * (100 * s + (order + 1) * (s / h) ** order), [0, h]
+    )
+    assert 1.2 * h < error < bound
+
+
+def test_without_rounding_the_solution_is_missed(monkeypatch):
+    # 40 bits, so that nearly all of the bound is rounding; -cos(1) is known better.
+    monkeypatch.setattr(enclosure, "PRECISION", 40)
+
+    def miss():
+        with enclosure.precision():
+            p, e = last(*oscillator(), 1.0).at(1.0)
+            return abs(float(p[0]) - math.cos(1.0)), float(e[0])
+
+    error, bound = miss()
+    assert 1e-16 < error < bound < 1e-9
+    expand, end = enclosure.expand, enclosure.region_at_end
+
+    def exactly(f, at, order):
+        p, defects = expand(f, at, order)
+        return p, [[0 * x for x in row] for row in defects]
+
+    monkeypatch.setattr(enclosure, "expand", exactly)
+    monkeypatch.setattr(enclosure, "region_at_end", lambda step: end(step)._replace(b=step.w))
+    error, bound = miss()
+    assert error > bound
+
+
+def test_a_wrong_jacobian_misses_a_motion_of_the_range(monkeypatch):
+    f, jacobian, box = oscillator(1e-3)
+    with enclosure.precision():
+        e = last(f, jacobian, box, 1.0).at(1.0)[1]
+        wrong = last(f, lambda t, x, v: (v, -x, 0, -0.5, 0.5, 0), box, 1.0).at(1.0)[1]
+    # from (1.001, 0.001)
+    apart = 1.001 * math.cos(1.0) + 0.001 * math.sin(1.0) - math.cos(1.0)
+    assert float(wrong[0]) < apart < float(e[0])
+
+
+def test_the_end_of_the_stroke_is_enclosed_where_simulate_stops():
+    proven, found = certify("example2_stroke", t_eval=[0.5, 0.9]), simulate("example2_stroke")
+    (span,) = proven.limits["gamma_1 > 1.570796 rad"]
+    assert proven.reason == "gamma_1 > 1.570796 rad" and proven.until == span[0] and proven.success
+    assert span[1] - span[0] < 1e-11
+    assert abs(found.t[-1] - 0.5 * sum(span)) < 1e-9
+
+
+def test_limits_that_are_passed_are_enclosed():
+    proven = certify("example2", t_eval=[1.0])
+    passed = {name: spans for name, spans in proven.limits.items() if spans}
+    assert list(passed) == ["gamma_1 > 1.570796 rad", "beta_2 < 0"]
+    assert all(len(spans) == 1 and spans[0][1] - spans[0][0] < 1e-11 for spans in passed.values())
+
+
+def test_nothing_is_said_beyond_a_kink():
+    scene = load_scene("example2_heavy").with_values({"actuators": {"torque_limit": 4.5}})
+    proven, kink = certify(scene, None, 0.1), math.acos(4.5 / 5.0) / 12.0  # of 5 cos(12 t)
+    assert "kink" in proven.reason and not proven.success
+    assert kink - 1e-6 < proven.until < kink + 1e-15
+    assert proven.columns["t"].max() <= proven.until
+
+
+def test_elastic_stops_end_the_proof_at_the_first_contact():
+    proven, motion = (
+        certify("impacts", None, 1.0),
+        simulate("impacts", None, 1.0, t_eval=[0.9, 1.0]),
+    )
+    first = certify("example2_stroke").limits["gamma_1 > 1.570796 rad"][0]
+    assert "kink" in proven.reason and motion.success
+    assert first[0] - 1e-6 < proven.until <= first[1]
+
+
+def test_held_torques_are_followed_over_their_ticks():
+    scene, _ = case("general")
+    table = TorqueTable([0.0, 0.03, 0.05], [[1, 0, 0], [0, -1, 0.5], [0.2, 0.1, 0]])
+    proven = certify(scene, table, 0.05, t_eval=[0.03, 0.05])
+    motion = Motion(scene, (1.0, 0.0, 0.0))
+    assert worst(proven.columns, motion, 0, 0.03) < 1.0
+    motion.torque = (0.0, -1.0, 0.5)
+    assert worst(proven.columns, motion, 1, 0.05) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"torque": lambda t: (0.0, 0.0, 0.0)}, "torque"),
+        ({"bound": 0.0}, "bound"),
+        ({"ranges": {"base.v": 0.1}}, "must name bodies"),
+        ({"ranges": {"star.inertia.zz": -1.0}}, "must be a number >= 0"),
+        ({"ranges": {"no.key": 1.0}}, "no"),
+    ],
+)
+def test_what_cannot_be_proven_is_refused(given, word):
+    with pytest.raises(InputError, match=word):
+        certify("example2", **given)
+
+
+def test_the_command_prints_what_is_proven(capsys):
+    assert main(["certify", "example2", "--duration", "0.05", "--bound", "1e-12"]) == 0
+    said = capsys.readouterr().out
+    assert "to 0.05 s" in said and "no limit is reached and no singularity is passed" in said
