@@ -86,15 +86,15 @@ def indent(spaces: int, lines: list[str]) -> list[str]:
 
 def linearise_by_columns(
     program: Program, state: Sequence[str], drive: Sequence[str], slots: Slots
-) -> str:
-    """Text of `linearise` for numba: all columns of a Jacobian in a loop over directions.
+) -> list[str]:
+    """Texts of `differentiate` and `linearise`: all columns of a Jacobian in a loop.
 
     The program is the derivative by t, state and drive and its own along directions, the last
     inputs; of them the one of t, if it is there, comes last. The text is half as long as the
     operations of each column in a row, which takes half the time to compile, and the compiler takes
-    four columns at once; the digits are those of the columns. Ten lines of it:
+    four columns at once; the digits are those of the columns. Some lines of it:
 
-        def linearise(t, state, d, p, slope, by_time, matrix):
+        def differentiate(t, state, d, p, slope, columns):
             x = state[0]
             v0 = x * x
             slope[0] = v7
@@ -102,6 +102,9 @@ def linearise_by_columns(
                 d_x = 1.0 if k == 0 else 0.0
                 v8 = d_x * v0
                 columns[0 + k] = v9
+        def linearise(t, state, d, p, slope, by_time, matrix):
+            columns = vector(64)
+            differentiate(t, state, d, p, slope, columns)
             for i in range(8):
                 for k in range(7):
                     matrix[i][k] = columns[8 * i + k]
@@ -112,24 +115,28 @@ def linearise_by_columns(
     width = -(-len(directions) // _COLUMNS) * _COLUMNS
     by_time = "d_t" in directions
     states = len(directions) - by_time
-    body = [
+    differentiate = [
+        "def differentiate(t, state, d, p, slope, columns):",
         *(f"{name} = state[{i}]" for i, name in enumerate(state)),
         *(f"{name} = d[{i}]" for i, name in enumerate(drive)),
         *slots.reads([*before, *along, *results]),
         *before,
         *(f"slope[{i}] = {result}" for i, result in enumerate(results[:size])),
-        f"columns = vector({size * width})",
         f"for k in range({width}):",
         *(f"    {name} = 1.0 if k == {k} else 0.0" for k, name in enumerate(directions)),
         *(f"    {line}" for line in along),
         *(f"    columns[{i * width} + k] = {x}" for i, x in enumerate(results[size:])),
+    ]
+    linearise = [
+        "def linearise(t, state, d, p, slope, by_time, matrix):",
+        f"columns = vector({size * width})",
+        "differentiate(t, state, d, p, slope, columns)",
         f"for i in range({size}):",
         *([f"    by_time[i] = columns[{width} * i + {states}]"] if by_time else []),
         f"    for k in range({states}):",
         f"        matrix[i][k] = columns[{width} * i + k]",
     ]
-    head = "def linearise(t, state, d, p, slope, by_time, matrix):"
-    return "\n    ".join([head, *body]) + "\n"
+    return ["\n    ".join(lines) + "\n" for lines in (differentiate, linearise)]
 
 
 def flat_sin(x: float) -> float:

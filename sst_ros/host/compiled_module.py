@@ -49,11 +49,12 @@ _NUMBA = """\
 from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
 import numba
 import numpy as np
+from sst_ros.host.straight_line import straight_line
 
 options = dict(cache={cache}, error_model="numpy", nogil={nogil}{more}, no_cfunc_wrapper=True)
 jit = numba.njit(**options)
 jit_inner = numba.njit(**options, no_cpython_wrapper=True)
-jit_inline = numba.njit(**options, no_cpython_wrapper=True, forceinline=True)
+jit_inline = numba.njit(**options, no_cpython_wrapper=True, inline="always")
 
 @jit_inner
 def vector(n):
@@ -75,14 +76,15 @@ def copy(values, place):  # a slice would take seconds to compile
 
 # Compiled functions alone call these. What Python would need to call them - which without it is a
 # segmentation fault - takes a fifth of the time to compile.
-_INNER = (
-    "angles_and_rates joints_of normalise all_far step_factor next_length "
-    "evaluate linearise factorise substitute"
-)
+_INNER = "normalise all_far step_factor next_length linearise factorise substitute"
 
 # A call hands on each array as seven words on the stack and counts its readers by two atomic
-# operations: a step by calls takes 5 to 20 % longer. In what a run calls each has one caller.
-_INLINE = ("attempt", "step_pair")
+# operations: a step by calls takes 5 to 20 % longer. numba puts these where they are called, which
+# is one place in what a run calls, before it compiles.
+_INLINE = ("attempt_linearly_implicit", "step_pair")
+
+_STRAIGHT = ("rhs", "angles_and_rates", "joints_of", "evaluate", "attempt", "differentiate")
+"""Sequences of assignments of floats, which need no numba to find types."""
 
 _FREE_ROUNDING = ', fastmath={"arcp", "contract"}'
 
@@ -191,14 +193,16 @@ def _for_numba(
     head += "".join(f"{name} = np.array({name})\n" for name in tables)
     if base.texts:
         head += f"from {base.name} import {', '.join(map(_function_name, base.texts))}\n"
-    return "\n".join([head, *(f"{_decorator(text)}\n{text}" for text in texts)])
+    return "\n".join([head, *map(_definition, texts)])
 
 
-def _decorator(text: str) -> str:
+def _definition(text: str) -> str:
     name = _function_name(text)
+    if name in _STRAIGHT:
+        return f'{name} = straight_line("""\n{text}""", globals())\n'
     if name in _INLINE:
-        return "@jit_inline"
-    return "@jit_inner" if name in _INNER.split() else "@jit"
+        return f"@jit_inline\n{text}"
+    return f"@{'jit_inner' if name in _INNER.split() else 'jit'}\n{text}"
 
 
 def _function_name(text: str) -> str:
@@ -214,7 +218,8 @@ def _name_of(text: str) -> str:
     import numpy
 
     versions = (sys.version, numba_version(), numpy.__version__, platform.machine())
-    digest = hashlib.sha256("\n".join([text, *map(str, versions)]).encode()).hexdigest()[:24]
+    maker = Path(__file__).with_name("straight_line.py").read_text()
+    digest = hashlib.sha256("\n".join([text, maker, *map(str, versions)]).encode()).hexdigest()[:24]
     return f"sst_{digest}"
 
 

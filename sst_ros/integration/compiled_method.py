@@ -163,7 +163,7 @@ class CompiledMethod:
 
     def slope(self, t: float, y: Vector, d: Vector) -> tuple[float, ...]:
         """Return the derivative of the state."""
-        found: tuple[float, ...] = self._module.rhs(t, *y, *d, *self._extra)
+        found: tuple[float, ...] = self._module.slope(t, *y, *d, *self._extra)
         return found
 
     def hold(self, h: float, d: Vector) -> Periods:
@@ -245,9 +245,9 @@ def has_step_code(system: ODE, method: Method) -> bool:
 def compile_derivative(system: ODE) -> Function:
     """Return the derivative of a system in machine code, with the digits of plain Python."""
     _, _, base, numbers = _source(system, DORMAND_PRINCE, by_structure=True)
-    rhs: Function = compiled_module.load(list(base.texts), base.constants, numba=True).rhs
+    slope: Function = compiled_module.load(list(base.texts), base.constants, numba=True).slope
     place = np.array(numbers)
-    return lambda *inputs: rhs(*inputs, place)
+    return lambda *inputs: slope(*inputs, place)
 
 
 @lru_cache(maxsize=64)
@@ -277,6 +277,7 @@ def _source(
         "ERROR_ORDER": float(method.error_order),
     }
     inputs = ", ".join(["t", *y, *d, *p])
+    floats = inputs.replace("[", "").replace("]", "")
     joints = _assign(
         [f"joints[{i}]" for i in range(18)], f"angles_and_rates({', '.join(y[:7] + p)})"
     )
@@ -284,6 +285,7 @@ def _source(
         system.program.source("rhs", slots),
         system.dynamics.joints_program.source("angles_and_rates", slots),
         f"def joints_of(y, p, joints):\n{joints}",
+        f"def slope({floats}):\n    return rhs({floats})\n",
         *(inspect.getsource(function) for function in _SHARED),
     ]
     texts: list[str] = []
@@ -294,17 +296,15 @@ def _source(
         slope = [f"slope[{i}]" for i in range(size)]
         if slots is not None:
             columns = system.directional, system.state, system.drive
-            texts.append(linearise_by_columns(*columns, slots))
+            texts += linearise_by_columns(*columns, slots)
         else:  # without a compiler the columns in a row take less time
             texts.append(system.jacobian.source("jacobian"))
             texts.append(inspect.getsource(step_loops.linearise))
         evaluate = _assign(slope, f"rhs({inputs})")
         texts.append(f"def evaluate(t, y, d, p, slope):\n{evaluate}")
-        texts += [
-            inspect.getsource(function).replace("attempt_linearly_implicit", "attempt")
-            for function in _IMPLICIT
-        ]
-    texts += [inspect.getsource(function) for function in _LOOPS]
+        texts += [inspect.getsource(function) for function in _IMPLICIT]
+    attempt = "attempt(" if isinstance(method, Tableau) else f"{_IMPLICIT[-1].__name__}("
+    texts += [inspect.getsource(function).replace("attempt(", attempt) for function in _LOOPS]
     base = compiled_module.SharedFunctions(tuple(shared), common)
     return texts, constants, base, slots.values if slots else []
 
