@@ -111,7 +111,7 @@ def test_the_changelogs_agree():
 def test_the_parser_of_bloom_reads_every_release():
     changelog = pytest.importorskip("catkin_pkg.changelog").get_changelog_from_path(ROOT, "sst_ros")
     read = {version: (date, content) for version, date, content in changelog.foreach_version()}
-    assert list(read) == re.findall(r"^## \[(\d\S+)\] - ", MARKDOWN, re.M)
+    assert list(read)[::-1] == re.findall(r"^## \[(\d\S+)\] - ", MARKDOWN, re.M)
     date, content = read[sst_ros.__version__]
     assert f"## [{sst_ros.__version__}] - {date.date()}" in MARKDOWN
     released = MARKDOWN.partition(f"## [{sst_ros.__version__}]")[2].partition("\n## ")[0]
