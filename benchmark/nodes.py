@@ -105,7 +105,7 @@ class Process(subprocess.Popen[str]):
 
 
 def start_simulator(namespace: str = "", **given: Any) -> Process:
-    """Start a simulator, which by default would end with the scene's duration."""
+    """Start a simulator, which in lockstep by default would end with the scene's duration."""
     return Process("simulator", namespace, **{"duration": 0.0, **given})
 
 

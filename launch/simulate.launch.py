@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the simulator and, as asked, the player of the scene's torques, a recorder and RViz.
 
-The launch ends with the simulator, that is after `duration`, by default the duration of the scene;
-with play:=true and duration:=0 it ends with the player.
+The launch ends with the simulator, that is after `duration` if there is one, in lockstep by default
+that of the scene; without one it ends with the player of play:=true, or when it is stopped.
 """
 
 from launch import LaunchDescription
@@ -15,7 +15,7 @@ RUN = {
     "scene": ("example2", "scene, by name or by path of a .yaml file"),
     "rate": ("", "steps per second of simulated time [Hz]"),
     "publish_rate": ("", "published samples per second [Hz]"),
-    "duration": ("", "length of the run [s]; 0 for no end; by default that of the scene"),
+    "duration": ("", "length of the run [s]; 0 for no end; in lockstep by default the scene's"),
     "real_time_factor": ("", "simulated time per time of the clock; 0 for as fast as possible"),
     "publish_clock": ("", "true: publish the simulated time on /clock"),
     "sync": ("", "free, or lockstep with the commands; by default lockstep with play:=true"),
@@ -49,7 +49,8 @@ def actions(given: Given) -> list[Action]:
             "stamped": "" if run["sync"] == "lockstep" else "false",
             "min_subscribers": "2" if recorded else "",  # the recorder reads them, too
         }
-        endless = bool(given["duration"]) and float(given["duration"]) == 0.0
+        endless = given["duration"] or ("0" if run["sync"] == "free" else "")
+        endless = bool(endless) and float(endless) == 0.0
         nodes.append(launch_parts.node(given, "torque_player", played, ends=endless))
     return nodes
 

@@ -223,7 +223,7 @@ def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
         if spec.kind == "texts":
             shown = "those of config/topics.txt" if value else "none"
         elif (cls, name) == (SimulatorParameters, "duration"):
-            shown = "that of the scene"
+            shown = "0.0, in lockstep that of the scene"
         elif isinstance(value, tuple):
             shown = list(value)
         may = "yes" if name in changeable else "no"

@@ -21,6 +21,7 @@ from typing import Any, Generic, TypeVar
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import SetParametersResult as Result
+from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -53,6 +54,7 @@ _ACKNOWLEDGE_S = 1.2
 """A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
 _CLEAN_UP_S = 10.0
 """Longer than any clean-up of the middleware, also on a busy machine."""
+_WATCH_S = 0.25
 _STDERR = 2
 
 _TYPES = {
@@ -176,7 +178,14 @@ class AnsweringWorker(Worker[A]):
         self._commands = topic.publisher(self.node, simulator=given.simulator)
         heard = {"phase": self.hear, "joint_states": self.receive, **more}
         topics.subscribe(self.node, own, given.simulator, **heard)
-        every(self.node, 0.5, self.watch)
+        self._simulator: Any = None
+        if not given.stamped:
+            asked, name = own["get_parameters"], own["get_parameters"].name
+            self._simulator = self.node.create_client(
+                asked.kind, name.format(simulator=given.simulator)
+            )
+        self._sync: Any = None  # the future of the simulator's parameter
+        every(self.node, _WATCH_S, self.watch)
 
     def close(self) -> None:
         """Leave the actuators without torque where the work is not done."""
@@ -220,7 +229,15 @@ class AnsweringWorker(Worker[A]):
         self._commands.publish(self._message)
 
     def watch(self) -> None:
-        """Raise an SstError where no joint_states came for too long."""
+        """Raise an SstError where no joint_states came for too long, or no answer is taken."""
+        if self._sync is None:
+            if self._simulator is not None and self._simulator.service_is_ready():
+                self._sync = self._simulator.call_async(GetParameters.Request(names=["sync"]))
+        elif self._sync.done():
+            values = self._sync.result().values
+            if values and values[0].string_value == "lockstep":
+                text = "the simulator runs in lockstep and takes no command without a stamp"
+                raise SstError(f"stamped = false: {text}: give stamped:=true")
         silent = time.monotonic() - self.heard_s
         if silent > self.parameters.timeout:
             raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")

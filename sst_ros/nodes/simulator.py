@@ -49,7 +49,7 @@ class Simulator(Worker[SimulatorParameters]):
     """Worker of the process `simulator`: connects the parts, reports once a second."""
 
     def __init__(self) -> None:
-        super().__init__("sst_simulator", SimulatorParameters, _scene_duration)
+        super().__init__("sst_simulator", SimulatorParameters, _lockstep_duration)
         given = self.parameters
         simulated = scene.load(given.scene)
         self._topics = SimulatorTopics(self.node, simulated, given)
@@ -173,8 +173,10 @@ class Simulator(Worker[SimulatorParameters]):
             yield f"another node is named {own}, too"
 
 
-def _scene_duration(given: dict[str, Any]) -> dict[str, Any]:
+def _lockstep_duration(given: dict[str, Any]) -> dict[str, Any]:
     """Return the scene's duration as a default; faults of the scene are reported later."""
+    if given.get("sync") != "lockstep":
+        return {}
     try:
         simulated = scene.load(given.get("scene", SimulatorParameters().scene))
     except (InputError, TypeError):

@@ -84,6 +84,9 @@ subscribes joint_states sensor_msgs/msg/JointState 1000
     samples that are answered, from the first on
 subscribes {simulator}/phase std_msgs/msg/String 1 latched
     ends the player at a fault
+calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
+    whether it runs in lockstep, where a command without a stamp is of no use: then the node ends
+    if stamped is false
 
 [inverse_dynamics]
 publishes {simulator}/commands std_msgs/msg/Float64MultiArray 1000
@@ -106,6 +109,9 @@ subscribes {simulator}/phase std_msgs/msg/String 10 latched
 subscribes ~/joint_trajectory trajectory_msgs/msg/JointTrajectory 10
     motion to follow, from its stamp on or at once and in place of the present one; refused as a
     whole where it cannot be followed, and where motion is not topic
+calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
+    whether it runs in lockstep, where a command without a stamp is of no use: then the node ends
+    if stamped is false
 executes ~/follow_joint_trajectory control_msgs/action/FollowJointTrajectory
     the same with tolerances, feedback and a result
     if control_msgs is installed

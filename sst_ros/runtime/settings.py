@@ -40,8 +40,8 @@ class SimulatorParameters(Section):
     )
     wait_for_command: bool = entry("start the run at the first command, not at once", default=False)
     duration: float = _number(
-        "length of the run, after which the node ends, by default the duration of the scene; 0 for "
-        "no end",
+        "length of the run, after which the node ends; 0 for no end; in lockstep by default the "
+        "duration of the scene",
         "s",
         default=0.0,
         most=1e9,

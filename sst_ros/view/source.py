@@ -138,4 +138,4 @@ class Replay:
 def run_simulator(scene: str, speed: float = 1.0) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run a simulator of a scene to look at; `speed` is simulated time per time."""
     given = {"scene": scene, "publish_rate": _PUBLISH_RATE, "real_time_factor": speed}
-    return processes.run_beside("simulator", given | {"duration": 0.0}, stdout=subprocess.DEVNULL)
+    return processes.run_beside("simulator", given, stdout=subprocess.DEVNULL)

@@ -108,7 +108,7 @@ class Nodes:
 
     def run(self, command, *words, **given):
         """Fork a node, which starts in a third of the time."""
-        if command == "simulator":  # by default it would end with the scene's duration
+        if command == "simulator":  # in lockstep by default it would end with the scene's
             given.setdefault("duration", 0.0)
         words = [command, *words, "--ros-args", *processes.words(given)]
         self.running.append(ForkedNode(words, {**os.environ, "SST_ROS_NUMBA": "0"}))

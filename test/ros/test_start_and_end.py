@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from programs import python
+from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros.conftest import COMMANDS, NODE
 from std_msgs.msg import Float64MultiArray, String
@@ -41,15 +42,21 @@ def test_unknown_arguments_are_refused(run_here, tmp_path, words, refused, said)
     assert status == refused and said in err and "csv = " not in err
 
 
-def test_plain_options_are_parameters_and_the_duration_is_that_of_the_scene(nodes, observer):
+def test_plain_options_are_parameters_and_a_run_goes_on_until_it_is_ended(nodes, observer):
     scene = observer.listen(String, f"{NODE}/scene", latched=True)
-    words = ["--scene", "fast_spin", "--real-time-factor", "0.1"]
-    words += ["--wait-for-subscribers", "/diagnostics,~/scene"]
+    words = ["--scene", "fast_spin", "--wait-for-subscribers", "/diagnostics,~/scene"]
     process = nodes.start("simulator", *words)
     observer.until(lambda: scene, "the scene")
     assert "name: fast_spin" in scene[0].data
-    assert observer.told("phase", "finished")["simulated_time_s"] == "0.2"
-    assert nodes.ended(process)[0] == 0
+    # The scene has a duration of 0.2 s.
+    said = observer.told("simulated_time_s", lambda seconds: float(seconds) > 1.0)
+    assert said["phase"] == "running" and nodes.stop(process)[0] == 0
+
+
+def test_in_lockstep_the_duration_is_that_of_the_scene(nodes, observer):
+    nodes.start("simulator", "--scene", "fast_spin", "--sync", "lockstep")
+    reply = observer.call(GetParameters, f"{NODE}/get_parameters", names=["duration"])
+    assert reply.values[0].double_value == 0.2
 
 
 @pytest.mark.parametrize(

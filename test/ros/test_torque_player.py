@@ -60,6 +60,13 @@ def test_answers_with_the_torque_of_the_middle_of_the_hold(nodes, observer):
     assert err.count("two samples are 0.006 s apart, not 1 / rate = 0.004 s") == 1
 
 
+@pytest.mark.parametrize("command", ["torque_player", "inverse_dynamics"])
+def test_without_a_stamp_beside_lockstep_it_says_why_it_ends(nodes, command):
+    nodes.run("simulator", sync="lockstep", duration=1.0)
+    status, _, err = nodes.ended(nodes.run(command, stamped=False))
+    assert status == 1 and "takes no command without a stamp: give stamped:=true" in err
+
+
 def test_the_last_sample_ends_it_though_its_reader_has_left(nodes, observer, profile):
     table = profile("0,0.1,0.2,0.3", "0.1,0,0,0")
     other = observer.node.create_subscription(Float64MultiArray, COMMANDS, lambda _: None, 10)
