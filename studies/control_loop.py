@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.actuator_space import Reference, ReferenceMotion
-from sst_ros.control.controller import Controller, ControlStopped, Measurement
-from sst_ros.control.law import ControlChannel
+from sst_ros.control.controller import ChannelState, Controller, ControlStopped
 from sst_ros.control.tracking import Track, track_of
 from sst_ros.errors import RunStopped
 from sst_ros.host.compiled_module import numba_version
@@ -44,34 +43,6 @@ SHARE = 0.2
 """Part by which the model's bodies are too heavy or too light."""
 
 _GONE, _LOST = 1e-3, 1e2 * OFFSET
-
-
-class ChannelState:
-    """The memory of a channel during a run."""
-
-    def __init__(self, channel: ControlChannel, seed: int) -> None:
-        self._channel, self._random = channel, np.random.default_rng(seed)
-        self._deviations = np.repeat((channel.angle_noise, channel.rate_noise), 3)
-        self._before: Any = None
-        self._queue: Any = (0.0,) * (3 * channel.delay)
-        self._first = 1.0
-
-    def measure(self, gamma: Vector3, gamma_dot: Vector3) -> Measurement:
-        """Return what the controller receives of gamma [rad] and gamma_dot [rad/s] at a sample."""
-        channel, noise = self._channel, []
-        if channel.counts and self._before is None:
-            earlier = axpy(1.0, gamma, -channel.period, gamma_dot)
-            self._before = tuple(map(channel.count, earlier))
-        if self._deviations.any():
-            noise = (self._random.standard_normal(6) * self._deviations).tolist()
-        *measured, self._before = channel.measure(gamma, gamma_dot, self._before, noise)
-        return Measurement(*measured)
-
-    def transmit(self, command: Vector3) -> Vector3:
-        """Return the torques [N m] that act when this command has been sent."""
-        torque, self._queue = self._channel.transmit(command, self._queue, self._first)
-        self._first = 0.0
-        return torque
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
-from sst_ros.control.law import Command, ControllerSettings
+from sst_ros.control.law import Command, ControlChannel, ControllerSettings
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import (
@@ -27,7 +27,7 @@ from sst_ros.errors import (
     refuse_unless,
 )
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.generic_math import symmetric_rows, triple
+from sst_ros.mechanism.generic_math import axpy, symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import SceneInput, scene_of, terms
 from sst_ros.state import ZERO, Explained, Quaternion, State, Vector3, finite_vector
@@ -190,6 +190,34 @@ class Measurement(NamedTuple):
 
     gamma: Vector3
     gamma_dot: Vector3
+
+
+class ChannelState:
+    """The memory of a channel during a run, with its noise by seed."""
+
+    def __init__(self, channel: ControlChannel, seed: int | Sequence[int]) -> None:
+        self._channel, self._random = channel, np.random.default_rng(seed)
+        self._deviations = np.repeat((channel.angle_noise, channel.rate_noise), 3)
+        self._before: Any = None
+        self._queue: Any = (0.0,) * (3 * channel.delay)
+        self._first = 1.0
+
+    def measure(self, gamma: Vector3, gamma_dot: Vector3) -> Measurement:
+        """Return what the controller receives of gamma [rad] and gamma_dot [rad/s] at a sample."""
+        channel, noise = self._channel, []
+        if channel.counts and self._before is None:
+            earlier = axpy(1.0, gamma, -channel.period, gamma_dot)
+            self._before = tuple(map(channel.count, earlier))
+        if self._deviations.any():
+            noise = (self._random.standard_normal(6) * self._deviations).tolist()
+        *measured, self._before = channel.measure(gamma, gamma_dot, self._before, noise)
+        return Measurement(*measured)
+
+    def transmit(self, command: Vector3) -> Vector3:
+        """Return what arrives when this was sent: torques [N m] that act, or what is measured."""
+        torque, self._queue = self._channel.transmit(command, self._queue, self._first)
+        self._first = 0.0
+        return torque
 
 
 class Controller:

@@ -114,8 +114,8 @@ class ControllerSettings(Section):
 class ControlChannel(Section):
     """What lies between plant and controller; zeros change nothing.
 
-    Until the first of delayed commands arrives it acts already. An encoder measures no rate: that
-    is the difference of its last two angles over the period. Noise is new at every sample.
+    Until the first of what is delayed arrives it is there already. An encoder measures no rate:
+    that is the difference of its last two angles over the period. Noise is new at every sample.
     """
 
     period: float = entry("control period", "s", default=1e-3, least=1e-6, most=1.0)

@@ -26,8 +26,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
+from sst_ros.control.controller import ChannelState
+from sst_ros.control.law import ControlChannel
 from sst_ros.description.robot import urdf
 from sst_ros.errors import refuse_unless
+from sst_ros.mechanism.generic_math import triple
 from sst_ros.nodes import topics
 from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
@@ -83,7 +86,7 @@ def _layout(*fields: str | int, align: int = 8) -> bytes:
     return bytes(data[_STAMP.size :]) + bytes(-len(data) % align)
 
 
-def state_messages(frame_id: str = "") -> tuple[Message, Message, Message]:
+def state_messages(frame_id: str = "") -> tuple[Message, ...]:
     """Return what makes the messages joint_states, orientation and euler_zyz.
 
     The frame is that of joint_states, whose effort is the torque over the step that ended; the
@@ -129,6 +132,40 @@ def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
         theta, psi = 0.0, 2.0 * (total - difference)
     theta, psi = (math.remainder(angle, 2.0 * math.pi) for angle in (theta, psi))
     return theta, 2.0 * math.atan2(sine, cosine), psi
+
+
+class Measurements:
+    """Messages joint_states as a robot gives them: all nine joints behind a channel.
+
+    A sample that is dropped has no message, which is empty here.
+    """
+
+    def __init__(self, given: SimulatorParameters, exact: Message) -> None:
+        self._given, self._exact = given, exact
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew at the first sample of a run: the same seed gives the same noise."""
+        channel, seed = self._given.channel or ControlChannel(), self._given.measurement_seed
+        self._random = np.random.default_rng(seed)
+        kinds = range(len(JOINTS) // 3)  # gamma, mu, beta
+        self._angles = [ChannelState(channel, (seed, kind)) for kind in kinds]
+        self._rates = [ChannelState(channel, 0) for kind in kinds]  # only late, as the angles
+
+    def message(self, at: bytes, numbers: Numbers) -> bytes:
+        """Return the message of a sample."""
+        quaternion, joints, torque = numbers
+        found: list[list[float]] = [[], []]
+        for kind, (angles, rates) in enumerate(zip(self._angles, self._rates, strict=True)):
+            first = 3 * kind
+            triples = triple(joints[first : first + 3]), triple(joints[9 + first : 12 + first])
+            measured = angles.measure(*triples)
+            found[0] += angles.transmit(measured.gamma)
+            found[1] += rates.transmit(measured.gamma_dot)
+        dropped = self._given.dropped_samples
+        if dropped and self._random.random() < dropped:
+            return b""
+        return self._exact(at, (quaternion, [*found[0], *found[1]], torque))
 
 
 class TorqueLog:
@@ -193,6 +230,14 @@ class SimulatorTopics:
         depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
         shown = ("joint_states", "orientation", "euler_zyz", "applied_torques")
         *self._shown, self._torques = (own[name].publisher(node, depth) for name in shown)
+        self._samples, self._idles = state_messages(), state_messages(IDLE_FRAME_ID)
+        self._measured: Measurements | None = None
+        if given.channel is not None:
+            exact, *others = self._samples
+            self._measured = Measurements(given, exact)
+            self._samples = (self._measured.message, *others, exact)
+            self._idles = (*self._idles, self._idles[0])
+            self._shown.append(own["true_joint_states"].publisher(node, depth))
         self._read: list[Publisher[Any]] = []
         self._states: list[tuple[Publisher[Any], Message]] = []
         self._counted_ns = 0
@@ -216,7 +261,6 @@ class SimulatorTopics:
         if self._clock is not None:
             self._time_ns = self.now_ns()
         self._awaited = [made[name] for name in names]
-        self._samples, self._idles = state_messages(), state_messages(IDLE_FRAME_ID)
         moments = scene.moment is not None and scene.moment.topic
         ticks, period_ns = given.run.ticks_per_sample, given.run.period_ns
         self._log_ticks = math.ceil(LOG_NS / (ticks * period_ns)) * ticks
@@ -244,6 +288,8 @@ class SimulatorTopics:
     def sample(self, simulation: Simulation, stamp_ns: int) -> None:
         """Publish a sample of the run, and from time to time the torques logged up to it."""
         logged = len(self._log)
+        if self._measured is not None and not logged:  # the first sample of a run
+            self._measured.restart()
         self._count_subscribers(COUNT_NS if logged else 0)  # the first of a run goes to all
         y, joints, torque = simulation.sample
         numbers = y[:4], joints, torque
@@ -255,7 +301,8 @@ class SimulatorTopics:
             self._log_from_ns = stamp_ns
         at = stamp(stamp_ns)
         for publisher, message in self._states:
-            publisher.publish(message(at, numbers))
+            if data := message(at, numbers):
+                publisher.publish(data)
 
     def flush(self) -> None:
         """Publish the torques that have been logged, if any and if they are subscribed to."""
@@ -277,7 +324,7 @@ class SimulatorTopics:
             joints, torque = (*joints[:9], *_AT_REST), ZERO
         self._count_subscribers(0)
         for publisher, message in self._messages(self._idles):
-            at = stamp(stamp_ns if publisher is self._shown[0] else 0)
+            at = stamp(stamp_ns if "joint_states" in publisher.topic_name else 0)
             publisher.publish(message(at, (state.quaternion, joints, torque)))
 
     def publish_phase(self, phase: str) -> None:

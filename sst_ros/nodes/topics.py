@@ -36,6 +36,9 @@ _TABLE = """
 publishes joint_states sensor_msgs/msg/JointState 0
     gamma_1..3, mu_1..3, beta_1..3: position [rad], velocity [rad/s]; effort: torque over the step
     that ended [N m]; frame_id `idle` where it is no sample of a run
+publishes ~/true_joint_states sensor_msgs/msg/JointState 0
+    joint_states without noise, delay and gaps
+    if encoder_counts, angle_noise, rate_noise, measurement_delay or dropped_samples is set
 publishes ~/orientation geometry_msgs/msg/QuaternionStamped 0
     orientation of {E} in {B}, frame_id `base_link`
 publishes ~/euler_zyz geometry_msgs/msg/Vector3Stamped 0

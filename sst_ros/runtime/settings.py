@@ -8,7 +8,7 @@ import sys
 from functools import partial
 from typing import Any, ClassVar
 
-from sst_ros.control.law import ControllerSettings
+from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Rules, Section, choice, entry
@@ -93,6 +93,29 @@ class SimulatorParameters(Section):
         "the same bits, and a process of low priority compiles the scene for the next",
         default=True,
     )
+    encoder_counts: int = _whole(
+        "steps per turn of the encoders that joint_states come from, whose rates are differences "
+        "of angles; 0 for exact angles and rates",
+        "1",
+        default=0,
+        least=0,
+        most=2**31 - 1,
+    )
+    angle_noise: float = entry(
+        "standard deviation of noise on the angles of joint_states", "rad", 0.0, least=0.0, most=1.0
+    )
+    rate_noise: float = _number(
+        "standard deviation of noise on the rates of joint_states", "rad/s", 0.0, most=1e3
+    )
+    measurement_delay: int = _whole(
+        "samples by which the angles and rates of joint_states are late", "1", 0, 0, 100
+    )
+    dropped_samples: float = entry(
+        "share of the samples without joint_states", "1", default=0.0, least=0.0, most=0.99
+    )
+    measurement_seed: int = _whole(
+        "seed of the noise, and of the samples that are dropped", "1", 0, 0, 2**31 - 1
+    )
     realtime_priority: int = _whole(
         "SCHED_FIFO priority of the run's thread where that is permitted, the other threads of the "
         "node get half of it; 0 for none",
@@ -117,6 +140,9 @@ class SimulatorParameters(Section):
         whole = "must divide 1e9, so that a step is whole nanoseconds"
         yield NANOSECONDS % rate, "rate", rate, whole
         yield rate % shown, "publish_rate", shown, f"must divide rate = {rate}"
+        waits = self.sync == "lockstep" and self.dropped_samples
+        allowed = "must be 0 in lockstep, where each sample is answered"
+        yield waits, "dropped_samples", self.dropped_samples, allowed
         for name in self.CHANGEABLE:
             value = getattr(self, name)
             yield 0.0 < value < 1e-3, name, value, "must be 0 or >= 0.001"
@@ -135,6 +161,19 @@ class SimulatorParameters(Section):
             lockstep_timeout=self.lockstep_timeout,
             subscriber_timeout=self.subscriber_timeout,
         )
+
+    @property
+    def channel(self) -> ControlChannel | None:
+        """Return what lies between the joints and joint_states; None for nothing."""
+        channel = ControlChannel(
+            period=1.0 / self.publish_rate,
+            delay=self.measurement_delay,
+            counts=self.encoder_counts,
+            angle_noise=self.angle_noise,
+            rate_noise=self.rate_noise,
+        )
+        plain = ControlChannel(period=channel.period)
+        return None if channel == plain and not self.dropped_samples else channel
 
 
 class AnsweringParameters(Section):
