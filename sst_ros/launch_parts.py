@@ -246,6 +246,7 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
 def _state_publisher(given: Given, document: str) -> Node:
     description = ParameterValue(document, value_type=str)
     parameters = {"robot_description": description, "frame_prefix": _frame_prefix(given)}
+    parameters["ignore_timestamp"] = True  # time stands still in a pause, and /tf goes on
     return _node(given, "robot_state_publisher", parameters=[parameters])
 
 

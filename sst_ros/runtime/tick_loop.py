@@ -366,12 +366,13 @@ class TickLoop:
         """Publish the state of a run that does not advance, marked as idle.
 
         Its stamp is the ROS time at which the state holds: that of the last sample where samples
-        will follow it, else the present time. Stamps never go back.
+        will follow it, else the present time. Stamps never go back; where time stands still they
+        differ by 1 ns, because tf2 warns of transforms that have the stamp of the one before.
         """
-        stamp_ns = self._stamp_ns
+        stamp_ns = min(max(self._stamp_ns, self._idle_ns) + 1, self._stamp_ns + self._period_ns - 1)
         if fault or not self.begun:
             now = self._output.now_ns()
-            stamp_ns = max(now, stamp_ns + 1, self._idle_ns) if now else self._idle_ns
+            stamp_ns = max(now, self._stamp_ns + 1, self._idle_ns) if now else self._idle_ns
         self._output.idle(self.simulation.state, stamp_ns, at_rest=fault)
         self._idle_ns = stamp_ns
         self._input.accept_idle(stamp_ns)

@@ -131,7 +131,7 @@ class TorqueInput:
         """Return the torques that answer the sample of this stamp [N m], None without an answer.
 
         With None an answer to a state shown before the run is looked for. In a run such answers are
-        ignored, because they may arrive late.
+        ignored, because they may arrive late. In a pause the state of the sample is shown again.
         """
         found: Vector3 | None = None
         for _ in self._commands.read(math.inf):
@@ -140,7 +140,9 @@ class TorqueInput:
         for message in self._read_stamped(math.inf):
             stamp = nanoseconds(message.header.stamp)
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
-            if found is None and (to_idle if stamp_ns is None else stamp == stamp_ns):
+            behind = stamp - (stamp_ns or 0)
+            fits = to_idle if stamp_ns is None else 0 <= behind < self._run.period_ns
+            if found is None and fits:
                 found = self._accept(torque_by_name, message, now_ns)
             elif not to_idle:
                 reason = f"stamp {stamp} ns answers no sample that waits"
