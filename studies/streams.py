@@ -27,7 +27,7 @@ from sst_ros.scene import scene
 
 AHEAD_S, ROUND_S = 1.0, 8.0  # time of the point from now, and of a round of the path
 AMPLITUDES = (0.1, 0.05, 0.02)  # [rad]
-WAIT_S = 60.0
+WAIT_S = 300.0  # a busy machine needs a minute to start them
 
 
 def main(words: Sequence[str] | None = None) -> None:

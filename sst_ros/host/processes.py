@@ -117,9 +117,9 @@ class Assistant:
             self._connection.send(given)
 
     def result(self) -> Any:
-        """Return the result of the call or the exception that it raised; None until it is there.
+        """Return the result of the call, or the SstError why there is none; None until it is there.
 
-        Where the process has ended, that is an SstError, and another process is begun.
+        Where the process has ended another one is begun.
         """
         try:
             return self._connection.recv() if self._connection.poll() else None
@@ -145,7 +145,7 @@ def assist(number: int) -> None:
             try:
                 result = function(*given)
             except Exception as error:
-                result = error
+                result = error if isinstance(error, SstError) else SstError(repr(error))
             connection.send(result)
 
 

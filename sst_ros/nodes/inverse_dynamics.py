@@ -29,7 +29,7 @@ from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker, every
 from sst_ros.nodes.topics import ActionGoal
 from sst_ros.report.results import render
-from sst_ros.runtime.planning import Order, Superseded
+from sst_ros.runtime.planning import Order
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
@@ -193,13 +193,14 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             self.heard_s = time.monotonic()  # in lockstep no message was received meanwhile
 
     def _is_accepted(self, outcome: concurrent.futures.Future[None]) -> bool:
-        """Whether a trajectory is followed; else count, log and publish the refusal."""
-        if (error := outcome.exception()) is None:
-            log = self.node.get_logger()
-            log.info("trajectory taken", throttle_duration_sec=_LOG_PERIOD_S)
-        elif not isinstance(error, Superseded):
+        """Whether a trajectory is followed; else count, log and publish the refusal, if any."""
+        if outcome.cancelled():
+            return False
+        if (error := outcome.exception()) is not None:
             self._refuse(error)
-        return error is None
+            return False
+        self.node.get_logger().info("trajectory taken", throttle_duration_sec=_LOG_PERIOD_S)
+        return True
 
     def _refuse(self, error: BaseException) -> None:
         """Count, log and publish a refusal."""

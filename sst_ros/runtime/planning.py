@@ -75,15 +75,12 @@ def plan(model: Scene, points: Points, begin: Reference, passed: float) -> Refer
     return motion
 
 
-class Superseded(SstError):
-    """A trajectory was left out, because a newer one came before it was checked."""
-
-
 class Order:
     """A trajectory between its message and its motion.
 
     Attributes:
-        outcome: a result where the trajectory is accepted, else the SstError that says why not.
+        outcome: a result where the trajectory is accepted, else the SstError that says why not;
+            cancelled where a newer one came before this was checked.
         passed: time of the trajectory at which its motion begins [s].
 
     """
@@ -96,6 +93,5 @@ class Order:
         self.begin_ns: int | None = None  # of that; None where it stands still until then
 
     def refuse(self, error: SstError) -> None:
-        """Say why it is not followed, once."""
-        if not self.outcome.done():
-            self.outcome.set_exception(error)
+        """Say why it is not followed."""
+        self.outcome.set_exception(error)

@@ -29,7 +29,7 @@ from sst_ros.host.processes import Assistant
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
-from sst_ros.runtime.planning import Order, Superseded, plan, read_points
+from sst_ros.runtime.planning import Order, plan, read_points
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import Actuators
@@ -38,7 +38,6 @@ from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
 NO_TOLERANCE = -1.0  # in a message: the default does not hold either
-_SUPERSEDED = "a newer trajectory came before it was checked"
 _FIRST_PERIODS_AHEAD = 25
 """Control periods that the first check may take where the reference moves; then twice the last."""
 _MOST_CHECKS = 5
@@ -192,7 +191,7 @@ class TrajectoryFollower:
     def restart(self) -> None:
         """Forget the run, as after a reset of the simulator, and all trajectories."""
         for order in filter(None, (self._checked, self._waiting)):
-            order.refuse(SstError("the run began anew"))
+            order.outcome.cancel()
         self.stage, self._last_ns, self._waiting = Stage.WAITING, 0, None
         self._rows, self._metrics = array("d"), TrackingMetrics()
         self._last: Command | None = None
@@ -212,7 +211,7 @@ class TrajectoryFollower:
         refuse_unless("joint_trajectory", ("motion", motion, motion == "topic", allowed))
         order = Order(read_points(message), seen, seen_ns)
         if self._waiting is not None:
-            self._waiting.refuse(Superseded(_SUPERSEDED))
+            self._waiting.outcome.cancel()
         self._waiting = order
         self.proceed()
         return order
@@ -265,10 +264,8 @@ class TrajectoryFollower:
             self._follow(order, result)
         elif isinstance(result, SstError):
             order.refuse(result)
-        elif isinstance(result, Exception):
-            order.refuse(SstError(f"internal error: {type(result).__name__}: {result}"))
         elif self._waiting is not None:
-            order.refuse(Superseded(_SUPERSEDED))
+            order.outcome.cancel()
         elif order.asked == _MOST_CHECKS:
             order.refuse(SstError(f"checked too late {_MOST_CHECKS} times, on a busy machine"))
         else:

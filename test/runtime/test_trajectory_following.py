@@ -19,7 +19,6 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, SstError
 from sst_ros.host import processes
 from sst_ros.runtime import trajectory_following
-from sst_ros.runtime.planning import Superseded
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import (
     ErrorCode,
@@ -258,9 +257,9 @@ def test_a_stream_is_followed_without_a_jump_however_long_its_checks_take(
     # Of a quintic of 0.5 s the jerk is below 60 * 0.2 / 0.5^3 = 96 rad/s^3, its change in 2 ms 0.2.
     position, velocity, acceleration = stream.jumps()
     assert position < 1e-9 and velocity < 1e-6 and acceleration < 0.25
-    errors = [order.outcome.exception() for order in orders if order.outcome.done()]
-    assert all(error is None or isinstance(error, Superseded) for error in errors)
-    assert errors.count(None) >= (len(orders) if takes < every else len(orders) // 9)
+    taken = [order for order in orders if not order.outcome.cancelled()]  # by a newer one
+    assert not any(order.outcome.exception() for order in taken)
+    assert len(taken) >= (len(orders) if takes < every else len(orders) // 9)
 
 
 def test_control_goes_on_beside_the_check_of_a_trajectory():
@@ -298,7 +297,7 @@ def test_the_process_that_checks_ends_with_its_reason_and_another_begins():
             return found
 
         assert result(4.0) == 2.0
-        assert isinstance(result(-1.0), ValueError)
+        assert "math domain error" in str(result(-1.0))
         os.kill(assistant._process.pid, signal.SIGKILL)
         assert "has ended with status -9" in str(result(9.0))
         assert result(9.0) == 3.0
@@ -360,7 +359,7 @@ def test_a_check_whose_beginning_has_changed_is_repeated(monkeypatch):
     stopped = stream.send(0.5, (0.1, 0.0, 0.0))
     stream.follower.restart()
     stream.samples(100)
-    assert "began anew" in str(stopped.outcome.exception())
+    assert stopped.outcome.cancelled()
     assert stream.follower.stage is Stage.WAITING
 
 
