@@ -213,7 +213,8 @@ def text_of(name_or_path: str | Path) -> tuple[str, str]:
         return path.read_text(encoding="utf-8"), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         allowed = f"must be a readable .yaml file or one of {', '.join(names())}"
-        allowed += suggestion(str(name_or_path), names()) if is_name else f" ({error})"
+        reason = getattr(error, "strerror", None) or error  # without the path, which is said
+        allowed += suggestion(str(name_or_path), names()) if is_name else f" ({reason})"
         raise refusal("scene", "scene", str(name_or_path), allowed) from None
 
 
