@@ -133,7 +133,7 @@ def plain(value: Any) -> Any:
         return plain(given | {name: dict(given[name]) for name in notes if name in given})
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, (np.ndarray, np.generic)):
+    if hasattr(value, "tolist"):  # arrays and numbers of NumPy, series of pandas
         return value.tolist()
     return [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples of a study: row i depends on the seed and on i alone, and has the distribution asked."""
 
+from array import array
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -67,6 +69,8 @@ def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
     found = study.draw(0, 6)
     assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
     assert found["initial.gamma"][:, 1].tolist() == [0.7, 0.8, 0.9] * 2
+    series = SweepStudy(SCENE, vary | {KEY: array("d", [0.2, 0.3])})  # it has tolist, as in pandas
+    assert series.digest == study.digest
     even = {KEY: ("linspace", 0.2, 0.3, 2), "initial.gamma": ("linspace", 0.7, [0.9, 0.7, 1.1], 3)}
     found = SweepStudy(SCENE, even).draw(0, 6)
     assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
