@@ -39,7 +39,6 @@ from sst_ros.mechanism.geometry import (
     dot,
     frozen,
     quaternion_of,
-    rotation_matrix,
 )
 from sst_ros.state import Assembly
 
@@ -184,24 +183,6 @@ def describe_assemblies(
     most = np.asarray(geometry.beta_max)[..., None]
     valid = np.all(edge & (beta > 0.0) & (beta <= most), axis=-1)
     return mu, beta, -volume, valid
-
-
-def body_rates(
-    geometry: Geometry, quaternion: Array, gamma_dot: Array, mu_dot: Array, beta_dot: Array
-) -> Array:
-    """Compute W in {E} [rad/s], shape (..., 3), from the rates of the joints [rad/s], (..., 3).
-
-    It follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without a matrix
-    that could be singular; the mean of the three is taken. All mu_k are in (0, pi). Where the
-    orientation is nan, W is.
-    """
-    known = np.isfinite(quaternion).all(axis=-1, keepdims=True)
-    rotation = rotation_matrix(np.where(known, quaternion, (0.0, 0.0, 0.0, 1.0)))
-    t, w = geometry.e, geometry.w @ rotation  # rows in {E}
-    r = np.cross(t, w)
-    r /= np.linalg.norm(r, axis=-1)[..., None]
-    of_legs = w * gamma_dot[..., None] - r * mu_dot[..., None] - t * beta_dot[..., None]
-    return np.asarray(np.where(known, of_legs.mean(axis=-2), np.nan))
 
 
 def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:

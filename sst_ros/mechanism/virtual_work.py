@@ -10,7 +10,7 @@ otherwise. The simulation runs `kernel`, which the tests hold against this file.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +33,11 @@ class Mechanism:
     star: Array
     actuated: Array
     intermediate: Array
+    #: gravity [m/s^2] in {B}, shape (3,), and mass times centre [kg m] of the star, of actuated and
+    #: of intermediate links in their frames, shapes (3,), (3, 3), (3, 3): for `rates.of_motion`
+    gravity: Array
+    weights: tuple[Array, Array, Array]
+    others: tuple[str, ...]  #: terms of the scene that neither these equations nor `rates` have
 
     @classmethod
     def of(cls, scene: Scene) -> Mechanism:
@@ -43,7 +48,17 @@ class Mechanism:
             actuated[:, 2, 2] += motor.gear_ratio**2 * motor.rotor_inertia
         star = star if payload is None else star + payload.about_o
         intermediate = np.stack([link.tensor for link in scene.intermediate_links])
-        return cls(Geometry.of(scene), star, actuated, intermediate)
+        carried: list[Any] = [scene.star] if payload is None else [scene.star, payload]
+        weights = (
+            np.sum([body.mass * np.array(body.centre) for body in carried], axis=0),
+            np.array([np.multiply(link.mass, link.centre) for link in scene.actuated_links]),
+            np.array([np.multiply(link.mass, link.centre) for link in scene.intermediate_links]),
+        )
+        gravity = np.array(ZERO if scene.gravity is None else scene.gravity.acceleration)
+        others = tuple(name for name in ("friction", "springs") if getattr(scene, name))
+        others += ("stroke.stiffness",) if scene.stroke.stiffness is not None else ()
+        geometry = Geometry.of(scene)
+        return cls(geometry, star, actuated, intermediate, gravity, weights, others)
 
 
 @dataclass(frozen=True)
@@ -128,7 +143,7 @@ def link_frames(at: Posture) -> tuple[Array, Array]:
 
 
 def link_jacobians(at: Posture) -> tuple[Array, Array]:
-    """Direct link Jacobians J_a in {1k} and J_ipl in {2k}, Eqs. 53 to 62, each (3, 3, 3)."""
+    """Direct link Jacobians J_a in {1k} and J_ipl in {2k}, Eqs. 57 and 61, each (3, 3, 3)."""
     first, second = link_frames(at)
     d = np.eye(3)
     ja = np.stack([first[k].T @ np.outer(at.w[k], d[k]) for k in range(3)])

@@ -22,7 +22,7 @@ from sst_ros.host import figures
 from sst_ros.host.figures import BLUE, DEGREES, GREY, LINES, VERMILION, leg_names, stack
 from sst_ros.host.output import write_into
 from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
-from sst_ros.mechanism.kinematics import body_rates
+from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot import workspace
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE

@@ -21,7 +21,7 @@ from sst_ros.dynamics.motion_table import JOINTS
 from sst_ros.errors import InputError, refusal, require
 from sst_ros.host.output import require_free, write_into, write_table
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.mechanism.kinematics import body_rates
+from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import topic_tables as topics
 from sst_ros.recording.bag_reader import Bag
 from sst_ros.recording.topic_tables import Integers, Series, TopicTable, places

@@ -12,7 +12,7 @@ from sst_ros.control.controller import Controller, ControlStopped, Measurement
 from sst_ros.control.law import MODES, ControllerSettings
 from sst_ros.control.reference_motions import geodesic_motion
 from sst_ros.errors import InputError
-from sst_ros.mechanism import continuation, kinematics, virtual_work
+from sst_ros.mechanism import continuation, kinematics, rates, virtual_work
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene import scene
 from sst_ros.scene.loads import Actuators, Initial, Moment
@@ -104,12 +104,13 @@ def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says(sample):
     desired = ActuatorSpaceMap(sample.geometry).of_star(
         tuple(there.tolist()), tuple(rate * axis), tuple(acceleration * axis)
     )
-    gamma_dot = np.linalg.solve(sample.posture.j, here @ ((rate - dot) * axis))
+    motion = rates.of_star(sample.geometry, here, here @ ((rate - dot) * axis))
     settings = {"mode": "computed_torque", "space": "so3", "bandwidth": w}
-    told = answer(sample, desired, gamma_dot, **settings)
-    moving = sample.posture, gamma_dot
-    gamma_ddot = virtual_work.direct_dynamics(sample.mechanism, *moving, told.torque)
-    found = sample.posture.j @ gamma_ddot + virtual_work.bias(*moving).omega_dot
+    told = answer(sample, desired, motion.gamma_dot, **settings)
+    gamma_ddot = virtual_work.direct_dynamics(
+        sample.mechanism, sample.posture, motion.gamma_dot, told.torque
+    )
+    found = rates.of_actuators(sample.posture, motion.gamma_dot, gamma_ddot).omega_dot
     expected = here @ ((acceleration - ddot) * axis)
     assert np.allclose(found, expected, rtol=1e-9, atol=1e-9)
 

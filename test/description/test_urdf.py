@@ -31,7 +31,7 @@ from sst_ros.description.robot import (
     urdf,
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.mechanism import virtual_work
+from sst_ros.mechanism import rates, virtual_work
 from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.loads import JOINTS, Actuators
 from sst_ros.scene.scene import load, names
@@ -150,7 +150,7 @@ def closed(read, geometry):
     return model, ties, data
 
 
-def acceleration(scene, angles, at, gamma_dot, torque, moment=(0.0, 0.0, 0.0)):
+def acceleration(scene, angles, motion, torque, moment=(0.0, 0.0, 0.0)):
     """W_dot of the star in {E} by Pinocchio, from the URDF alone."""
     read = Read(scene)
     pin, geometry = read.pin, Geometry.of(scene)
@@ -160,7 +160,7 @@ def acceleration(scene, angles, at, gamma_dot, torque, moment=(0.0, 0.0, 0.0)):
     model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
     open_joints = {name: angle for name, angle in angles.items() if model.existJointName(name)}
     q, v, u = read.configuration(open_joints), np.zeros(model.nv), np.zeros(model.nv)
-    rate_of = by_joint(gamma_dot, at.a @ gamma_dot, at.b @ gamma_dot)
+    rate_of = by_joint(motion.gamma_dot, motion.mu_dot, motion.beta_dot)
     for name in open_joints:
         v[model.joints[model.getJointId(name)].idx_v] = rate_of[name]
     for k, leg in enumerate(LEGS):
@@ -183,12 +183,14 @@ def acceleration(scene, angles, at, gamma_dot, torque, moment=(0.0, 0.0, 0.0)):
 def test_motion_of_random_mechanisms(seed):
     """Other engines are compared, on one scene, in test/benchmark/test_peers.py."""
     sample = random_sample(np.random.default_rng(seed), ISOTROPIC if seed % 4 == 0 else None)
-    moving, loads = (sample.posture, sample.gamma_dot), (sample.torque, sample.moment)
-    answer = virtual_work.direct_dynamics(sample.mechanism, *moving, *loads)
+    loads = sample.torque, sample.moment
+    answer = virtual_work.direct_dynamics(
+        sample.mechanism, sample.posture, sample.gamma_dot, *loads
+    )
+    motion = rates.of_actuators(sample.posture, sample.gamma_dot, answer)
     angles = angles_of(sample.geometry, sample.gamma, sample.rotation)
-    found = acceleration(sample.scene, angles, *moving, *loads)
-    omega_dot = sample.posture.j @ answer + virtual_work.bias(*moving).omega_dot
-    expected = sample.rotation.T @ omega_dot
+    found = acceleration(sample.scene, angles, motion, *loads)
+    expected = sample.rotation.T @ motion.omega_dot
     assert np.linalg.norm(found - expected) < 1e-12 * np.linalg.norm(expected)
 
 
@@ -197,13 +199,14 @@ def test_motion_under_gravity_with_payload_and_rotors():
     geometry, gamma = Geometry.of(scene), np.add(scene.initial.gamma, [0.05, -0.03, 0.02])
     at = virtual_work.posture(geometry, gamma)
     gamma_dot, torque = np.array([1.0, -2.0, 0.5]), np.array([0.3, -1.0, 2.0])
+    motion = rates.of_actuators(at, gamma_dot)
     angles = angles_of(geometry, gamma, at.rotation)
     for spring in scene.springs:  # URDF has none
         torque[LEGS.index(int(spring.joint[-1]))] -= spring.stiffness * (
             angles[spring.joint] - spring.rest
         )
-    found = acceleration(scene, angles, at, gamma_dot, torque)
-    state = (*quaternion_of(at.rotation), *(at.rotation.T @ at.j @ gamma_dot))
+    found = acceleration(scene, angles, motion, torque)
+    state = (*quaternion_of(at.rotation), *(at.rotation.T @ motion.omega))
     expected = np.array(Dynamics.of(replace(scene, springs=())).derivative(*state, *torque)[4:7])
     assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rates of every joint and link against differences, and accelerations against Newton and Euler.
+"""Rates of every joint and link against differences, and the constraint moments between them.
 
-Their maximal-coordinate model knows bodies, axes and inertias only: 21 angular accelerations, 18
-multipliers.
+The moments are held against the multipliers of a maximal-coordinate Newton-Euler model, which knows
+bodies, axes and inertias only: 21 angular accelerations, 18 multipliers.
 """
 
 import numpy as np
@@ -12,9 +12,12 @@ from hypothesis import strategies as st
 from lagrange import Lagrange, Motion
 from mechanism.closed_chains import ISOTROPIC, random_sample
 
-from sst_ros.errors import SingularConfiguration
-from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.geometry import quaternion_of
+from sst_ros.control.controller import InverseDynamics
+from sst_ros.errors import InputError, SingularConfiguration
+from sst_ros.mechanism import kinematics, rates, virtual_work
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.virtual_work import Mechanism
+from sst_ros.scene.scene import load
 
 EXACT = 1e-12
 RELATIVE = 1e-10
@@ -39,10 +42,24 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample, gamma):
     exact = Motion(Lagrange(sample.scene, sample.rotation), gamma, rate, acceleration)
     here = exact.here
     omega, omega_dot = (x[0].astype(float) for x in (exact.omega, exact.omega_dot))
-    of_links = here.own(exact.omega)[1:].astype(float)
+    of_links, links_dot = (here.own(x)[1:].astype(float) for x in (exact.omega, exact.omega_dot))
     joints, joints_dot = exact.rates.astype(float), exact.accelerations.astype(float)
     at = virtual_work.posture(sample.geometry, gamma, here.rotation.astype(float))
-    turned = kinematics.body_rates(sample.geometry, quaternion_of(at.rotation), *joints)
+    from_star = rates.of_star(sample.geometry, at.rotation, omega, omega_dot, gamma)
+    from_actuators = rates.of_actuators(at, rate, acceleration)
+    assert not from_actuators.omega.flags.writeable
+    for motion in (from_star, from_actuators):
+        pairs = [
+            (motion.omega, omega),
+            (motion.omega_dot, omega_dot),
+            ([motion.gamma_dot, motion.mu_dot, motion.beta_dot], joints),
+            ([motion.gamma_ddot, motion.mu_ddot, motion.beta_ddot], joints_dot),
+            (motion.omega_a, of_links[:3]),
+            (motion.omega_a_dot, links_dot[:3]),
+            (motion.omega_ipl, of_links[3:]),
+            (motion.omega_ipl_dot, links_dot[3:]),
+        ]
+        assert max(relative(np.ravel(f), np.ravel(e)) for f, e in pairs) <= EXACT
     # The paper's rows, one by one.
     bias = virtual_work.bias(at, rate)
     ja, jipl = virtual_work.link_jacobians(at)
@@ -58,13 +75,11 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample, gamma):
         (ja @ rate, of_links[:3]),
         (jipl @ rate, of_links[3:]),
     ]
-    if np.array_equal(gamma, sample.gamma):  # the branch of all admissible assemblies
-        pairs.append((at.rotation @ turned, omega))
     assert max(relative(np.ravel(f), np.ravel(e)) for f, e in pairs) <= EXACT
 
 
 def newton_euler(sample):
-    """Angular accelerations of the seven bodies in {B}, shape (7, 3)."""
+    """Accelerations (7, 3) and joint moments (9, 3) in {B}; joints by kind, then by leg."""
     scene, rotation, at = sample.scene, sample.rotation, sample.posture
     w, r, t = at.w, at.r, at.t
     joints = [(None, k, w[k]) for k in range(3)]
@@ -100,23 +115,69 @@ def newton_euler(sample):
     force[18:] += sample.moment
     system = np.block([[mass, -rows.T], [rows, np.zeros((18, 18))]])
     solved = np.linalg.solve(system, np.concatenate([force, -bias]))
-    return solved[:21].reshape(BODIES, 3)
+    multipliers = solved[21:].reshape(9, 2)
+    moments = np.array([m @ pair for m, pair in zip(multipliers, pairs, strict=True)])
+    return solved[:21].reshape(BODIES, 3), moments, frames
 
 
 @settings(max_examples=120)
 @given(st.integers(0, 2**32 - 1))
-def test_accelerations_are_those_of_the_model(seed):
+def test_accelerations_and_constraint_moments_are_those_of_the_model(seed):
     sample = random_sample(np.random.default_rng(seed))
+    moving, expected, frames = newton_euler(sample)
     given_motion = sample.mechanism, sample.posture, sample.gamma_dot
     answer = virtual_work.direct_dynamics(*given_motion, sample.torque, sample.moment)
-    truth = np.sum(newton_euler(sample)[:3] * sample.geometry.w, axis=1)
+    truth = np.sum(moving[:3] * sample.geometry.w, axis=1)
     assert relative(answer, truth) <= RELATIVE
+    found = rates.of_motion(*given_motion, answer, sample.moment)
+    moments = np.concatenate([found.actuated, found.revolute, found.prismatic])
+    assert relative(moments, expected) <= RELATIVE
+    local = [found.actuated_local, found.revolute_local, found.prismatic_local]
+    turned = [frames[0:3], frames[3:6], frames[3:6]]
+    for kind in range(3):
+        seen = [turned[kind][k].T @ expected[3 * kind + k] for k in range(3)]
+        assert np.linalg.norm(local[kind] - seen) <= RELATIVE * np.linalg.norm(expected)
+    assert not np.any(found.actuated_local[:, 2])
+    assert not np.any(found.revolute_local[:, 0])
+    assert not np.any(found.prismatic_local[:, 2])
+    assert not found.actuated.flags.writeable
+    assert np.linalg.norm(found.torque - sample.torque) <= RELATIVE
 
 
-def test_a_serial_singularity_is_told():
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda rotation, gamma: rates.of_star(ISOTROPIC, rotation, [1.0, 0.0, 0.0]),
+        lambda rotation, gamma: virtual_work.posture(ISOTROPIC, gamma, rotation),
+    ],
+)
+def test_a_serial_singularity_is_told(ask):
     t, x = ISOTROPIC.w[0], np.array([1.0, 0.0, 0.0])  # t_1 = R e_1 = w_1
     assert t @ x == 0.0
     s = np.cos(0.7) * x + np.sin(0.7) * np.cross(t, x)
     rotation = np.stack([np.cross(t, s), t, s], axis=1)
     with pytest.raises(SingularConfiguration, match="serial"):
-        virtual_work.posture(ISOTROPIC, kinematics.inverse(ISOTROPIC, rotation)[0], rotation)
+        ask(rotation, kinematics.inverse(ISOTROPIC, rotation)[0])
+
+
+def test_reactions_at_rest_carry_the_weight():
+    scene, gamma = load("gravity_payload"), np.array(load("gravity_payload").initial.gamma)
+    scene = scene.with_values({"friction": None, "springs": None})
+    at, mechanism = virtual_work.posture(Geometry.of(scene), gamma), Mechanism.of(scene)
+    found = rates.of_motion(mechanism, at, np.zeros(3), np.zeros(3))
+    held = InverseDynamics(scene).gravity_torque(gamma)
+    assert found.torque == pytest.approx(held, abs=1e-13)
+    # About O: base on the links, and the motors, against all weights; the same for the star alone.
+    frames = [at.rotation[None], *virtual_work.link_frames(at)]
+    centres = [np.atleast_2d(weight) for weight in mechanism.weights]
+    star, *links = (
+        np.cross(np.einsum("kij,kj->ki", frame, centre), mechanism.gravity).sum(axis=0)
+        for frame, centre in zip(frames, centres, strict=True)
+    )
+    total = found.actuated.sum(axis=0) + found.torque @ at.w
+    assert np.abs(star).max() > 0.1
+    assert total == pytest.approx(-(star + sum(links)), abs=1e-13)
+    assert found.prismatic.sum(axis=0) == pytest.approx(-star, abs=1e-13)
+    with pytest.raises(InputError, match="springs"):
+        spring = {"springs": [{"joint": "mu_1", "stiffness": 1.0, "rest": 0.0}]}
+        rates.of_motion(Mechanism.of(scene.with_values(spring)), at, np.zeros(3), np.zeros(3))

@@ -8,9 +8,8 @@ from rclpy.action import ActionClient
 from ros.conftest import NODE, foreign_types
 
 from sst_ros import load_scene
-from sst_ros.mechanism import kinematics
+from sst_ros.mechanism import kinematics, rates
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
-from sst_ros.mechanism.virtual_work import posture
 from sst_ros.nodes.simulation_interfaces import FEATURES
 from sst_ros.state import nanoseconds
 
@@ -175,7 +174,7 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     assert (found.twist.angular.x, found.twist.angular.y, found.twist.angular.z) == pytest.approx(
         turning, abs=1e-9
     )
-    expected = np.linalg.solve(posture(geometry, gamma, rotation).j, turning)
+    expected = rates.of_star(geometry, rotation, turning).gamma_dot
     assert client.states[-1].velocity[:3] == pytest.approx(expected, abs=1e-7)
     listed = client.call("GetEntitiesStates")
     assert listed.entities == ["star"] and listed.states[0].pose == found.pose
