@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one evaluation and one step cost: numba, plain Python, and C from the same traced program.
+"""What one step costs: numba, plain Python, and C from the same traced program.
 
 python -m benchmark.kernel [--scene example2_heavy] [--rounds 15]
 """
@@ -16,12 +16,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numba
-import numpy as np
-
 from benchmark import c_floor
 from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
-from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
@@ -33,14 +29,6 @@ FLAGS = {"C -O3": ("-O3",), "C -O3 -march=native": ("-O3", "-march=native")}
 NUMBA, PLAIN = "numba", "plain Python"
 STEPS, STEP = 1000, 1e-4
 AT_MOST_C, AT_MOST_PLAIN = 1.3, 60e-6
-
-_SLOPES = """
-def slopes(count, y):
-    for i in range(count):
-        {names} = rhs(i * 1e-9, {state})
-        {updates}
-    return y[0]
-"""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,10 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
     host = describe_machine("numpy", "numba", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
-    counts = {
-        (work, who): STEPS // 10 if who == PLAIN and work != "evaluation" else STEPS
-        for work, who in seconds
-    }
+    counts = {key: STEPS // 10 if key[1] == PLAIN else STEPS for key in seconds}
     costs = Costs(seconds, counts, "C -O3")
     size = sum(system.program.operations.values())
     print(f"Scene {options.scene}: {size} operations an evaluation, torques as sines included.")
@@ -80,13 +65,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _calls(
     system: ODE, y: list[float], folder: Path | None
 ) -> dict[tuple[str, str], Callable[[], Any]]:
-    """What is timed, by (work, who): STEPS evaluations or steps each."""
+    """What is timed, by (work, who): STEPS steps each, fewer of plain Python."""
     calls: dict[tuple[str, str], Callable[[], Any]] = {}
-    slopes = _chain(system.program, numba.njit(error_model="numpy"))
-    start = np.array(y)
-    calls["evaluation", NUMBA] = lambda: slopes(STEPS, start.copy())
-    plain_slopes = _chain(system.program, lambda function: function)
-    calls["evaluation", PLAIN] = lambda: plain_slopes(STEPS, list(y))
     for name, method in METHODS.items():
         fast = CompiledMethod(system, method, compiled=True)
         plain = CompiledMethod(system, method, compiled=False)
@@ -114,27 +94,7 @@ def _add_c(
         def march(library: Any = library, error: Any = error) -> Any:
             return library.march(0.0, STEP, STEPS, array(*y), error)
 
-        def slopes(library: Any = library) -> Any:
-            return library.slopes(STEPS, array(*y))
-
         calls[f"{name} step", who] = march
-        calls.setdefault(("evaluation", who), slopes)
-
-
-def _chain(program: Program, compiled: Callable[[Any], Any]) -> Callable[..., float]:
-    """A loop of evaluations, each at what the last one gives."""
-    size = len(program.outputs)
-    text = _SLOPES.format(
-        names=", ".join(f"k{j}" for j in range(size)),
-        state=", ".join(f"y[{j}]" for j in range(size)),
-        updates="; ".join(f"y[{j}] += 1e-9 * k{j}" for j in range(size)),
-    )
-    names: dict[str, Any] = {}
-    exec("from math import atan2, cos, exp, sin, sqrt, tanh\n" + program.source("rhs"), names)
-    names["rhs"] = compiled(names["rhs"])
-    exec(text, names)
-    function: Callable[..., float] = compiled(names["slopes"])
-    return function
 
 
 if __name__ == "__main__":

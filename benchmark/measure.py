@@ -153,14 +153,12 @@ class Costs:
             return None
         return divide(self._ns, (work, who), (work, other))
 
-    def judge(self, work: str, who: str, other: str, target: float, *, least: bool = False) -> None:
-        """Print whether a ratio of at most `target` is met, or of `least` that."""
+    def judge(self, work: str, who: str, other: str, target: float) -> None:
+        """Print whether a ratio of at most `target` is met."""
         value = self.ratio(work, who, other)
         if value is not None:
-            met = value >= target if least else value <= target
-            said = f"{value:.0f}" if least else f"{value:.2f}"
-            verdict = "met" if met else "MISSED"
-            print(f"{work}: {who} over {other} {said}, target {target}: {verdict}")
+            verdict = "met" if value <= target else "MISSED"
+            print(f"{work}: {who} over {other} {value:.2f}, target {target}: {verdict}")
 
     def print(self) -> None:
         """Print the medians, and the ratios to the floor where they are known."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study of a million runs against its own kernel, and MuJoCo.
+"""A study of a million runs against its own kernel.
 
-python -m benchmark.sweep [--rows 1000000] [--mujoco]
+python -m benchmark.sweep [--rows 1000000]
 
 Example 2, one second, DOP853 by the steps that reach 1e-9 rad, the inertia of every body varied by
 a factor of its own, final states to Parquet.
@@ -9,7 +9,6 @@ a factor of its own, final states to Parquet.
 
 from __future__ import annotations
 
-import os
 import resource
 import sys
 import tempfile
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.measure import describe_machine, join_line, read_options, time_in_turn
+from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros import load_scene, sweep
 from sst_ros.host.many_runs import run_many
 from sst_ros.sweeps.prepared import PreparedSweep
@@ -35,9 +34,6 @@ BODIES = (
     *(f"{links}[{k}]" for links in ("actuated_links", "intermediate_links") for k in range(3)),
 )
 VARY = {f"{body}.inertia": ("uniform", 0.9, 1.1, "relative") for body in BODIES}
-MUJOCO_STEPS = 2780
-"""Steps, with the softness below, by which rollout reaches 1e-6 rad soonest (docs/peers.csv)."""
-
 ROUNDS, CHUNKS = 3, 16
 """What is compared takes turns, so many times, each with so many chunks."""
 
@@ -48,7 +44,7 @@ def study_of(rows: int) -> SweepStudy:
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print; the exit status is 0."""
-    options = read_options("sweep", __doc__, arguments, rows=1_000_000, mujoco=False)
+    options = read_options("sweep", __doc__, arguments, rows=1_000_000)
     found: dict[str, Any] = {"machine": describe_machine("numpy", "numba", "dask", "pyarrow")}
     began = time.perf_counter()
     sweep("example2_heavy", VARY, n=1000, progress=False)
@@ -58,8 +54,6 @@ def main(arguments: list[str] | None = None) -> int:
     _arrays(PreparedSweep(study_of(100_000), found["steps"]))
     found["seconds to prepare 1e5 rows"] = time.perf_counter() - began
     found |= _ratios(found["steps"])
-    if options.mujoco:
-        found |= _mujoco(found["us a run"])
     for name, value in found.items():
         if name != "machine":
             print(f"{name:>44}: {value:.6g}")
@@ -138,27 +132,6 @@ def _timed(call: Callable[[], Any]) -> tuple[float, float]:
     began, processor = time.perf_counter(), time.process_time()
     call()
     return time.perf_counter() - began, time.process_time() - processor
-
-
-def _mujoco(ours_us: float) -> dict[str, float]:
-    """MuJoCo's `rollout` on as many threads, by the setting that is fastest to 1e-6 rad.
-
-    The runs are alike: other inertias would not change its time.
-    """
-    from benchmark.peers.mujoco_peer import Rollout
-    from benchmark.peers.study import solve_task
-    from benchmark.peers.task import Task, turn_between
-
-    task, threads, copies = Task(), len(os.sched_getaffinity(0)), 8
-    engine = Rollout(task, "RK4", 0.01, 0.003, MUJOCO_STEPS, copies, threads)
-    seconds = time_in_turn({"": engine.run}, ROUNDS)[""]
-    best = min(seconds) / copies
-    error = turn_between(engine.pose(None).rotation, solve_task(task).pose.rotation)
-    return {
-        "us a run, MuJoCo rollout": 1e6 * best,
-        "error of MuJoCo [rad]": error,
-        "MuJoCo rollout over the study": 1e6 * best / ours_us,
-    }
 
 
 if __name__ == "__main__":

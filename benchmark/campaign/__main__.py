@@ -10,6 +10,7 @@ python -m benchmark.campaign --write         # and write docs/robustness.md
 from __future__ import annotations
 
 import argparse
+import os
 import platform
 import sys
 import time
@@ -38,10 +39,10 @@ def format_ledgers(ledgers: list[Ledger]) -> str:
     return markdown(data_frame(rows))
 
 
-def run_apart(part: str, share: float, seed: int) -> Ledger:
+def run_apart(part: str, share: float, seed: int, patience: float) -> Ledger:
     """Run a part in a new process: what it leaves in memory is no other's."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        return process.submit(run_part, part, share, seed).result()
+        return process.submit(run_part, part, share, seed, patience).result()
 
 
 def main() -> int:
@@ -51,6 +52,7 @@ def main() -> int:
     parser.add_argument("--share", type=float, default=1.0, help="share of all cases, 0 to 1")
     parser.add_argument("--seed", type=int, default=2026, help="seed of all random choices")
     parser.add_argument("--only", nargs="+", choices=sorted(PARTS), help="parts to run")
+    parser.add_argument("--patience", type=float, default=1.0, help="factor of bounds of time")
     parser.add_argument("--processes", type=int, default=2, help="parts at once")
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
     options = parser.parse_args()
@@ -61,7 +63,8 @@ def main() -> int:
         # The longest first: `bits` compiles 200 scenes, then the nodes.
         long_first = sorted(parts, key=lambda part: (part != "bits", PARTS[part][0] != "nodes"))
         waiting = {
-            pool.submit(run_apart, part, options.share, options.seed): part for part in long_first
+            pool.submit(run_apart, part, options.share, options.seed, options.patience): part
+            for part in long_first
         }
         for future in as_completed(waiting):
             part = waiting[future]
@@ -77,6 +80,7 @@ def main() -> int:
     if options.write:
         made = (
             f"Seed {options.seed}, share {options.share:g} of all cases, {minutes:.0f} minutes, "
+            f"bounds of time times {options.patience:g}, load {os.getloadavg()[0]:.0f} at the end, "
             f"{platform.machine()}, Python {platform.python_version()}, {date.today()}."
         )
         fill_page(PAGE, {"results": f"{text}\n\n{made}"})

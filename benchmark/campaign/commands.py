@@ -95,7 +95,7 @@ simulator --ros-args -p nonexist:=1
 simulator --ros-args -p rate:=0
 simulator --ros-args -p rate:=nan
 simulator --ros-args -p real_time_factor:=5e-324
-simulator --ros-args --params-file /etc/passwd
+simulator --ros-args --params-file /nonexistent
 recorder --ros-args -p output:=/proc/bag
 torque_player --ros-args -p scene:=nosuchscene
 inverse_dynamics --ros-args -p mode:=nosuchmode
@@ -155,12 +155,12 @@ def surroundings(ledger: Ledger) -> None:
             before = len(ledger.notes)
             sst_ros(ledger, words.split(), folder=folder, env=env, user=user, bound=60.0)
             ledger.notes[before:] = [f"{label}: {note}" for note in ledger.notes[before:]]
-        for verb in (["scene", "list"], ["scene", "keys"], ["--help"]):
+        for verb in (["scene", "list"], ["scene", "show", "stiff"], ["--help"]):
             ledger.tried += 1
             with Path("/dev/full").open("w") as disk:
                 command = [sys.executable, "-m", "sst_ros", *verb]
                 pipes: dict[str, Any] = {"stdout": disk, "stderr": subprocess.PIPE, "text": True}
-                done = subprocess.run(command, cwd=folder, timeout=COMMAND_BOUND_S, **pipes)
+                done = subprocess.run(command, cwd=folder, timeout=60.0 * ledger.patience, **pipes)
             if "Traceback" in done.stderr:
                 note = f"{' '.join(verb)} into a full disk: {done.stderr[-200:]}"
                 ledger.found("tracebacks", note)

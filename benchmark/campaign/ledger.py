@@ -102,6 +102,11 @@ class Ledger:
 PARTS = {
     "invariants": ("scenes", "random scenes: invariants over 0.1 s"),
     "bits": ("scenes", "random scenes: compiled against interpreted"),
+    "estimates": ("scenes", "error estimates: ten classes of scenes, all methods"),
+    "workers": ("machine", "simulations in threads, forked and spawned processes"),
+    "saves": ("machine", "saves to one path at a time"),
+    "damage": ("machine", "files with a bit flipped, or cut"),
+    "interrupts": ("machine", "commands with signals, and without streams"),
     "command_lines": ("commands", "command lines"),
     "surroundings": ("commands", "surroundings: home, disk, locale, user"),
     "recorder_kills": ("nodes", "recorders killed with -9"),

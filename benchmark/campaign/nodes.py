@@ -174,7 +174,7 @@ def recorder_kills(ledger: Ledger) -> None:
             recorder = start("recorder", output=bag)
             simulator = start("simulator", scene="swing", duration=0.0)
             try:
-                deadline = time.monotonic() + 30
+                deadline = time.monotonic() + 30 * ledger.patience
                 while time.monotonic() < deadline and _size(bag) < 50_000:
                     time.sleep(0.01)
                 # The wait is the experiment: the moment of the kill is random.

@@ -7,7 +7,8 @@ from benchmark.campaign.ledger import PARTS, Ledger, run_part
 from sst_ros.errors import SstError
 
 ROS = {part for part, (room, _) in PARTS.items() if room == "nodes"}
-QUICK = {"messages", *(PARTS.keys() - ROS - {"bits"})}  # which compiles a scene of its own
+LONG = {"bits", "estimates", "workers", "interrupts"}
+QUICK = {"messages", *(PARTS.keys() - ROS - LONG)}
 
 
 @pytest.mark.parametrize(
