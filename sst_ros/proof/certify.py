@@ -21,9 +21,9 @@ import numpy as np
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, mark_present, trace
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.dynamics.model import SINGULAR_MU, limits_of
+from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import JOINTS
-from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics, limit_distances
+from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
 from sst_ros.errors import check_kinds, refusal, refuse_unless, require
 from sst_ros.host.output import Bar
 from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
@@ -51,7 +51,7 @@ from sst_ros.scene.torque_profile import FunctionTorque, LostTorque, SineTorque,
 from sst_ros.scene.yaml_document import find_fields
 from sst_ros.simulation.simulate import TorqueInput, simulate
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Explained
+from sst_ros.state import NANOSECONDS, Explained, clamp
 
 Span = tuple[float, float, int]  # begin, end, sign of a number in between; 0 where not known
 PARALLEL = "parallel singularity, det J2 = 0"
@@ -134,12 +134,10 @@ class _Equations:
     def start(self) -> Region:
         """Enclose the start by Krawczyk's test; Refused: it is not proven to be the only one."""
         x, y, z, w, *_ = start_of(self.scene)
+        initial = leaves(self.scene.initial)
         gamma, gamma_dot = (
-            [self.ranges.get(("initial", name, k), arb(angle)) for k, angle in enumerate(angles)]
-            for name, angles in (
-                ("gamma", self.scene.initial.gamma),
-                ("gamma_dot", self.scene.initial.gamma_dot),
-            )
+            [self.ranges.get(("initial", name, k), arb(initial[name, k])) for k in range(3)]
+            for name in ("gamma", "gamma_dot")
         )
 
         def turned(a: Any, b: Any, c: Any) -> Any:
@@ -154,9 +152,8 @@ class _Equations:
         def at(turn: Any) -> tuple[Any, Any]:  # how far gamma is off, and its derivatives
             found = run(*entries(turn))
             off = [arb(x) - angle for x, angle in zip(found, gamma, strict=False)]
-            return column(off), arb_mat(
-                [[found[3 + 3 * j + i] for j in range(3)] for i in range(3)]
-            )
+            slopes = [[found[3 + 3 * j + i] for j in range(3)] for i in range(3)]
+            return column(off), arb_mat(slopes)
 
         middle = column([0] * 3)
         for _ in range(5):  # Newton
@@ -194,13 +191,17 @@ class _Equations:
         """Return the derivative, and it with the Jacobian, of time and state between two kinks."""
         acting, limit = self.profile.acting(begin, end), self.scene.torque_limit
 
-        def torque(t: Any) -> list[Any]:
+        def torque(t: Any) -> Sequence[Any]:
             if isinstance(acting, SineTorque):
                 rows = zip(acting.amplitude, acting.frequency, acting.phase, strict=True)
                 found: Any = [(f * t + p).sin() * a if a else 0.0 for a, f, p in rows]
+            elif callable(acting):
+                found = acting(t)
             else:
-                found = acting(t) if callable(acting) else acting
-            return [clamp_on_balls(x, limit) for x in found]
+                return clamp(acting, limit)
+            if limit is None:
+                return list(found)
+            return [limit - positive(2 * limit - positive(x + limit)) for x in found]
 
         f, jacobian = self._derivatives
         return (lambda t, *y: f(*y, *torque(t))), (lambda t, *y: jacobian(*y, *torque(t)))
@@ -216,33 +217,28 @@ class _Equations:
     def limits(self) -> tuple[list[str], Function]:
         """Names of limits, and numbers of time and state that are zero there, positive inside."""
         stop = SimpleNamespace(at_end="stop", at_edge="stop")
-        limits = limits_of(SimpleNamespace(stroke=stop, workspace=stop), Geometry.of(self.scene))
-        found = [x for x in limits if not x.reason.endswith("= pi")]  # as one with mu = 0
-        ends = []
-        for limit in found:
-            kind, leg = divmod(limit.joint, 3)
-            upper_end = self._axes.arc[leg] if kind == 0 else self._axes.beta_max
-            ends.append(arb(SINGULAR_MU if kind == 1 else 0) if limit.sign > 0 else upper_end)
+        found = limits_of(SimpleNamespace(stroke=stop, workspace=stop), Geometry.of(self.scene))
+        ends = {0: self._axes.arc, 2: [self._axes.beta_max] * 3}  # enclosed, unlike those of floats
+        limits = [
+            limit._replace(end=ends[limit.joint // 3][limit.joint % 3])
+            if limit.sign < 0 and limit.joint // 3 in ends
+            else limit
+            for limit in found
+        ]
 
-        def distances(model: Any, *given: Any) -> Any:
-            pairs = list(zip(given[7::2], given[8::2], strict=True))
-            first, *others = (at.g for at in kernel.leg_motions(model, given[:7]))
-            apart = limit_distances(found, pairs, model, given[:7])
-            return (*apart[: len(found)], dot3(first, cross3(*others)))
+        def watch(model: Any, *y: Any) -> Any:
+            legs = list(kernel.leg_motions(model, y))
+            first, *others = (at.g for at in legs)
+            angles = (kernel.joint_angle(at, kind) for kind in range(3) for at in legs)
+            return (*angles, dot3(first, cross3(*others)))
 
-        names = (f"{part}_{i}" for i in range(len(found)) for part in ("cos", "sin"))
-        run, trig = self.compile(distances, (*MOTION, *names)), [(x.cos(), x.sin()) for x in ends]
-        numbers = [x for pair in trig for x in pair]
-        return [*(x.reason for x in found), PARALLEL], lambda t, *y: run(*y[:7], *numbers)
+        run = self.compile(watch, MOTION)
 
+        def distances(_: Any, *y: Any) -> list[Any]:
+            *angles, determinant = run(*y[:7])
+            return [*(limit.distance(angles) for limit in limits), determinant]
 
-def clamp_on_balls(torque: Any, limit: float | None) -> Any:
-    """Clamp a torque [N m]; Refused: it may meet the limit."""
-    if limit is None:
-        return torque
-    if isinstance(torque, float):
-        return min(max(torque, -limit), limit)
-    return limit - positive(2 * limit - positive(torque + limit))
+        return [*(limit.reason for limit in limits), PARALLEL], distances
 
 
 class ProvenMotion(Explained):

@@ -219,6 +219,14 @@ def test_held_torques_are_followed_over_their_ticks():
     assert worst(proven.columns, motion, 1, 0.05) < 1.0
 
 
+def test_torques_at_their_limit_are_clamped_exactly():
+    scene = case("general")[0].with_values({"actuators": {"torque_limit": 0.5}})
+    beyond, at = TorqueTable([0.0], [[0.5, -9.0, 0.1]]), (0.5, -0.5, 0.1)
+    times = {"t_eval": [0.02]}
+    clamped, same = certify(scene, beyond, 0.02, **times), certify(scene, at, 0.02, **times)
+    assert clamped.success and clamped.columns["angle"] == same.columns["angle"]
+
+
 @pytest.mark.parametrize(
     ("given", "word"),
     [
