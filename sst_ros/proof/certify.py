@@ -419,7 +419,7 @@ def certify(
         for _ in range(ATTEMPTS):
             found = ProvenMotion(equations, bound, trajectory)
             _prove(found, equations, breaks, tolerance, Bar("certify", progress))
-            if found.success or places or not 0.0 < found.largest < math.inf:
+            if found.largest <= bound or places or found.largest == math.inf:
                 break
             tolerance *= 0.1 * bound / found.largest
         return found
