@@ -18,6 +18,7 @@ from sst_ros.recording import recording
 
 PREFIXES = [Path(path) for path in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
 RUN_S = 110
+ROS2 = shutil.which("ros2")
 
 
 def installed(package):
@@ -29,7 +30,7 @@ pytestmark = [
     pytest.mark.ros,
     pytest.mark.timeout(400),  # several launches in a test
     pytest.mark.skipif(
-        not (shutil.which("ros2") and installed("ros2launch") and installed("sst_ros")),
+        not (ROS2 and installed("ros2launch") and installed("sst_ros")),
         reason="needs `ros2 launch` of a ROS installation with this package built by colcon",
     ),
 ]
@@ -46,7 +47,11 @@ class Launch:
         with self._printed.open("w") as out:
             env = {**os.environ, "SST_ROS_NUMBA": "0", "ROS_LOG_DIR": str(folder / "log")}
             self._process = subprocess.Popen(
-                ["ros2", *words], cwd=folder, stdout=out, stderr=subprocess.STDOUT, env=env
+                [shutil.which("ros2"), *words],
+                cwd=folder,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env=env,
             )
 
     @property
@@ -272,18 +277,46 @@ STAND_INS = {
 """Programs of the packages that ros2_control.launch.py needs."""
 
 
-def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch):
-    index = tmp_path / "share" / "ament_index" / "resource_index" / "packages"
+def stand_in(monkeypatch, prefix, packages):
+    """Make those packages of an installation that are not there, with their programs."""
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
     index.mkdir(parents=True)
-    for package, programs in STAND_INS.items():
+    for package, programs in packages.items():
         if not installed(package):
             (index / package).touch()
-            (tmp_path / "lib" / package).mkdir(parents=True)
+            (prefix / "lib" / package).mkdir(parents=True)
             for name, text in programs.items():
-                path = tmp_path / "lib" / package / name
+                path = prefix / "lib" / package / name
                 path.write_text(text)
                 path.chmod(0o755)
-    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}:{os.environ['AMENT_PREFIX_PATH']}")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{prefix}:{os.environ['AMENT_PREFIX_PATH']}")
+
+
+LOSES_THE_FIRST = """#!/usr/bin/env python3
+import signal, sys, time
+signal.signal(signal.SIGINT, lambda *_: print("a lost signal", flush=True))
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+time.sleep(1000)
+"""
+"""`ros2 bag record` while it starts, between the handler of rclcpp and its own."""
+
+
+def test_a_recorder_that_loses_a_signal_while_it_starts_is_ended(launch, tmp_path, monkeypatch):
+    """The controller fails at its start: what is not up yet ends as well, by the next signal."""
+    stand_in(monkeypatch, tmp_path, {"ros2bag": {}, "rosbag2_storage_mcap": {}})
+    path = tmp_path / "bin" / "ros2"
+    path.parent.mkdir()
+    path.write_text(LOSES_THE_FIRST)
+    path.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{path.parent}:{os.environ['PATH']}")
+    (tmp_path / "given.yaml").write_text("/**: {ros__parameters: {mode: nosuch}}")
+    run = launch("feedforward.launch.py", "params_file:=given.yaml", "bag:=ros2").ended(1)
+    assert "inverse_dynamics failed with exit status 1" in run.text
+    assert "a lost signal" in run.text
+
+
+def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch):
+    stand_in(monkeypatch, tmp_path, STAND_INS)
     run = launch("ros2_control.launch.py")
     run.until("running")
     run.until(r"\[spawner-\d\]: process has finished cleanly")
