@@ -47,6 +47,7 @@ def actions(given: Given) -> list[Action]:
         "scene": given["model"] or given["scene"],
         "rate": given["control_rate"],
         "stamped": "true" if given["sync"] == "lockstep" else "",
+        "timeout": launch_parts.Default(launch_parts.WAIT_S),  # also until the simulator is up
         "wait_for_recorder": given["record"],
         "min_subscribers": "2" if recorded else "",  # the recorder reads the commands, too
     }

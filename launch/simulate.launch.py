@@ -46,6 +46,7 @@ def actions(given: Given) -> list[Action]:
         played = {
             "scene": given["scene"],
             "rate": given["publish_rate"],
+            "timeout": launch_parts.Default(launch_parts.WAIT_S),  # also until the simulator is up
             "stamped": "" if run["sync"] == "lockstep" else "false",
             "min_subscribers": "2" if recorded else "",  # the recorder reads them, too
         }

@@ -65,7 +65,7 @@ _SIGNAL_AGAIN_S = "10"
 first signal while it starts, when the handler of rclcpp is there and its own is not yet."""
 _CLOSING_S = "60"  # time that a recorder has to write its index before it is killed
 _ENDS = {"sigterm_timeout": _SIGNAL_AGAIN_S, "sigkill_timeout": _CLOSING_S}
-_WAIT_S = "60"  # that a simulator waits for its recorder; on a busy machine one starts in 20 s
+WAIT_S = "60.0"  # [s] of the nodes for each other; on a busy machine one starts in 20 s
 
 
 def recording_arguments(name: str) -> dict[str, tuple[str, str]]:
@@ -167,7 +167,7 @@ def _in_namespace(given: Given, topic: str) -> str:
 
 def simulator(given: Given, parameters: Mapping[str, str], *, recorded: bool) -> Node:
     """Describe a simulator, which does not start its run before it is recorded."""
-    waits = {"wait_for_subscribers": ",".join(topics.SAMPLED), "subscriber_timeout": _WAIT_S}
+    waits = {"wait_for_subscribers": ",".join(topics.SAMPLED), "subscriber_timeout": WAIT_S}
     return node(given, "simulator", {**parameters, **waits} if recorded else parameters)
 
 
