@@ -275,6 +275,7 @@ EXTRAS = {
 
 _APT = ("lz4", "matplotlib", "numba", "pandas", "xarray", "zstandard")
 _PIP = {**dict.fromkeys(("mcap", "rosbags"), "mcap rosbags"), "distributed": "dask[distributed]"}
+_PIP |= {"flint": "python-flint", "pinocchio": "pin"}
 _ROS = ("ament_index_python", "rclpy", "rcl_interfaces", "builtin_interfaces", "launch")
 
 

@@ -64,7 +64,7 @@ _SIGNAL_AGAIN_S = "10"
 """Wait for the end after SIGINT, before SIGTERM asks for the same: `ros2 bag record` can lose the
 first signal while it starts, when the handler of rclcpp is there and its own is not yet."""
 _CLOSING_S = "60"  # time that a recorder has to write its index before it is killed
-_ENDS = {"sigterm_timeout": _SIGNAL_AGAIN_S, "sigkill_timeout": _CLOSING_S}
+_ENDS: dict[str, Any] = {"sigterm_timeout": _SIGNAL_AGAIN_S, "sigkill_timeout": _CLOSING_S}
 WAIT_S = "60.0"  # [s] of the nodes for each other; on a busy machine one starts in 20 s
 
 
@@ -99,7 +99,7 @@ def description(
             raise RuntimeError(f"params_file:={path}: no such file")
         chosen = Given({n: values[n] if n in given else Default(values[n]) for n in every})
         pushed = prefix_namespace(values.get("ros_namespace"), values["namespace"])
-        chosen["namespace"] = make_namespace_absolute(pushed) or ""
+        chosen["namespace"] = make_namespace_absolute(pushed or "")
         if "output" in every and "output" not in given:  # not that of another robot's recording
             words = [*filter(None, chosen["namespace"].split("/")), chosen["output"]]
             chosen["output"] = Default("_".join(words))
