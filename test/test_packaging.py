@@ -33,7 +33,7 @@ PYTHON_KEYS = {name: f"python3-{name}" for name in (*_SAME.split(), "pytest-time
 Each is a package of apt on Ubuntu and on Debian, as bloom needs it: it refuses keys of pip.
 """
 
-WITHOUT_KEY = {"control", "dask", "mcap", "pyarrow", "rosbags", "viser", "xarray"}
+WITHOUT_KEY = {"control", "dask", "mcap", "pyarrow", "python-flint", "rosbags", "viser", "xarray"}
 """Python packages of setup.py that have none, or one of pip: `pip install sst_ros[all]`."""
 
 ROS_KEYS = {
@@ -57,7 +57,11 @@ def test_every_extra_that_a_message_names_brings_the_module():
     for module, extra in EXTRAS.items():
         assert f'"{extra}"' in setup
         if module not in ("lz4", "zstandard"):  # brought by rosbags
-            names = {"pinocchio": "pin>=", "distributed": "dask[distributed]"}
+            names = {
+                "flint": "python-flint>=",
+                "pinocchio": "pin>=",
+                "distributed": "dask[distributed]",
+            }
             package = names.get(module, module)
             assert f'"{package}' in setup
 
