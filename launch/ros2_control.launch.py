@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start a simulator as the hardware of ros2_control: controller manager, broadcaster, a controller.
 
-The run starts at the first command. The launch ends with the simulator.
+The run starts at the first command. With sync:=lockstep each sample waits for an update of the
+controllers, at publish_rate. The launch ends with the simulator.
 """
 
 from launch import LaunchDescription
@@ -15,6 +16,8 @@ RUN = {
     "rate": ("", "steps per second of simulated time [Hz]"),
     "publish_rate": ("", "published samples per second [Hz]"),
     "duration": ("0.0", "length of the run [s]; 0 for no end"),
+    "real_time_factor": ("", "simulated time per time of the clock; 0.0 for as fast as possible"),
+    "sync": ("", "free, or lockstep: one update of the controllers for each sample"),
     "publish_clock": ("", "true: publish the simulated time on /clock"),
 }
 ARGUMENTS = {
@@ -31,6 +34,7 @@ def actions(given: Given) -> list[Action]:
     """Describe the nodes."""
     run = {
         **{name: given[name] for name in RUN},
+        **({"publish_clock": "true"} if given["sync"] == "lockstep" else {}),
         "wait_for_command": "true",
         "partial_commands": "true",
         "publish_description": "false",  # robot_state_publisher publishes that with the tag

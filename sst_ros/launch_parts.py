@@ -31,7 +31,7 @@ from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import suggestion
 from sst_ros.host import processes
 from sst_ros.nodes import arguments, topics
-from sst_ros.runtime.settings import default_topics
+from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.scene import load, share_directory
 
 
@@ -227,7 +227,9 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
     path = controllers or str(share_directory() / "config" / "controllers.yaml")
     if not Path(path).is_file():
         raise RuntimeError(f"controllers:={path}: no such file")
-    names = ["controller_manager", "joint_state_topic_hardware_interface", "robot_state_publisher"]
+    lockstep = given["sync"] == "lockstep"
+    hardware = "sst_ros_hardware" if lockstep else "joint_state_topic_hardware_interface"
+    names = ["controller_manager", hardware, "robot_state_publisher"]
     spawned = ["joint_state_broadcaster", controller]
     for listed in yaml.safe_load(Path(path).read_text(encoding="utf-8")).values():
         given_there = listed.get("ros__parameters", {})
@@ -235,10 +237,13 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
         names += [plugin.partition("/")[0] for plugin in types if plugin]
     require(*names)
     topics_there = [_in_namespace(given, topic) for topic in TOPICS]
-    words = [*spawned, "--param-file", path]
+    words = [*spawned, "--param-file", path, "--switch-timeout", WAIT_S]  # /clock may come late
+    timed: dict[str, Any] = {"use_sim_time": lockstep}
+    if lockstep:  # an update for each sample
+        timed["update_rate"] = int(given["publish_rate"] or SimulatorParameters().publish_rate)
     return [
-        _state_publisher(given, urdf(load(given["scene"]), topics_there)),
-        _node(given, "controller_manager", "ros2_control_node", parameters=[path]),
+        _state_publisher(given, urdf(load(given["scene"]), topics_there, lockstep=lockstep)),
+        _node(given, "controller_manager", "ros2_control_node", parameters=[path, timed]),
         _node(given, "controller_manager", "spawner", ends=False, arguments=words),
     ]
 

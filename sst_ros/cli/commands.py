@@ -130,7 +130,13 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write a scene as URDF",
         "cli.scenes:describe",
         _scene("--scene", _OF_SCENE, default="example2", metavar="S"),
-        _flag("--ros2-control", "with the tag by which ros2_control drives a running simulator"),
+        Arg(
+            "--ros2-control",
+            "with the tags by which ros2_control drives a running simulator; free by default",
+            nargs="?",
+            const="free",
+            choices=("free", "lockstep"),
+        ),
     ),
     "compile": Subcommand(
         "compile a scene before its first fast run",

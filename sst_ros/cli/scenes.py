@@ -25,4 +25,5 @@ def print_schema(_: argparse.Namespace) -> None:
 
 def describe(options: argparse.Namespace) -> None:
     """Print a scene as URDF."""
-    print(urdf(load(options.scene), TOPICS if options.ros2_control else ()), end="")
+    sync = options.ros2_control
+    print(urdf(load(options.scene), TOPICS if sync else (), lockstep=sync == "lockstep"), end="")

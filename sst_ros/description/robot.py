@@ -16,9 +16,10 @@ A scene gives inertias about O, and a mass only where something weighs; URDF wan
 scene has none, it is the one that would have this tensor on the sphere of its link,
 trace / (2 radius^2), with its centre at O: the motion is then the same for any mass.
 
-The actuators can be hardware of ros2_control, which drives them over topics by the plug-in
-JointStateTopicSystem of the package joint_state_topic_hardware_interface. It sends the effort of
-the joints of its tag only: passive joints, which have no command, must not be in it.
+The actuators can be hardware of ros2_control, which drives them over topics, by LockstepSystem of
+the package in hardware/ or JointStateTopicSystem of joint_state_topic_hardware_interface. That one
+sends the names of all joints of its tag with the efforts of those that have one: the passive
+joints, which have states only, get a tag of their own.
 """
 
 from __future__ import annotations
@@ -59,6 +60,7 @@ SERVO_TORQUE, SERVO_RATE = 10.6, np.pi
 (30 rev/min) of a geared servo for arms of this size, ROBOTIS XM540-W270 at 12 V."""
 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
+LOCKSTEP_PLUGIN = "sst_ros_hardware/LockstepSystem"
 TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
 """Of commands and states, by which ros2_control drives a simulator."""
 
@@ -193,13 +195,13 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
     return found
 
 
-def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
+def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) -> str:
     """Write a scene as a URDF document.
 
-    With topics of commands by name and of joint states it has the ros2_control tag of the
-    actuators. Until the first of them arrive, the hardware has the initial state of the scene:
-    without it joint_trajectory_controller, activated before, holds nan, and no command starts the
-    run.
+    With topics of commands by name and of joint states it has the ros2_control tags of the
+    actuators and the passive joints. Until the first joint states arrive, the actuators have the
+    initial state of the scene: without it joint_trajectory_controller, activated before, holds nan,
+    and no command starts the run.
     """
     geometry, drawn = Geometry.of(scene), shapes(scene)
     joints, bodies = joints_of(geometry), {body.name: body for body in _bodies(scene)}
@@ -227,7 +229,8 @@ def urdf(scene: Scene, topics: Sequence[str] = ()) -> str:
         joints=limited,
         starts=list(zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)),
         topics=topics,
-        plugin=PLUGIN,
+        passive=JOINTS[3:],
+        plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
         roll_pitch_yaw=roll_pitch_yaw,
     )
     return document

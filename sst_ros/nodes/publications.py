@@ -310,12 +310,14 @@ class SimulatorTopics:
             self._torques.publish(self._log.take(self._log_from_ns))
         self._log.clear()
 
-    def idle(self, state: State, stamp_ns: int, *, at_rest: bool) -> None:
+    def idle(self, state: State, stamp_ns: int, *, at_rest: bool, moves: bool = False) -> None:
         """Publish a state that is no sample; `at_rest` with zero rates and efforts.
 
-        joint_states has this stamp and IDLE_FRAME_ID, the other topics the stamp zero.
+        joint_states has this stamp and IDLE_FRAME_ID, the other topics the stamp zero; where it
+        `moves`, our clock goes on to the stamp.
         """
         if self._clock is not None:
+            self._time_ns = stamp_ns if moves else self._time_ns
             self._clock.publish(clock_message(self._time_ns))  # again, for late subscribers
         self.flush()
         self._torques.publish(self._log.take(0))

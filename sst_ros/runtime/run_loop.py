@@ -107,10 +107,10 @@ class RunLoop(TickLoop):
                     self.warm_up()
                 if self.requested.is_set():
                     self._serve()
-                if self.phase is Phase.WAITING and not self._start():
+                if self.phase is Phase.WAITING and not self._start(self._run.waits):
                     if time.monotonic() - shown > IDLE_PERIOD_S:
                         shown = time.monotonic()
-                        self.show(fault=False)
+                        self.show(fault=False, waits=True)
                     time.sleep(_POLL_S)
                 elif self.phase is Phase.RUNNING:
                     if self.to_next_sample(paced=True) and self.complete:
@@ -144,7 +144,8 @@ class RunLoop(TickLoop):
             self._resume()
         else:
             self._to(Phase.WAITING)
-            self._start()
+            # With /clock in lockstep an update for each wait would come before the run.
+            self._start(self._run.waits and not self._idle_step_ns)
         return Reply(True, self.phase.value)
 
     def step(self, samples: int = 1) -> Reply:
@@ -204,8 +205,8 @@ class RunLoop(TickLoop):
                 finally:
                     pending.set_result(reply)
 
-    def _start(self) -> bool:
-        """Start the run, unless it has to wait; return whether it runs."""
+    def _start(self, waits: bool) -> bool:
+        """Start the run, unless it has to wait, also for a command; return whether it runs."""
         if self._missing_since is not None:  # of subscribers that have to be there once
             if missing := self._output.missing_subscribers():
                 if time.monotonic() - self._missing_since > self._run.subscriber_timeout:
@@ -214,7 +215,7 @@ class RunLoop(TickLoop):
                     raise NoAnswer(f"no subscriber of {', '.join(missing)} {reason}")
                 return False
             self._missing_since = None
-        if (self._run.waits and not self._input.starts_run()) or not self.begin():
+        if (waits and not self._input.starts_run()) or not self.begin():
             return False
         self._resume()
         return True

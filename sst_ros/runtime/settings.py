@@ -155,6 +155,7 @@ class SimulatorParameters(Section):
             ticks_per_sample=self.rate // self.publish_rate,
             last_tick=math.ceil(self.duration * self.rate - 1e-6) or sys.maxsize,
             lockstep=self.sync == "lockstep",
+            own_clock=self.publish_clock,
             waits=self.wait_for_command or self.sync == "lockstep",
             partial_commands=self.partial_commands,
             command_timeout_ns=self.command_timeout * NANOSECONDS,

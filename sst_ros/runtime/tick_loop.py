@@ -251,6 +251,8 @@ class TickLoop:
         self._run, self._input, self._pacer, self._output = run, torque_input, pacer, output
         self._lockstep, self._last_tick = run.lockstep, run.last_tick
         self._period_ns, self._ticks_per_sample = run.period_ns, run.ticks_per_sample
+        self._control_ns = run.period_ns * run.ticks_per_sample
+        self._idle_step_ns = self._control_ns if run.lockstep and run.own_clock else 0
         self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
         self._kept: Vector3 | None = None  # in lockstep, an answer whose deadline has not come
         self._awaited_since = self._waits_since = time.monotonic()
@@ -277,8 +279,8 @@ class TickLoop:
         now = self._output.now_ns()
         if now == 0:
             return False
-        sample = self._stamp_ns + self._period_ns * self._ticks_per_sample
-        self._start_ns = max(now, sample, self._idle_ns + 1)
+        sample = self._stamp_ns + self._control_ns
+        self._start_ns = max(now + self._idle_step_ns, sample, self._idle_ns + 1)
         self.begun = True
         self._publish()
         return True
@@ -362,20 +364,24 @@ class TickLoop:
         with contextlib.suppress(Exception):
             self._output.flush()
 
-    def show(self, *, fault: bool) -> None:
+    def show(self, *, fault: bool, waits: bool = False) -> None:
         """Publish the state of a run that does not advance, marked as idle.
 
         Its stamp is the ROS time at which the state holds: that of the last sample where samples
         will follow it, else the present time. Stamps never go back; where time stands still they
         differ by 1 ns, because tf2 warns of transforms that have the stamp of the one before.
+
+        In lockstep our /clock moves by a control period where the run waits: controllers that are
+        updated by it can become active, and the run begins one update after what a command answers.
         """
+        moves = waits and self._idle_step_ns > 0
         stamp_ns = min(max(self._stamp_ns, self._idle_ns) + 1, self._stamp_ns + self._period_ns - 1)
         if fault or not self.begun:
-            now = self._output.now_ns()
+            now = self._output.now_ns() + moves * self._idle_step_ns
             stamp_ns = max(now, self._stamp_ns + 1, self._idle_ns) if now else self._idle_ns
-        self._output.idle(self.simulation.state, stamp_ns, at_rest=fault)
+        self._output.idle(self.simulation.state, stamp_ns, at_rest=fault, moves=moves)
         self._idle_ns = stamp_ns
-        self._input.accept_idle(stamp_ns)
+        self._input.accept_idle(stamp_ns, alone=moves)
 
     def _ticks_left(self) -> int:
         left = self._ticks_per_sample - self._tick % self._ticks_per_sample

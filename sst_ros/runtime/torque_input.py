@@ -42,6 +42,7 @@ class RunSettings:
     last_tick: int = sys.maxsize  # after which the run ends, if at all
     lockstep: bool = False  # each sample is answered before the next tick
     waits: bool = False  # a command starts the run
+    own_clock: bool = False  # /clock is ours, and in lockstep goes on before the run, too
     partial_commands: bool = False  # an effort that is nan means zero torque
     command_timeout_ns: float = 0.0  # age at which a command is no longer held; 0 for never
     lockstep_timeout: float = 0.0  # longest wait for the answer to a sample [s]; 0 for no end
@@ -101,9 +102,9 @@ class TorqueInput:
             return False
         return self.moment == ZERO or not self._is_old(self._moment_since, until_ns)
 
-    def accept_idle(self, stamp_ns: int) -> None:
-        """Accept answers to a state that was published with this stamp before the run."""
-        self._idle_ns = [self._idle_ns[0] or stamp_ns, stamp_ns]
+    def accept_idle(self, stamp_ns: int, *, alone: bool = False) -> None:
+        """Accept answers to a state shown with this stamp before the run, `alone` to no other."""
+        self._idle_ns = [(not alone and self._idle_ns[0]) or stamp_ns, stamp_ns]
 
     def starts_run(self) -> bool:
         """Take the messages that arrived before the run; return whether a command starts it."""

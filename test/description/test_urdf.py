@@ -38,6 +38,7 @@ from sst_ros.scene.scene import load, names
 
 ACTUATORS = list(JOINTS[:3])
 CONTROLLERS = Path(__file__).parents[2] / "config" / "controllers.yaml"
+HARDWARE = ET.parse(Path(__file__).parents[2] / "hardware" / "plugins.xml").getroot()
 EXACT = 2e-14  # a product of nine rotations, each rounded
 GEARED = Actuators(rotor_inertia=1e-4, gear_ratio=10.0)
 LINKS = {STAR, *ACTUATED, *INTERMEDIATE}
@@ -300,19 +301,27 @@ def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name)
         assert points @ e == pytest.approx(0.0, abs=1e-15)
 
 
-def test_the_tag_has_the_actuators_the_topics_and_the_states_before_the_first_message():
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_the_tags_have_the_joints_the_topics_and_the_states_before_the_first_message(lockstep):
     """Without those a controller that is activated first holds nan, and no run starts."""
     scene = load("swing")
-    text = urdf(scene, ("/a/commands", "/a/states"))
-    (tag,) = ET.fromstring(text).findall("ros2_control")
-    assert tag.attrib == {"name": "sst_ros", "type": "system"}
-    hardware = tag.find("hardware")
-    assert hardware.findtext("plugin") == PLUGIN
-    assert {param.get("name"): param.text for param in hardware.findall("param")} == {
-        "joint_commands_topic": "/a/commands",
-        "joint_states_topic": "/a/states",
-        "trigger_joint_command_threshold": "-1",
-    }
+    text = urdf(scene, ("/a/commands", "/a/states"), lockstep=lockstep)
+    tag, passive = ET.fromstring(text).findall("ros2_control")
+    plugin = HARDWARE.find("class").get("name") if lockstep else PLUGIN
+    topics = {"joint_commands_topic": "/a/commands", "joint_states_topic": "/a/states"}
+    for one, name, given in (
+        (tag, "sst_ros", topics | {"trigger_joint_command_threshold": "-1"}),
+        (passive, "sst_ros_passive", {"joint_states_topic": "/a/states"}),
+    ):
+        assert one.attrib == {"name": name, "type": "system"}
+        assert one.findtext("hardware/plugin") == plugin
+        params = one.findall("hardware/param")
+        assert {param.get("name"): param.text for param in params} == given
+    assert [joint.get("name") for joint in passive.findall("joint")] == list(JOINTS[3:])
+    assert not passive.findall(".//command_interface")
+    for joint in passive.findall("joint"):
+        states = [one.get("name") for one in joint.findall("state_interface")]
+        assert states == ["position", "velocity"]
     assert [joint.get("name") for joint in tag.findall("joint")] == ACTUATORS
     starts = zip(scene.initial.gamma, scene.initial.gamma_dot, strict=True)
     for joint, (gamma, gamma_dot) in zip(tag.findall("joint"), starts, strict=True):
@@ -331,7 +340,8 @@ def test_the_command_writes_both_and_the_rest_of_the_second_is_the_first(capsys)
     assert capsys.readouterr().out == urdf(load("swing"))
     assert main(["describe", "--scene", "swing", "--ros2-control"]) == 0
     root = ET.fromstring(capsys.readouterr().out)
-    root.remove(root.find("ros2_control"))
+    for tag in root.findall("ros2_control"):
+        root.remove(tag)
     plain = ET.fromstring(urdf(load("swing")))
     for tree in (root, plain):
         ET.indent(tree)

@@ -258,7 +258,7 @@ node = rclpy.create_node("controller_manager")
 commands = node.create_publisher(JointState, "/sst_simulator/commands_stamped", 10)
 def write(states):
     command = JointState(name=states.name[:3], effort=[0.0] * 3)
-    command.header.stamp = node.get_clock().now().to_msg()
+    command.header.stamp = states.header.stamp
     commands.publish(command)
 node.create_subscription(JointState, "/joint_states", write, 10)
 try:
@@ -266,13 +266,14 @@ try:
 except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
     pass
 """
-"""Stands in for the real one, with the messages of its plug-in for an effort controller."""
+"""Stands in for the real one, with the messages of its plug-ins for an effort controller."""
 STAND_INS = {
     "controller_manager": {"ros2_control_node": CONTROLLER_MANAGER, "spawner": "#!/bin/true\n"},
     "robot_state_publisher": {"robot_state_publisher": "#!/bin/sh\nexec sleep 60\n"},
     "joint_state_broadcaster": {},
     "joint_trajectory_controller": {},
     "joint_state_topic_hardware_interface": {},
+    "sst_ros_hardware": {},
 }
 """Programs of the packages that ros2_control.launch.py needs."""
 
@@ -315,9 +316,10 @@ def test_a_recorder_that_loses_a_signal_while_it_starts_is_ended(launch, tmp_pat
     assert "a lost signal" in run.text
 
 
-def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch):
+@pytest.mark.parametrize("words", [(), ("sync:=lockstep", "publish_rate:=100")])
+def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch, words):
     stand_in(monkeypatch, tmp_path, STAND_INS)
-    run = launch("ros2_control.launch.py")
+    run = launch("ros2_control.launch.py", *words)
     run.until("running")
     run.until(r"\[spawner-\d\]: process has finished cleanly")
     run.interrupt()

@@ -2,18 +2,21 @@
 """Lockstep: a closed loop gives the same bits on an idle and on a loaded machine."""
 
 import ast
+import contextlib
 import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from ros.conftest import STAMPED, named
+from rclpy.qos import qos_profile_sensor_data
+from ros.conftest import STAMPED, Observer, named
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from sst_ros import Simulation, load_scene, simulate
 from sst_ros.recording import recording
-from sst_ros.state import Joints
+from sst_ros.state import IDLE_FRAME_ID, Joints, nanoseconds
 
 pytestmark = pytest.mark.ros
 AT_ONCE = {"sync": "lockstep", "real_time_factor": 0.0}
@@ -68,6 +71,66 @@ def test_simulate_and_the_bag_of_nodes_have_the_same_bits(nodes, observer, tmp_p
     # The bag has no body rate: it is computed from the rates of the joints.
     np.testing.assert_allclose(bag.body_rate, whole.body_rate, atol=1e-12)
     assert bag.error_estimate == pytest.approx(whole.error_estimate, rel=1e-2)
+
+
+class ControllerManager:
+    """Stands in for a controller manager with use_sim_time whose hardware is hardware/.
+
+    It is updated where /clock is a period or more after the update before, by the joint state of
+    that time, however late that comes, and answers it; before the run from the update `begins` on.
+    """
+
+    def __init__(self, node, period_ns, begins):
+        self.period_ns, self.begins = period_ns, begins
+        self.now_ns, self.answered = 0, 0
+        self.states, self.updates = [], []
+        self.publisher = node.create_publisher(JointState, STAMPED, 10)
+        node.create_subscription(Clock, "/clock", self.tick, qos_profile_sensor_data)
+        node.create_subscription(JointState, "/joint_states", self.read, 10)
+
+    def tick(self, message):
+        self.now_ns = nanoseconds(message.clock)
+        self.update()
+
+    def read(self, state):
+        self.states.append(state)
+        self.update()
+
+    def update(self):
+        last_ns = self.updates[-1] if self.updates else 0
+        is_due = self.now_ns - last_ns >= self.period_ns
+        if not (is_due and self.states):
+            return
+        state = self.states[-1]
+        if nanoseconds(state.header.stamp) != self.now_ns:
+            return
+        self.updates.append(self.now_ns)
+        if len(self.updates) > self.begins:
+            # By the count of updates too: one more or less would give other bits.
+            torque = [0.02 * self.answered - 6.0 * rate for rate in state.velocity[:3]]
+            self.answered += state.header.frame_id != IDLE_FRAME_ID
+            self.publisher.publish(named(torque, state.header.stamp))
+
+
+@pytest.mark.parametrize("rate", [100, 500])
+def test_a_controller_manager_by_our_clock_has_one_update_for_each_sample(nodes, domain, rate):
+    """The same bits whether its controller is there at once or later."""
+    count = int(0.2 * rate) + 1
+    rates = {"rate": 500, "publish_rate": rate, "duration": 0.2}
+    runs = []
+    for begins in (0, 3):
+        with contextlib.closing(Observer(domain)) as observer:
+            manager = ControllerManager(observer.node, 10**9 // rate, begins)
+            simulator = nodes.run("simulator", publish_clock=True, **rates, **AT_ONCE)
+            observer.until(lambda heard=manager: heard.answered == count, "end of the run", 100.0)
+            assert nodes.ended(simulator)[0] == 0
+        samples = [state for state in manager.states if Observer.stamp(state)]
+        assert manager.updates[-count:] == [*map(Observer.stamp, samples)]
+        assert len(manager.updates) > count + begins
+        assert set(np.diff(manager.updates)) == {10**9 // rate}
+        runs.append([(*state.position, *state.velocity, *state.effort) for state in samples])
+    assert runs[0] == runs[1]
+    assert np.ptp(runs[0], axis=0)[:3].min() > 1e-3  # it moves
 
 
 @pytest.mark.parametrize("name", [pytest.param("example1", marks=pytest.mark.slow), "example2"])

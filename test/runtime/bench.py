@@ -53,11 +53,12 @@ class Arrived(list):
 
 
 class Output:
-    """Keeps what the run publishes; gives time from 1 s on."""
+    """Keeps what the run publishes; gives time from 1 s on, by its own clock if it has one."""
 
     unread = False
 
-    def __init__(self, missing):
+    def __init__(self, missing, own_clock):
+        self.own_clock = own_clock
         self.samples, self.acted, self.idles, self.phases = [], [], [], []
         self.flushed, self.unpublished = 0, {}
         self.now, self.missing = 10**9, missing
@@ -73,13 +74,15 @@ class Output:
         self.acted.extend([torque] * count)
 
     def sample(self, simulation, stamp_ns):
+        self.now = stamp_ns if self.own_clock else self.now
         self.samples.append((stamp_ns, simulation.state))
         self.on_sample(stamp_ns)
 
     def flush(self):
         self.flushed = len(self.acted)
 
-    def idle(self, state, stamp_ns, *, at_rest):
+    def idle(self, state, stamp_ns, *, at_rest, moves=False):
+        self.now = stamp_ns if moves else self.now
         self.idles.append((state, at_rest, stamp_ns))
 
     def publish_phase(self, phase):
@@ -116,7 +119,7 @@ class Bench:
         parameters = SimulatorParameters(scene=scene, **given)
         run = parameters.run
         self.queue, self.stamped = Arrived(map(plain, commands)), Arrived()
-        self.output = Output([*parameters.wait_for_subscribers])
+        self.output = Output([*parameters.wait_for_subscribers], parameters.publish_clock)
         self.input = TorqueInput(run, None, self.queue, self.stamped)
         self.pacer = Pacer(run.period_ns, parameters.real_time_factor, clock or SteadyTime())
         self.loop = RunLoop(load_scene(scene), build, run, self.input, self.pacer, self.output)

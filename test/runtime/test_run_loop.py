@@ -380,6 +380,35 @@ def test_after_a_reset_a_late_answer_does_not_start_the_run(start, of_the_run_be
     assert (len(bench.output.samples) > 1) == starts
 
 
+def test_in_lockstep_our_clock_goes_on_before_the_run_by_whole_periods(start):
+    """So that a controller manager, which is updated by it, can have its controllers activated."""
+    bench = start(sync="lockstep", publish_clock=True)
+    output, period_ns = bench.output, 2_000_000
+
+    def idles():
+        return [stamp for _, _, stamp in output.idles]
+
+    bench.until(lambda: len(idles()) > 3)
+    assert np.diff(idles())[1:3].tolist() == [period_ns] * 2  # the first is that of the start
+    bench.stamped.append(stamped(idles()[-2]))  # late: an update has been since
+    bench.until(lambda: not bench.stamped)
+    assert not output.samples
+    while not output.samples:
+        if not bench.stamped:
+            bench.stamped.append(stamped(idles()[-1]))
+        time.sleep(0.001)
+    assert output.stamps == [idles()[-1] + period_ns]
+    for stamp in (1, 2, 3):
+        bench.stamped.append(stamped(output.stamps[-1]))
+        bench.until(lambda count=stamp + 1: len(output.samples) == count)
+    assert np.diff(output.stamps).tolist() == [period_ns] * 3
+    # A run that was reset in a pause begins with the next period when it is resumed.
+    assert bench.ask("pause", True).success and bench.ask("reset").success
+    assert bench.ask("pause", False) == (True, "running")
+    bench.until(lambda: len(output.samples) == 5)
+    assert output.stamps[4] == output.stamps[3] + period_ns
+
+
 @pytest.mark.parametrize(("waits", "phase"), [(False, Phase.RUNNING), (True, Phase.WAITING)])
 def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(start, waits, phase):
     bench = start(wait_for_command=waits)
