@@ -11,6 +11,7 @@ from sst_ros import (
     Batch,
     InverseDynamics,
     Simulation,
+    certify,
     load_scene,
     read_bag,
     reference_motion,
@@ -34,10 +35,12 @@ def made(bag):
         batch,
         batch.run(start, 0.0 * start, step=1e-3, count=2),
         simulate(scene, duration=0.1),
+        certify("example2", duration=0.01, t_eval=[0.01]),
     )
 
 
 def test_each_object_says_in_ten_lines_what_its_table_says(example2_bag, interpreted):
+    pytest.importorskip("flint")
     objects = list(made(example2_bag))
     explained = {*Explained.__subclasses__(), *MotionTable.__subclasses__()} - {MotionTable}
     assert {type(one) for one in objects} == explained

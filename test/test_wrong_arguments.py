@@ -52,6 +52,8 @@ TASK |= {
     "breaks": (),
     "max_step": None,
 }
+PROOF = {name: TASK[name] for name in ("scene", "torque", "duration", "initial", "t_eval")}
+PROOF |= {"bound": 1e-9, "ranges": None, "progress": False}
 STUDY = {"scene": SCENE, "vary": {"star.inertia.zz": [0.26, 0.27]}, "duration": 0.01, "n": 2}
 STUDY |= {"seed": 0, "out": None, "client": None, "workers": 1, "resume": False, "progress": False}
 
@@ -64,6 +66,7 @@ def of(**arguments):
 def calls():
     """Public functions, and methods of what they give, with arguments that are right."""
     pytest.importorskip("numba")
+    pytest.importorskip("flint")
     geometry, settings = sst_ros.Geometry.of(SCENE), sst_ros.ControllerSettings()
     run, motion = simulate(**TASK), sst_ros.reference_motion(MOVING)
     inverse, batch = sst_ros.InverseDynamics(SCENE), Batch(SCENE)
@@ -87,6 +90,7 @@ def calls():
         (simulate, TASK),
         (simulate, TASK | {"torque": lambda t: REST, "control_period": 1e-3}),
         (sst_ros.prepare, TASK),
+        (sst_ros.certify, PROOF),
         (load_scene, of(scene="example2")),
         (SCENE.with_values, of(values={"star.mass": 1.0})),
         (lambda k, x: SCENE.with_values({key(k): x}), of(k="star.mass", x=1.0)),
@@ -171,5 +175,5 @@ def test_each_public_name_is_thrown_at(calls):
     others = {name for name in sst_ros.__all__ if getattr(sst_ros, name) not in thrown}
     errors = {name for name in others if name.endswith(("Error", "Stopped", "Configuration"))}
     # A version, what gives others by methods above, and what only results have.
-    results = {"Scene", "Geometry", "Identification", "LinearModel", "State"}
+    results = {"Scene", "Geometry", "Identification", "LinearModel", "ProvenMotion", "State"}
     assert others - errors == {"__version__", *results}
