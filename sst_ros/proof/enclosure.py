@@ -20,7 +20,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from operator import methodcaller
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -37,7 +37,7 @@ PRECISION, LONGEST = 128, 100  # bits; coefficients of a series
 V_ORDER = 8
 SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogonal
 GROWTH = 0.05  # of a set by the remainder of V, largest in a step
-LEAST = 1e-9  # of a step, relative to the usual length: the proof ends
+LEAST = 1e-9  # of a step, relative to the whole time: the proof ends
 
 
 class Refused(ArithmeticError):
@@ -113,15 +113,35 @@ def _atan2(y: Any, x: Any) -> Any:
     return ((y.derivative() * x - x.derivative() * y) / (x * x + y * y)).integral() + angle
 
 
-def _step(x: Any) -> int:
-    if not (value := _first(x)) > 0 and not value < 0:
+class _Kink:
+    """What may be on both sides of a kink: nothing is known of it, but that zero times it is zero.
+
+    So is the damping of an elastic stop that is not touched.
+    """
+
+    def __mul__(self, other: Any) -> Any:
+        numbers = other.coeffs() if isinstance(other, arb_series) else [other]
+        return self if any(isinstance(x, _Kink) or x != 0 for x in numbers) else arb(0)
+
+    __rmul__ = __mul__
+
+    def refuse(self, *_: object) -> NoReturn:
         raise Refused("a kink: a contact begins or ends, or a torque meets its limit")
-    return int(bool(value > 0))
+
+    __add__ = __radd__ = __sub__ = __rsub__ = __neg__ = refuse
+    __truediv__ = __rtruediv__ = __arb__ = refuse
+
+
+def _step(x: Any) -> Any:
+    value = _first(x)
+    known = not isinstance(value, _Kink) and (value > 0 or value < 0)
+    return int(bool(value > 0)) if known else _Kink()
 
 
 def positive(x: Any, _zero: float = 0.0) -> Any:
-    """Return x where x > 0 and 0 elsewhere; Refused: it may be both."""
-    return x * _step(x)
+    """Return x where x > 0 and 0 elsewhere, or what may be both."""
+    side = _step(x)
+    return side if isinstance(side, _Kink) else x * side
 
 
 _ON_BALLS: dict[str, Callable[..., Any]] = {name: methodcaller(name) for name in FUNCTIONS}
@@ -149,6 +169,8 @@ def _series(polynomial: Any, size: int) -> Any:
 
 
 def _coefficients(x: Any, size: int) -> list[Any]:
+    if isinstance(x, _Kink):
+        x.refuse()
     found = x.coeffs() if isinstance(x, arb_series) else [arb(x)]
     return [*found, *[arb(0)] * size][:size]
 
@@ -323,6 +345,7 @@ def enclose(
 
     """
     factor, usual, most = 0.4, end - here.time, math.inf
+    least = LEAST * usual
     while here.time < end:
         p, defects = expand(f, here, order)
         sizes = [(k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)]
@@ -341,7 +364,7 @@ def enclose(
                     tube, tries = why.wider, tries + 1
                     continue
                 h, tube, tries, most = why.shorter * (target - here.time), narrow, 0, 0.0
-                if h < LEAST * usual or here.time + h == here.time:
+                if h < least or here.time + h == here.time:
                     raise why from None
         yield step
         taken = target - here.time

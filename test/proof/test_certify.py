@@ -199,8 +199,6 @@ def test_nothing_is_said_beyond_a_kink():
     assert proven.columns["t"].max() <= proven.until
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_elastic_stops_end_the_proof_at_the_first_contact():
     proven, motion = (
         certify("impacts", None, 1.0),
