@@ -168,7 +168,7 @@ class _Equations:
         if not all(b.contains_interior(t) for b, t in zip(entries(box), image, strict=True)):
             raise Refused("the posture at the start is not proven to be the only one near")
         q, rate = turned(*image), [arb(0)] * 3
-        if any(x != 0 for x in gamma_dot):
+        if not all(x == 0 for x in gamma_dot):
             legs = self.compile(
                 lambda model, *y: [x for at in kernel.leg_motions(model, y) for x in at.g], MOTION
             )

@@ -121,7 +121,8 @@ class _Kink:
 
     def __mul__(self, other: Any) -> Any:
         numbers = other.coeffs() if isinstance(other, arb_series) else [other]
-        return self if any(isinstance(x, _Kink) or x != 0 for x in numbers) else arb(0)
+        # A ball around zero is neither == 0 nor != 0.
+        return arb(0) if all(not isinstance(x, _Kink) and x == 0 for x in numbers) else self
 
     __rmul__ = __mul__
 

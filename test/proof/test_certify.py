@@ -11,7 +11,7 @@ from sst_ros import InputError, SineTorque, TorqueTable, certify, load_scene, si
 from sst_ros.__main__ import main
 from sst_ros.dynamics.motion_table import JOINTS
 from sst_ros.proof import enclosure
-from sst_ros.proof.enclosure import Region, arb
+from sst_ros.proof.enclosure import Region, arb, arb_series
 
 FREE = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore"}
 SINE = SineTorque(amplitude=(1.0, -0.5, 2.0), frequency=(15.0, 12.0, 20.0), phase=(0.0, 1.0, 0.5))
@@ -197,6 +197,26 @@ def test_nothing_is_said_beyond_a_kink():
     assert "kink" in proven.reason and not proven.success and proven.largest < 1e-12
     assert kink - 1e-6 < proven.until < kink + 1e-15
     assert proven.columns["t"].max() <= proven.until
+
+
+def test_a_range_around_a_rate_of_zero_widens_what_is_proven():
+    scene = load_scene("general").with_values({**FREE, "initial.gamma_dot": (0.0, 0.0, 0.0)})
+    motion, slow = {"t_eval": [0.0, 0.05]}, {"ranges": {"initial.gamma_dot": 1e-4}}
+    wide = certify(scene, SINE, 0.05, **motion, **slow).columns
+    for rate in ((1e-4, -1e-4, 1e-4), (-1e-4, -1e-4, 0.0)):
+        moving = simulate(scene.with_values({"initial.gamma_dot": rate}), SINE, 0.05, **motion)
+        for leg, found in enumerate(moving.gamma_dot.T, 1):
+            name = f"gamma_dot_{leg}"
+            assert (abs(found - wide[name]) <= wide[f"{name}_bound"] + 1e-9).all()
+
+
+@pytest.mark.parametrize("number", [arb(0, 1e-3), 0.5, arb_series([0, 1])])
+def test_only_what_is_exactly_zero_hides_a_kink(number):
+    unknown = enclosure.positive(arb(0, 1))
+    assert (unknown * arb(0), arb_series([0]) * unknown, 0.0 * unknown) == (0, 0, 0)
+    for product in (unknown * number, number * unknown):
+        with pytest.raises(enclosure.Refused, match="kink"):
+            product + 1.0
 
 
 def test_elastic_stops_end_the_proof_at_the_first_contact():
