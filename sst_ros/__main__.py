@@ -6,18 +6,27 @@ from __future__ import annotations
 
 import sys
 
-from sst_ros.nodes import signals
-
 NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command or a node; return the exit status."""
+    """Run a command or a node; return the exit status.
+
+    While modules are imported a SIGINT ends the process of a command at once and in silence: a
+    KeyboardInterrupt there would come out of them as it is, or as an ImportError of numpy's.
+    """
     given = sys.argv[1:] if arguments is None else arguments
-    if given and given[0] in NODES:
-        signals.handle()
     try:
+        from sst_ros.nodes import signals
+
+        if given and given[0] in NODES:
+            signals.handle()
+        elif arguments is None:
+            signals.interrupt(at_once=True)
         from sst_ros.cli.commands import run_command
+
+        if arguments is None:
+            signals.interrupt(at_once=False)
     except KeyboardInterrupt:
         return 130
     return run_command(given)

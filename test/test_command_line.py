@@ -2,6 +2,7 @@
 """The command `sst-ros`: help, names, one line for each error, and its exit status."""
 
 import os
+import signal
 import subprocess
 from pathlib import Path
 
@@ -40,6 +41,29 @@ OPTIONAL = (
 )  # fmt: skip
 
 TOP = [name for name in COMMANDS if " " not in name]
+
+
+INTERRUPTED = """
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "datetime":  # of which NumPy makes an ImportError with a page of advice
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.modules.pop("datetime", None)
+sys.meta_path.insert(0, Interrupt())
+from sst_ros.__main__ import main
+
+sys.argv = ["sst-ros", "workspace", "example2"]
+sys.exit(main())
+"""
+
+
+def test_an_interrupt_while_modules_are_imported_ends_in_silence():
+    told = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    done = python(INTERRUPTED, status=-signal.SIGINT, **told)
+    assert done.stdout == done.stderr == ""
 
 
 def test_alone_it_prints_help_with_every_command_and_node(capsys):

@@ -22,6 +22,13 @@ def handle() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
 
 
+def interrupt(*, at_once: bool) -> None:
+    """Have a SIGINT without a handler end the process at once, or raise KeyboardInterrupt."""
+    usual = signal.SIG_DFL, signal.default_int_handler
+    if signal.getsignal(signal.SIGINT) in usual:  # not ignored, as behind a shell's `&`
+        signal.signal(signal.SIGINT, usual[not at_once])
+
+
 def ignore() -> None:
     """Ignore signals from now on: Python gives up its handlers before it has exited."""
     for number in _NUMBERS:

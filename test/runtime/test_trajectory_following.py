@@ -263,7 +263,7 @@ def test_a_stream_is_followed_without_a_jump_however_long_its_checks_take(
 
 
 def test_control_goes_on_beside_the_check_of_a_trajectory():
-    """With the process that does it: it is stopped for 50 samples, so no check is ever too quick."""
+    """With the process that does it: stopped for 50 samples, no check is too quick."""
     with pytest.MonkeyPatch.context() as patch:
         stream = Stream(patch, 0, mode="computed_torque")
     stream.send(1.0, (0.05, 0.0, 0.0))
