@@ -16,7 +16,6 @@ from pathlib import Path
 from sst_ros.cli.commands import free_out, function
 from sst_ros.errors import InputError, Problem, SstError, refuse_unless, require
 from sst_ros.host import compiled_module, processes
-from sst_ros.host.compiled_module import cache_folder, configured_folder
 from sst_ros.host.output import SUFFIXES, require_free, results_folder
 from sst_ros.integration import compiled_method
 from sst_ros.mechanism import workspace
@@ -89,7 +88,7 @@ def compile_code(options: argparse.Namespace) -> None:
     if compiled_module.numba_version() is None:
         require("numba")
         raise SstError("numba is switched off by SST_ROS_NUMBA=0")
-    if (folder := cache_folder()) != configured_folder():
+    if (folder := compiled_module.cache_folder()) != compiled_module.configured_folder():
         raise SstError("compiled code would not be kept; see the warning above")
     simulated = load(options.scene)
     compiled_method.make_code(simulated, options.integrator)

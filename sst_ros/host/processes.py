@@ -32,21 +32,15 @@ _DOMAINS = 100
 _next = itertools.count(os.getpid())  # what comes later leaves the last ones to end
 
 
-def start(command: str, given: dict[str, object], **more: Any) -> Popen[str]:
-    """Start a node with parameters; it ends when this process does, however that comes."""
-    keep_domain()
-    return Popen(
-        [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)],
-        env={**os.environ, PARENT: str(os.getpid())},
-        text=True,
-        **more,
-    )
-
-
 @contextmanager
 def run_beside(command: str, given: dict[str, object], **more: Any) -> Iterator[Popen[str]]:
-    """Have a node beside a block; it gets SIGINT, and is killed if its end takes 10 s."""
-    with start(command, given, **more) as process:
+    """Have a node with parameters beside a block; it ends when this process does, however.
+
+    Behind the block it gets SIGINT, and is killed if its end takes 10 s.
+    """
+    keep_domain()
+    started = [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)]
+    with Popen(started, env={**os.environ, PARENT: str(os.getpid())}, text=True, **more) as process:
         try:
             yield process
         finally:

@@ -27,7 +27,6 @@ from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.errors import SstError
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker, every
-from sst_ros.nodes.topics import ActionGoal
 from sst_ros.report.results import render
 from sst_ros.runtime.planning import Order
 from sst_ros.runtime.settings import ControllerNodeParameters
@@ -81,17 +80,15 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._seen_ns = 0
         self._refused, self._last_refusal = 0, ""
         self._finished = self._has_heard = False
-        self._active: ActionGoal | None = None
-        self._goal: tuple[TrajectoryGoal, Order] | None = (
-            None  # of the active one, or accepted last
-        )
+        self._active: topics.ActionGoal | None = None
+        self._goal: tuple[TrajectoryGoal, Order] | None = None  # the active one, or accepted last
         render("tracking.txt", found=TrackingMetrics())  # later it would delay the control
         self._feedback: Any = None
         self.connect(own, joint_trajectory=self._replace)
         every(self.node, 1.0, self._report)
         if FollowJointTrajectory is not None:
             name = own["follow_joint_trajectory"].name
-            ActionGoal.serve(
+            topics.ActionGoal.serve(
                 self.node,
                 FollowJointTrajectory,
                 name,
@@ -272,7 +269,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         return GoalResponse.ACCEPT
 
     def _begin(self, handle: Any) -> None:
-        self._active, self._feedback = ActionGoal(handle), None
+        self._active, self._feedback = topics.ActionGoal(handle), None
         if self._goal is not None and not self.follower.has(self._goal[1]):
             self._interrupt("replaced by a newer trajectory")
 

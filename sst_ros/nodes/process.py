@@ -37,7 +37,6 @@ from std_msgs.msg import String
 from sst_ros.errors import Check, InputError, SstError, refuse_unless
 from sst_ros.host.processes import is_orphan
 from sst_ros.nodes import arguments, signals, topics
-from sst_ros.nodes.topics import Endpoint
 from sst_ros.runtime.settings import AnsweringParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.schema import Section, Spec
@@ -166,7 +165,7 @@ class AnsweringWorker(Worker[A]):
     by a fault, or says nothing for longer than the parameter `timeout`.
     """
 
-    def connect(self, own: dict[str, Endpoint], **more: Callable[[Any], None]) -> None:
+    def connect(self, own: dict[str, topics.Endpoint], **more: Callable[[Any], None]) -> None:
         """Publish commands, and listen to topics of its own table, as soon as it can answer."""
         given, self.begun, self.heard_s = self.parameters, False, time.monotonic()
         topic, torques = own["commands_stamped" if given.stamped else "commands"], array("d", ZERO)

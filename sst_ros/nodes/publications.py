@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 import struct
 import time
-from array import array
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -32,7 +31,6 @@ from sst_ros.description.robot import urdf
 from sst_ros.errors import refuse_unless
 from sst_ros.mechanism.generic_math import triple
 from sst_ros.nodes import topics
-from sst_ros.nodes.topics import COUNT_NS
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import JOINTS, MOMENTS
@@ -177,42 +175,34 @@ class TorqueLog:
     def __init__(self, period_ns: int, *, moments: bool = False) -> None:
         self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
         self._period_ns, self._moments = period_ns, moments
-        self._rows = array("d")
         # Each point begins with no positions, velocities and accelerations and the length of a row;
         # the first beginning is part of what stands before the points.
         self._begin = 0, 0, 0, len(self._names)
-        parts = ("row", "<f8", (len(self._names),)), ("time", "<i4", (2,)), ("begin", "<u4", (4,))
-        self._point = np.dtype([*parts])
-        self._lay_out(0)
+        self._point = struct.Struct(f"<{len(self._names)}d2i{len(self._begin)}I")
+        self.clear()
 
     def __len__(self) -> int:
-        return len(self._rows) // len(self._names)
+        return len(self._rows)
 
     def clear(self) -> None:
         """Forget the rows."""
-        self._rows = array("d")
+        self._rows: list[tuple[float, ...]] = []
 
     def append(self, torque: Vector3, moment: Sequence[float], ticks: int = 1) -> None:
         """Log the torque [N m] and the moment [N m] of some ticks."""
-        self._rows.extend(((*torque, *moment) if self._moments else torque) * ticks)
+        self._rows += [(*torque, *moment) if self._moments else torque] * ticks
 
     def take(self, stamp_ns: int) -> bytes:
         """Return the message of the ticks logged since stamp_ns and clear the log."""
-        if len(self) != len(self._points):  # most messages have as many as the one before
-            self._lay_out(len(self))
-        self._points["row"] = np.array(self._rows).reshape(self._points["row"].shape)
+        named = BASE_FRAME, len(self._names), *self._names, len(self)
+        head = _layout(*named, *self._begin) if self._rows else _layout(*named, align=1)
+        ends = (divmod(tick * self._period_ns, NANOSECONDS) for tick in range(1, len(self) + 1))
+        points = b"".join(
+            self._point.pack(*row, *end, *self._begin)
+            for row, end in zip(self._rows, ends, strict=True)
+        )
         self.clear()
-        behind = 4 * len(self._begin)
-        return _ENCAPSULATION + stamp(stamp_ns) + self._head + self._points.tobytes()[:-behind]
-
-    def _lay_out(self, count: int) -> None:
-        """Make what stands before the points and behind each row."""
-        named = BASE_FRAME, len(self._names), *self._names, count
-        self._head = _layout(*named, *self._begin) if count else _layout(*named, align=1)
-        self._points = np.empty(count, self._point)
-        ends = self._period_ns * np.arange(1, count + 1)
-        self._points["time"] = np.stack(np.divmod(ends, NANOSECONDS), axis=1)
-        self._points["begin"] = self._begin
+        return _ENCAPSULATION + stamp(stamp_ns) + head + points[: -4 * len(self._begin)]
 
 
 def follows_clock(node: Node) -> bool:
@@ -278,7 +268,7 @@ class SimulatorTopics:
     @property
     def unread(self) -> bool:
         """Whether nothing receives samples, so that only the last of several has to be made."""
-        self._count_subscribers(COUNT_NS)
+        self._count_subscribers(topics.COUNT_NS)
         return not self._read and self._clock is None
 
     def ticks(self, torque: Vector3, moment: Vector3, count: int) -> None:
@@ -290,7 +280,7 @@ class SimulatorTopics:
         logged = len(self._log)
         if self._measured is not None and not logged:  # the first sample of a run
             self._measured.restart()
-        self._count_subscribers(COUNT_NS if logged else 0)  # the first of a run goes to all
+        self._count_subscribers(topics.COUNT_NS if logged else 0)  # the first of a run goes to all
         y, joints, torque = simulation.sample
         numbers = y[:4], joints, torque
         if self._clock is not None:

@@ -22,7 +22,6 @@ from rosbags import interfaces
 from sst_ros.errors import SstError
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import Worker, every
-from sst_ros.nodes.topics import Endpoint, NeverSpun
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters
 
@@ -130,7 +129,7 @@ class Recorder(Worker[RecorderParameters]):
         else:
             log.info(text, throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
 
-    def _subscribe(self, topic: str, type_name: str, own: Endpoint | None) -> None:
+    def _subscribe(self, topic: str, type_name: str, own: topics.Endpoint | None) -> None:
         if not self._bag.knows(type_name):  # a name that others chose must not get to the import
             text = f"{topic} is not recorded: its type {type_name} is unknown"
             self.node.get_logger().error(text)
@@ -147,7 +146,7 @@ class Recorder(Worker[RecorderParameters]):
         if all(one.reliability == ReliabilityPolicy.RELIABLE for one in offers):
             reliability = ReliabilityPolicy.RELIABLE
         qos = QoSProfile(depth=_DEPTH, durability=durability, reliability=reliability)
-        kind, group = topics.message_type(type_name), NeverSpun()
+        kind, group = topics.message_type(type_name), topics.NeverSpun()
         subscription = self.node.create_subscription(
             kind, topic, lambda _: None, qos, callback_group=group, raw=True
         )

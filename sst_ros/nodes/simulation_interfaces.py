@@ -26,7 +26,6 @@ from sst_ros.errors import AssemblyError
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import angle_between, quaternion_of, rotation_matrix
 from sst_ros.nodes import topics
-from sst_ros.nodes.topics import ActionGoal
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Quaternion, Vector3
 
@@ -71,7 +70,7 @@ def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> None:
         kind = getattr(srv, name.title().replace("_", ""))
         qos = topics.SERVICE_QOS
         node.create_service(kind, f"~/{name}", getattr(answers, name), qos_profile=qos)
-    ActionGoal.serve(node, action.SimulateSteps, "~/simulate_steps", answers.begin_steps)
+    topics.ActionGoal.serve(node, action.SimulateSteps, "~/simulate_steps", answers.begin_steps)
 
 
 class SimulationInterfaces:
@@ -207,7 +206,7 @@ class SimulationInterfaces:
                 handle.publish_feedback(feedback)
             goal.end(answer_with(action.SimulateSteps.Result(), reply), success=reply.success)
 
-        goal = ActionGoal(handle)
+        goal = topics.ActionGoal(handle)
         threading.Thread(target=run, daemon=True).start()
 
     def _actuators(self, quaternion: Quaternion, rate: Vector3) -> tuple[Vector3, Vector3]:

@@ -20,19 +20,16 @@ from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, SstError
 from sst_ros.host import compiled_module, processes
-from sst_ros.host.compiled_module import cache_folder
 from sst_ros.integration import compiled_method
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
-from sst_ros.nodes.topics import Reader
 from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
-from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
 
@@ -57,7 +54,7 @@ class Simulator(Worker[SimulatorParameters]):
         names = ["commands", "commands_stamped"]
         if simulated.moment is not None and simulated.moment.topic:
             names.append("external_moment")
-        readers = [Reader(self.node, topics.SIMULATOR[name]) for name in names]
+        readers = [topics.Reader(self.node, topics.SIMULATOR[name]) for name in names]
         self._input = TorqueInput(run, simulated.actuators, *readers)
         followed = follows_clock(self.node)
         source = FollowedClock(self.node) if followed else SteadyTime()
@@ -223,16 +220,16 @@ class CodeCompiler:
     integrator changes its method.
     """
 
-    def __init__(self, node: Node, scene: Scene, given: SimulatorParameters) -> None:
+    def __init__(self, node: Node, simulated: scene.Scene, given: SimulatorParameters) -> None:
         self._node, self._given = node, given
         self._timer: Timer | None = None
         self.available = False
         log = node.get_logger()
         if compiled_module.numba_version() is None:
             log.info("plain Python: numba is not installed (or SST_ROS_NUMBA=0)")
-        elif compiled_method.code_is_there(scene, given.integrator):
+        elif compiled_method.code_is_there(simulated, given.integrator):
             self.available = True
-            log.info(f"compiled code from {cache_folder()}")
+            log.info(f"compiled code from {compiled_module.cache_folder()}")
         else:
             log.info("plain Python, the same bits but slower: the scene is not compiled yet")
             self._timer = every(node, _DELAY_S, self.start)

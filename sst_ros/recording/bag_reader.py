@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import os
 import sqlite3
 import tempfile
 import zlib
@@ -66,11 +67,7 @@ class Bag:
     """
 
     def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
-        try:
-            there = path.exists()
-        except OSError:  # as of a name that is too long
-            there = False
-        if not there:
+        if not os.path.exists(path):  # noqa: PTH110  # Path's raises where a name is too long
             raise refusal(path, "bag", str(path), "does not exist")
         self.path = path
         self.topics: dict[str, str] = {}  # full names of the topics found, by key
@@ -181,13 +178,14 @@ class Bag:
         return self._channels[channel]
 
     def _not_whole(self, reason: object, where: str = "", advice: str = "") -> InputError:
-        is_database = self.path.suffix == ".db3" or any(self.path.glob("*.db3"))
-        by_sqlite = "sqlite3 FILE .recover | sqlite3 NEW"
-        recovery = by_sqlite if is_database else "python -m sst_ros recover BAG"
-        allowed = "must be a whole rosbag2 recording, MCAP or sqlite3; "
-        allowed += f"reading failed{where}: {_one_line(reason)}; "
-        allowed += f"{recovery} makes a whole one of what is intact"
-        return refusal(self.path, "bag", self.path.name, allowed + advice)
+        sqlite = self.path.suffix == ".db3" or any(self.path.glob("*.db3"))
+        by = "sqlite3 FILE .recover | sqlite3 NEW" if sqlite else "python -m sst_ros recover BAG"
+        allowed = (
+            "must be a whole rosbag2 recording, MCAP or sqlite3; "
+            f"reading failed{where}: {_one_line(reason)}; "
+            f"{by} makes a whole one of what is intact{advice}"
+        )
+        return refusal(self.path, "bag", self.path.name, allowed)
 
 
 @dataclass
