@@ -260,17 +260,9 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
-_RECORD = ("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard")
-EXTRAS = {
-    **{"distributed": "cluster", "matplotlib": "plot", "numba": "fast", "pinocchio": "engines"},
-    **{
-        "control": "control",
-        "flint": "proof",
-        "viser": "view",
-        "xarray": "all",
-        **dict.fromkeys(_RECORD, "record"),
-    },
-}
+EXTRAS = dict.fromkeys(("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard"), "record")
+EXTRAS |= {"distributed": "cluster", "matplotlib": "plot", "numba": "fast", "pinocchio": "engines"}
+EXTRAS |= {"control": "control", "flint": "proof", "viser": "view", "xarray": "all"}
 """Extra of this package that installs a module."""
 
 _APT = ("lz4", "matplotlib", "numba", "pandas", "xarray", "zstandard")

@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -41,10 +41,8 @@ class Given(dict[str, str]):
     Those end together, and nothing else of a launch that includes this one does.
     """
 
-    def __init__(self, values: Mapping[str, str]) -> None:
-        super().__init__(values)
-        self.partners: list[Action] = []
-        self.ending = False
+    partners: Sequence[Action] = ()
+    ending = False
 
 
 class Default(str):
@@ -105,8 +103,8 @@ def description(
             chosen["output"] = Default("_".join(words))
         for name in every.keys() - given:
             del values[name]  # the next file that is included has defaults of its own
-        chosen.partners = actions(chosen)
-        return chosen.partners
+        chosen.partners = made = actions(chosen)
+        return made
 
     def note(context: LaunchContext) -> None:
         given.update(context.launch_configurations)
@@ -161,10 +159,6 @@ def _node(given: Given, package: str, executable: str = "", ends: bool = True, *
     )
 
 
-def _in_namespace(given: Given, topic: str) -> str:
-    return ("/" + given["namespace"].strip("/")).rstrip("/") + topic
-
-
 def simulator(given: Given, parameters: Mapping[str, str], *, recorded: bool) -> Node:
     """Describe a simulator, which does not start its run before it is recorded."""
     waits = {"wait_for_subscribers": ",".join(topics.SAMPLED), "subscriber_timeout": WAIT_S}
@@ -173,8 +167,8 @@ def simulator(given: Given, parameters: Mapping[str, str], *, recorded: bool) ->
 
 def recorder(given: Given) -> Action:
     """Describe what records the topics of config/topics.txt into `output`."""
-    shared = topics.SIMULATOR["diagnostics"].name
-    names = {t: t if t == shared else _in_namespace(given, t) for t in default_topics()}
+    shared, prefix = topics.SIMULATOR["diagnostics"].name, given["namespace"].rstrip("/")
+    names = {t: t if t == shared else prefix + t for t in default_topics()}
     if given["bag"] == "sst":
         recorded = {"output": given["output"], "topics": ",".join(names.values())}
         return node(given, "recorder", recorded)
@@ -236,7 +230,7 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
         types = [given_there[name].get("type", "") for name in spawned if name in given_there]
         names += [plugin.partition("/")[0] for plugin in types if plugin]
     require(*names)
-    topics_there = [_in_namespace(given, topic) for topic in TOPICS]
+    topics_there = [given["namespace"].rstrip("/") + topic for topic in TOPICS]
     words = [*spawned, "--param-file", path, "--switch-timeout", WAIT_S]  # /clock may come late
     timed: dict[str, Any] = {"use_sim_time": lockstep}
     if lockstep:  # an update for each sample
@@ -265,8 +259,7 @@ def require(*packages: str) -> None:
     if missing := [package for package in packages if package not in installed]:
         distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
         apt = " ".join(f"ros-{distribution}-{name.replace('_', '-')}" for name in missing)
-        text = f"this needs the ROS package(s) {', '.join(missing)}: apt install {apt}"
-        raise RuntimeError(text)
+        raise RuntimeError(f"this needs the ROS package(s) {', '.join(missing)}: apt install {apt}")
 
 
 def _exit_handler(
@@ -280,9 +273,8 @@ def _exit_handler(
     def handle(event: ProcessExited, context: LaunchContext) -> list[Action] | None:
         over = given.ending or context.is_shutdown
         failed = event.returncode and not (over and event.returncode == -signal.SIGINT)
-        if (
-            failed
-        ):  # launch takes its status from this handler, or from an exception, which ends all
+        if failed:
+            # launch takes its status from this handler, or from an exception, which ends all
             text = f"{name} failed with exit status {event.returncode}"
             context.asyncio_loop.call_exception_handler({"message": text})
         if over or not (failed or ends):

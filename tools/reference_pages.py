@@ -27,7 +27,7 @@ from sst_ros.nodes import arguments, inverse_dynamics, simulation_interfaces, to
 from sst_ros.nodes.topics import CALLS, EXECUTES, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
 from sst_ros.report.results import markdown
-from sst_ros.runtime import diagnostics
+from sst_ros.runtime import run_loop
 from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import REQUIRED, Section, Spec
@@ -136,7 +136,7 @@ def _default(value: Any) -> str:
 def nodes_tables() -> Iterator[tuple[str, str]]:
     """Yield the parts of docs/nodes.md: name and text."""
     for name, keys in (
-        ("diagnostics", diagnostics.KEYS),
+        ("diagnostics", run_loop.KEYS),
         ("inverse_dynamics diagnostics", inverse_dynamics.KEYS),
     ):
         yield name, _table(("key", "what"), ((f"`{key}`", text) for key, text in keys.items()))

@@ -26,7 +26,7 @@ from sst_ros.errors import SstError
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.view.scene_drawing import SceneDrawing
+from sst_ros.view.page import SceneDrawing
 from sst_ros.view.server import PageServer
 from sst_ros.view.source import ViewState, run_simulator
 from tools.browser import Browser, browse

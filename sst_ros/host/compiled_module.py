@@ -35,9 +35,6 @@ from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
 def vector(n):
     return [0.0] * n
 
-def square(n):
-    return [[0.0] * n for _ in range(n)]
-
 def rows(m, n):
     return [[0.0] * n for _ in range(m)]
 
@@ -59,10 +56,6 @@ jit_inline = numba.njit(**options, no_cpython_wrapper=True, inline="always")
 @jit_inner
 def vector(n):
     return np.zeros(n)
-
-@jit_inner
-def square(n):
-    return np.zeros((n, n))
 
 @jit_inner
 def rows(m, n):

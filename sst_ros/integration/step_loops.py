@@ -191,7 +191,7 @@ def attempt_linearly_implicit(t, h, y, near, d, p, new_y, error):
     at `near`: y itself, or for the second solution the first one, which is near. Beside a kink of a
     force the two may lie on different sides; the Jacobian is that of the first one.
     """
-    matrix = square(SIZE)
+    matrix = rows(SIZE, SIZE)
     slope = vector(SIZE)
     by_time = vector(SIZE)
     pivot = vector(SIZE)

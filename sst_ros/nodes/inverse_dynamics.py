@@ -28,11 +28,11 @@ from sst_ros.errors import SstError
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker, every
 from sst_ros.report.results import render
-from sst_ros.runtime.planning import Order
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.runtime.trajectory_following import (
     ErrorCode,
+    Order,
     Stage,
     TrajectoryFollower,
     TrajectoryGoal,

@@ -24,8 +24,7 @@ from sst_ros.integration import compiled_method
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
-from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
-from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
+from sst_ros.runtime.run_loop import Phase, Reply, RunDiagnostics, RunLoop, read_gauges
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer, SteadyTime
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
@@ -123,18 +122,15 @@ class Simulator(Worker[SimulatorParameters]):
         if thread is None or not self._thread.is_alive():
             return
         paced, running = given.real_time_factor > 0.0, self._loop.phase is Phase.RUNNING
-        before = shown.scheduling, shown.cpu_dma_latency
         try:
-            shown.scheduling = processes.schedule(given.realtime_priority if paced else 0, thread)
+            scheduling = processes.schedule(given.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
             return
-        latency_us = given.cpu_dma_latency if paced and running else -1
-        shown.cpu_dma_latency = self._latency.request(latency_us)
-        words = "scheduling of the run", "exit latency of idle states"
-        now = shown.scheduling, shown.cpu_dma_latency
-        for what, old, new in zip(words, before, now, strict=True):
-            if new != old:
-                self.node.get_logger().info(f"{what}: {new}")
+        latency = self._latency.request(given.cpu_dma_latency if paced and running else -1)
+        granted = {"scheduling": scheduling, "cpu_dma_latency": latency}
+        for what in (key for key in granted if granted[key] != shown.granted[key]):
+            self.node.get_logger().info(f"{what}: {granted[what]}")
+        shown.granted = granted
 
     def _read_gauges(self) -> None:
         self._diagnostics.gauges = read_gauges(self._loop.simulation, self._loop.held)

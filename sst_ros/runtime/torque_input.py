@@ -222,7 +222,7 @@ def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3
         allowed = ", ".join(ACTUATORS)
         reason = f"names {list(names)[:6]} must be {allowed}, each once"
         raise MessageRefused("wrong names", reason)
-    if len(values) != 3:
-        raise MessageRefused("wrong size", f"{list(values)[:6]} must be 3 finite {what}")
-    at = dict(zip(names, values, strict=True))
-    return three_numbers([at[name] for name in ACTUATORS], what)
+    if len(values) == 3:
+        at = dict(zip(names, values, strict=True))
+        values = [at[name] for name in ACTUATORS]
+    return three_numbers(values, what)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory following: the motion, when it began, its commands and its tracking error.
+"""Trajectories of messages: their points, a motion through them or a refusal, and following it.
 
 The rules of goals are those of ros2_controllers' joint_trajectory_controller: tolerances of the
 path hold until the time of the last point, those of the goal from then on.
@@ -11,10 +11,11 @@ import dataclasses
 import math
 from array import array
 from bisect import bisect_right
+from concurrent.futures import Future
 from enum import Enum, IntEnum
 from functools import partial
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,14 +23,13 @@ from sst_ros.control.actuator_space import Reference, ReferenceMotion, slow_down
 from sst_ros.control.controller import Controller, Measurement
 from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
-from sst_ros.control.reference_motions import reference_motion
+from sst_ros.control.reference_motions import reference_motion, through_points
 from sst_ros.control.tracking import TrackingMetrics, track_of
 from sst_ros.errors import Check, SstError, refusal, refuse_unless
 from sst_ros.host.processes import Assistant
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
-from sst_ros.runtime.planning import Order, plan, read_points
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.loads import Actuators
@@ -42,6 +42,79 @@ _FIRST_PERIODS_AHEAD = 25
 """Control periods that the first check may take where the reference moves; then twice the last."""
 _MOST_CHECKS = 5
 _NUMBERS = 256 * 19  # numbers of samples, 19 each, that are added to the tracking metrics at once
+
+
+class Points(NamedTuple):
+    """Points of a trajectory_msgs/JointTrajectory: rows in the order of the legs."""
+
+    stamp_ns: int  # when it begins; 0 for at once
+    times: list[float]  # from then on [s]
+    rows: tuple[list[list[float]], ...]  # positions, velocities, accelerations; empty where open
+
+
+def read_points(message: Any) -> Points:
+    """Read a trajectory_msgs/JointTrajectory; its joints may come in any order.
+
+    Positions are needed, velocities and accelerations may be left out. An InputError lists faults;
+    `plan` finds those of the numbers.
+    """
+    names, stamp_ns = list(message.joint_names), nanoseconds(message.header.stamp)
+    one_each = f"must be {', '.join(ACTUATORS)}, each once"
+    refuse_unless(
+        "joint_trajectory",
+        ("joint_names", names, sorted(names) == list(ACTUATORS), one_each),
+        *(
+            (f"points[{i}].effort", [*at.effort], not at.effort, "must be left out: it is computed")
+            for i, at in enumerate(message.points)
+        ),
+    )
+    places = [names.index(name) for name in ACTUATORS]
+
+    def by_leg(quantity: str) -> list[list[float]]:
+        """Sort by leg what is whole; what is not is refused as it is."""
+        rows = [list(map(float, getattr(point, quantity))) for point in message.points]
+        return [[row[k] for k in places] if len(row) == len(places) else row for row in rows]
+
+    times = [nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points]
+    return Points(stamp_ns, times, tuple(map(by_leg, ("positions", "velocities", "accelerations"))))
+
+
+def plan(model: Scene, points: Points, begin: Reference, passed: float) -> ReferenceMotion:
+    """Return the motion from a reference, which may be moving, through points; it is checked.
+
+    `passed` is the time of the trajectory at which it begins [s]. Points that lie before, and one
+    at time 0 where the reference moves, are passed already. An InputError lists every fault;
+    MotionRefused and SingularConfiguration say why the motion cannot be followed.
+    """
+    times, rows = points.times, list(points.rows)
+    if passed > 0.0 or any((*begin.gamma_dot, *begin.gamma_ddot)):
+        ahead = [index for index, time in enumerate(times) if time > passed]
+        late = f"must lie less than {max(times, default=0.0):g} s back: all points have passed"
+        refuse_unless("joint_trajectory", ("header.stamp", points.stamp_ns, bool(ahead), late))
+        times = [times[index] - passed for index in ahead]
+        rows = [[row[index] for index in ahead] for row in rows]
+    geometry, going = Geometry.of(model), (begin.gamma_dot, begin.gamma_ddot)
+    motion = through_points(geometry, begin.quaternion, times, rows[0], rows[1], rows[2], going)
+    check_motion(motion, model)
+    return motion
+
+
+class Order:
+    """A trajectory between its message and its motion.
+
+    Attributes:
+        outcome: a result where the trajectory is accepted, else the SstError that says why not;
+            cancelled where a newer one came before this was checked.
+        passed: time of the trajectory at which its motion begins [s].
+
+    """
+
+    def __init__(self, points: Points, seen: Measurement | None, seen_ns: int) -> None:
+        self.points, self.seen, self.seen_ns = points, seen, seen_ns
+        self.outcome: Future[None] = Future()
+        self.passed, self.asked, self.asked_ns = 0.0, 0, 0  # checks, and the sample at the last one
+        self.begin: Reference | None = None  # the reference from which it was planned
+        self.begin_ns: int | None = None  # of that; None where it stands still until then
 
 
 class ErrorCode(IntEnum):
@@ -228,7 +301,7 @@ class TrajectoryFollower:
                         self._follow(order, self._plan(*given))
                         continue
                 except SstError as error:
-                    order.refuse(error)
+                    order.outcome.set_exception(error)
                     continue
                 self._assistant.call(*given)
                 self._checked = order
@@ -263,21 +336,22 @@ class TrajectoryFollower:
         if isinstance(result, ReferenceMotion) and self._is_timely(order):
             self._follow(order, result)
         elif isinstance(result, SstError):
-            order.refuse(result)
+            order.outcome.set_exception(result)
         elif self._waiting is not None:
             order.outcome.cancel()
         elif order.asked == _MOST_CHECKS:
-            order.refuse(SstError(f"checked too late {_MOST_CHECKS} times, on a busy machine"))
+            late = f"checked too late {_MOST_CHECKS} times, on a busy machine"
+            order.outcome.set_exception(SstError(late))
         else:
             self._waiting = order
 
     def _is_timely(self, order: Order) -> bool:
-        if self._last is None or order.begin is None:
-            return self._last is None and order.asked_ns == 0
+        if self._last is None:
+            return True
         if order.begin_ns is None:
             return self._rests() and order.begin == self._motion.at(math.inf)
-        late = order.begin_ns < self._last_ns
-        return not late and order.begin == self._reference_at(order.begin_ns)
+        begin = self._reference_at(order.begin_ns)
+        return order.begin_ns >= self._last_ns and order.begin == begin
 
     def has(self, order: Order) -> bool:
         """Whether the trajectory is followed, or will be at its stamp."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: a picture by viser, numbers, plots and controls, some thirty times a second."""
+"""The page: a picture by viser, numbers, plots and controls, some thirty times a second.
+
+The picture has seven links that rotate about O, the path of E, s, and torques.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,21 @@ import threading
 import time
 import webbrowser
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from viser import GuiButtonHandle, GuiSliderHandle, GuiUplotHandle, Icon, uplot
+import trimesh
+import viser
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from sst_ros.description.robot import LEG_COLOURS
+from sst_ros.description import robot
 from sst_ros.host.output import load_templates
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
-from sst_ros.view.scene_drawing import ROOT, SceneDrawing
-from sst_ros.view.server import LOCAL, PORT, PageServer
+from sst_ros.view.server import PageServer
 from sst_ros.view.source import Replay, RunControl, ViewState
 
 PERIOD_S = 1.0 / 30.0
@@ -32,9 +37,18 @@ _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
 _REFUSAL_S = 4.0
 _WINDOW_S = 10.0
 _POINTS = 500
-_COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in LEG_COLOURS)
+_COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in robot.LEG_COLOURS)
 _BRAND = (0, 114, 178)
 _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
+
+PATH_POINTS = 400
+_POINT_PERIOD_S = 0.008
+_PATH_S = 4.0
+_LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
+"""The path lies a little outside the star, which would hide it; newer parts above older ones."""
+_OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
+ROOT = "/manipulator"
+_SIDES = 20  # corners of an arc's cross-section
 
 _PANEL: Any = load_templates("view").get_template("panel.html").module
 
@@ -45,7 +59,7 @@ class Page:
     Raises as `PageServer`.
     """
 
-    def __init__(self, source: RunControl | Replay, host: str = LOCAL, port: int = PORT) -> None:
+    def __init__(self, source: RunControl | Replay, host: str, port: int) -> None:
         self._source = source
         self._server = PageServer(host, port)
         self.url = self._server.url
@@ -165,9 +179,9 @@ class Page:
         self._show_controls(phase, at)
 
 
-def _plot(server: PageServer, label: str, range_: tuple[float, float]) -> GuiUplotHandle:
+def _plot(server: PageServer, label: str, range_: tuple[float, float]) -> viser.GuiUplotHandle:
     """Add a plot of three legs whose axis shows a range at least."""
-    lines: list[uplot.Series] = [{"label": "t [s]"}]
+    lines: list[viser.uplot.Series] = [{"label": "t [s]"}]
     for k, colour in zip("₁₂₃", _COLOURS, strict=True):
         lines.append({"label": f"{label[0]}{k}", "stroke": colour, "width": 2.0})
     low, high = ({"soft": value, "mode": 1, "pad": 0.1} for value in range_)
@@ -190,13 +204,13 @@ def _add_run_controls(
     """
     gui, most = server.gui, scene.torque_limit or _LARGEST_TORQUE
     with gui.add_folder("run", order=1.0):
-        pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
-        step = gui.add_button("Step", icon=Icon.PLAYER_SKIP_FORWARD, disabled=True)
-        reset = gui.add_button("Reset", icon=Icon.REFRESH)
+        pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        step = gui.add_button("Step", icon=viser.Icon.PLAYER_SKIP_FORWARD, disabled=True)
+        reset = gui.add_button("Reset", icon=viser.Icon.REFRESH)
     with gui.add_folder("manual torques [N m]", order=5.0):
         note = gui.add_html("")
         sliders = [gui.add_slider(f"τ{k}", -most, most, most / 100.0, 0.0) for k in "₁₂₃"]
-        zero = gui.add_button("Zero", icon=Icon.CIRCLE_OFF)
+        zero = gui.add_button("Zero", icon=viser.Icon.CIRCLE_OFF)
 
     def ask(event: Any) -> None:
         """Ask for what a button says, and notify the client of a refusal."""
@@ -241,7 +255,7 @@ def _add_replay_controls(server: PageServer, replay: Replay) -> Callable[[str, f
     """Add play, a time slider, and the speed of a recording; the function returned moves them."""
     gui = server.gui
     with gui.add_folder("recording", order=1.0):
-        play = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
+        play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         slider = gui.add_slider("t [s]", 0.0, replay.length, replay.length / 1000.0, 0.0)
         speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1 ×")
 
@@ -262,10 +276,139 @@ def _add_replay_controls(server: PageServer, replay: Replay) -> Callable[[str, f
     return show
 
 
-def _name(button: GuiButtonHandle, label: str) -> None:
+def _name(button: viser.GuiButtonHandle, label: str) -> None:
     button.label = label
-    button.icon = Icon.PLAYER_PAUSE if label == "Pause" else Icon.PLAYER_PLAY
+    button.icon = viser.Icon.PLAYER_PAUSE if label == "Pause" else viser.Icon.PLAYER_PLAY
 
 
-def _move(slider: GuiSliderHandle[float], value: float) -> None:
+def _move(slider: viser.GuiSliderHandle[float], value: float) -> None:
     slider.value = value  # type: ignore[misc]  # its setter does not follow its getter at once
+
+
+class SceneDrawing:
+    """One scene as drawn, in nodes below ROOT."""
+
+    def __init__(self, server: viser.ViserServer, scene: Scene) -> None:
+        self._server, self._scene, self._geometry = server, scene, Geometry.of(scene)
+        self._joints = robot.joints_of(self._geometry)
+        self._frames = {}
+        for link, drawn in robot.shapes(scene).items():
+            self._frames[link] = server.scene.add_frame(f"{ROOT}/{link}", show_axes=False)
+            for index, shape in enumerate(drawn):
+                add_shape(server, f"{ROOT}/{link}/{index}", shape)
+        self._size = size = max(scene.base.radius, scene.star.radius)
+        self._add_labels()
+        self._points: deque[tuple[float, Array]] = deque(maxlen=PATH_POINTS)
+        self._last = -np.inf
+        fade = np.linspace(0.0, 1.0, PATH_POINTS)[:, None]
+        colours = (1.0 - fade) * _OLD + fade * _NEW
+        self._path = server.scene.add_line_segments(
+            f"{ROOT}/path",
+            np.zeros((PATH_POINTS - 1, 2, 3)),
+            np.stack([colours[:-1], colours[1:]], axis=1),
+            thickness=0.016 * size,
+        )
+        outward = scene.star.radius * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.28]])
+        self._add_arrow(f"{robot.STAR}/s", outward, robot.STAR_COLOUR, (0.010, 0.028, 0.075))
+        self._torques = [
+            self._add_arrow(f"torque_{k}", np.zeros((2, 3)), colour, (0.014, 0.040, 0.090))
+            for k, colour in enumerate(robot.LEG_COLOURS, 1)
+        ]
+        for arrow in self._torques:
+            arrow.visible = False
+        self._largest_torque = 1.0
+
+    def add(self, time: float | None, angles: Mapping[str, float]) -> None:
+        """Add E at a time [s] and joint angles [rad] to the path.
+
+        A time that goes back begins a new path, and so does None: there is no run.
+        """
+        if time is None or time < self._last:
+            self._points.clear()
+            self._last = -np.inf
+        if time is not None and time - self._last >= _POINT_PERIOD_S:
+            self._last = time
+            star = robot.rotations(self._joints[:3], angles)[robot.STAR]
+            self._points.append((time, self._scene.star.radius * star[:, 2]))
+            while self._points[0][0] < time - _PATH_S:
+                self._points.popleft()
+
+    def show(self, angles: Mapping[str, float], torque: Sequence[float]) -> None:
+        """Move everything to joint angles [rad], and show torques [N m], shape (3,)."""
+        found = robot.rotations(self._joints, angles)
+        for link, frame in self._frames.items():
+            frame.wxyz = wxyz(found[link])
+        end = self._scene.star.radius * found[robot.STAR][:, 2]
+        points = np.array([*(point for _, point in self._points), end])[-PATH_POINTS:]
+        points = np.concatenate([np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points])
+        points *= _LIFT
+        self._path.points = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+        # tau_k along w_k, outwards where positive; the largest yet has full length
+        self._largest_torque = max(self._largest_torque, *map(abs, torque))
+        for arrow, tau, w in zip(self._torques, torque, self._geometry.w, strict=True):
+            length = 0.45 * self._size * abs(tau) / self._largest_torque
+            visible = length > 0.01 * self._size
+            if visible:
+                foot = 1.17 * self._scene.base.radius
+                ends = np.array([foot * w, (foot + length) * w])
+                arrow.points = (ends if tau > 0.0 else ends[::-1]).astype(np.float32)[None]
+            arrow.visible = visible
+
+    def _add_arrow(
+        self, name: str, ends: Array, colour: ArrayLike, sizes: tuple[float, float, float]
+    ) -> viser.ArrowsHandle:
+        """Add an arrow between two points; sizes of shaft and head are parts of the largest link's.
+
+        viser takes linear colours for arrows, and sRGB for all else.
+        """
+        shaft, head, length = (self._size * size for size in sizes)
+        linear = np.asarray(colour, dtype=float) ** 2.2
+        given: Any = {"shaft_radius": shaft, "head_radius": head, "head_length": length}
+        return self._server.scene.add_arrows(f"{ROOT}/{name}", ends[None], linear, **given)
+
+    def _add_labels(self) -> None:
+        """Name the vertices P_k of the base triangle, on its outer side, and E."""
+        v = self._geometry.v
+        outwards = v - v.mean(axis=0)
+        outwards /= np.linalg.norm(outwards, axis=1)[:, None]
+        points = self._scene.base.radius * (v + 0.13 * outwards)
+        end = self._scene.star.radius * np.array([0.0, 0.0, 1.36])
+        places = [(f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at) for k, at in enumerate(points, 1)]
+        for name, text, at in (*places, (f"{robot.STAR}/E", "E", end)):
+            self._server.scene.add_label(
+                f"{ROOT}/{name}", text, position=at, anchor="center-center", font_screen_scale=2.0
+            )
+
+
+def add_shape(server: viser.ViserServer, name: str, shape: robot.Shape) -> None:
+    """Add a shape to viser's scene under a name."""
+    scene = server.scene
+    if isinstance(shape, robot.Ball):
+        scene.add_icosphere(
+            name, shape.radius, shape.colour, position=shape.centre,
+            subdivisions=3 if shape.radius < 0.1 else 20,  # of an edge of the icosahedron
+            opacity=shape.opacity if shape.opacity < 1.0 else None,
+        )  # fmt: skip
+    elif isinstance(shape, robot.Box):
+        scene.add_box(name, shape.colour, shape.size, position=shape.centre)
+    elif isinstance(shape, robot.Arc):
+        turns = 2.0 * np.pi * np.arange(_SIDES + 1) / _SIDES
+        outline = np.stack([np.cos(turns), np.sin(turns)], axis=1) * shape.thickness
+        mesh = trimesh.creation.revolve(
+            outline + np.array([shape.radius, 0.0]), angle=shape.angle, sections=len(shape.points())
+        )
+        frame = np.stack([shape.begin, np.cross(shape.axis, shape.begin), shape.axis], axis=1)
+        scene.add_mesh_simple(name, mesh.vertices @ frame.T, mesh.faces, color=shape.colour)
+        for index, end in enumerate(shape.points()[[0, -1]]):
+            add_shape(server, f"{name}/{index}", robot.Ball(end, shape.thickness, shape.colour))
+    else:
+        along = shape.end - shape.begin
+        middle, length = (shape.begin + shape.end) / 2.0, float(np.linalg.norm(along))
+        turn = wxyz(Rotation.align_vectors(along, [0.0, 0.0, 1.0])[0].as_matrix())
+        size = shape.thickness, length
+        scene.add_cylinder(name, *size, shape.colour, position=middle, wxyz=turn)
+
+
+def wxyz(rotation: Array) -> Array:
+    """Quaternion (w, x, y, z), as viser takes it, of a rotation matrix."""
+    return np.roll(quaternion_of(rotation), 1)

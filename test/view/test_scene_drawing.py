@@ -12,7 +12,7 @@ from sst_ros.description.robot import BASE, STAR, Arc, Ball, Box, Rod, shapes
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.view.scene_drawing import ROOT, SceneDrawing, add_shape
+from sst_ros.view.page import ROOT, SceneDrawing, add_shape
 from sst_ros.view.source import ViewState
 
 RED = (1.0, 0.0, 0.0)
