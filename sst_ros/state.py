@@ -120,12 +120,11 @@ class State(Explained):
         return cls(time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), by_kind, torque)
 
     def _facts(self) -> dict[str, object]:
-        kinds = ("gamma", "mu", "beta")
         return {
             "time [s]": self.time_ns / NANOSECONDS,
             "quaternion": self.quaternion,
             "body_rate [rad/s]": self.body_rate,
-            **{f"{kind} [rad]": getattr(self.joints, kind) for kind in kinds},
+            **{f"{kind} [rad]": getattr(self.joints, kind) for kind in ("gamma", "mu", "beta")},
             "gamma_dot [rad/s]": self.joints.gamma_dot,
             "torque [N m]": self.torque,
         }

@@ -143,8 +143,7 @@ def _on_cluster(
         """Take a worker out of the cluster, and say so once: else job after job fails on it."""
         if worker not in faults:
             faults[worker] = fault
-            text = f"worker {worker} gets no more {name}s: {fault}"
-            print(text, file=sys.stderr, flush=True)
+            print(f"worker {worker} gets no more {name}s: {fault}", file=sys.stderr, flush=True)
             client.retire_workers([worker])
 
     failed: dict[int, str] = {}
@@ -171,8 +170,7 @@ def _on_worker(number: int, work: bytes, versions: str) -> Any:
             function, jobs = _unpickle(work)
         return function(jobs[number])
     except (OSError, ImportError) as error:
-        address = require("distributed").get_worker().address
-        raise UnfitWorker(str(address), str(error)) from None
+        raise UnfitWorker(str(require("distributed").get_worker().address), str(error)) from None
 
 
 _unpickle = lru_cache(maxsize=1)(pickle.loads)  # where the versions are known to be the sender's

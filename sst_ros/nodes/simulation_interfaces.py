@@ -214,8 +214,7 @@ class SimulationInterfaces:
 
         At a serial singularity an ArithmeticError is raised.
         """
-        matrix = rotation_matrix(quaternion)
-        x, y, z = (matrix.T @ rate).tolist()
+        x, y, z = (rotation_matrix(quaternion).T @ rate).tolist()
         at = self._space.of_star(quaternion, (x, y, z), ZERO)
         assembly = kinematics.admissible(self._space.geometry, at.gamma)
         if not angle_between(quaternion_of(assembly.rotation), quaternion) < _SAME:

@@ -144,8 +144,7 @@ class Simulator(Worker[SimulatorParameters]):
         level, text, news = self._diagnostics.status(values, [*self._warnings(commands)])
         for line in news:
             self.node.get_logger().warning(line)
-        message = topics.diagnostics(self.node, "run", level, text, values)
-        self._topics.diagnostics.publish(message)
+        self._topics.diagnostics.publish(topics.diagnostics(self.node, "run", level, text, values))
         gc.collect()  # the garbage since `quiet`
         if self._loop.phase is not Phase.FINISHED:
             self._loop.post(self._read_gauges)

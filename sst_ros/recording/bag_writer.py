@@ -54,8 +54,7 @@ class _McapStorage:
         self._channels[connection.id] = self._writer.register_channel(*named)
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        channel = self._channels[connection.id]
-        self._writer.add_message(channel, timestamp, bytes(data), timestamp)
+        self._writer.add_message(self._channels[connection.id], timestamp, bytes(data), timestamp)
 
     def flush(self) -> None:
         self._writer.flush()

@@ -245,8 +245,7 @@ class RunLoop(TickLoop):
             return Reply(False, f"refused: pause or reset first, the run is {self._status}")
         try:
             initial = Initial(gamma=gamma, gamma_dot=gamma_dot)
-            scene = dataclasses.replace(self._original.scene, initial=initial)
-            self.restart(self._build(scene))
+            self.restart(self._build(dataclasses.replace(self._original.scene, initial=initial)))
         except SstError as error:
             return Reply(False, f"refused: {error}")
         self.warm_up()

@@ -220,8 +220,7 @@ def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3
     """Return one value for each actuator, gamma_1 to gamma_3, which may come in any order."""
     if sorted(names) != list(ACTUATORS):
         allowed = ", ".join(ACTUATORS)
-        reason = f"names {list(names)[:6]} must be {allowed}, each once"
-        raise MessageRefused("wrong names", reason)
+        raise MessageRefused("wrong names", f"names {list(names)[:6]} must be {allowed}, each once")
     if len(values) == 3:
         at = dict(zip(names, values, strict=True))
         values = [at[name] for name in ACTUATORS]

@@ -350,8 +350,7 @@ class TrajectoryFollower:
             return True
         if order.begin_ns is None:
             return self._rests() and order.begin == self._motion.at(math.inf)
-        begin = self._reference_at(order.begin_ns)
-        return order.begin_ns >= self._last_ns and order.begin == begin
+        return order.begin_ns >= self._last_ns and order.begin == self._reference_at(order.begin_ns)
 
     def has(self, order: Order) -> bool:
         """Whether the trajectory is followed, or will be at its stamp."""
