@@ -12,14 +12,15 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from benchmark.measure import DOCS
 from sst_ros.host.figures import BLUE, GREY, INK, save_figure, styled
-from sst_ros.identification.measured_motion import take_readings
-from sst_ros.identification.simulation_fit import FittedMotion, describe_combination
-from sst_ros.mechanism.geometry import Array
+from sst_ros.identification.identify import describe_combination
+from sst_ros.mechanism.geometry import Array, rotation_matrix, zyz_angles
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import find_number
+from sst_ros.simulation.simulate import simulate
 
 ERROR = math.radians(1.0)
 READINGS = 26
@@ -34,6 +35,7 @@ INERTIAS = {
     "intermediate_links.inertia.yy": "I_{p,yy}",
     "intermediate_links.inertia.zz": "I_{p,zz}",
 }
+ZYZ = "theta", "phi", "psi"
 RATE = {"initial.gamma_dot": r"\dot{\gamma}"}
 PANELS = (
     ("Fig. 9: ψ of Example 1; the initial rate is lost as well", "example1", ("psi",), True),
@@ -45,18 +47,30 @@ LEAST, MOST = 1e-3, 1e2
 
 
 def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str], Array]:
-    """Return the combinations of an example's lost numbers, and their relative deviations."""
+    """Return the combinations of an example's lost numbers, and their relative deviations.
+
+    Readings are of ZYZ angles, or of coordinates of E, whose error is that of an angle by the
+    radius.
+    """
     scene = load(name)
     words = INERTIAS | (RATE if rate else {})
-    names = tuple(words)
     t = np.linspace(0.0, scene.duration or 1.0, READINGS + 1)[1:]
-    lengths = ERROR * (scene.star.radius if "x" in read else 1.0)
-    data = {"t": t, "deviation": lengths} | {key: np.zeros(READINGS) for key in read}
-    torque, found = take_readings(data, scene)
-    motion = FittedMotion(scene, names, torque)
-    values = np.array([find_number(scene, key) for key in names], dtype=float)
-    _, slopes = motion.compare(values, found)
-    _, singular, rows = np.linalg.svd(slopes * values)
+    motion = simulate(scene, t_eval=t, sensitivities=[*words])
+    rotation = rotation_matrix(motion.quaternion)
+    if read == ("x", "y", "z"):
+        by_turn = rotation @ np.cross(np.eye(3), [0.0, 0.0, 1.0]).T  # of R z by turns in {E}
+    else:
+        h = 1e-5  # of central differences [rad]: rounding and truncation are below 1e-9
+        turns = Rotation.from_rotvec(h * np.vstack([np.eye(3), -np.eye(3)])).as_matrix()
+        ahead, back = np.split(zyz_angles(rotation[:, None] @ turns), 2, axis=1)
+        angles = np.angle(np.exp(1j * (ahead - back))).swapaxes(1, 2) / (2.0 * h)
+        by_turn = angles[:, [ZYZ.index(key) for key in read]]
+    # All legs alike: derivatives add up.
+    slopes = np.stack(
+        [find_number(scene, key) * motion.sensitivities[key].rotation.sum(axis=2) for key in words],
+        axis=2,
+    )
+    _, singular, rows = np.linalg.svd((by_turn @ slopes).reshape(-1, len(words)) / ERROR)
     relative = 1.0 / np.maximum(singular, 1e-9)
     labels = (describe_combination(row, tuple(words.values())) for row in rows)
     powers = [re.sub(r"(\S+)\^([+-][\d.]+)", r"$\1^{\2}$", label) for label in labels]

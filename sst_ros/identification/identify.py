@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""identify(): constants of a scene from a recorded or simulated motion, here from its torques.
+"""identify(): constants of a scene from a recorded or simulated motion.
 
-Torques are fitted by weighted least squares on the inverse dynamics; `simulation_fit` fits angles.
+Torques are fitted by weighted least squares on the inverse dynamics, which is linear in most of
+them. Any other constant is found by simulation: the motion that fits measured angles.
 
 With measured rates the motion is a Hermite spline, exact to rounding where the data are. Without,
 or with a cut-off, angles pass a Butterworth filter of order 4 forwards and backwards (no phase) and
@@ -24,8 +25,10 @@ docs/howto/identify.md has the bias with and without them, measured.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import compress
 from typing import Any
 
@@ -34,18 +37,27 @@ from numpy.typing import ArrayLike
 from scipy.fft import dst
 from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap
-from sst_ros.errors import AssemblyError, check_kinds, refuse_errors, refuse_unless
+from sst_ros.dynamics.kernel import joints, model_of
+from sst_ros.dynamics.variational import VariationalEquations
+from sst_ros.errors import AssemblyError, InputError, check_kinds, refuse_errors, refuse_unless
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, fit_weighted, scales
-from sst_ros.identification.measured_motion import Measured, MeasuredMotion, open_data, read_motion
+from sst_ros.identification.measured_motion import (
+    Measured,
+    MeasuredMotion,
+    open_data,
+    read_motion,
+    take_angles,
+)
 from sst_ros.identification.parameters import BaseParameters, Identification, Regressor
-from sst_ros.identification.simulation_fit import fit_simulation
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene, SceneInput, scene_of
+from sst_ros.scene.yaml_document import find_number
 from sst_ros.state import finite_vector
 
 STILL = 1e-6  # range of gamma [rad] below which a motion is none
@@ -56,6 +68,8 @@ SIGNIFICANT = 25.0  # chi^2 from which no bodies that can exist explain the esti
 BAND = 3.0
 MARGIN = 10.0  # default cut-off over the bandwidth of the motion
 STEP = 0.03  # between poses that continuation follows [rad]; Newton's method takes the rest
+POSITIVE = re.compile(r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$")
+NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
 _EDGE = 8  # samples at both ends at which an interpolating quintic spline has not its full order
 
 
@@ -122,9 +136,7 @@ def identify(
     Args:
         data: a recording or its path, a `Trajectory`, or a mapping of arrays: t [s], gamma [rad]
             (n, 3), torque [N m] (n, 3), and where they are known gamma_dot [rad/s] (n, 3),
-            quaternion (4,) at the first sample, held (torques act to the next sample). By
-            simulation also numbers read off a figure: t, any of gamma_1 to gamma_3, theta, phi,
-            psi [rad], x, y, z [m], and deviation, their standard deviation.
+            quaternion (4,) at the first sample, held (torques act to the next sample).
         scene: what is known of the manipulator, and the values to start from; by default the
             scene of the data.
         parameters: names of unknowns, by inverse dynamics also how their names begin ("star",
@@ -320,3 +332,111 @@ def find_bandwidth(period: float, gamma: Array) -> float:
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
     frequencies = np.fft.rfftfreq(len(gamma), period)
     return float(frequencies[max(int(np.searchsorted(share, 1.0 - 1e-4)), 1)])
+
+
+@dataclass(frozen=True)
+class SimulationFit(Identification):
+    """Constants identified by simulation; `values` differ from estimates that no body has.
+
+    Attributes:
+        relative: relative standard deviations of the combinations `directions`, rising, (p,).
+        directions: combinations as rows, relative changes of the parameters, shape (p, p).
+        error: root of the mean square of the residuals [rad].
+
+    """
+
+    relative: Array
+    directions: Array
+    error: float
+
+    @property
+    def combinations(self) -> list[tuple[float, str]]:
+        """The combinations as text, each with its relative standard deviation."""
+        texts = [describe_combination(row, self.names) for row in self.directions]
+        return list(zip(self.relative.tolist(), texts, strict=True))
+
+
+def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None) -> SimulationFit:
+    """Identify by simulation; arguments as for `identify`.
+
+    Gauss-Newton steps take the sensitivities of the motion, exact to rounding. In sizes of the
+    parameters, their singular values over the measuring errors show which combinations are known
+    and how well: often fewer than there are parameters.
+    """
+    given = () if requested is None else requested
+    names = (given,) if isinstance(given, str) else tuple(given)
+    allowed = "must be keys of numbers of the scene, with method simulation"
+    refuse_unless("identify", ("parameters", requested, bool(names), allowed))
+    torque, t, gamma = take_angles(data, scene)
+    motion, model = VariationalEquations(scene, names, torque, caller="identify"), model_of(scene)
+    given = np.array([find_number(scene, name) for name in names], dtype=float)
+    least = np.where([bool(POSITIVE.match(name)) for name in names], 1e-3, -np.inf)
+    allowed = "must not be 0 in the scene: it begins there, and must be > 0"
+    begins = zip(names, given, (given > 0.0) | np.isinf(least), strict=True)
+    refuse_unless("identify", *((name, x, bool(good), allowed) for name, x, good in begins))
+    size = np.abs(given) + (given == 0.0)
+
+    @lru_cache(maxsize=1)  # SciPy asks for residuals and slopes one after the other
+    def compare(*x: float) -> tuple[Array, Array]:
+        """Return computed less measured angles [rad], (3 n,), and derivatives, (3 n, p)."""
+        states, slopes = motion.run(np.array(x) * size, t)
+        rows = states[:, :7].T
+        turned = np.exp(1j * (np.stack(joints(model, tuple(rows)).gamma, axis=1) - gamma))
+        by_state = motion.differentiate_joints(rows)[:, :3]
+        changes = np.einsum("qcn,nqp->ncp", by_state, slopes[:, :7])
+        return np.angle(turned).ravel(), changes.reshape(-1, len(names))
+
+    found = least_squares(
+        lambda x: compare(*x)[0],
+        given / size,
+        lambda x: compare(*x)[1] * size,
+        bounds=(least, np.inf),
+        xtol=1e-13,
+        ftol=1e-13,
+        gtol=None,
+        max_nfev=100,
+    )
+    off, slopes = compare(*found.x)
+    fitted = found.x * size
+    scale = np.where(fitted == 0.0, 1.0, fitted)  # changes of logarithms
+    unit = float(np.sqrt(np.sum(off**2) / max(len(off) - len(names), 1))) + 1e-300
+    _, singular, rows = np.linalg.svd(slopes * scale / unit, full_matrices=True)
+    relative = np.full(len(names), np.inf)
+    some = singular > 1e-12 * max(float(singular[0]), 1e-300)
+    relative[: len(singular)][some] = 1.0 / singular[some]
+    spread = (rows.T * np.minimum(relative, 1e9) ** 2) @ rows * np.outer(scale, scale)
+    vague = rows[relative >= NOT_DETERMINED]
+    note, kept, warnings = "identified by simulation", names, tuple[str, ...]()
+    try:
+        adjusted = parameters.with_parameters(scene, names, fitted, note)
+    except InputError:
+        kept = tuple(name for name in names if ".inertia." not in name)
+        if kept == names:
+            raise
+        chosen = [name in kept for name in names]
+        adjusted = parameters.with_parameters(scene, kept, fitted[chosen], note)
+        warnings = ("no bodies have the inertias that fit best: the scene keeps the given ones",)
+    return SimulationFit(
+        scene=adjusted,
+        names=names,
+        values=parameters.values(adjusted, names),
+        labels=names,
+        before=given,
+        estimate=fitted,
+        covariance=spread,
+        undetermined=tuple(describe_combination(row, names) for row in vague),
+        warnings=warnings,
+        relative=relative,
+        directions=rows,
+        error=float(np.sqrt(np.mean(off**2))),
+    )
+
+
+def describe_combination(row: Array, names: tuple[str, ...]) -> str:
+    """Write relative changes as a product of powers."""
+    largest = float(row[int(np.argmax(np.abs(row)))])
+    return " ".join(
+        f"{name}^{np.sign(largest) * value:+.2f}"
+        for name, value in zip(names, row, strict=True)
+        if abs(value) > 0.05 * abs(largest)
+    )

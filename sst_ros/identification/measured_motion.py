@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured: angles and torques of the actuators, or numbers read off a figure.
+"""What was measured: angles and torques of the actuators.
 
 Torques are samples at the times of the angles, or each is held over an interval, as a controller's
-are. Identification by torques takes a `MeasuredMotion`, identification by simulation readings.
+are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sst_ros.errors import Problem, refusal, refuse_errors, refuse_unless
+from sst_ros.errors import Problem, refusal
 from sst_ros.scene import torque_profile as torques
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Rules, Section, build, entry
@@ -30,8 +29,6 @@ Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any] | str | Path"
 
 FEWEST = 20  # samples to identify anything: filters and splines have transients at both ends
 _HELD = (torques.TorqueTable, torques.ConstantTorque)
-OBSERVABLES = ("gamma_1", "gamma_2", "gamma_3", "theta", "phi", "psi", "x", "y", "z")
-"""Actuator angles and ZYZ angles [rad], position of E in {B} [m]."""
 
 
 class MeasuredMotion(Section):
@@ -132,63 +129,19 @@ def _average(law: torques.TorqueProfile, t: Array) -> Array:
     return np.asarray(total / np.diff(t)[:, None])
 
 
-Readings: TypeAlias = tuple[Array, Array, Array | None]
-"""Times from 0 or later [s], shape (n,); `OBSERVABLES` [rad], [m], shape (n, 9), nan where there is
-none; and their standard deviations, None where they are unknown."""
-
-
-def take_readings(data: Measured, scene: Scene) -> tuple[torques.TorqueProfile, Readings]:
-    """Take measured angles from a motion as for `read_motion`, or readings off a figure.
-
-    Those are a mapping with t [s] and any of OBSERVABLES, shape (n,), nan where nothing was read,
-    and deviation, their standard deviation. The torques are then those of the scene.
-    """
-    if isinstance(data, Mapping) and "torque" not in data:
-        return _take_figure(data, scene)
+def take_angles(data: Measured, scene: Scene) -> tuple[torques.TorqueProfile, Array, Array]:
+    """Take the torques that move a scene, times from 0 on [s] (n,), and measured gamma (n, 3)."""
     measured = read_motion(data)
     t = measured.t - measured.t[0]
-    values = np.pad(measured.gamma, ((0, 0), (0, 6)), constant_values=np.nan)
     if hasattr(data, "ticks"):  # a recording: torques before the lag, which the model has
         begins = np.round(data.ticks.start_ns / 1e9 - measured.t[0], 9)
-        return torques.TorqueTable(begins, data.ticks.torque), (t, values, None)
-    # A simulated motion as well, while its torques are known.
-    if isinstance(data, Trajectory) and data.law and data.scene.lags and scene.lags:
-        held = isinstance(data.law, _HELD)
-        torque = _average(data.law, data.t) if held else data.law.values(data.t)
-        if np.isfinite(torque).all():  # not of the state, and not lost
-            limit = data.scene.torque_limit or np.inf
-            measured = replace(measured, torque=np.clip(torque, -limit, limit), held=held)
+        return torques.TorqueTable(begins, data.ticks.torque), t, measured.gamma
+    # A simulated motion as well, while its torques are known: not of the state, and not lost.
+    if isinstance(data, Trajectory) and data.t[0] == 0.0 and data.scene.lags <= scene.lags:
+        law = data.law
+        if law and np.isfinite(law.values(t)).all():
+            return law, t, measured.gamma
     if measured.held:
-        return torques.TorqueTable(t[:-1], measured.torque), (t, values, None)
+        return torques.TorqueTable(t[:-1], measured.torque), t, measured.gamma
     spline = CubicSpline(t, measured.torque)
-    return torques.PolynomialTorque(spline.c, spline.x), (t, values, None)
-
-
-def _take_figure(data: Mapping[str, Any], scene: Scene) -> tuple[torques.TorqueProfile, Readings]:
-    t = np.atleast_1d(np.asarray(data.get("t", ()), dtype=float))
-    good = t.size > 0 and torques.ascend(t) and bool(t[0] >= 0.0)
-    refuse_unless("identify", ("t", t, good, "must be ascending times >= 0 [s]"))
-    known, deviation = f"one of {', '.join(OBSERVABLES)}", data.get("deviation")
-    with refuse_errors("identify", "data", list(data), "must be numbers", TypeError, ValueError):
-        read = {name: np.atleast_1d(np.asarray(x, dtype=float)) for name, x in data.items()}
-    rows = {name: row for name, row in read.items() if name in OBSERVABLES}
-    positive = deviation is None or bool((read["deviation"] > 0.0).all())
-    named, shape = f"must be t, deviation or {known}", f"must have the shape {t.shape}"
-    refuse_unless(
-        "identify",
-        *((x, data[x], x in (*OBSERVABLES, "t", "deviation"), named) for x in data),
-        *(
-            (x, y.shape, y.shape == t.shape and not np.isinf(y).any(), shape)
-            for x, y in rows.items()
-        ),
-        ("data", list(data), bool(rows), f"must have {known}"),
-        ("deviation", deviation, positive, "must be > 0"),
-        ("torque", None, scene.torque is not None, "must be in the scene, or be given as samples"),
-    )
-    assert scene.torque is not None
-    values, columns = np.full((t.size, len(OBSERVABLES)), np.nan), [*map(OBSERVABLES.index, rows)]
-    values[:, columns] = np.transpose(list(rows.values()))
-    spread = None if deviation is None else np.ones_like(values)
-    if spread is not None:
-        spread[:, columns] = deviation
-    return scene.torque, (t, values, spread)
+    return torques.PolynomialTorque(spline.c, spline.x), t, measured.gamma
