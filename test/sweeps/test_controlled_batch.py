@@ -14,8 +14,7 @@ from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.sweeps.controlled_batch import NOISE
-from sst_ros.sweeps.prepared import PreparedSweep
-from sst_ros.sweeps.sweep import run_study
+from sst_ros.sweeps.sweep import PreparedSweep, run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from studies.control_loop import ChannelState, ControlLoop, run_loop
 

@@ -10,8 +10,7 @@ import pytest
 import sst_ros
 from sst_ros import InputError, Simulation, load_scene, simulate
 from sst_ros.sweeps import results
-from sst_ros.sweeps.prepared import PreparedSweep
-from sst_ros.sweeps.sweep import SweepFailed, run_study
+from sst_ros.sweeps.sweep import PreparedSweep, SweepFailed, run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
 for module in ("numba", "pandas", "pyarrow"):
