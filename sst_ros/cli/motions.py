@@ -19,8 +19,7 @@ from sst_ros.identification.parameters import Identification
 from sst_ros.report.results import render
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
-from sst_ros.sweeps.results import read_sweep, summarize
-from sst_ros.sweeps.sweep import run_study
+from sst_ros.sweeps.sweep import read_sweep, run_study, summarize
 from sst_ros.sweeps.sweep_study import SweepStudy
 
 PLOT, DESIGN = "plot", "design"  # words in place of a study, and of a bag

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
-from sst_ros.control.controller import Controller
-from sst_ros.control.tracking import BAND
+from sst_ros.control.controller import BAND, Controller
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, indent, loop

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_ros.host.figures import BLUE, GREY, VERMILION, styled
 from sst_ros.report.results import publish
-from sst_ros.sweeps.results import correlate, list_outputs
+from sst_ros.sweeps.sweep import correlate, list_outputs
 
 COLUMNS, MOST_INPUTS, MOST_RUNS = 4, 6, 200
 MOST_POINTS = 2000  # of all runs in a scatter plot; the worst are drawn over them

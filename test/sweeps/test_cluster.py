@@ -33,7 +33,7 @@ OLD = "from sst_ros import version; version.VERSION = '0.0.9'"
 FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))"
 BEFORE_A_CHUNK = """
 import os, signal, time
-
+from sst_ros.sweeps.sweep import PreparedSweep
 compute = PreparedSweep.chunk
 def patched(self, index):
     {}

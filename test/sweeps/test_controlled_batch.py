@@ -8,9 +8,8 @@ import pytest
 from scipy import stats
 
 from sst_ros import load_scene, sweep
-from sst_ros.control.controller import Controller, Measurement
+from sst_ros.control.controller import Controller, Measurement, TrackingMetrics
 from sst_ros.control.law import MODES, ControlChannel, ControllerSettings
-from sst_ros.control.tracking import TrackingMetrics
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.sweeps.controlled_batch import NOISE

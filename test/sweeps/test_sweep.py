@@ -9,7 +9,7 @@ import pytest
 
 import sst_ros
 from sst_ros import InputError, Simulation, load_scene, simulate
-from sst_ros.sweeps import results
+from sst_ros.sweeps import sweep as engine
 from sst_ros.sweeps.sweep import PreparedSweep, SweepFailed, run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
@@ -128,7 +128,7 @@ def test_files_are_whole_and_explain_themselves(table, tmp_path):
     same(found, table)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == [f"part-{i:07d}.parquet" for i in range(5)]
-    about = results.read_about(tmp_path / "out" / names[0])
+    about = engine.read_about(tmp_path / "out" / names[0])
     units, study = about["units"], about["study"]
     assert about["version"] == sst_ros.__version__
     assert (units["gamma_dot_1"], units["star.inertia"]) == ("rad/s", "1")
@@ -157,7 +157,7 @@ def test_resume_computes_only_what_is_missing(table, tmp_path, monkeypatch):
 
 
 def test_a_full_disk_leaves_whole_files_and_the_study_resumes(table, tmp_path, monkeypatch):
-    out, write, written = tmp_path / "out", results.write_part, []
+    out, write, written = tmp_path / "out", engine.write_part, []
 
     def full(table, folder, index, about):
         if len(written) == 2:

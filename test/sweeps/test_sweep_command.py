@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import spearmanr
 
 from sst_ros.cli.commands import run_command
-from sst_ros.sweeps.results import correlate, read_sweep
+from sst_ros.sweeps.sweep import correlate, read_sweep
 
 for module in ("numba", "pandas", "pyarrow", "matplotlib"):
     pytest.importorskip(module, reason="the command needs it")
