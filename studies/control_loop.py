@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.actuator_space import Reference, ReferenceMotion
-from sst_ros.control.controller import ChannelState, Controller, ControlStopped
-from sst_ros.control.tracking import Track, track_of
+from sst_ros.control.controller import ChannelState, Controller, ControlStopped, Track, track_of
 from sst_ros.errors import RunStopped
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.generic_math import axpy

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.control.tracking import Track, TrackingMetrics, track_of
+from sst_ros.control.controller import Track, TrackingMetrics, track_of
 from sst_ros.errors import InputError, SingularConfiguration, refusal
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix

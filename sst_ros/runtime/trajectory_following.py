@@ -20,11 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.control.actuator_space import Reference, ReferenceMotion, slow_down
-from sst_ros.control.controller import Controller, Measurement
+from sst_ros.control.controller import Controller, Measurement, TrackingMetrics, track_of
 from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference_motions import reference_motion, through_points
-from sst_ros.control.tracking import TrackingMetrics, track_of
 from sst_ros.errors import Check, SstError, refusal, refuse_unless
 from sst_ros.host.processes import Assistant
 from sst_ros.mechanism import kinematics

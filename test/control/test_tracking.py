@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sst_ros.control.tracking import BAND, TRACK, TrackingMetrics, track_of
+from sst_ros.control.controller import BAND, TRACK, TrackingMetrics, track_of
 from sst_ros.report.results import render
 
 TIME = np.linspace(0.0, 2.0, 2001)
