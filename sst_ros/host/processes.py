@@ -12,6 +12,7 @@ import gc
 import itertools
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -28,7 +29,7 @@ PARENT = "SST_ROS_PARENT"  # variable with the number of the process without whi
 NO_LIMIT = "no limit"
 _SWITCH_INTERVAL_S = 1e-4
 _END_S = 10.0
-_DOMAINS = 100
+_DOMAINS, _PARTICIPANTS = 100, 32
 _next = itertools.count(os.getpid())  # what comes later leaves the last ones to end
 
 
@@ -60,7 +61,10 @@ def keep_domain() -> None:
 
 
 def lock_domain() -> tuple[int, int]:
-    """Return the number of a domain, and the descriptor that keeps it until it is closed."""
+    """Return the number of a domain, and the descriptor that keeps it until it is closed.
+
+    No node is in it, neither one whose parent has just ended nor one that a user has started.
+    """
     for _ in range(_DOMAINS):
         number = 1 + next(_next) % _DOMAINS
         path = Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}"
@@ -68,11 +72,19 @@ def lock_domain() -> tuple[int, int]:
             lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+                _refuse_nodes(number)
+            except OSError:
                 os.close(lock)
                 continue
             return number, lock
     raise SstError(f"all ROS domains from 1 to {_DOMAINS} are in use: set ROS_DOMAIN_ID")
+
+
+def _refuse_nodes(domain: int) -> None:
+    """Raise OSError where a port of a participant of this domain is taken (RTPS 2.5, 9.6.2.3)."""
+    for port in range(7410 + 250 * domain, 7410 + 250 * domain + 2 * _PARTICIPANTS, 2):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("", port))
 
 
 def words(given: dict[str, object]) -> list[str]:

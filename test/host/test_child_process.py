@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS domains of processes that start nodes."""
 
+import contextlib
 import itertools
 import os
+import socket
 import subprocess
 import sys
 
@@ -48,3 +50,21 @@ def test_a_process_keeps_its_domain_until_it_ends(monkeypatch):
         process.communicate()
     with own_domain() as same:
         assert str(same) == number
+
+
+@pytest.mark.parametrize("participant", [0, 3])
+def test_a_domain_in_which_a_node_is_left_is_not_taken(monkeypatch, participant):
+    """A node that has lost its parent goes on for a second or two; a user's has no lock at all.
+
+    A test once recorded the scene of another test's simulator beside its own.
+    """
+    with own_domain() as number:
+        pass
+    monkeypatch.setattr(processes, "_next", itertools.count(number - 1))
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as node:
+        node.bind(("", 7400 + 250 * number + 10 + 2 * participant))  # RTPS 2.5, 9.6.2.3
+        with own_domain() as other:
+            assert other != number
+    monkeypatch.setattr(processes, "_next", itertools.count(number - 1))
+    with own_domain() as same:
+        assert same == number
