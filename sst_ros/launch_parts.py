@@ -33,6 +33,7 @@ from sst_ros.host import processes
 from sst_ros.nodes import arguments, topics
 from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.scene import load, share_directory
+from sst_ros.state import BASE_FRAME
 
 
 class Given(dict[str, str]):
@@ -160,7 +161,11 @@ def _node(given: Given, package: str, executable: str = "", ends: bool = True, *
 
 
 def simulator(given: Given, parameters: Mapping[str, str], *, recorded: bool) -> Node:
-    """Describe a simulator, which does not start its run before it is recorded."""
+    """Describe a simulator, which does not start its run before it is recorded.
+
+    In a namespace its frame has that as a prefix, as those of robot_state_publisher.
+    """
+    parameters = {**parameters, "base_frame": Default(f"{_frame_prefix(given)}{BASE_FRAME}")}
     waits = {"wait_for_subscribers": ",".join(topics.SAMPLED), "subscriber_timeout": WAIT_S}
     return node(given, "simulator", {**parameters, **waits} if recorded else parameters)
 

@@ -84,14 +84,15 @@ def _layout(*fields: str | int, align: int = 8) -> bytes:
     return bytes(data[_STAMP.size :]) + bytes(-len(data) % align)
 
 
-def state_messages(frame_id: str = "") -> tuple[Message, ...]:
+def state_messages(frame_id: str = "", base_frame: str = BASE_FRAME) -> tuple[Message, ...]:
     """Return what makes the messages joint_states, orientation and euler_zyz.
 
-    The frame is that of joint_states, whose effort is the torque over the step that ended; the
-    others are in base_link. Each is one call of a struct: field by field takes 1.7 times as long.
+    The frame_id is that of joint_states, whose effort is the torque over the step that ended; the
+    others are in the base frame. Each is one call of a struct: field by field takes 1.7 times as
+    long.
     """
     count = len(JOINTS)
-    names, base = _layout(frame_id, count, *JOINTS, count), _layout(BASE_FRAME)
+    names, base = _layout(frame_id, count, *JOINTS, count), _layout(base_frame)
     stamped = f"<{len(_ENCAPSULATION)}s{_STAMP.size}s"
     more = f"I4x{count}d"  # a sequence: its length, padding, the numbers
     pack_joints, pack_quaternion, pack_angles = (
@@ -172,7 +173,10 @@ class TorqueLog:
     Point i holds over tick i; its time is the end of that tick, relative to the header's stamp.
     """
 
-    def __init__(self, period_ns: int, *, moments: bool = False) -> None:
+    def __init__(
+        self, period_ns: int, *, moments: bool = False, base_frame: str = BASE_FRAME
+    ) -> None:
+        self._base_frame = base_frame
         self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
         self._period_ns, self._moments = period_ns, moments
         # Each point begins with no positions, velocities and accelerations and the length of a row;
@@ -194,7 +198,7 @@ class TorqueLog:
 
     def take(self, stamp_ns: int) -> bytes:
         """Return the message of the ticks logged since stamp_ns and clear the log."""
-        named = BASE_FRAME, len(self._names), *self._names, len(self)
+        named = self._base_frame, len(self._names), *self._names, len(self)
         head = _layout(*named, *self._begin) if self._rows else _layout(*named, align=1)
         ends = (divmod(tick * self._period_ns, NANOSECONDS) for tick in range(1, len(self) + 1))
         points = b"".join(
@@ -220,7 +224,8 @@ class SimulatorTopics:
         depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
         shown = ("joint_states", "orientation", "euler_zyz", "applied_torques")
         *self._shown, self._torques = (own[name].publisher(node, depth) for name in shown)
-        self._samples, self._idles = state_messages(), state_messages(IDLE_FRAME_ID)
+        self._samples = state_messages("", given.base_frame)
+        self._idles = state_messages(IDLE_FRAME_ID, given.base_frame)
         self._measured: Measurements | None = None
         if given.channel is not None:
             exact, *others = self._samples
@@ -254,7 +259,7 @@ class SimulatorTopics:
         moments = scene.moment is not None and scene.moment.topic
         ticks, period_ns = given.run.ticks_per_sample, given.run.period_ns
         self._log_ticks = math.ceil(LOG_NS / (ticks * period_ns)) * ticks
-        self._log = TorqueLog(period_ns, moments=moments)
+        self._log = TorqueLog(period_ns, moments=moments, base_frame=given.base_frame)
         self._log_from_ns = 0
 
     def now_ns(self) -> int:

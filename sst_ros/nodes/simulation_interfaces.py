@@ -27,7 +27,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import angle_between, quaternion_of, rotation_matrix
 from sst_ros.nodes import topics
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
-from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Quaternion, Vector3
+from sst_ros.state import NANOSECONDS, ZERO, Quaternion, Vector3
 
 try:
     from simulation_interfaces import action, srv
@@ -61,11 +61,11 @@ INFORMATION = (
 )
 
 
-def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> None:
+def offer(node: Node, loop: RunLoop, leave: Callable[[], None], base_frame: str) -> None:
     """Create the services and the action if the package is installed; `leave` ends the node."""
     if srv is None:
         return
-    answers = SimulationInterfaces(loop, leave)
+    answers = SimulationInterfaces(loop, leave, base_frame)
     for name in SERVICES:
         kind = getattr(srv, name.title().replace("_", ""))
         qos = topics.SERVICE_QOS
@@ -76,8 +76,8 @@ def offer(node: Node, loop: RunLoop, leave: Callable[[], None]) -> None:
 class SimulationInterfaces:
     """Answers the services; each takes a request and fills a response."""
 
-    def __init__(self, loop: RunLoop, leave: Callable[[], None]) -> None:
-        self._loop, self._leave = loop, leave
+    def __init__(self, loop: RunLoop, leave: Callable[[], None], base_frame: str) -> None:
+        self._loop, self._leave, self._base_frame = loop, leave, base_frame
         self._space = ActuatorSpaceMap(loop.simulation.geometry)
 
     def get_simulator_features(self, _: Any, response: Any) -> Any:
@@ -164,8 +164,8 @@ class SimulationInterfaces:
         if unknown := _refuse_other(request, response):
             return unknown
         frame, pose, twist = request.state.header.frame_id, request.state.pose, request.state.twist
-        if frame not in ("", "world", BASE_FRAME):
-            return answer(response, FAILED, f"frame_id {frame!r} must be {BASE_FRAME}")
+        if frame not in ("", "world", self._base_frame):
+            return answer(response, FAILED, f"frame_id {frame!r} must be {self._base_frame}")
         now, refusal = self._loop.simulation.state, INVALID_POSE
         quaternion, rate = now.quaternion, _turn(now.quaternion, now.body_rate)
         try:
@@ -226,7 +226,7 @@ class SimulationInterfaces:
         state = self._loop.simulation.state
         stamp = divmod(self._loop.stamp_ns(state), NANOSECONDS)
         message.header.stamp.sec, message.header.stamp.nanosec = stamp
-        message.header.frame_id = BASE_FRAME
+        message.header.frame_id = self._base_frame
         at, turning = message.pose.orientation, message.twist.angular
         at.x, at.y, at.z, at.w = state.quaternion
         turning.x, turning.y, turning.z = _turn(state.quaternion, state.body_rate)

@@ -73,7 +73,7 @@ class Simulator(Worker[SimulatorParameters]):
         period_s = run.period_ns / NANOSECONDS
         self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
         serve(self.node, self._loop)
-        simulation_interfaces.offer(self.node, self._loop, self.done.set)
+        simulation_interfaces.offer(self.node, self._loop, self.done.set, given.base_frame)
         every(self.node, 1.0, self._report)
         self._read_gauges()
         self._loop.post(processes.quiet)  # once the code of all methods is loaded

@@ -40,7 +40,7 @@ publishes ~/true_joint_states sensor_msgs/msg/JointState 0
     joint_states without noise, delay and gaps
     if encoder_counts, angle_noise, rate_noise, measurement_delay or dropped_samples is set
 publishes ~/orientation geometry_msgs/msg/QuaternionStamped 0
-    orientation of {E} in {B}, frame_id `base_link`
+    orientation of {E} in {B}, the frame_id is base_frame
 publishes ~/euler_zyz geometry_msgs/msg/Vector3Stamped 0
     the same as ZYZ angles theta, phi, psi [rad]
 publishes ~/applied_torques trajectory_msgs/msg/JointTrajectory 0

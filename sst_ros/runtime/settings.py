@@ -13,7 +13,7 @@ from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Rules, Section, choice, entry
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import BASE_FRAME, NANOSECONDS
 
 _OF_A_GOAL = ", where the goal does not give it; 0 for none"
 
@@ -55,6 +55,10 @@ class SimulatorParameters(Section):
     publish_clock: bool = entry("publish the simulated time on /clock", default=False)
     publish_description: bool = entry(
         "publish the scene as URDF on robot_description", default=True
+    )
+    base_frame: str = entry(
+        "frame {B} in headers; with a prefix where robot_state_publisher has it as frame_prefix",
+        default=BASE_FRAME,
     )
     wait_for_subscribers: tuple[str, ...] = entry(
         "topics of the node, such as joint_states or ~/orientation, that must have a subscriber "

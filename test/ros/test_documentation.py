@@ -19,7 +19,10 @@ from tools.reference_pages import NODES, SIMULATION_INTERFACES, policy
 pytestmark = pytest.mark.ros
 CONFIG = Path(__file__).parents[2] / "config"
 RIGHTS = ("publish", "subscribe", "reply", "request")
-WITHOUT_REASON = {"/clock", "/sst_simulator/external_moment", "/sst_simulator/commands_stamped"}
+WITHOUT_REASON = {
+    *("/clock", "/sst_simulator/external_moment", "/sst_simulator/commands_stamped"),
+    "/sst_simulator/true_joint_states",
+}
 """Topics that exist under conditions only: a parameter, or the scene."""
 PUBLISHED = {
     endpoint.at(f"/{node.name}"): endpoint.kind

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from sst_ros.recording import recording
@@ -106,6 +107,13 @@ def counts(bag):
         return {topic: info.msgcount for topic, info in reader.topics.items()}
 
 
+def frames(bag, name):
+    with AnyReader([bag]) as reader:
+        connections = [one for one in reader.connections if one.topic.endswith(f"/{name}")]
+        for connection, _, data in reader.messages(connections):
+            yield reader.deserialize(data, connection.msgtype).header.frame_id
+
+
 @pytest.mark.parametrize("bag", ["sst", pytest.param("ros2", marks=needs_rosbag2)])
 def test_a_recorded_run_is_complete_and_ends_the_launch(launch, tmp_path, bag):
     words = ["play:=true", "duration:=0.5", "record:=true", f"bag:={bag}", "output:=bag"]
@@ -182,6 +190,7 @@ def test_namespace_params_file_and_log_level_reach_the_nodes(launch, tmp_path):
     assert found["/left/joint_states"] >= 101
     assert found["/left/sst_simulator/scene"] == 1
     assert recording.read(tmp_path / "bag").scene.name == "example1"
+    assert {*frames(tmp_path / "bag", "orientation")} == {"left/base_link"}  # as those of /tf
 
 
 def test_ctrl_c_ends_a_view_and_a_recorder_closes_its_bag(launch, tmp_path):

@@ -28,6 +28,7 @@ class Client:
 
         self.observer, self.srv, self.states = observer, srv, observer.states
         given = {"scene": SCENE, "duration": 0.0, "publish_rate": 100}
+        given["base_frame"] = "left/base_link"
         self.process = nodes.start("simulator", env=env, **given)
 
     def call(self, kind, **fields):
@@ -168,7 +169,7 @@ def test_the_star_is_read_and_set_with_its_joints(client):
         "the state that was set",
     )
     found = client.call("GetEntityState", entity="star").state
-    assert found.header.frame_id == "base_link"
+    assert found.header.frame_id == "left/base_link"
     read = found.pose.orientation
     assert np.abs(rotation_matrix((read.x, read.y, read.z, read.w)) - rotation).max() < 1e-9
     assert (found.twist.angular.x, found.twist.angular.y, found.twist.angular.z) == pytest.approx(

@@ -39,11 +39,11 @@ def test_publishes_all_joints_at_whole_periods_from_the_start(nodes, observer):
 
 
 def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
-    """Torques of every tick come every 50 ms and at the end."""
+    """Torques of every tick come every 50 ms and at the end; all are in the frame of this robot."""
     orientation = observer.listen(QuaternionStamped, f"{NODE}/orientation")
     euler = observer.listen(Vector3Stamped, f"{NODE}/euler_zyz")
     applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
-    nodes.run("simulator", wait_for_command=True, duration=0.131)
+    nodes.run("simulator", wait_for_command=True, duration=0.131, base_frame="left/base_link")
     observer.until(lambda: orientation and euler and applied, "preview of every topic")
     observer.command(1.0, 0.0, 0.0)
     stamps = observer.stamps
@@ -56,6 +56,8 @@ def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
         == stamps(euler)
         == [start + 1_000_000 * min(2 * k, 131) for k in range(67)]
     )
+    frames = {message.header.frame_id for message in (*orientation, *euler, *applied)}
+    assert frames == {"left/base_link"}
     messages = [message for message in applied if message.points]
     assert [len(message.points) for message in messages] == [50, 50, 31]
     assert stamps(messages) == [start + k * 50_000_000 for k in range(3)]
