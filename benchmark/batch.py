@@ -19,8 +19,8 @@ import numpy as np
 from benchmark import c_floor
 from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_source import SIMD_WIDTH
 from sst_ros.integration.methods import DOP853, RK4, Tableau
+from sst_ros.integration.simd_source import SIMD_WIDTH
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 

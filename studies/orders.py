@@ -24,11 +24,10 @@ from sst_ros.errors import InputError
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.figures import GREY, INK, MARKERS, styled
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
-from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array, Geometry, angle_between
 from sst_ros.report.results import data_frame, publish, render
-from sst_ros.simulation.simulate_gauss import GAUSS, NODES
+from sst_ros.simulation.simulate_gauss import GAUSS, NODES, Collocation, PreparedMotion
 from studies import DOCS, PAGES, run, run_jobs
 from studies.extreme_scenes import FREE, Changes, bouncing, changed
 from studies.sampled_data import slope

@@ -14,7 +14,7 @@ from bags import bags, example2, example2_bag, read, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
 from sst_ros.host import compiled_module
-from sst_ros.integration import batch, batch_source
+from sst_ros.integration import batch, simd_source
 
 # By its default an example of 0.2 s is a failure: on a loaded machine any may take that long.
 hypothesis.settings.register_profile("untimed", deadline=None)
@@ -51,7 +51,7 @@ def interpret_batches(monkeypatch):
     plain = SimpleNamespace(load=load, numba_version=compiled_module.numba_version)
     for module in (batch, controlled_batch):
         monkeypatch.setattr(module, "compiled_module", plain)
-    for module in (batch, batch_source, controlled_batch):
+    for module in (batch, simd_source, controlled_batch):
         monkeypatch.setattr(module, "SIMD_WIDTH", 4)
 
 

@@ -15,13 +15,13 @@ from sst_ros import TorqueTable, prepare
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
 from sst_ros.host.compiled_module import numba_version
-from sst_ros.integration.gauss import Collocation
 from sst_ros.integration.propagator import Propagator
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump, plain
 from sst_ros.simulation import simulate_gauss, stepped_motion
 from sst_ros.simulation.simulate import simulate
+from sst_ros.simulation.simulate_gauss import Collocation
 from sst_ros.simulation.simulation import Simulation
 
 EXAMPLE2 = load("example2_heavy")

@@ -11,8 +11,8 @@ from benchmark.peers.study import Engine, Series, Setting, list_steps
 from benchmark.peers.task import DURATION, Moving, Pose, Task
 from sst_ros import Trajectory, prepare
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.gauss import Collocation, PreparedMotion
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
+from sst_ros.simulation.simulate_gauss import Collocation, PreparedMotion
 
 ENGINE, PACKAGE = "sst_ros", "numba"
 PUBLIC = "prepare().run()"

@@ -18,6 +18,7 @@ from sst_ros.state import ZERO
 
 SINGULAR_MU = 1e-6  # distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
 CONTACT_BAND = 1e-9  # farther beyond than this [rad], an actuator has not just reached the contact
+GRAZING = 1e-12  # a distance below this [rad] counts as zero: closure and rounding reach 1e-15
 
 
 class JointSpring(NamedTuple):

@@ -16,12 +16,13 @@ from sst_ros.integration.compiled_method import (
     CompiledMethod,
     JointRanges,
     Linearisation,
+    MethodChange,
     Periods,
+    Point,
     Vector,
     methods_of,
 )
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RODAS5P, Method, Rosenbrock
-from sst_ros.integration.point import MethodChange, Point
 from sst_ros.mechanism.geometry import Array
 
 _STIFF, _EASY = 2.0, 0.5
@@ -78,12 +79,7 @@ class EvaluationBudget:
             self._end = self.per_period + self.spent
 
     def charge(self, evaluations: int) -> None:
-        """Count evaluations before they are made.
-
-        Raises:
-            BudgetSpent: the period has none left.
-
-        """
+        """Count evaluations before they are made; BudgetSpent: the period has none left."""
         if self.spent + evaluations > self._end:
             what = "motion" if self._whole_run else "step"
             raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the {what}")
@@ -118,9 +114,7 @@ class Step(NamedTuple):
     def inside(self, x: float) -> Point:
         """Return the solution x [s] after its begin, by one shorter step; not the second one.
 
-        Raises:
-            ArithmeticError: it is not finite.
-
+        ArithmeticError: it is not finite.
         """
         at, size = self.machine.step_pair(self.t, x, self.begin, self.drive, parts=1)
         if size == math.inf:
@@ -195,12 +189,9 @@ class AdaptiveStepper:
     ) -> Iterator[Step]:
         """Step from t to end; `origin` is the time of the run at which these are zero [s].
 
-        The second solution has the drive `other`, by default that of the first.
-
-        Raises:
-            CannotStep: steps shrink below the rounding of time.
-            BudgetSpent: the period takes more evaluations than it may.
-
+        The second solution has the drive `other`, by default that of the first. CannotStep: steps
+        shrink below the rounding of time. BudgetSpent: the period takes more evaluations than it
+        may.
         """
         rejected, stops = 0, list[float]()
         while True:

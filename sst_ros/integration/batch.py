@@ -25,8 +25,8 @@ from sst_ros.errors import check_kinds, refuse_unless, require
 from sst_ros.host import compiled_module
 from sst_ros.host.many_runs import run_many
 from sst_ros.host.output import slices
-from sst_ros.integration.batch_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.integration.methods import DOP853, Tableau
+from sst_ros.integration.simd_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import TURN

@@ -15,12 +15,11 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from multiprocessing import get_context
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sst_ros.dynamics.expression import Slots
-from sst_ros.dynamics.simd_source import linearise_by_columns
 from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, Function, recent_ode
 from sst_ros.host import compiled_module
 from sst_ros.host.compiled_module import cache_folder
@@ -34,7 +33,7 @@ from sst_ros.integration.methods import (
     Rosenbrock,
     Tableau,
 )
-from sst_ros.integration.point import Point
+from sst_ros.integration.simd_source import linearise_by_columns
 from sst_ros.scene.scene import Scene
 
 Vector = Sequence[float]
@@ -52,6 +51,9 @@ JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
 
+_MARGIN, _FLOOR = 2.0, 8 * 2.220446049250313e-16
+"""Of the distance: an error that halves with the steps is twice as large; of rounding, a step."""
+
 _SHARED = (
     step_loops.size_of,
     step_loops.normalise,
@@ -67,6 +69,65 @@ def methods_of(integrator: str) -> tuple[Method, ...]:
     """Methods that an integrator may use, the one it begins with first: of auto three."""
     named = METHODS.get(integrator)
     return (named,) if named else (DORMAND_PRINCE, DOP853, RODAS5P)
+
+
+class MethodChange(NamedTuple):
+    """A change of method."""
+
+    time: float  # [s]
+    method: str  # the new one
+    reason: str
+
+
+class Point(NamedTuple):
+    """Where a run stands: all that its next step depends on; and how far it can be trusted.
+
+    A second solution goes through each step by two of half the length: its distance is the error.
+    No order is assumed, as none holds where a torque jumps, a clamp or a contact bends the motion,
+    or friction is sharp. Where the method has its order, the second solution is nearly exact, and
+    the distance is the error; where each step loses its order, the error halves, and the distance
+    is half of the error.
+    """
+
+    y: list[float]  # the solution
+    z: list[float]  # the second one, by steps of half the length
+    joints: tuple[float, ...]  # nine angles and nine rates of y
+    method: Method
+    h: float = math.inf  # longest next step [s]
+    attempts: int = 0  # since the method was chosen
+    steps: int = 0  # accepted since the start
+    changes: tuple[MethodChange, ...] = ()
+
+    @property
+    def error(self) -> float:
+        """Estimated global error of the orientation [rad]."""
+        return estimate_error(orientation_distance(self.y, self.z), self.steps)
+
+    @property
+    def rate_error(self) -> float:
+        """Estimated global error of the body rate [rad/s]."""
+        speed = max(1.0, math.hypot(*self.y[4:7]))
+        return speed * estimate_error(math.dist(self.y[4:7], self.z[4:7]) / speed, self.steps)
+
+
+def estimate_error(distance: float, steps: int) -> float:
+    """Estimate the error of a solution by that of a second one, by steps of half the length."""
+    return max(_MARGIN * distance, _FLOOR * math.sqrt(steps + 1.0))
+
+
+def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
+    """Angle between the orientations of two states that are near [rad]; q and -q are the same."""
+    return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
+
+
+def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
+    """Distance of orientations [rad], or that of the rest relative to the rate if it is larger.
+
+    Rates below 1 rad/s count as 1 rad/s; infinite where a number is not finite.
+    """
+    speed = max(1.0, math.hypot(*z[4:7]))
+    distance = max(orientation_distance(y, z), math.dist(y[4:], z[4:]) / speed)
+    return distance if math.isfinite(distance) else math.inf
 
 
 class CompiledMethod:
@@ -146,12 +207,8 @@ class CompiledMethod:
         """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
 
         The second one has the drive `other`, by default that of the first; with one part in place
-        of three it has no meaning.
-
-        Returns:
-            Where they end, and the local error estimate in units of the tolerance; infinite where
-            the step has no finite result.
-
+        of three it has no meaning. Returns where they end, and the local error estimate in units of
+        the tolerance; infinite where the step has no finite result.
         """
         one, begin = self.hold(h, d), at._replace(h=math.inf)
         done, end = self.step_many(0, 1, one, begin, ranges=self._no_ranges, t=t, parts=parts)
@@ -187,6 +244,8 @@ class CompiledMethod:
     ) -> tuple[int, Point]:
         """Advance from period `first` to `end`; stop before one that needs more than steps.
 
+        Returns the first period that was not done, and where it begins.
+
         Args:
             first: number of the period that begins.
             end: number of the last one, and one.
@@ -198,9 +257,6 @@ class CompiledMethod:
             ranges: in place of those of the method.
             t: time at which periods begin, as the system takes it [s].
             parts: see `step_pair`.
-
-        Returns:
-            The first period that was not done, and where it begins.
 
         """
         y, z, joints = self._place
@@ -226,9 +282,7 @@ class CompiledMethod:
     def step_fixed(self, t: float, h: float, count: int, y: Vector, d: Vector) -> list[float]:
         """Advance by `count` steps of h, errors unseen.
 
-        Raises:
-            ArithmeticError, ValueError: in plain Python, where a step has no finite result.
-
+        ArithmeticError, ValueError: in plain Python, where a step has no finite result.
         """
         new = self._vector(y)
         drive = self._vector(d)

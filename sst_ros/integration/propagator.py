@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, cached_property, partial
 from itertools import pairwise
 from typing import Any
@@ -12,14 +12,20 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics.expression import compile_program
-from sst_ros.dynamics.model import Limit, contact_events_of, free_range, limits_of, ranges_of
+from sst_ros.dynamics.model import (
+    CONTACT_BAND,
+    GRAZING,
+    Limit,
+    contact_events_of,
+    free_range,
+    limits_of,
+    ranges_of,
+)
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, recent_ode
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper, EvaluationBudget, Step, TorqueLaw
-from sst_ros.integration.compiled_method import compile_derivative
-from sst_ros.integration.events import first_event, just_beyond, may_occur
-from sst_ros.integration.point import Point
+from sst_ros.integration.compiled_method import Point, compile_derivative
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque, torque_at
@@ -28,7 +34,10 @@ from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 Moment = tuple[float, ...]
 """External moment on the star in {B} [N m] where the scene takes it from a topic, else empty."""
 
+Signal = Callable[[float], float]
 
+TIME_TOLERANCE = 1e-15
+"""Accuracy of a located time [s], above the rounding of the time itself."""
 _SEARCHED = 8
 """Parts of a step in which a jump is looked for."""
 _TIME_STEP = 1e-7
@@ -105,14 +114,9 @@ class Propagator:
         """Advance by `count` periods of h [s] from `start` [s], or by fewer, but by one at least.
 
         Periods in which nothing happens but steps are one call; another is done by itself. The
-        torque is one of `AppliedTorque.acting`.
-
-        Returns:
-            Where the last period ended that was done, and how many were.
-
-        Raises:
-            LimitReached, CannotStep, ArithmeticError, ValueError: the first period is not done.
-
+        torque is one of `AppliedTorque.acting`. Returns where the last period ended that was done,
+        and how many were. Where the first is not done, LimitReached, CannotStep, ArithmeticError or
+        ValueError is raised.
         """
         stepper, drive = self._begin_period(torque, start, moment)
         if stepper is self._constant:
@@ -152,12 +156,8 @@ class Propagator:
     ) -> Iterator[Step]:
         """Yield the steps of a period: of their own lengths, each up to the first event in it.
 
-        The second solution has the constant torques `other`, by default those of the first.
-
-        Raises:
-            LimitReached, CannotStep, ArithmeticError, ValueError: as `advance`, after the last
-                valid step.
-
+        The second solution has the constant torques `other`, by default those of the first. Errors
+        are those of `advance`, raised after the last valid step.
         """
         stepper, drive = self._begin_period(torque, start, moment)
         second = None if other is None else (*other, *moment)
@@ -273,9 +273,7 @@ class AppliedTorque:
     def begin(self, torque: Torque, start: float) -> Vector3:
         """Take what acts in a period that begins at `start` [s].
 
-        Returns:
-            Three numbers of the drive: phases of a sine [rad], else zero.
-
+        Returns three numbers of the drive: phases of a sine [rad], else zero.
         """
         if isinstance(torque, SineTorque):
             rows = zip(torque.frequency, torque.phase, strict=True)
@@ -288,11 +286,8 @@ class AppliedTorque:
         """Torques that act at a time [s] and a state y, within the limit [N m].
 
         In the state that a function is given are the lagged torques of the actuators; without lag
-        zero, for torques of this instant are what it returns.
-
-        Raises:
-            ArithmeticError: the state is not finite, as in a trial step that is too long.
-
+        zero, for torques of this instant are what it returns. ArithmeticError: the state is not
+        finite, as in a trial step that is too long.
         """
         given: tuple[Any, ...] = (time,)
         if _has_feedback(torque):
@@ -303,7 +298,10 @@ class AppliedTorque:
             given = time, State.of(round(time * NANOSECONDS), y, joints, lagged)
         found = torque_at(torque, *given)
         try:
-            first, second, third = map(float, found)
+            first, second, third = found
+            if isinstance(first + second + third, np.complexfloating):
+                raise TypeError
+            first, second, third = float(first), float(second), float(third)
         except (TypeError, ValueError):  # a ValueError would count as a motion that diverges
             allowed = "a torque function must return three torques [N m]"
             raise InputError("torque", [Problem(f"f({time:g})", found, allowed)]) from None
@@ -377,3 +375,76 @@ class AppliedTorque:
 
 def _has_feedback(torque: Torque) -> bool:
     return bool(getattr(torque, "feedback", False))
+
+
+# Events inside a step: when a joint reaches a limit, or meets or leaves an elastic stop. The force
+# of a stop has a kink where contact begins and ends, so steps end there.
+
+
+def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:
+    """Test cheaply whether an event may lie in a step, given the joints at both ends.
+
+    A limit counts where the step starts on it; a contact that the step starts on does not.
+    """
+    before = event.distance(begin)
+    if event.error is not None:
+        if before <= 0.0:
+            return True
+    elif before <= GRAZING and not (before > -CONTACT_BAND and event.slope(begin) > 0.0):
+        return False
+    return event.distance(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
+
+
+def just_beyond(event: Limit, x: float, joints: Sequence[float], h: float) -> float:
+    """Time just after an event at x, where the Jacobian is that of the side beyond the kink."""
+    return min(x + min(1e-14 / max(abs(event.slope(joints)), 1e-200), 1e-3 * h), h)
+
+
+def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
+    """Time x in [0, h] at which `distance` becomes negative, or None.
+
+    Both signals are smooth functions of the time since the step began and `slope` is the rate of
+    `distance`. A dip below zero and back inside the step is found where the slope changes sign
+    once. A distance that starts at zero counts if it shrinks, and not if it grows.
+    """
+    begin, end = 0.0, h
+    rising, falling = slope(0.0) > 0.0, slope(h) < 0.0
+    if distance(0.0) <= GRAZING:
+        if not rising:
+            leaves = slope(0.0) < 0.0 or distance(h) < -GRAZING  # from rest, the latter
+            return 0.0 if distance(0.0) < -GRAZING or leaves else None
+        if distance(h) >= 0.0 or (distance(h) >= -GRAZING and not falling):
+            return None
+        # It grew first: the crossing lies behind the maximum.
+        begin = _root(slope, 0.0, h) if falling else 0.0
+    elif distance(h) >= 0.0:
+        if rising or falling:
+            return None
+        end = _root(slope, 0.0, h)
+        if distance(end) >= 0.0:
+            return None
+    return _root(distance, begin, end)
+
+
+def first_event(
+    limits: Iterable[Limit], joints: Callable[[float], Sequence[float]], h: float
+) -> tuple[float, Limit] | None:
+    """Return time in [0, h] and limit of the first event; `joints` are those at a time."""
+    found = []
+    for limit in limits:
+        x = first_crossing(
+            lambda x, at=limit: at.distance(joints(x)),  # type: ignore[misc]
+            lambda x, at=limit: at.slope(joints(x)),  # type: ignore[misc]
+            h,
+        )
+        if x is not None:
+            found.append((x, limit))
+    return min(found, key=lambda pair: pair[0]) if found else None
+
+
+def _root(signal: Signal, begin: float, end: float) -> float:
+    if signal(begin) == 0.0 or signal(begin) * signal(end) > 0.0:
+        return begin
+    from scipy.optimize import brentq  # takes 0.4 s, and many runs have no event
+
+    return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))

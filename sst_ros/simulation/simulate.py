@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.errors import check_kinds, refusal
+from sst_ros.dynamics.variational import Sensitivities
+from sst_ros.errors import check_kinds, refusal, refuse_unless
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Initial
-from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
+from sst_ros.scene.scene import SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import (
     FeedbackFunction,
     FunctionTorque,
@@ -29,7 +30,6 @@ from sst_ros.scene.torque_profile import (
     ascend,
     profile_of,
 )
-from sst_ros.simulation.sensitivities import Sensitivities
 from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
 from sst_ros.simulation.simulation import AUTO, INTEGRATORS, describe_conditioning
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
@@ -173,22 +173,25 @@ def prepare(
         _refuse("duration", None, "must be given: the scene has none")
     span_ns, jumps = _nanoseconds("duration", length), np.atleast_1d(np.array(breaks, dtype=float))
     longest = math.inf if max_step is None else max_step
-    if not isinstance(memoryless, bool):
-        _refuse("memoryless", memoryless, "must be True or False")
-    if method not in METHODS:
-        _refuse("method", method, "must be one of " + ", ".join(METHODS))
-    if not 0.0 < tolerance < math.inf:
-        _refuse("tolerance", tolerance, "must be a number > 0 [rad]")
-    if not longest >= (least := span_ns / NANOSECONDS / _MOST_PERIODS):
-        _refuse("max_step", max_step, f"must be > 0 s, at least {least:.3g} s for this duration")
-    if not ascend(jumps):
-        _refuse("breaks", breaks, "must be ascending times [s]")
-    period, end = _check_period(control_period, profile, span_ns), span_ns / NANOSECONDS
+    end = span_ns / NANOSECONDS
+    least = end / _MOST_PERIODS
+    shortest = f"must be > 0 s, at least {least:.3g} s for this duration"
+    refuse_unless(
+        "simulate",
+        ("method", method, method in METHODS, "must be one of " + ", ".join(METHODS)),
+        ("tolerance", tolerance, 0.0 < tolerance < math.inf, "must be a number > 0 [rad]"),
+        ("max_step", max_step, longest >= least, shortest),
+        ("breaks", breaks, ascend(jumps), "must be ascending times [s]"),
+    )
+    period = _check_period(control_period, profile, span_ns)
     inside = jumps[(jumps > 0.0) & (jumps < end)]
     times = _times(samples, t_eval, span_ns, period)
+    parameters = (sensitivities,) if isinstance(sensitivities, str) else tuple(sensitivities)
+    if parameters:  # refuses what no motion is differentiated by
+        Sensitivities(given, parameters, profile)
     task = Task(
         given, profile, (0.0, end), times, method, tolerance, period, memoryless, inside,
-        float(longest), _check_parameters(sensitivities, given, profile),
+        float(longest), parameters,
     )  # fmt: skip
     reason = ""
     if method in (AUTO, GAUSS):
@@ -277,16 +280,6 @@ def _check_period(period: float | None, profile: TorqueProfile, span: int) -> in
     if span > _MOST_PERIODS * found:
         least = span / NANOSECONDS / _MOST_PERIODS
         _refuse("control_period", period, f"must be at least {least:.3g} s for this duration")
-    return found
-
-
-def _check_parameters(
-    names: str | Sequence[str], scene: Scene, profile: TorqueProfile
-) -> tuple[str, ...]:
-    """Return the names of parameters, once it is clear that a motion can be differentiated."""
-    found = (names,) if isinstance(names, str) else tuple(names)
-    if found:
-        Sensitivities(scene, found, profile)
     return found
 
 

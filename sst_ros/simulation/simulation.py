@@ -16,8 +16,8 @@ from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.errors import Diverged, StepBudgetExceeded, check_kinds, refuse_unless
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import BudgetSpent, CannotStep, EvaluationBudget
+from sst_ros.integration.compiled_method import MethodChange, Point
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
-from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
@@ -33,6 +33,9 @@ EQUATIONS = ("quaternion", "virtual_work")
 
 _THREE = "must be three finite numbers [N m]"
 _TORQUE = f"{_THREE}, a SineTorque or a function of t [s]"
+
+_MOST = 10**9
+"""Steps of one call: a compiled loop cannot be interrupted."""
 
 _PLAIN_BUDGET = 3_000_000
 """Operations a step in plain Python may take: 0.12 s at 37 ns each, on a 3 GHz core."""
@@ -188,14 +191,15 @@ class Simulation(Explained):
 
         """
         length, number = _whole(dt_ns), _whole(count)
-        if not (length > 0 and number > 0 and finite_vector(torque) and finite_vector(moment)):
-            known = callable(torque) or isinstance(torque, SineTorque) or finite_vector(torque)
+        known = 0 < number <= _MOST and length > 0
+        if not (known and finite_vector(torque) and finite_vector(moment)):
+            acts = callable(torque) or isinstance(torque, SineTorque) or finite_vector(torque)
             refuse_unless(
                 "step",
-                ("torque", torque, bool(known), _TORQUE),
+                ("torque", torque, bool(acts), _TORQUE),
                 ("moment", moment, finite_vector(moment) is not None, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
-                ("count", count, number > 0, "must be > 0, a whole number"),
+                ("count", count, 0 < number <= _MOST, f"must be > 0 and <= {_MOST:g}, and whole"),
             )
         torque = self.acting(torque)
         if callable(torque) and not self._warned:

@@ -19,8 +19,7 @@ from sst_ros.integration.adaptive_stepper import (
     EvaluationBudget,
     Step,
 )
-from sst_ros.integration.compiled_method import CompiledMethod, has_step_code
-from sst_ros.integration.point import Point, state_distance
+from sst_ros.integration.compiled_method import CompiledMethod, Point, has_step_code, state_distance
 from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import Torque, TorqueProfile, torque_at

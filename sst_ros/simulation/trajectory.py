@@ -19,11 +19,10 @@ from numpy.typing import ArrayLike
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.motion_table import JOINTS, MotionTable
 from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.variational import Sensitivities, Sensitivity
 from sst_ros.errors import (
     Diverged,
-    InputError,
     MissingDependency,
-    Problem,
     check_kinds,
     refusal,
     refuse_errors,
@@ -45,7 +44,6 @@ from sst_ros.scene.torque_profile import (
     record_of,
 )
 from sst_ros.scene.yaml_document import dump, read
-from sst_ros.simulation.sensitivities import Sensitivities, Sensitivity
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array
 
@@ -126,22 +124,19 @@ class Trajectory(MotionTable):
         parameters: Sequence[str] = (),
     ) -> None:
         self.scene, self.t = scene, _own(t)
-        n, problems = self.t.size, []
-        if not isinstance(scene, Scene):
-            problems.append(Problem("scene", scene, "must be a Scene"))
-        if not ascend(self.t):
-            problems.append(Problem("t", t, "must be finite, ascending times [s], shape (n,)"))
         given: dict[str, Any] = {"quaternion": quaternion, "body_rate": body_rate, "torque": torque}
         given |= {} if joints is None else {"_joints": joints}
         if dense is None or any(array is not None for array in given.values()):
             vars(self).update({name: _own(array) for name, array in given.items()})
-        for name, size in (("quaternion", 4), ("body_rate", 3), ("torque", 3), ("_joints", 18)):
-            array = vars(self).get(name)
-            if array is not None and array.shape != (n, size):
-                allowed = f"must have the shape ({n}, {size})"
-                problems.append(Problem(name.strip("_"), array.shape, allowed))
-        if problems:
-            raise InputError("trajectory", problems)
+        sizes = {"quaternion": 4, "body_rate": 3, "torque": 3, "_joints": 18}
+        shapes = {name: (self.t.size, size) for name, size in sizes.items() if name in vars(self)}
+        shaped = ((name, vars(self)[name].shape, shape) for name, shape in shapes.items())
+        refuse_unless(
+            "trajectory",
+            ("scene", scene, isinstance(scene, Scene), "must be a Scene"),
+            ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
+            *((name.strip("_"), x, x == y, f"must have the shape {y}") for name, x, y in shaped),
+        )
         self.status, self.message, self.method = status, message, method
         self.error_estimate, self._residual = error_estimate, energy_residual
         self.evaluations, self.step = evaluations, step
@@ -401,9 +396,11 @@ class Trajectory(MotionTable):
 def _own(value: ArrayLike) -> Array:
     """Return an array that nothing can change: a copy, unless it is one already."""
     try:
+        if np.iscomplexobj(value):
+            raise TypeError
         array: Array = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError, MemoryError):
-        raise InputError("trajectory", [Problem("array", value, "must be numbers")]) from None
+        raise refusal("trajectory", "array", value, "must be real numbers") from None
     if array is value and (array.flags.writeable or not array.flags.owndata):
         array = array.copy()
     array.flags.writeable = False

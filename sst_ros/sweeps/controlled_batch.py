@@ -23,11 +23,19 @@ from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, Referenc
 from sst_ros.control.controller import BAND, Controller
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.expression import Expression, Program, trace
-from sst_ros.dynamics.simd_source import Layout, evaluate_lanes, indent, loop
 from sst_ros.errors import refuse_unless
 from sst_ros.host import compiled_module
 from sst_ros.integration.batch import Batch, BatchResult
-from sst_ros.integration.batch_source import SIMD_WIDTH, load_lanes, over_blocks, replace_valid
+from sst_ros.integration.simd_source import (
+    SIMD_WIDTH,
+    Layout,
+    evaluate_lanes,
+    indent,
+    load_lanes,
+    loop,
+    over_blocks,
+    replace_valid,
+)
 from sst_ros.mechanism.generic_math import axpy, dot3, positive
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy

@@ -10,7 +10,7 @@ import pytest
 from benchmark import c_floor
 from benchmark.batch import FLAGS, METHODS
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.batch_source import SIMD_WIDTH
+from sst_ros.integration.simd_source import SIMD_WIDTH
 from sst_ros.scene.scene import load
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")]

@@ -11,7 +11,7 @@ from sst_ros import load_scene
 from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.initial_state import NO_RATE
 from sst_ros.errors import InputError
-from sst_ros.integration import batch_source
+from sst_ros.integration import simd_source
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism import workspace
@@ -106,7 +106,7 @@ def test_what_is_the_same_in_all_rows_costs_nothing():
 def test_other_values_are_the_same_code():
     def text(low, high):
         batch = Batch(EXAMPLE2, RK4, parameters={"star.inertia.zz": [low, high]})
-        return batch_source.batch_source(
+        return simd_source.batch_source(
             batch.model.program, batch.model.limit_distances, RK4, len(batch.model.ode.state)
         )
 

@@ -16,7 +16,6 @@ from loaded_scenes import IGNORE
 from programs import python
 
 from sst_ros.host import compiled_module
-from sst_ros.integration import gauss
 from sst_ros.integration.compiled_method import code_is_there, make_code
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.loads import Initial
@@ -86,8 +85,8 @@ def test_one_process_makes_code_at_a_time(tmp_path, monkeypatch):
 def test_collocation_of_another_inertia_needs_no_compilation(tmp_path, monkeypatch):
     """Under `auto` it has the digits of plain Python."""
     monkeypatch.setenv("SST_ROS_CACHE", str(tmp_path))
-    monkeypatch.setattr(gauss, "_WORTH_COMPILING", 0)
-    monkeypatch.setattr(gauss, "_WORTH_LOADING", 0)
+    monkeypatch.setattr(simulate_gauss, "_WORTH_COMPILING", 0)
+    monkeypatch.setattr(simulate_gauss, "_WORTH_LOADING", 0)
     made = None
     for scene in (EXAMPLE2, heavier(EXAMPLE2)):
         monkeypatch.delenv("SST_ROS_NUMBA", raising=False)

@@ -21,13 +21,12 @@ from sst_ros.dynamics.expression import Slots, number_constants, trace
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, recent_ode
 from sst_ros.host import compiled_module
-from sst_ros.integration import gauss
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.compiled_method import CompiledMethod, Point
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
-from sst_ros.integration.point import Point
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.scene.schema import Section
+from sst_ros.simulation import simulate_gauss
 
 DRIVE = (3.0, -2.0, 1.0)
 MOMENT = (0.1, 0.2, 0.3)
@@ -203,7 +202,7 @@ def text_of_steps(ode):
 
 
 def text_of_collocation(ode):
-    return "".join(gauss.source(ode, 4, None)[0])
+    return "".join(simulate_gauss.source(ode, 4, None)[0])
 
 
 @pytest.mark.parametrize("text", [text_of_steps, text_of_collocation])

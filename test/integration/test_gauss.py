@@ -12,14 +12,14 @@ from loaded_scenes import loaded, start_of
 from scipy.integrate import solve_ivp
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.simd_source import flat_sin
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.host import compiled_module
 from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.gauss import Collocation, PreparedMotion, tables
+from sst_ros.integration.compiled_method import orientation_distance as apart
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.point import orientation_distance as apart
+from sst_ros.integration.simd_source import flat_sin
 from sst_ros.scene.scene import load
+from sst_ros.simulation.simulate_gauss import Collocation, PreparedMotion, tables
 
 EXAMPLE2 = load("example2_heavy")
 STATE = start_of(EXAMPLE2)
