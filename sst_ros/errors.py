@@ -111,6 +111,9 @@ _KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
 }
 """Whether an argument is what an annotation says up to its brackets, and this in words."""
 
+_FAILURES = TypeError, ValueError, AttributeError, LookupError, ArithmeticError, MemoryError
+"""Of a function that was given something else."""
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -151,7 +154,7 @@ def check_kinds(function: F, *, late: bool = False) -> F:
             return function(*args, **options)
         try:
             return function(*args, **options)
-        except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError):
+        except _FAILURES:
             check(args, options)
             raise
 

@@ -41,6 +41,8 @@ def finite_vector(value: Any) -> Vector3 | None:
         return None
     try:
         first, second, third = value
+        if isinstance(first + second + third, np.complexfloating):
+            return None  # of which `math` takes the real part
         finite = math.isfinite(first) and math.isfinite(second) and math.isfinite(third)
     except (TypeError, ValueError, OverflowError):
         return None

@@ -12,6 +12,7 @@ from sst_ros import (
     InverseDynamics,
     Simulation,
     certify,
+    linearize,
     load_scene,
     read_bag,
     reference_motion,
@@ -36,6 +37,7 @@ def made(bag):
         batch.run(start, 0.0 * start, step=1e-3, count=2),
         simulate(scene, duration=0.1),
         certify("example2", duration=0.01, t_eval=[0.01]),
+        linearize(scene, None, (0.0, 0.0, 0.0)),
     )
 
 

@@ -42,6 +42,7 @@ WRONG = [
     *(lambda: 0, lambda t: 0, lambda t: "abc", lambda t: (1, 2), lambda state, t: 0),
     *(["1", "2", "3"], [1, 2, 3, 4, 5, 6, 7], bytearray(b"12"), type(SCENE), pytest, "a" * 5000),
     *(None, object(), Ellipsis, set(), {}, {"star": {}}, {1: 2}, {"a": [1]}, LIST, DICT),
+    *(10**18, range(10**12), [range(10**12)] * 3, {"gamma": range(10**12)}, dict, list),
 ]
 TASK = {"scene": SCENE, "torque": REST, "duration": 0.01, "initial": None, "t_eval": None}
 TASK |= {
@@ -168,6 +169,42 @@ def test_nothing_but_an_sst_error_comes_out(calls, seed, tmp_path, monkeypatch):
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
+
+
+COMPLEX = [1j, 0.0, 0.0], np.array([1j, 0, 0]), np.array([1j, 0, 0], np.complex64)
+COMPLEX += ((np.complex128(1.0), 0, 0),)
+
+
+@pytest.mark.parametrize("torque", COMPLEX)
+def test_complex_torques_are_refused_and_not_cut(torque, recwarn):
+    def acting(t):
+        return torque
+
+    simulation = Simulation(SCENE)
+    calls = [
+        lambda: simulate(SCENE, torque, 0.01),
+        lambda: simulate(SCENE, acting, 0.01),
+        lambda: simulation.step(torque, 1000),
+        lambda: simulation.step(acting, 1000),
+        lambda: simulation.step(REST, 1000, torque),
+        lambda: sst_ros.linearize(SCENE, None, torque),
+        lambda: sst_ros.SineTorque(amplitude=torque, frequency=REST),
+        lambda: sst_ros.TorqueTable([0.0], [torque]),
+        lambda: Trajectory(SCENE, [0.0], [[0, 0, 0, 1]], [REST], [torque]),
+    ]
+    for call in calls:
+        with pytest.raises(SstError):
+            call()
+    assert not recwarn.list
+
+
+def test_what_is_given_stands_in_the_message():
+    with pytest.raises(SstError, match="vary = None"):
+        sst_ros.sweep(SCENE, None)
+    with pytest.raises(SstError, match="count = 1000000000000000000: must be"):
+        Simulation(SCENE).steps(REST, 1000, 10**18)
+    with pytest.raises(SstError, match="class 'dict'"):
+        simulate(SCENE, dict, 0.01)
 
 
 def test_each_public_name_is_thrown_at(calls):

@@ -24,6 +24,7 @@ from sst_ros.errors import (
     SstError,
     check_kinds,
     check_kinds_late,
+    refuse_errors,
     refuse_unless,
 )
 from sst_ros.mechanism import kinematics, virtual_work
@@ -66,7 +67,7 @@ class InverseDynamics(Explained):
         """
         parts = quaternion, body_rate, body_acceleration, moment if self._has_moment_topic else ()
         given: Any = parts
-        with contextlib.suppress(ArithmeticError, TypeError, ValueError):
+        with contextlib.suppress(ArithmeticError, TypeError, ValueError, MemoryError):
             given = *parts[0], *parts[1], *parts[2], *parts[3]
             first, second, third, determinant, *squares = self._program(*given)
             det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
@@ -128,8 +129,9 @@ class InverseDynamics(Explained):
     def _orientation(self, at: State | Sequence[float]) -> Quaternion:
         """Quaternion of {E} in {B} of a state, of angles gamma or of itself."""
         pose: Any = at.quaternion if isinstance(at, State) else at
-        fits = np.array(pose, object).shape in ((3,), (4,))
         allowed = "must be a State, three angles gamma or a quaternion"
+        with refuse_errors("inverse dynamics", "at", at, allowed, MemoryError):
+            fits = np.array(pose, object).shape in ((3,), (4,))
         refuse_unless("inverse dynamics", ("at", at, fits, allowed))
         if len(pose) == 3:
             rotation = kinematics.admissible(Geometry.of(self.scene), pose).rotation

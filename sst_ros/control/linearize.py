@@ -21,16 +21,15 @@ import numpy as np
 
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.dynamics.model import limits_of
+from sst_ros.dynamics.model import GRAZING, limits_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.variational import VariationalEquations, trace_derivatives
 from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
-from sst_ros.integration.events import GRAZING
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import ConstantTorque
-from sst_ros.state import ZERO, Array, State, finite_vector
+from sst_ros.state import ZERO, Array, Explained, State, finite_vector
 
 COORDINATES = {
     "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
@@ -40,8 +39,8 @@ _MOST, _CHECKS = 20_000, 8
 """Evaluations for a period: without end in a singularity; parts after which limits are checked."""
 
 
-@dataclass(frozen=True)
-class LinearModel:
+@dataclass(frozen=True, repr=False)
+class LinearModel(Explained):
     """Deviations x of a motion by deviations u of its torques: x' = A x + B u.
 
     With `dt` they are those from one period to the next: x[k + 1] = A x[k] + B u[k].
@@ -58,6 +57,15 @@ class LinearModel:
     B: Array
     states: tuple[str, ...]
     dt: float | None
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "x": self.states,
+            "A": " x ".join(map(str, self.A.shape)),
+            "B": " x ".join(map(str, self.B.shape)),
+            "dt [s]": self.dt or "none: x' = A x + B u",
+            "largest abs(eigenvalue of A)": float(np.abs(np.linalg.eigvals(self.A)).max()),
+        }
 
     def to_control(self) -> Any:
         """Return a `control.StateSpace` with the outputs x; needs the package control."""

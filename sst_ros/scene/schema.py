@@ -274,7 +274,7 @@ def _freeze_all(given: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:
     for key, spec, value in given:
         try:
             found[key] = accept(spec, value)
-        except (ValueError, TypeError, OverflowError):
+        except (ValueError, TypeError, OverflowError, MemoryError):
             problems.append(Problem(key, value, spec.refuse()))
         except InputError as error:
             for one in error.problems:
@@ -339,7 +339,8 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
         if spec.nonzero and not any(x * x for x in found):
             raise ValueError
         return found
-    if isinstance(value, bool) or (isinstance(value, str) and not _NUMBER.fullmatch(value)):
+    text = isinstance(value, str) and not _NUMBER.fullmatch(value)
+    if text or isinstance(value, (bool, np.complexfloating)):
         raise ValueError
     result = float(value)
     if not (math.isfinite(result) and spec.allows(result)):

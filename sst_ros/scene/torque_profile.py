@@ -191,6 +191,9 @@ def _three(value: Any, name: str) -> Vector3:
 
 def count_arguments(function: Callable[..., Any]) -> int:
     """Positional arguments that a function must be given, 1 or 2, or refuse it."""
+    allowed = "must be a function f(t) or f(t, state), in this order"
+    if isinstance(function, type):
+        raise refusal("simulate", "torque", function, allowed)
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
@@ -202,7 +205,6 @@ def count_arguments(function: Callable[..., Any]) -> int:
             if named[0] != "state" and (count == 1 or named[-1] not in ("t", "time")):
                 return count
             break
-    allowed = "must be a function f(t) or f(t, state), in this order"
     raise refusal("simulate", "torque", function, allowed)
 
 

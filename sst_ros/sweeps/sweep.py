@@ -97,6 +97,7 @@ def sweep(
     """
     fits = client is None or hasattr(client, "scheduler_info")
     named = not isinstance(vary, Iterable) or all(isinstance(key, str) for key in vary)
+    named = named and vary is not None
     refuse_unless("sweep", ("client", client, fits, "must be a dask.distributed Client"))
     refuse_unless("sweep", ("vary", vary, named, "must have keys of the scene, as text"))
     rows = {"table" if hasattr(vary, "columns") else "vary": vary}

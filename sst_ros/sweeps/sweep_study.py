@@ -176,7 +176,7 @@ class SweepStudy(Section):
         for key, given in {str(key): given for key, given in self.vary.items()}.items():
             try:
                 found.append(read_variation(key, given, self._targets(key)))
-            except (ValueError, TypeError, OverflowError) as error:
+            except (ValueError, TypeError, OverflowError, MemoryError) as error:
                 problems.append(Problem(f"vary.{key}", given, str(error)))
         columns: dict[str, dict[str, Any]] = {}
         for name, column in (self.table or {}).items():  # a trailing index is that of a component
