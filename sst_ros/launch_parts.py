@@ -30,8 +30,8 @@ from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import suggestion
 from sst_ros.host import processes
-from sst_ros.nodes import arguments, topics
-from sst_ros.runtime.settings import SimulatorParameters, default_topics
+from sst_ros.nodes import topics
+from sst_ros.runtime.settings import SimulatorParameters, default_topics, ros_arguments
 from sst_ros.scene.scene import load, share_directory
 from sst_ros.state import BASE_FRAME
 
@@ -134,7 +134,7 @@ def node(
     defaults = {k: str(v) for k, v in parameters.items() if v and isinstance(v, Default)}
     set_here = {k: v for k, v in parameters.items() if v and k not in defaults}
     words = [f"--{key.replace('_', '-')}={text}" for key, text in set_here.items()]
-    arguments.ros_arguments(executable, words)
+    ros_arguments(executable, words)
     return _node(
         given,
         "sst_ros",

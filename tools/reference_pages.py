@@ -23,11 +23,11 @@ from pandas import DataFrame
 
 from benchmark import measure
 from sst_ros.cli import commands
-from sst_ros.nodes import arguments, inverse_dynamics, simulation_interfaces, topics
+from sst_ros.nodes import inverse_dynamics, simulation_interfaces, topics
 from sst_ros.nodes.topics import CALLS, EXECUTES, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
 from sst_ros.report.results import markdown
-from sst_ros.runtime import run_loop
+from sst_ros.runtime import run_loop, settings
 from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import REQUIRED, Section, Spec
@@ -53,7 +53,7 @@ class Described(NamedTuple):
 
 NODES = tuple(
     Described(command, f"sst_{command}", parameters, tuple(topics.NODES[command].values()))
-    for command, (_, parameters) in arguments.COMMANDS.items()
+    for command, (_, parameters) in settings.COMMANDS.items()
 )
 
 

@@ -355,8 +355,7 @@ def _run(words: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:
         importlib.import_module("argcomplete").autocomplete(parser())
     if words and words[0] in NODES:
-        status: int = function("nodes.process:run")(words)
-        return status
+        return int(function("nodes.process:run")(words))
     options, unknown = parser().parse_known_args(words)
     if unknown:
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")

@@ -131,24 +131,22 @@ def write_table(
     """
     texts = dict(texts or {})
     texts[_CHECKSUM] = _checksum(texts, columns)
-    if path.suffix == ".npz":
-        named: dict[str, Any] = {**columns, **texts}
-        with replace_file(path) as own, own.open("wb") as file:
-            np.savez(file, **named)
-    elif path.suffix == ".csv":
-        # pandas writes the fewest digits that read back as the same bits.
-        table = require("pandas").DataFrame(columns)
-        with replace_file(path) as own:
-            table.to_csv(own, index=False, lineterminator="\n")
-    else:
-        pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
-        arrays = [pyarrow.array(column, from_pandas=True) for column in columns.values()]
-        fields = [
-            pyarrow.field(name, array.type, metadata=about[name])
-            for name, array in zip(columns, arrays, strict=True)
-        ]
-        whole = pyarrow.Table.from_arrays(arrays, schema=pyarrow.schema(fields, texts))
-        with replace_file(path) as own:
+    with replace_file(path) as own:
+        if path.suffix == ".npz":
+            named: dict[str, Any] = {**columns, **texts}
+            with own.open("wb") as file:
+                np.savez(file, **named)
+        elif path.suffix == ".csv":
+            # pandas writes the fewest digits that read back as the same bits.
+            require("pandas").DataFrame(columns).to_csv(own, index=False, lineterminator="\n")
+        else:
+            pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
+            arrays = [pyarrow.array(column, from_pandas=True) for column in columns.values()]
+            fields = [
+                pyarrow.field(name, array.type, metadata=about[name])
+                for name, array in zip(columns, arrays, strict=True)
+            ]
+            whole = pyarrow.Table.from_arrays(arrays, schema=pyarrow.schema(fields, texts))
             parquet.write_table(whole, own, write_page_checksum=True)
 
 

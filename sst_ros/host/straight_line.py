@@ -178,8 +178,7 @@ class _Instructions:
         """Return the address of an element of an array."""
         return self.builder.gep(self.values[node.value.id], [self.value(node.slice)])
 
-    def call(self, node: Any) -> list[Any]:
+    def call(self, node: Any) -> Any:
         """Return the results of another straight-line function."""
-        other, given = self.names[node.func.id].function, map(self.value, node.args)
-        found: list[Any] = _call(other, self.names, self.context, self.builder, list(given))
-        return found
+        other, given = self.names[node.func.id].function, [*map(self.value, node.args)]
+        return _call(other, self.names, self.context, self.builder, given)

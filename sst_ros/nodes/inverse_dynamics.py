@@ -57,11 +57,9 @@ KEYS = {
 }
 """Keys of the controller's /diagnostics, in order."""
 _FEEDBACK_PERIOD_S = 0.05
-_LOG_PERIOD_S = 1.0
-"""Trajectories of a stream are not logged more often."""
+_LOG_PERIOD_S = 1.0  # trajectories of a stream are not logged more often
 _SPINS_AT_END = 20
-_SPIN_S = 0.01
-"""Least time to deliver the result of a goal that the end of the node aborts: 0.2 s."""
+_SPIN_S = 0.01  # least time to deliver the result of a goal that the end of the node aborts: 0.2 s
 
 
 class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):

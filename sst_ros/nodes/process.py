@@ -36,23 +36,20 @@ from std_msgs.msg import String
 
 from sst_ros.errors import Check, InputError, SstError, refuse_unless
 from sst_ros.host.processes import is_orphan
-from sst_ros.nodes import arguments, signals, topics
-from sst_ros.runtime.settings import AnsweringParameters
+from sst_ros.nodes import signals, topics
+from sst_ros.runtime import settings
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.schema import Section, Spec
 from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-_FIRST_RCLPY_ON_FAST_DDS_3 = 9
-"""Of ROS 2 Kilted."""
-_POLL_S = 0.1
-"""Longest delay of a signal. The executor would take half a millisecond for each look."""
+_FIRST_RCLPY_ON_FAST_DDS_3 = 9  # of ROS 2 Kilted
+_POLL_S = 0.1  # longest delay of a signal. The executor would take half a millisecond for each look
 _CALLBACK_S = 1.0
 """Wait for a callback in progress: a service that waits for the run ends once that is closed."""
 _ACKNOWLEDGE_S = 1.2
 """A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
-_CLEAN_UP_S = 10.0
-"""Longer than any clean-up of the middleware, also on a busy machine."""
+_CLEAN_UP_S = 10.0  # longer than any clean-up of the middleware, also on a busy machine
 _WATCH_S = 0.25
 _STDERR = 2
 
@@ -67,7 +64,7 @@ _TYPES = {
 _WIDEST = 1e300
 
 P = TypeVar("P", bound=Section)
-A = TypeVar("A", bound=AnsweringParameters)
+A = TypeVar("A", bound=settings.AnsweringParameters)
 
 
 class Worker(Generic[P]):
@@ -131,12 +128,12 @@ def _declare(
             node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
             checks.append((name, value, False, spec.describe()))
-    ours = {name for _, parameters in arguments.COMMANDS.values() for name in parameters.SPECS}
+    ours = {name for _, parameters in settings.COMMANDS.values() for name in parameters.SPECS}
     for name in sorted(given.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")
-        elif not name.startswith(arguments.FOREIGN):
-            checks.append(arguments.unknown_name(name, values))
+        elif not name.startswith(settings.FOREIGN):
+            checks.append(settings.unknown_name(name, values))
     refuse_unless(origin, *checks)
     try:
         return cls(**values)  # `build` would take a number for text, as a YAML file has it
@@ -246,17 +243,17 @@ def run(words: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker close. Words
-    are a key of `arguments.COMMANDS` and the arguments behind it. The exit status is 0, 1 for a
+    are a key of `settings.COMMANDS` and the arguments behind it. The exit status is 0, 1 for a
     failure, 2 for arguments that are refused.
     """
     signals.handle()
     command, *given = words
     if {"-h", "--help"} & set(given):
-        arguments.make_parser(command).print_help()
+        settings.make_parser(command).print_help()
         return 0
     configure_middleware()
     try:
-        ros = arguments.ros_arguments(command, given)
+        ros = settings.ros_arguments(command, given)
         rclpy.init(args=[command, *ros], signal_handler_options=SignalHandlerOptions.NO)
     except InputError as error:
         print(error, file=sys.stderr)
@@ -267,8 +264,8 @@ def run(words: Sequence[str]) -> int:
     try:
         if not signals.came:
             module = importlib.import_module(f"sst_ros.nodes.{command}")
-            worker = getattr(module, arguments.COMMANDS[command][0])()
-            for line in arguments.unused_files(ros, worker.node.get_fully_qualified_name()):
+            worker = getattr(module, settings.COMMANDS[command][0])()
+            for line in settings.unused_files(ros, worker.node.get_fully_qualified_name()):
                 worker.node.get_logger().warning(line)
             spin(worker)
     except (SstError, ParameterException) as error:

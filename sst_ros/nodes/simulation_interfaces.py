@@ -30,19 +30,17 @@ from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.state import NANOSECONDS, ZERO, Quaternion, Vector3
 
 try:
-    from simulation_interfaces import action, srv
+    from simulation_interfaces import action, msg, srv
 except ImportError:  # not part of every installation, nor of the wheels
-    action = srv = None
+    action = msg = srv = None
 
 NAME = "star"
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 """Codes of Result."""
 INVALID_POSE = 101
 
-_UNIT = 1e-3
-"""Largest deviation of a quaternion's length from 1; it is normalised."""
-_SAME = 1e-6
-"""Largest angle between an orientation and the assembly at its actuator angles [rad]."""
+_UNIT = 1e-3  # largest deviation of a quaternion's length from 1; it is normalised
+_SAME = 1e-6  # largest angle between an orientation and the assembly at its actuator angles [rad]
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
 ALREADY_THERE, INCORRECT_TRANSITION = 101, 103
 SCOPE_TIME, SCOPE_STATE, SCOPE_SPAWNED, SCOPE_ALL = 1, 2, 4, 255
@@ -147,9 +145,7 @@ class SimulationInterfaces:
         """List the star and its state."""
         self.get_entities(request, response)
         if response.entities:
-            from simulation_interfaces.msg import EntityState
-
-            response.states = [self._fill(EntityState())]
+            response.states = [self._fill(msg.EntityState())]
         return response
 
     def get_entity_state(self, request: Any, response: Any) -> Any:

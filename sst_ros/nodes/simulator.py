@@ -34,8 +34,7 @@ from sst_ros.state import NANOSECONDS
 
 _DELAY_S = 5.0
 """Delay of the compiler: the first seconds of a real-time run have the processor alone."""
-_END_S = 0.5
-"""Wait for the thread of the run, where a step does not end."""
+_END_S = 0.5  # wait for the thread of the run, where a step does not end
 FOLLOWED_STEP_NS = 200_000_000
 """Steps of a followed clock up to this length are simulated; longer ones are dropped time."""
 _LONGEST_WAIT_S = 0.05
@@ -103,9 +102,8 @@ class Simulator(Worker[SimulatorParameters]):
 
     def change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
-        before, self.parameters, run = self.parameters, changed, changed.run
-        self._run.command_timeout_ns = run.command_timeout_ns
-        self._run.lockstep_timeout = run.lockstep_timeout
+        before, self.parameters = self.parameters, changed
+        vars(self._run).update(vars(changed.run))  # its times, as all else stays
         if changed.real_time_factor != before.real_time_factor:
             self._loop.post(self._change_speed)
 

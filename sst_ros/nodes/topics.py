@@ -11,6 +11,7 @@ import importlib
 import math
 import re
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -76,28 +77,24 @@ serves ~/step std_srvs/srv/Trigger
 serves ~/reset std_srvs/srv/Trigger
     back to the initial state, also out of a fault; stamps continue
 
-[torque_player]
-publishes {simulator}/commands std_msgs/msg/Float64MultiArray 1000
-    the profile's torques [N m] for the hold that each joint_states begins
-    if stamped is false
-publishes {simulator}/commands_stamped sensor_msgs/msg/JointState 1000
-    the same, by name and stamp
-    if stamped is true
-subscribes joint_states sensor_msgs/msg/JointState 1000
-    samples that are answered, from the first on
-subscribes {simulator}/phase std_msgs/msg/String 1 latched
-    ends the player at a fault
-calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
-    whether it runs in lockstep, where a command without a stamp is of no use: then the node ends
-    if stamped is false
-
-[inverse_dynamics]
+[torque_player inverse_dynamics]
 publishes {simulator}/commands std_msgs/msg/Float64MultiArray 1000
     torques [N m] that answer each joint_states
     if stamped is false
 publishes {simulator}/commands_stamped sensor_msgs/msg/JointState 1000
     the same, by name and stamp
     if stamped is true
+calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
+    whether it runs in lockstep, where a command without a stamp is of no use: then the node ends
+    if stamped is false
+
+[torque_player]
+subscribes joint_states sensor_msgs/msg/JointState 1000
+    samples that are answered, from the first on
+subscribes {simulator}/phase std_msgs/msg/String 1 latched
+    ends the player at a fault
+
+[inverse_dynamics]
 publishes ~/reference sensor_msgs/msg/JointState 1000
     desired gamma [rad] and gamma_dot [rad/s]; effort: feedforward [N m]; the stamp is that of the
     joint_states it belongs to
@@ -112,9 +109,6 @@ subscribes {simulator}/phase std_msgs/msg/String 10 latched
 subscribes ~/joint_trajectory trajectory_msgs/msg/JointTrajectory 10
     motion to follow, from its stamp on or at once and in place of the present one; refused as a
     whole where it cannot be followed, and where motion is not topic
-calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
-    whether it runs in lockstep, where a command without a stamp is of no use: then the node ends
-    if stamped is false
 executes ~/follow_joint_trajectory control_msgs/action/FollowJointTrajectory
     the same with tolerances, feedback and a result
     if control_msgs is installed
@@ -137,8 +131,6 @@ calls {simulator}/step std_srvs/srv/Trigger
     the button Step
 calls {simulator}/reset std_srvs/srv/Trigger
     the button Reset
-
-[recorder]
 """
 
 SERVICE_QOS = QoSProfile(depth=1000)
@@ -188,14 +180,14 @@ _ROW = re.compile(r"(\w+) (\S+) (\S+) ?(\w*)( latched)?\n((?:    (?!if ).*\n)*)(
 
 def _read(table: str) -> dict[str, dict[str, Endpoint]]:
     """Return the endpoints by node and by the last part of their names."""
-    nodes: dict[str, dict[str, Endpoint]] = {}
+    nodes: dict[str, dict[str, Endpoint]] = defaultdict(dict)
     for part in table.replace("MOST_WAITING", str(MOST_WAITING)).split("\n[")[1:]:
-        node, _, rows = part.partition("]\n")
-        nodes[node] = {}
+        sharing, _, rows = part.partition("]\n")
         for use, name, kind, depth, latched, doc, when in _ROW.findall(rows):
             text = " ".join(doc.split())
             one = Endpoint(use, name, kind, int(depth or 10), bool(latched), when, text)
-            nodes[node][name.rpartition("/")[2]] = one
+            for node in sharing.split():
+                nodes[node][name.rpartition("/")[2]] = one
     return nodes
 
 

@@ -30,8 +30,7 @@ from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 
 _REPLY_S = 5.0
-_REPEAT_S = 0.05
-"""Period of manual commands; the simulator drops commands older than half a second."""
+_REPEAT_S = 0.05  # period of manual commands; the simulator drops commands older than half a second
 _LOOK_S = 0.5
 _QUEUE = topics.VIEWER["joint_states"].depth
 

@@ -10,8 +10,8 @@ from builtin_interfaces.msg import Duration
 from docs.blocks import ROOT
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros.nodes.arguments import COMMANDS, ros_arguments
 from sst_ros.nodes.topics import EXECUTES, PUBLISHES, SERVES, SUBSCRIBES
+from sst_ros.runtime.settings import COMMANDS, ros_arguments
 from tools.reference_pages import NODES
 
 ENDPOINTS = {

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sst_ros.errors import InputError
-from sst_ros.nodes.arguments import COMMANDS, make_parser, ros_arguments, unused_files
+from sst_ros.runtime.settings import COMMANDS, make_parser, ros_arguments, unused_files
 
 
 def values(command, *words):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from programs import python
 
-from sst_ros.nodes.arguments import COMMANDS
+from sst_ros.runtime.settings import COMMANDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 SOURCE = Path(__file__).parents[2]

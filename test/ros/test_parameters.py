@@ -15,9 +15,8 @@ import yaml
 from rcl_interfaces.srv import DescribeParameters
 from ros.conftest import NODE
 
-from sst_ros.nodes.arguments import COMMANDS
 from sst_ros.nodes.process import Worker
-from sst_ros.runtime.settings import SimulatorParameters
+from sst_ros.runtime.settings import COMMANDS, SimulatorParameters
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[2]
