@@ -123,16 +123,14 @@ def description(
     return LaunchDescription([named, *declared, OpaqueFunction(function=perform)])
 
 
-def node(
-    given: Given, executable: str, parameters: Mapping[str, str], *, ends: bool = True
-) -> Node:
+def node(given: Given, executable: str, values: Mapping[str, str], *, ends: bool = True) -> Node:
     """Describe a node of this package, which ends with the launch, however that ends.
 
-    Parameters that are empty are left to params_file or the default; an InputError lists what the
+    Values that are empty are left to params_file or the default; an InputError lists what the
     node would refuse. Where it `ends`, its end is that of its partners; its failure always is.
     """
-    defaults = {k: str(v) for k, v in parameters.items() if v and isinstance(v, Default)}
-    set_here = {k: v for k, v in parameters.items() if v and k not in defaults}
+    defaults = {k: str(v) for k, v in values.items() if v and isinstance(v, Default)}
+    set_here = {k: v for k, v in values.items() if v and k not in defaults}
     words = [f"--{key.replace('_', '-')}={text}" for key, text in set_here.items()]
     ros_arguments(executable, words)
     return _node(
@@ -211,10 +209,8 @@ def rviz(given: Given, scene_name: str) -> list[Action]:
     if prefix:
         text = layout.read_text(encoding="utf-8").replace("base_link", f"{prefix}base_link")
         path = _temporary_file(text.replace('TF Prefix: ""', f"TF Prefix: {prefix[:-1]}"))
-    return [
-        _state_publisher(given, urdf(load(scene_name))),
-        _node(given, "rviz2", arguments=["-d", path]),
-    ]
+    state_publisher = _state_publisher(given, urdf(load(scene_name)))
+    return [state_publisher, _node(given, "rviz2", arguments=["-d", path])]
 
 
 def ros2_control(given: Given, controller: str, controllers: str) -> list[Action]:

@@ -27,12 +27,8 @@ def clamp(torque: Vector3, limit: float | None) -> Vector3:
     """Clamp torques [N m] to the limit of the actuators, where they have one."""
     if limit is None:
         return torque
-    first, second, third = torque
-    return (
-        min(max(first, -limit), limit),
-        min(max(second, -limit), limit),
-        min(max(third, -limit), limit),
-    )
+    first, second, third = (min(max(each, -limit), limit) for each in torque)
+    return first, second, third
 
 
 def finite_vector(value: Any) -> Vector3 | None:
@@ -59,9 +55,8 @@ class Explained:
     def __repr__(self) -> str:
         said = {name: _say(value) for name, value in self._facts().items()}
         width = max(map(len, said))
-        return "\n".join(
-            [type(self).__name__, *(f"  {name:<{width}}  {text}" for name, text in said.items())]
-        )
+        lines = (f"  {name:<{width}}  {text}" for name, text in said.items())
+        return "\n".join([type(self).__name__, *lines])
 
     def _repr_html_(self) -> str:
         rows = "".join(

@@ -51,9 +51,8 @@ DEGREES = float(np.degrees(1.0))
 SMALLEST_SHOWN = 1e-17
 """Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
 
-STYLE: Any = mpl.rc_params_from_file(
-    Path(__file__).with_suffix(".mplstyle"), use_default_template=False
-)
+_FILE = Path(__file__).with_suffix(".mplstyle")
+STYLE: Any = mpl.rc_params_from_file(_FILE, use_default_template=False)
 styled = mpl.rc_context(STYLE)  # gives a function that makes a figure the style, as a decorator
 
 

@@ -70,9 +70,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         given, own = self.parameters, topics.CONTROLLER
         self.follower = TrajectoryFollower(scene.load(given.scene), given)
         names = ("reference", "tracking_error", "diagnostics")
-        self._reference, self._error, self._diagnostics = (
-            own[name].publisher(self.node) for name in names
-        )
+        publishers = (own[name].publisher(self.node) for name in names)
+        self._reference, self._error, self._diagnostics = publishers
         self._seen: Measurement | None = None
         self._seen_ns = 0
         self._refused, self._last_refusal = 0, ""

@@ -176,10 +176,9 @@ class AnsweringWorker(Worker[A]):
         topics.subscribe(self.node, own, given.simulator, **heard)
         self._simulator: Any = None
         if not given.stamped:
-            asked, name = own["get_parameters"], own["get_parameters"].name
-            self._simulator = self.node.create_client(
-                asked.kind, name.format(simulator=given.simulator)
-            )
+            asked = own["get_parameters"]
+            name = asked.name.format(simulator=given.simulator)
+            self._simulator = self.node.create_client(asked.kind, name)
         self._sync: Any = None  # the future of the simulator's parameter
         every(self.node, _WATCH_S, self.watch)
 

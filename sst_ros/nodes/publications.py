@@ -102,10 +102,8 @@ def state_messages(frame_id: str = "", base_frame: str = BASE_FRAME) -> tuple[Me
 
     def joint_states(at: bytes, numbers: Numbers) -> bytes:
         _, joints, torque = numbers
-        angles, rates = joints[:9], joints[9:]
-        return pack_joints(
-            _ENCAPSULATION, at, names, *angles, count, *rates, count, *torque, *_PASSIVE
-        )
+        sequences = *joints[:9], count, *joints[9:], count, *torque, *_PASSIVE
+        return pack_joints(_ENCAPSULATION, at, names, *sequences)
 
     def orientation(at: bytes, numbers: Numbers) -> bytes:
         return pack_quaternion(_ENCAPSULATION, at, base, *numbers[0])

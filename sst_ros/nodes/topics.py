@@ -165,9 +165,8 @@ class Endpoint(NamedTuple):
 
     def publisher(self, node: Node, depth: int = 10, *, simulator: str = "") -> Publisher[Any]:
         """Create its publisher; the depth is for a topic that has none of its own."""
-        return node.create_publisher(
-            self.kind, self.name.format(simulator=simulator), self.qos(depth)
-        )
+        topic = self.name.format(simulator=simulator)
+        return node.create_publisher(self.kind, topic, self.qos(depth))
 
     def qos(self, depth: int = 10) -> QoSProfile:
         """Return its QoS; the depth is for a topic that has none of its own."""
@@ -255,10 +254,8 @@ def take(subscription: Subscription[Any]) -> tuple[bytes, dict[str, Any]] | None
     """
     handle: Any = subscription.handle
     with handle:
-        taken: tuple[bytes, dict[str, Any]] | None = handle.take_message(
-            subscription.msg_type, True
-        )
-    return taken
+        one: tuple[bytes, dict[str, Any]] | None = handle.take_message(subscription.msg_type, True)
+    return one
 
 
 class Reader:
@@ -318,13 +315,11 @@ class ActionGoal:
         handle.execute(self._wait)
 
     @staticmethod
-    def serve(
-        node: Node, kind: Any, name: str, begin: Callable[[Any], None], **callbacks: Any
-    ) -> None:
+    def serve(node: Node, kind: Any, name: str, begin: Callable[[Any], None], **more: Any) -> None:
         """Serve an action whose goals `begin` makes, from handles of rclpy."""
         from rclpy.action.server import ActionServer, CancelResponse  # most nodes have no action
 
-        given = {"cancel_callback": lambda _: CancelResponse.ACCEPT, **callbacks}
+        given = {"cancel_callback": lambda _: CancelResponse.ACCEPT, **more}
         ActionServer(node, kind, name, lambda _: None, handle_accepted_callback=begin, **given)
 
     async def _wait(self, _: Any) -> Any:

@@ -310,10 +310,8 @@ class RunLoop(TickLoop):
 class RunDiagnostics:
     """Collects the counters of the parts of the node."""
 
-    def __init__(
-        self, loop: RunLoop, torque_input: TorqueInput, pacer: Pacer, period_s: float
-    ) -> None:
-        self._loop, self._input, self._pacer, self._period_s = loop, torque_input, pacer, period_s
+    def __init__(self, loop: RunLoop, commands: TorqueInput, pacer: Pacer, period_s: float) -> None:
+        self._loop, self._input, self._pacer, self._period_s = loop, commands, pacer, period_s
         self.gauges: dict[str, object] = {}
         self.granted = {"scheduling": "", "cpu_dma_latency": processes.NO_LIMIT}
         self._noted: dict[str, Any] = {}

@@ -45,9 +45,7 @@ class SimulatorParameters(Section):
     CHANGEABLE: ClassVar = ("real_time_factor", "command_timeout", "lockstep_timeout")
 
     scene: str = entry("scene, by name or by path of a .yaml file", default="example2")
-    rate: int = _whole(
-        "steps per second of simulated time, a divisor of 1e9", "Hz", 1000, 1, 100000
-    )
+    rate: int = _whole("steps per second of simulated time, a divisor of 1e9", "Hz", 1000, 1, 10**5)
     publish_rate: int = _whole(
         "published samples per second of simulated time, a divisor of rate", "Hz", 500, 1, 100000
     )
@@ -66,9 +64,7 @@ class SimulatorParameters(Section):
         most=1000.0,
     )
     publish_clock: bool = entry("publish the simulated time on /clock", default=False)
-    publish_description: bool = entry(
-        "publish the scene as URDF on robot_description", default=True
-    )
+    publish_description: bool = entry("publish the scene's URDF on robot_description", default=True)
     base_frame: str = entry(
         "frame {B} in headers; with a prefix where robot_state_publisher has it as frame_prefix",
         default=BASE_FRAME,
@@ -205,9 +201,7 @@ class AnsweringParameters(Section):
         most=100000,
     )
     simulator: str = entry("name of the simulator's node", default="sst_simulator")
-    stamped: bool = entry(
-        "answer on commands_stamped, as a simulator in lockstep asks", default=False
-    )
+    stamped: bool = entry("answer on commands_stamped, which lockstep needs", default=False)
     min_subscribers: int = _whole(
         "least number of subscribers of the commands, before which none is sent", "1", 1, 1, 100
     )
@@ -286,9 +280,7 @@ def default_topics() -> tuple[str, ...]:
 class RecorderParameters(Section):
     """Parameters of sst_recorder."""
 
-    output: str = entry(
-        "folder of the bag, which must not exist yet; - for a dated name", default="-"
-    )
+    output: str = entry("folder of the bag, which must not exist; - for a dated name", default="-")
     topics: tuple[str, ...] = entry("topics to record", default=default_topics())
     timeout: float = _number(
         "longest wait until they are recorded, after which the node ends with an error; 0 for no "

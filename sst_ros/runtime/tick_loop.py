@@ -222,10 +222,8 @@ class HeldTorques:
         without, by_late, by_lost = (
             dynamics.derivative(*y, *torque, *rest)[4:7] for torque in (ZERO, late, lost)
         )
-        return (
-            0.5 * period * math.dist(by_late, without),
-            period**2 / 24.0 * math.dist(by_lost, without),
-        )
+        of_start = 0.5 * period * math.dist(by_late, without)
+        return of_start, period**2 / 24.0 * math.dist(by_lost, without)
 
 
 class NoAnswer(SstError):

@@ -91,9 +91,8 @@ class AccessCheck:
         response.body = response.body.replace(b"<title>Viser</title>", title, 1)
         del headers["Content-Length"]
         headers["Content-Length"] = str(len(response.body))
-        headers["Set-Cookie"] = (
-            f"{COOKIE.format(port)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-        )
+        cookie = f"{COOKIE.format(port)}={self.token}"
+        headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
         headers["X-Frame-Options"], headers["Referrer-Policy"] = "DENY", "no-referrer"
 
 
