@@ -7,7 +7,6 @@ Diagnostics: one status a second, and at the end a table of errors over run time
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 import time
@@ -23,8 +22,8 @@ from sst_ros.errors import RunStopped, SstError
 from sst_ros.host import processes
 from sst_ros.runtime.tick_loop import HeldTorques, NoAnswer, Pacer, RunOutput, TickLoop
 from sst_ros.runtime.torque_input import RunSettings, TorqueInput
-from sst_ros.scene.loads import JOINTS, Initial
-from sst_ros.scene.scene import Scene
+from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.scene import Scene, with_initial
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3
 
@@ -244,8 +243,7 @@ class RunLoop(TickLoop):
         if self.phase not in (Phase.WAITING, Phase.PAUSED):
             return Reply(False, f"refused: pause or reset first, the run is {self._status}")
         try:
-            initial = Initial(gamma=gamma, gamma_dot=gamma_dot)
-            self.restart(self._build(dataclasses.replace(self._original.scene, initial=initial)))
+            self.restart(self._build(with_initial(self._original.scene, (gamma, gamma_dot))))
         except SstError as error:
             return Reply(False, f"refused: {error}")
         self.warm_up()

@@ -31,7 +31,6 @@ from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
@@ -236,9 +235,7 @@ class TrajectoryFollower:
         self._model, self._settings, self._geometry = model, settings, Geometry.of(model)
         limit = float(command_limit(settings.torque_limit, model))
         if math.isfinite(limit):  # for the check of motions, too
-            actuators = model.actuators or Actuators(torque_limit=limit)
-            actuators = dataclasses.replace(actuators, torque_limit=limit)
-            self._model = dataclasses.replace(model, actuators=actuators)
+            self._model = model.with_values({"actuators.torque_limit": limit})
         self._planned: ReferenceMotion | None = None
         if settings.motion == "scene":
             self._planned = reference_motion(model, _read_motion)
