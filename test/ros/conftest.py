@@ -325,12 +325,11 @@ def observer_of_module(domain_of_module):
 def forked_demos(domain_of_module):
     """Have demos fork their nodes, too; test_demo.py starts them as a user does."""
 
-    def start(command, given, **_):
-        words = [command, "--ros-args", *processes.words(given)]
-        return ForkedNode(words, {**os.environ, "SST_ROS_NUMBA": "0"})
+    def start(words, env, **_):
+        return ForkedNode(words[words.index("sst_ros") + 1 :], {**env, "SST_ROS_NUMBA": "0"})
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(processes, "start", start)
+        patch.setattr(processes, "Popen", start)
         yield
 
 
