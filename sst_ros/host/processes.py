@@ -16,10 +16,12 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
+from queue import SimpleQueue
 from subprocess import Popen
 from typing import Any, BinaryIO
 
@@ -97,12 +99,15 @@ class Assistant:
     """A process of low priority that calls one function, which pickle takes; it ends with this one.
 
     What takes longer than a control period is computed there: a thread would share the
-    interpreter's lock with the control.
+    interpreter's lock with the control. A thread here waits for that process, which may take long
+    to read and to write what the kernel does not hold at once.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+        self._function, self._closed = function, False
+        self._calls, self._results = SimpleQueue[Any](), SimpleQueue[Any]()
         self._begin()
+        threading.Thread(target=self._exchange, name="assistant", daemon=True).start()
 
     def _begin(self) -> None:
         self._connection, theirs = Pipe()
@@ -119,25 +124,33 @@ class Assistant:
 
     def call(self, *given: Any) -> None:
         """Have the function called; not before the result of the last call is there."""
-        with contextlib.suppress(OSError):  # it has ended: `result` says so
-            self._connection.send(given)
+        self._calls.put(given)
 
     def result(self) -> Any:
         """Return the result of the call, or the SstError why there is none; None until it is there.
 
         Where the process has ended another one is begun.
         """
-        try:
-            return self._connection.recv() if self._connection.poll() else None
-        except (EOFError, OSError):
-            status = self._process.wait()
-            self._begin()
-            return SstError(f"the process beside this one has ended with status {status}")
+        return None if self._results.empty() else self._results.get()
+
+    def _exchange(self) -> None:
+        while not self._closed:
+            given = self._calls.get()
+            try:
+                self._connection.send(given)
+                self._results.put(self._connection.recv())
+            except (EOFError, OSError):
+                if self._closed:
+                    return
+                text = f"the process beside this one has ended with status {self._process.wait()}"
+                self._begin()
+                self._results.put(SstError(text))
 
     def close(self) -> None:
         """End the process."""
-        self._connection.close()
-        self._process.kill()
+        self._closed = True
+        self._calls.put(())  # to the thread, where that waits for a call
+        self._process.kill()  # where it waits for the process
         self._process.wait()
 
 

@@ -4,8 +4,11 @@
 import contextlib
 import dataclasses
 import math
+import multiprocessing
 import os
+import pickle
 import signal
+import struct
 import time
 import tracemalloc
 
@@ -13,8 +16,7 @@ import numpy as np
 import pytest
 from runtime.bench import Message, duration
 
-from sst_ros.control import tracking
-from sst_ros.control.controller import ControlStopped, Measurement
+from sst_ros.control.controller import BAND, ControlStopped, Measurement
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, SstError
 from sst_ros.host import processes
@@ -74,7 +76,7 @@ def test_it_follows_holds_and_ends_with_zero_torque():
     assert stages == (Stage.FOLLOWING,) * 25 + (Stage.HOLDING,) * 5 + (Stage.ENDED,)
     assert commands[-1].torque == REST and follower.samples == 31
     judged = follower.tracking()
-    assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / tracking.BAND
+    assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / BAND
     rms, largest = follower.errors
     assert largest == judged.largest.max()
     assert rms == pytest.approx(np.sqrt(np.mean(judged.rms**2)))
@@ -287,6 +289,27 @@ def test_control_goes_on_beside_the_check_of_a_trajectory():
         follower.proceed()
     assert sorted(took)[len(took) // 2] < 0.002
     assert max(stream.jumps()[:2]) < 1e-6
+
+
+@pytest.mark.timeout(20)
+def test_a_long_result_of_which_a_part_has_come_delays_no_sample():
+    """Of a process that has to let others run meanwhile; a kernel keeps 200 kB of what is sent."""
+    ours, theirs = multiprocessing.Pipe()
+    with pytest.MonkeyPatch.context() as patch, theirs:
+        patch.setattr(processes, "Pipe", lambda: (ours, multiprocessing.Pipe()[1]))
+        with contextlib.closing(processes.Assistant(bytes)) as assistant:
+            long = bytes(1_000_000)
+            assistant.call(long)  # nobody has taken it yet
+            assert (theirs.recv(), theirs.recv()) == (bytes, (long,))
+            sent = pickle.dumps(long)
+            os.write(theirs.fileno(), struct.pack("!i", len(sent)) + sent[:1000])
+            assert assistant.result() is None
+            os.set_blocking(theirs.fileno(), False)
+            rest = memoryview(sent)[1000:]
+            while (found := assistant.result()) is None:
+                with contextlib.suppress(BlockingIOError):
+                    rest = rest[os.write(theirs.fileno(), rest) :] if rest else rest
+            assert found == long
 
 
 def test_the_process_that_checks_ends_with_its_reason_and_another_begins():
