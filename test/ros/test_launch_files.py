@@ -48,7 +48,7 @@ class Launch:
         with self._printed.open("w") as out:
             env = {**os.environ, "SST_ROS_NUMBA": "0", "ROS_LOG_DIR": str(folder / "log")}
             self._process = subprocess.Popen(
-                [shutil.which("ros2"), *words],
+                [ROS2, *words],
                 cwd=folder,
                 stdout=out,
                 stderr=subprocess.STDOUT,
