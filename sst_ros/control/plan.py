@@ -125,18 +125,19 @@ def examine_motion(motion: ReferenceMotion, scene: Scene, *, exact: bool = True)
         rows = [(*at.quaternion, *at.body_rate, *inverse.reference_torque(at)) for at in found]
         return np.array(rows)
 
-    samples = np.array(list(map(measure, desired)))
+    samples, find = _sample(motion, measure, times, desired)
     star = np.array([(*at.quaternion, *at.body_rate) for at in desired])
     t, rows = np.unique(times, return_index=True)  # ends of pieces may be equal up to rounding
     trajectory = Trajectory(
         scene, t, star[rows, :4], star[rows, 4:], samples[rows, :3], message="planned",
         law=lambda time: inverse.reference_torque(motion.at(time)), dense=states,
     )  # fmt: skip
-    bounds = [-math.inf if exact else limits.get(name, math.inf) for name in UNITS]
-    floors = [(bound, bound) for bound in bounds for _ in range(3)]
-    extremes = _extremes(motion, measure, times, samples, floors)
-    largest = [max(high, low, key=lambda peak: abs(peak.value)) for low, high in extremes]
-    peaks = {name: largest[3 * k : 3 * k + 3] for k, name in enumerate(UNITS)}
+    peaks = {}
+    for first, name in zip(range(0, 12, 3), UNITS, strict=True):
+        floor = -math.inf if exact else limits.get(name, math.inf)
+        legs = range(first, first + 3)
+        both = ([find(index, sign, floor) for sign in (1.0, -1.0)] for index in legs)
+        peaks[name] = [max(ends, key=lambda peak: abs(peak.value)) for ends in both]
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
     squares = simpson(samples[pieces, :3] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
     rms = np.sqrt(squares / times[-1]).tolist()
@@ -144,27 +145,25 @@ def examine_motion(motion: ReferenceMotion, scene: Scene, *, exact: bool = True)
     return MotionPlan(motion, trajectory, peaks, limits, rms, distances, faults)
 
 
-def _extremes(
+def _sample(
     motion: ReferenceMotion,
     measure: Callable[[Reference], tuple[float, ...]],
     times: Array,
-    samples: Array,
-    floors: Sequence[tuple[float, float]],
-) -> Iterator[tuple[Peak, Peak]]:
-    """Yield the lowest and the highest of each number that is measured at a reference.
+    desired: Sequence[Reference],
+) -> tuple[Array, Callable[[int, float, float], Peak]]:
+    """Return m numbers that are measured at n references, (n, m), and what finds their extremes.
 
-    `floors` are those of `maximum`, for minus the number and for the number.
+    That takes the index of a number, a sign, +1 for its highest value or -1 for its lowest, and the
+    floor of `maximum` for the number times the sign.
     """
+    samples = np.array(list(map(measure, desired)))
 
-    def sample(sign: float, index: int, time: float) -> float:
-        return sign * measure(motion.at(time))[index]
+    def find(index: int, sign: float, floor: float) -> Peak:
+        values = sign * samples[:, index]
+        found = maximum(lambda time: sign * measure(motion.at(time))[index], times, values, floor)
+        return Peak(sign * found.value, found.time)
 
-    for index, values in enumerate(samples.T):
-        low, high = (
-            maximum(partial(sample, sign, index), times, sign * values, floor)
-            for sign, floor in zip((-1.0, 1.0), floors[index], strict=True)
-        )
-        yield Peak(-low.value, low.time), high
+    return samples, find
 
 
 def maximum(
@@ -213,25 +212,23 @@ def _distances(
                 posture[leg] = -posture[leg]
         return (*at.gamma, *posture)
 
-    samples = np.array(list(map(measure, desired)))
-    sign = math.copysign(1.0, samples[0, 9])
+    samples, find = _sample(motion, measure, times, desired)
+
+    def reach(index: int, end: float, sign: float, held: bool = True) -> Peak:
+        """Return the value closest to a limit, or farthest beyond."""
+        floor = -math.inf if exact else -sign * end if held else math.inf
+        return find(index, -sign, floor)
+
     arcs, edges = geometry.arc.tolist(), [geometry.beta_max] * 3
     in_stroke, in_workspace = scene.stroke.at_end != "ignore", scene.workspace.at_edge != "ignore"
-    none = math.inf, math.inf
-    floors = [
-        *((0.0, end) if in_stroke else none for end in arcs),
-        *[(-SINGULAR_MU, math.inf)] * 3,
-        *((0.0, end) if in_workspace else none for end in edges),
-        (-SINGULAR_J2, math.inf) if sign > 0.0 else (math.inf, -SINGULAR_J2),
-    ]
-    floors = [(-math.inf, -math.inf)] * 10 if exact else floors
-    extremes = list(_extremes(motion, measure, times, samples, floors))
-    ranges = ("gamma", extremes[:3], arcs, in_stroke), ("beta", extremes[6:9], edges, in_workspace)
-    for name, reached, ends, held in ranges:
-        for leg, ((low, high), end) in enumerate(zip(reached, ends, strict=True), start=1):
-            yield LimitDistance(f"{name}_{leg}", 0.0, 1.0, "rad", low, held)
-            yield LimitDistance(f"{name}_{leg}", end, -1.0, "rad", high, held)
-    for leg, (low, _) in enumerate(extremes[3:6], start=1):
+    ranges = ("gamma", 0, arcs, in_stroke), ("beta", 6, edges, in_workspace)
+    for name, first, ends, held in ranges:
+        for leg, most in enumerate(ends):
+            for end, sign in ((0.0, 1.0), (most, -1.0)):
+                reached = reach(first + leg, end, sign, held)
+                yield LimitDistance(f"{name}_{leg + 1}", end, sign, "rad", reached, held)
+    for leg in (1, 2, 3):
+        low = reach(2 + leg, SINGULAR_MU, 1.0)
         if low.value < SINGULAR_MU:
             said = f"serial singularity of leg {leg} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(said, low.value)
@@ -240,7 +237,8 @@ def _distances(
     def determinant(time: float) -> float:
         return measure(motion.at(time))[9]
 
-    nearest = extremes[9][0 if sign > 0.0 else 1]
+    sign = math.copysign(1.0, samples[0, 9])
+    nearest = reach(9, sign * SINGULAR_J2, sign)
     if sign * nearest.value < SINGULAR_J2:
         crosses = sign * nearest.value <= 0.0
         time = brentq(determinant, 0.0, nearest.time) if crosses else nearest.time
