@@ -313,7 +313,7 @@ def through_points(
     for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
         ends[np.isnan(ends)] = 0.0
     begun = follow_assembly(geometry, start, here, gamma[0])
-    path = _quintic_path(at, gamma, rates, seconds)
+    path = partial(_on_curve, quintic(at, gamma, rates, seconds))
     return move_actuators(geometry, path, tuple(at.tolist()), begun)
 
 
@@ -327,7 +327,7 @@ def through_samples(
     """
     times, gamma = times - times[0], np.unwrap(positions, axis=0)
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
-    path = _quintic_path(times, gamma, velocities, np.full_like(gamma, np.nan))
+    path = partial(_on_curve, quintic(times, gamma, velocities, np.full_like(gamma, np.nan)))
     return move_actuators(geometry, path, pieces, start)
 
 
@@ -360,10 +360,6 @@ def _check_points(at: Array, rates: Array) -> Iterator[Check]:
         still = not np.nan_to_num(rates[end]).any()
         allowed = "must be zero: a motion begins and ends at rest"
         yield f"velocities[{end}]", rates[end].tolist(), still, allowed
-
-
-def _quintic_path(times: Array, *nodes: Array) -> ActuatorPath:
-    return partial(_on_curve, quintic(times, *nodes))
 
 
 def _on_curve(curve: PPoly, time: float) -> tuple[Vector3, Vector3, Vector3]:

@@ -218,7 +218,10 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
         limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
         limited.append((joint, limits, getattr(scene.friction, kind, None)))
     templates = load_templates("description")
-    templates.filters |= {"exact": _exact, "short": _short}
+    templates.filters |= {
+        "exact": lambda values: " ".join(repr(float(x) + 0.0) for x in values),
+        "short": lambda values: " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values),
+    }
     document: str = templates.get_template("urdf.xml").render(
         # An XML name has no spaces.
         name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
@@ -309,11 +312,3 @@ def _solids(shape: Shape) -> Iterator[tuple[Any, ...]]:
             length = float(np.linalg.norm(end - begin)) + 0.1 * shape.thickness
             size = {"radius": [shape.thickness], "length": [length]}
             yield "cylinder", size, (begin + end) / 2.0, turn, colour
-
-
-def _exact(values: Iterable[float]) -> str:
-    return " ".join(repr(float(x) + 0.0) for x in values)
-
-
-def _short(values: Iterable[float]) -> str:
-    return " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)

@@ -30,6 +30,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import compress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,6 @@ from sst_ros.identification.consistency import find_consistent_values, fit_weigh
 from sst_ros.identification.measured_motion import (
     Measured,
     MeasuredMotion,
-    open_data,
     read_motion,
     take_angles,
 )
@@ -115,7 +115,7 @@ class TorqueFit(Identification):
 
 @check_kinds
 def identify(
-    data: Measured,
+    data: Measured | str | Path,
     scene: SceneInput | None = None,
     parameters: Collection[str] | None = None,
     method: str = "inverse_dynamics",
@@ -157,7 +157,10 @@ def identify(
     """
     known = method in ("inverse_dynamics", "simulation")
     refuse_unless("identify", ("method", method, known, "must be inverse_dynamics or simulation"))
-    data = open_data(data)
+    if isinstance(data, (str, Path)):
+        from sst_ros.recording.recording import read  # needs rosbags, which other data do not
+
+        data = read(data)
     given: Any = scene if scene is not None else getattr(data, "scene", None)
     refuse_unless("identify", ("scene", None, given is not None, "must be given with arrays"))
     given = scene_of(given)

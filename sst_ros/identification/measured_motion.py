@@ -8,7 +8,6 @@ are.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from sst_ros.recording.recording import Recording
 
 
-Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any] | str | Path"
+Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any]"
 
 FEWEST = 20  # samples to identify anything: filters and splines have transients at both ends
 _HELD = (torques.TorqueTable, torques.ConstantTorque)
@@ -70,18 +69,8 @@ class MeasuredMotion(Section):
             yield wrong, name, np.shape(array), f"must have the shape {count, 3}"
 
 
-def open_data(data: Measured) -> Recording | Trajectory | Mapping[str, Any]:
-    """Read a recording if a path is given; return other data as they are."""
-    if not isinstance(data, (str, Path)):
-        return data
-    from sst_ros.recording.recording import read  # needs rosbags, which other data do not
-
-    return read(data)
-
-
 def read_motion(data: Measured) -> MeasuredMotion:
     """Read a motion from a recording, a trajectory, or arrays, see `identify`, or refuse it."""
-    data = open_data(data)
     given = data if isinstance(data, Mapping) else _take_samples(data)
     known = {name: value for name, value in given.items() if value is not None}
     return build(MeasuredMotion, known, "identify")
