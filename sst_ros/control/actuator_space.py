@@ -14,14 +14,14 @@ import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_for_arrays, compile_program, trace
+from sst_ros.dynamics.expression import compile_program, trace
 from sst_ros.errors import SingularConfiguration, check_kinds, check_kinds_late, refuse_unless
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism import generic_math as gm
@@ -118,9 +118,9 @@ def slow_down(motion: ReferenceMotion, begin: float, duration: float) -> Referen
 class ActuatorSpaceMap:
     """Map between star and actuators: traced kinematics of one geometry.
 
-    Each function of numbers raises an ArithmeticError in a singularity: of_star and posture in a
-    serial one (sin(mu_k) = 0), orientation in a parallel one (det J2 = 0), the others in both.
-    Those of arrays give numbers that are not finite there, and a warning of NumPy.
+    Functions of numbers raise an ArithmeticError in a singularity: of_star and posture in a serial
+    one (sin(mu_k) = 0), newton_step in a parallel one (det J2 = 0), the others in both. Of arrays
+    they give numbers that are not finite there, and a warning of NumPy.
     """
 
     def __init__(self, geometry: Geometry) -> None:
@@ -196,26 +196,11 @@ class ActuatorSpaceMap:
             found += [c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)]
         return found
 
-    @cached_property
-    def star_rates(self) -> Callable[..., tuple[Any, ...]]:
-        """W and W_dot in {E}, six arrays (n,), of (q, gamma_dot, gamma_ddot), ten arrays (n,)."""
-        return compile_for_arrays(trace(self.star_accelerations, _MOVING))
-
-    @cached_property
-    def postures(self) -> Callable[..., tuple[Any, ...]]:
-        """See `posture`: seven arrays (n,) of a quaternion, four arrays (n,)."""
-        return compile_for_arrays(trace(self._of_posture, _STAR[:4]))
-
-    @cached_property
-    def _newton_of_arrays(self) -> Callable[..., tuple[Any, ...]]:
-        return compile_for_arrays(trace(self.newton_step, _POSE))
-
     def orientations(self, near: Array, gamma: Array, steps: int = _STEPS) -> Array:
         """Quaternions (n, 4) at gamma (n, 3) by steps of Newton's method from `near` (n, 4)."""
-        newton, carriages = self._newton_of_arrays, self.carriages(gamma.T)
-        q: Any = near.T
+        carriages, q = self.carriages(gamma.T), list(near.T)
         for _ in range(steps):
-            *q, first, second, third = newton(*q, *carriages)
+            *q, first, second, third = self.newton_step(*q, *carriages)
             if np.abs((first, second, third)).max(initial=0.0) < 1e-9:
                 break  # quadratic: the next step would be rounding
         return np.stack(q, axis=1)
@@ -229,7 +214,8 @@ class ActuatorSpaceMap:
             *(dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for at in legs),
         )
 
-    def _of_posture(self, *q: Any) -> tuple[Any, ...]:
+    def postures(self, *q: Any) -> tuple[Any, ...]:
+        """See `posture`; of a quaternion of numbers of any kind."""
         rows = gm.rotation_rows((q[0], q[1], q[2], q[3]))
         legs = [kernel.leg_motion(leg, rows, ZERO) for leg in self._legs]
         sines = [gm.sqrt(at.u) for at in legs]
@@ -268,7 +254,7 @@ def _compile(space: ActuatorSpaceMap) -> tuple[Callable[..., Any], ...]:
     return (
         compile_program(trace(space._of_star, _STAR)),
         compile_program(trace(space.star_accelerations, _MOVING)),
-        compile_program(trace(space._of_posture, _STAR[:4])),
+        compile_program(trace(space.postures, _STAR[:4])),
         compile_program(trace(space.newton_step, _POSE)),
     )
 

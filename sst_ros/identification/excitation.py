@@ -176,7 +176,8 @@ class _Trial:
             for part in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
                 here = self.centre + part * (gamma - self.centre)
                 quaternion = space.orientations(quaternion, here, 5 if part == 1.0 else 2)
-            star = np.stack(space.star_rates(*quaternion.T, *rate.T, *acceleration.T), axis=1)
+            moving = *quaternion.T, *rate.T, *acceleration.T
+            star = np.stack(space.star_accelerations(*moving), axis=1)
             known, columns = self._regressor(quaternion, star[:, :3], star[:, 3:])
             torque = known + columns @ self._values
             posture = np.stack(space.postures(*quaternion.T), axis=1)

@@ -279,7 +279,8 @@ def form_equations(
     angles, rates, accelerations = (one(times[rows].ravel()) for one in path)
     coordinates = ActuatorSpaceMap(Geometry.of(regressor.scene))
     quaternion = _follow_orientations(coordinates, angles, measured)
-    star = np.stack(coordinates.star_rates(*quaternion.T, *rates.T, *accelerations.T), axis=1)
+    moving = *quaternion.T, *rates.T, *accelerations.T
+    star = np.stack(coordinates.star_accelerations(*moving), axis=1)
     found = regressor(quaternion, star[:, :3], star[:, 3:])
     known, columns = (
         part.reshape(-1, times.shape[1], *part.shape[1:]).mean(axis=1) for part in found
