@@ -78,22 +78,18 @@ def read_motion(data: Measured) -> MeasuredMotion:
 
 def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
     """Take a simulated motion, or a recorded run while it has torques."""
-    law: Any
-    if isinstance(data, Trajectory):
-        motion, rows = data, np.full(len(data.t), True)
-        # With a lag the torques at the joints are behind those of the law, as in a recording.
-        law = "sampled" if data.scene.lags else data.law
-    elif hasattr(data, "ticks"):
-        motion, ticks = data.trajectory, data.ticks
-        begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
-        rows = (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12)
-        # With a lag the recorded effort is the torque at the joint, behind that of the tick.
-        law = "sampled" if data.scene.lags else torques.TorqueTable(begins, ticks.torque)
-    else:
+    motion = data if isinstance(data, Trajectory) else getattr(data, "trajectory", None)
+    if motion is None:
         allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
         raise refusal("identify", "data", data, allowed)
+    law, rows = motion.law, np.full(len(motion.t), True)
+    if not isinstance(data, Trajectory):
+        begins, ends = data.ticks.start_ns / 1e9, data.ticks.end_ns / 1e9
+        rows = (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12)
+        law = torques.TorqueTable(begins, data.ticks.torque)
     t, torque = motion.t[rows], motion.torque[rows]
-    held = law is None or isinstance(law, _HELD)
+    # With a lag the torques at the joints are behind those of the law: they are samples.
+    held = not motion.scene.lags and (law is None or isinstance(law, _HELD))
     if held:  # without a law to their sample, see `Trajectory`
         torque = torque[1:] if law is None else _average(law, t)
     return {

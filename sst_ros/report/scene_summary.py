@@ -15,7 +15,6 @@ import contextlib
 import math
 import textwrap
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of, limits_of
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, recent_ode
 from sst_ros.errors import InputError, SstError
 from sst_ros.integration.methods import DORMAND_PRINCE, Method, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
@@ -129,13 +128,10 @@ def eigenvalues(
     They are of a state - quaternion, body rate [rad/s], lagged torques - by default the start, and
     of the torque that acts there [N m], shape (3,).
     """
-    ode = _ode(Dynamics.of(scene))
+    ode = recent_ode(Dynamics.of(scene))
     y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
     lagged, moment = (0.0,) * (len(ode.state) - len(y)), (0.0,) * (len(ode.drive) - 3)
     return np.asarray(ode.eigenvalues(0.0, (*y, *lagged), (*torque, *moment)), dtype=complex)
-
-
-_ode = lru_cache(maxsize=4)(ODE)  # whose Jacobian is traced once
 
 
 def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
