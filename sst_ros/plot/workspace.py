@@ -135,9 +135,8 @@ def draw_triangle(axes: Axes, geometry: Geometry) -> None:
         for point, name in ((middle, f"$\\gamma_{k}$"), (corner, f"$P_{k}$")):
             x, y = point * (1.0 + 0.1 / np.hypot(*point))
             axes.text(x, y, name, fontsize=12, color=INK, ha="center", va="center")
-    axes.set_aspect("equal")
-    axes.set_xlim(-1.22 * reach, 1.22 * reach)
-    axes.set_ylim(-0.86 * reach, 1.2 * reach)
+    ylim = -0.86 * reach, 1.2 * reach
+    axes.set(aspect="equal", xlim=(-1.22 * reach, 1.22 * reach), ylim=ylim)
     axes.set_axis_off()
 
 

@@ -331,7 +331,7 @@ def _draw_comparison(axes: Axes, seconds: Array, comparison: Comparison) -> None
     names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
     for values, name, looks in zip(comparison.error.to_numpy().T, names, LINES, strict=False):
         axes.plot(seconds, hide_zeros(values), label=name, **looks)
-    axes.set(yscale="log", ylabel="largest difference")
+    axes.set_yscale("log")
     axes.set_ylim(bottom=least)
     axes.legend(fontsize=8, ncol=2, loc="lower right")
 
@@ -343,10 +343,9 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     figure = Figure(figsize=(12.0, 10.4))
     grid = iter(figure.subplots(3, 2).ravel())
 
-    def panel(title: str, values: Any, xlabel: str = "time t [s]") -> Axes:
+    def panel(title: str, values: Any, ylabel: str, xlabel: str = "time t [s]") -> Axes:
         axes: Axes = next(grid)
-        axes.set_title(title)
-        axes.set_xlabel(xlabel)
+        axes.set(title=title, ylabel=ylabel, xlabel=xlabel)
         if xlabel == "time t [s]":
             axes.set_xlim(0.0, seconds[-1])
         if not np.isfinite(np.asarray(values)).any():
@@ -354,14 +353,13 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
         return axes
 
     errors = found.integration.error
-    axes = panel("Integration error, against the same torques", errors)
+    axes = panel("Integration error, against the same torques", errors, "largest difference")
     _draw_comparison(axes, seconds, found.integration)
-    axes = panel("Energy residual", found.integration.energy)
-    axes.set_ylabel("energy residual [J]")
+    axes = panel("Energy residual", found.integration.energy, "energy residual [J]")
     axes.plot(seconds, found.integration.energy, color=BLUE, linewidth=1.4)
     axes.yaxis.set_major_formatter("{x:.1e}")
-    axes = panel("Real-time factor (recorder clock), and losses", measured.pace)
-    axes.set_ylabel("real-time factor")
+    title = "Real-time factor (recorder clock), and losses"
+    axes = panel(title, measured.pace, "real-time factor")
     axes.plot(measured.pace.index, measured.pace, color=BLUE, marker=".")
     axes.axhline(1.0, color=GREY, linewidth=0.9, linestyle="--")
     figures.widen(axes, np.append(measured.pace, 1.0), 0.04)
@@ -378,15 +376,13 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
         axes.plot(times, np.full(len(times), height), mark, label=name, **foot)
     axes.legend(fontsize=8, loc="best", ncol=3)
     label = "deviation from the nominal period [µs]"
-    axes = panel("Period between received samples", measured.period_us, xlabel=label)
+    axes = panel("Period between received samples", measured.period_us, "samples", label)
     axes.hist(measured.period_us - run.period_ns / 1e3, bins=80, color=BLUE, log=True)
-    axes.set_ylabel("samples")
     axes.set_ylim(bottom=0.5)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     commands = measured.commands
     title = "Latency: reception of a command to the step that applies it"
-    axes = panel(title, commands.received_us)
-    axes.set_ylabel("latency [µs]")
+    axes = panel(title, commands.received_us, "latency [µs]")
     axes.plot(commands.time_s, commands.received_us, ".", color=BLUE, markersize=3)
     axes.axhline(0.0, color=GREY, linewidth=0.9, linestyle="--")
     used = (1e-6 * reported.ticks * reported.step_mean_us).to_numpy()
@@ -401,8 +397,9 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     ):
         curves[name] = used, reported[column].to_numpy()
     title = "Error against computing time used, over the run"
-    axes = panel(title, used, xlabel="computing time of all steps [ms]")
-    axes.set(ylabel="error of the orientation [rad]", yscale="log")
+    label = "computing time of all steps [ms]"
+    axes = panel(title, used, "error of the orientation [rad]", label)
+    axes.set_yscale("log")
     for (name, (times, values)), looks in zip(curves.items(), LINES, strict=False):
         marker = "" if name == "integration error" else "o"
         axes.plot(1e3 * times, hide_zeros(values), label=name, marker=marker, **looks)
