@@ -25,9 +25,11 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 from sst_ros.host.output import replace_file
+
+Known: TypeAlias = dict[str, Any]  # constants by their names
 
 _PLAIN = """\
 from math import atan2, cos, exp, inf as INFINITE, nan, sin, sqrt, tanh
@@ -48,7 +50,7 @@ import numba
 import numpy as np
 from sst_ros.host.straight_line import straight_line
 
-options = dict(cache={cache}, error_model="numpy", nogil={nogil}{more}, no_cfunc_wrapper=True)
+options = dict(cache={cache}, error_model="numpy", nogil={more}, no_cfunc_wrapper=True)
 jit = numba.njit(**options)
 jit_inner = numba.njit(**options, no_cpython_wrapper=True)
 jit_inline = numba.njit(**options, no_cpython_wrapper=True, inline="always")
@@ -98,12 +100,12 @@ class SharedFunctions:
     """Functions that several modules call, one text each, and their constants."""
 
     texts: tuple[str, ...]
-    constants: dict[str, Any]
+    constants: Known
 
     @cached_property
     def text(self) -> str:
         """Text of their module for numba."""
-        return _for_numba(self.texts, self.constants)
+        return _for_numba([*self.texts], self.constants, ALONE)
 
     @cached_property
     def name(self) -> str:
@@ -111,17 +113,17 @@ class SharedFunctions:
         return _name_of(self.text)
 
 
-NOTHING_SHARED = SharedFunctions((), {})
+ALONE = SharedFunctions((), {})  # what a module has that calls no others
 
 
 def load(
     texts: list[str],
-    constants: dict[str, Any],
+    constants: Known,
     *,
     numba: bool,
     nogil: bool = False,
     rounding: bool = True,
-    base: SharedFunctions = NOTHING_SHARED,
+    base: SharedFunctions = ALONE,
 ) -> ModuleType:
     """Turn function texts into a module, for the interpreter or compiled by numba.
 
@@ -133,15 +135,14 @@ def load(
     if not numba:
         everything = [_PLAIN, _named(base.constants | constants), *base.texts, *texts]
         return _executed("\n".join(everything), "sst_ros_plain")
-    more = "" if rounding else _FREE_ROUNDING
-    text = _for_numba(texts, constants, nogil=nogil, more=more, base=base)
+    more = str(nogil) + _FREE_ROUNDING * (not rounding)
+    text = _for_numba(texts, constants, base, more)
     if not base.texts or import_text(base.name, base.text) is not None:
         module = import_text(_name_of(text), text)
         if module is not None:
             return module
     everything, known = [*base.texts, *texts], base.constants | constants
-    text = _for_numba(everything, known, nogil=nogil, more=more, cache=False)
-    return _executed(text, "sst_ros_compiled")
+    return _executed(_for_numba(everything, known, ALONE, more, False), "sst_ros_compiled")
 
 
 def _executed(text: str, name: str) -> ModuleType:
@@ -156,14 +157,10 @@ def _code(text: str, name: str) -> CodeType:
 
 
 def has_code(
-    texts: list[str],
-    constants: dict[str, Any],
-    functions: Sequence[str],
-    *,
-    base: SharedFunctions = NOTHING_SHARED,
+    texts: list[str], constants: Known, functions: Sequence[str], base: SharedFunctions = ALONE
 ) -> bool:
     """Return whether machine code of these functions of the module is there to be loaded."""
-    module = _name_of(_for_numba(texts, constants, base=base))
+    module = _name_of(_for_numba(texts, constants, base))
     try:
         cached = cache_folder() / "__pycache__"
     except OSError:
@@ -172,17 +169,11 @@ def has_code(
 
 
 def _for_numba(
-    texts: Sequence[str],
-    constants: dict[str, Any],
-    *,
-    nogil: bool = False,
-    more: str = "",
-    base: SharedFunctions = NOTHING_SHARED,
-    cache: bool = True,
+    texts: list[str], known: Known, base: SharedFunctions, more: str = "False", cache: bool = True
 ) -> str:
     # A tuple would be read by a jump to one of its numbers.
-    tables = {name: value for name, value in constants.items() if isinstance(value, tuple)}
-    head = _NUMBA.format(cache=cache, nogil=nogil, more=more) + _named(constants)
+    tables = {name: value for name, value in known.items() if isinstance(value, tuple)}
+    head = _NUMBA.format(cache=cache, more=more) + _named(known)
     head += "".join(f"{name} = np.array({name})\n" for name in tables)
     if base.texts:
         head += f"from {base.name} import {', '.join(map(_function_name, base.texts))}\n"
@@ -202,7 +193,7 @@ def _function_name(text: str) -> str:
     return text.removeprefix("def ").split("(")[0]
 
 
-def _named(constants: dict[str, Any]) -> str:
+def _named(constants: Known) -> str:
     return "".join(f"{name} = {value!r}\n" for name, value in constants.items())
 
 

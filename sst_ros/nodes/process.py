@@ -16,7 +16,7 @@ from array import array
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -63,6 +63,8 @@ _TYPES = {
 }
 _WIDEST = 1e300
 
+Defaults: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
+"""Defaults of some parameters, by the values that others are given."""
 P = TypeVar("P", bound=Section)
 A = TypeVar("A", bound=settings.AnsweringParameters)
 
@@ -74,14 +76,9 @@ class Worker(Generic[P]):
     values given at the start. An InputError lists all that are refused, and all unknown names.
     """
 
-    def __init__(
-        self,
-        node: str,
-        cls: type[P],
-        more_defaults: Callable[[dict[str, Any]], dict[str, Any]] = lambda given: {},
-    ) -> None:
+    def __init__(self, node: str, cls: type[P], more: Defaults = lambda given: {}) -> None:
         self.node, self.done = Node(node), threading.Event()
-        self.parameters = _declare(self.node, cls, more_defaults)
+        self.parameters = _declare(self.node, cls, more)
         self.node.add_on_set_parameters_callback(self._set)
 
     def close(self) -> None:
@@ -109,12 +106,10 @@ class Worker(Generic[P]):
         return Result(successful=True)
 
 
-def _declare(
-    node: Node, cls: type[P], more_defaults: Callable[[dict[str, Any]], dict[str, Any]]
-) -> P:
+def _declare(node: Node, cls: type[P], more: Defaults) -> P:
     # rclpy has no public call for the values that were given; Jazzy and Kilted have this.
     given: dict[str, Any] = {name: one.value for name, one in node._parameter_overrides.items()}
-    defaults, values = {**vars(cls()), **more_defaults(given)}, dict[str, Any]()
+    defaults, values = {**vars(cls()), **more(given)}, dict[str, Any]()
     origin, checks = node.get_fully_qualified_name(), list[Check]()
     for name, spec in cls.SPECS.items():
         value = given.get(name, defaults[name])

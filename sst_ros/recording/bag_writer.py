@@ -59,8 +59,7 @@ class _McapStorage:
     def flush(self) -> None:
         self._writer.flush()
 
-    def close(self, version: int, metadata: str) -> None:
-        del version
+    def close(self, _: int, metadata: str) -> None:
         self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
         self._writer.finish()
         self._file.close()

@@ -195,10 +195,7 @@ def _legs(name: str) -> list[str]:
 
 
 def _table(
-    key: str,
-    message_type: str,
-    rows: Callable[[Any], Rows],
-    *parts: tuple[Sequence[str], str, str],
+    key: str, message_type: str, rows: Callable[[Any], Rows], *parts: tuple[Sequence[str], str, str]
 ) -> TopicTable:
     """Make the table of the topic that ends in its key; a part is columns, their unit and what."""
     columns = [Column(name, unit, what, key) for names, unit, what in parts for name in names]

@@ -13,7 +13,7 @@ import time
 import webbrowser
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import trimesh
@@ -50,6 +50,7 @@ _OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
 ROOT = "/manipulator"
 _SIDES = 20  # corners of an arc's cross-section
 
+Show: TypeAlias = Callable[[str, float | None], None]  # controls as in a phase, at a time [s]
 _PANEL: Any = load_templates("view").get_template("panel.html").module
 
 
@@ -195,9 +196,7 @@ def _plot(server: PageServer, label: str, range_: tuple[float, float]) -> viser.
     )
 
 
-def _add_run_controls(
-    server: PageServer, scene: Scene, run: RunControl
-) -> Callable[[str, float | None], None]:
+def _add_run_controls(server: PageServer, scene: Scene, run: RunControl) -> Show:
     """Add pause, step, reset, and manual torques while no controller commands the run.
 
     The function returned enables what is possible in a phase.
@@ -251,7 +250,7 @@ def _add_run_controls(
     return show
 
 
-def _add_replay_controls(server: PageServer, replay: Replay) -> Callable[[str, float | None], None]:
+def _add_replay_controls(server: PageServer, replay: Replay) -> Show:
     """Add play, a time slider, and the speed of a recording; the function returned moves them."""
     gui = server.gui
     with gui.add_folder("recording", order=1.0):
