@@ -24,7 +24,7 @@ from sst_ros.control.controller import ChannelState, Controller, ControlStopped,
 from sst_ros.errors import RunStopped
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.generic_math import axpy
-from sst_ros.runtime.tick_loop import Pacer, SteadyTime, TickLoop
+from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime, TickLoop
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene
@@ -131,7 +131,7 @@ def run_in_loop(
         unread=False,
     )
     settings, pacer = RunSettings(period_ns, last_tick=ticks), Pacer(period_ns, 0.0, SteadyTime())
-    loop = TickLoop(simulation, settings, ends, pacer, ends)
+    loop = TickLoop(simulation, RunParts(settings, ends, pacer, ends))
     if warm:
         loop.warm_up()
     loop.begin()

@@ -26,11 +26,10 @@ from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
 from sst_ros.runtime.run_loop import Phase, Reply, RunDiagnostics, RunLoop, read_gauges
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.tick_loop import Pacer, SteadyTime
+from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import NANOSECONDS
 
 _DELAY_S = 5.0
 """Delay of the compiler: the first seconds of a real-time run have the processor alone."""
@@ -68,9 +67,9 @@ class Simulator(Worker[SimulatorParameters]):
             equations=given.equations,
         )
         self._latency = processes.CpuDmaLatency()
-        self._loop = RunLoop(simulated, build, run, self._input, self._pacer, self._topics)
-        period_s = run.period_ns / NANOSECONDS
-        self._diagnostics = RunDiagnostics(self._loop, self._input, self._pacer, period_s)
+        parts = RunParts(run, self._input, self._pacer, self._topics)
+        self._loop = RunLoop(simulated, build, parts)
+        self._diagnostics = RunDiagnostics(self._loop)
         serve(self.node, self._loop)
         simulation_interfaces.offer(self.node, self._loop, self.done.set, given.base_frame)
         every(self.node, 1.0, self._report)

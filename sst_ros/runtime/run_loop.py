@@ -20,12 +20,11 @@ from typing import Any, NamedTuple
 from sst_ros.dynamics.model import limits_of
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.host import processes
-from sst_ros.runtime.tick_loop import HeldTorques, NoAnswer, Pacer, RunOutput, TickLoop
-from sst_ros.runtime.torque_input import RunSettings, TorqueInput
+from sst_ros.runtime.tick_loop import HeldTorques, NoAnswer, RunParts, TickLoop
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene, with_initial
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import Vector3
+from sst_ros.state import NANOSECONDS, Vector3
 
 IDLE_PERIOD_S = 0.1
 _POLL_S = 0.001
@@ -112,19 +111,11 @@ _NOT_DONE = Reply(False, "not done: the run has ended or failed")
 class RunLoop(TickLoop):
     """State machine of one node's run, whose ticks are those of a `TickLoop`."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        build: Callable[[Scene], Simulation],
-        run: RunSettings,
-        torque_input: TorqueInput,
-        pacer: Pacer,
-        output: RunOutput,
-    ) -> None:
+    def __init__(self, scene: Scene, build: Callable[[Scene], Simulation], parts: RunParts) -> None:
         self.phase, self.fault = Phase.WAITING, ""  # why the run stopped, until a reset
         self.failed = False  # the fault ends the node: nothing is left to wait for
         self._build, self._original = build, build(scene)
-        super().__init__(self._original, run, torque_input, pacer, output)
+        super().__init__(self._original, parts)
         self._requests: deque[tuple[Callable[[], Reply | None], Future[Reply]]] = deque()
         self._missing_since: float | None = time.monotonic()
 
@@ -308,8 +299,8 @@ class RunLoop(TickLoop):
 class RunDiagnostics:
     """Collects the counters of the parts of the node."""
 
-    def __init__(self, loop: RunLoop, commands: TorqueInput, pacer: Pacer, period_s: float) -> None:
-        self._loop, self._input, self._pacer, self._period_s = loop, commands, pacer, period_s
+    def __init__(self, loop: RunLoop) -> None:
+        self._loop = loop
         self.gauges: dict[str, object] = {}
         self.granted = {"scheduling": "", "cpu_dma_latency": processes.NO_LIMIT}
         self._noted: dict[str, Any] = {}
@@ -318,9 +309,9 @@ class RunDiagnostics:
 
     def values(self, publishers: int) -> dict[str, Any]:
         """Return the value of each key that has one."""
-        count, pacer, commands = self._loop.counters, self._pacer, self._input
-        period, ticks, wall, age = self._period_s, count.ticks, count.wall_s, commands.age
-        new = ticks - self._noted.get("ticks", 0)
+        count, (run, commands, pacer, _) = self._loop.counters, self._loop.parts
+        period, ticks, wall = run.period_ns / NANOSECONDS, count.ticks, count.wall_s
+        age, new = commands.age, ticks - self._noted.get("ticks", 0)
         passed = wall - self._noted.get("wall_time_s", 0.0)
         mean, most = count.step_mean_s, count.step_max_s
         factor = ticks * period / wall if wall else 0.0
@@ -352,8 +343,9 @@ class RunDiagnostics:
         Warnings are of the graph.
         """
         running, fault = values["phase"] == Phase.RUNNING.value, values["fault"]
+        commands = self._loop.parts.torque_input
         said = {
-            "commands_dropped": f"command dropped: {self._input.last_refusal}",
+            "commands_dropped": f"command dropped: {commands.last_refusal}",
             "commands_clamped": "commands clamped to the scene's torque limit",
             "command_timeouts": "no command within command_timeout: not held",
         }
@@ -371,7 +363,7 @@ class RunDiagnostics:
         doubts = [*news, *(warning for warning in warnings if warning not in news)]
         if missed:
             doubts.append(f"{missed} ticks missed")
-        if self._input.stale and running:
+        if commands.stale and running:
             doubts.append("the command is too old")
         if fault:
             return ERROR, fault, news

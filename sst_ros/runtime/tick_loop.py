@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.mechanism.generic_math import add, axpy
@@ -230,23 +230,27 @@ class NoAnswer(SstError):
     """No command answered a sample in lockstep, or no subscriber came."""
 
 
+class RunParts(NamedTuple):
+    """What a run works with, beside its simulation."""
+
+    run: RunSettings
+    torque_input: TorqueInput
+    pacer: Pacer
+    output: RunOutput
+
+
 class TickLoop:
     """Ticks and samples of one simulation."""
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        run: RunSettings,
-        torque_input: TorqueInput,
-        pacer: Pacer,
-        output: RunOutput,
-    ) -> None:
+    def __init__(self, simulation: Simulation, parts: RunParts) -> None:
         self.simulation = simulation  # its `state` may be read by any thread
         self.begun = False  # the first sample has been published
         self.counters, self.held = Counters(), HeldTorques()
         # Set by others to interrupt a wait, or to end.
         self.requested, self.stopped = threading.Event(), threading.Event()
-        self._run, self._input, self._pacer, self._output = run, torque_input, pacer, output
+        self.parts = parts
+        run, self._input, self._pacer, self._output = parts
+        self._run = run
         self._lockstep, self._last_tick = run.lockstep, run.last_tick
         self._period_ns, self._ticks_per_sample = run.period_ns, run.ticks_per_sample
         self._control_ns = run.period_ns * run.ticks_per_sample

@@ -10,7 +10,7 @@ from types import SimpleNamespace as Message
 from sst_ros import load_scene
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.tick_loop import Pacer, SteadyTime
+from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime
 from sst_ros.runtime.torque_input import ACTUATORS, MOST_WAITING, TorqueInput
 from sst_ros.simulation.simulation import Simulation
 
@@ -122,7 +122,8 @@ class Bench:
         self.output = Output([*parameters.wait_for_subscribers], parameters.publish_clock)
         self.input = TorqueInput(run, None, self.queue, self.stamped)
         self.pacer = Pacer(run.period_ns, parameters.real_time_factor, clock or SteadyTime())
-        self.loop = RunLoop(load_scene(scene), build, run, self.input, self.pacer, self.output)
+        parts = RunParts(run, self.input, self.pacer, self.output)
+        self.loop = RunLoop(load_scene(scene), build, parts)
         self.thread = threading.Thread(target=self.loop.run, daemon=True)
 
     def ask(self, name, *given):

@@ -419,7 +419,7 @@ def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(start, waits, 
 def test_words_and_values_of_the_diagnostics_do_not_contradict_each_other():
     """The run goes on while they are read: what is not in the values is told the next time."""
     bench = Bench(wait_for_command=True)
-    diagnostics = RunDiagnostics(bench.loop, bench.input, bench.pacer, 1e-3)
+    diagnostics = RunDiagnostics(bench.loop)
     before = diagnostics.values(1)
     bench.loop.phase = Phase.RUNNING
     unheard = diagnostics.status(diagnostics.values(1), [])
