@@ -342,14 +342,15 @@ def test_no_launch_file_is_left_out():
 
 @needs_rosbag2
 def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
-    torques = [f"{k / 100},0.01,0.02,0.03" for k in range(101)]  # by which it hardly moves
+    # It hardly moves by them, also where they are recorded and played for a long time.
+    torques = [f"{k / 100},1e-8,2e-8,3e-8" for k in range(101)]
     (tmp_path / "torques.csv").write_text("\n".join(["time,tau_1,tau_2,tau_3", *torques]))
     (tmp_path / "given.yaml").write_text(
         "/**: {ros__parameters: {csv: torques.csv, wait_for_command: true, command_timeout: 0.0}}"
     )
     words = ["params_file:=given.yaml", "record:=true", "bag:=sst"]
     launch("simulate.launch.py", "play:=true", "sync:=free", *words, "output:=bag").ended()
-    fresh = launch("simulate.launch.py", "duration:=5.0", *words, "output:=again")
+    fresh = launch("simulate.launch.py", *words, "output:=again")  # has all the time it takes
     fresh.until("waiting")
     topic = "/sst_simulator/commands"
     # A player that keeps ten messages, as it does by itself, cannot repeat those that a busy
@@ -357,8 +358,10 @@ def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
     kept = {topic: {"reliability": "reliable", "history": "keep_last", "depth": 1000}}
     (tmp_path / "qos.yaml").write_text(json.dumps(kept))
     options = ["--rate", "0.25", "--delay", "10", "--qos-profile-overrides-path", "qos.yaml"]
+    options += ["--wait-for-all-acked", "10000"]
     player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, *options)
     player.ended()
+    fresh.interrupt()
     fresh.ended()
     received = recording.read(tmp_path / "again").diagnostics["commands_received"]
     assert int(received) == counts(tmp_path / "bag")[topic] > 400
