@@ -108,12 +108,15 @@ def lines(
 
 @styled
 def draw_panels(
-    seconds: Array, panels: Sequence[tuple[str, Sequence[str], Array]], height: float = 2.2
+    seconds: Array,
+    panels: Sequence[tuple[str, Sequence[str], Array]],
+    height: float = 2.2,
+    least_span: float = 0.0,
 ) -> Figure:
-    """Draw panels over time: label of the axis, names of the curves, and their values (n, k)."""
+    """Draw panels over time: label of the axis, names of curves, values (n, k); see `lines`."""
     figure, grid = stack([label for label, _, _ in panels], height)
     for axes, (_, names, values) in zip(grid, panels, strict=True):
-        lines(axes, seconds, values, names)
+        lines(axes, seconds, values, names, least_span=least_span)
     return figure
 
 

@@ -113,18 +113,14 @@ def zyz_degrees(quaternion: Array, which: int) -> Array:
 
 def _position(run: Signals, scene: Scene) -> Figure:
     """Draw the coordinates of E over time."""
-    figure, (axes,) = stack([POSITION], 3.2)
     values = position_of_e(scene, run.take(*QUATERNION))
-    figures.lines(axes, run.seconds(), values, "xyz", least_span=LEAST_POSITION_M)
-    return figure
+    return figures.draw_panels(run.seconds(), [(POSITION, "xyz", values)], 3.2, LEAST_POSITION_M)
 
 
 def _angle(run: Signals, _: Scene | None, which: int) -> Figure:
     """Draw one of the ZYZ angles over time."""
-    figure, (axes,) = stack([f"{ZYZ[which]} [deg]"], 3.2)
-    values = zyz_degrees(run.take(*QUATERNION), which)
-    figures.lines(axes, run.seconds(), values, ZYZ[which], least_span=LEAST_ANGLE_DEG)
-    return figure
+    panel = f"{ZYZ[which]} [deg]", ZYZ[which], zyz_degrees(run.take(*QUATERNION), which)
+    return figures.draw_panels(run.seconds(), [panel], 3.2, LEAST_ANGLE_DEG)
 
 
 def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:

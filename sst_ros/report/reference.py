@@ -98,17 +98,6 @@ class TickPropagator(Propagator):
         return np.asarray(np.asarray(reached)[ends[ends <= k] - 1])
 
 
-def held_torques(recording: Recording) -> Held | None:
-    """Return the recorded ticks; None where the moment came from a topic and is not recorded."""
-    ticks, moment = recording.ticks, recording.scene.moment
-    drives = [ticks.torque]
-    if moment is not None and moment.topic:
-        if ticks.moment is None:
-            return None
-        drives.append(ticks.moment)
-    return ticks.start_ns, ticks.end_ns, np.hstack(drives)
-
-
 def begins(recording: Recording) -> bool:
     """Return whether the first sample is that of the start of the run.
 
@@ -154,7 +143,12 @@ def integration(recording: Recording) -> Comparison:
     A sample from which the reference restarts is not compared, and neither are samples between
     lost torques and the next restart; none where the moment is not recorded.
     """
-    return _compare(recording, None, held_torques(recording), known=begins(recording))
+    ticks, moment = recording.ticks, recording.scene.moment
+    drives = ticks.torque
+    if moment is not None and moment.topic:
+        drives = np.empty((0, 6)) if ticks.moment is None else np.hstack([drives, ticks.moment])
+    held = ticks.start_ns[: len(drives)], ticks.end_ns[: len(drives)], drives
+    return _compare(recording, None, held, known=begins(recording))
 
 
 def ideal(recording: Recording) -> Comparison | None:
@@ -172,7 +166,7 @@ def ideal(recording: Recording) -> Comparison | None:
 
 
 def _compare(
-    recording: Recording, torque: SineTorque | None, held: Held | None, *, known: bool
+    recording: Recording, torque: SineTorque | None, held: Held, *, known: bool
 ) -> Comparison:
     """Propagate a run with a second solution, and compare both at its samples.
 
@@ -182,7 +176,7 @@ def _compare(
     time = recording.time_ns
     samples = recording.quaternion, recording.gamma, recording.gamma_dot
     distances, energy = np.full((2, len(time), 3), np.nan), np.full(len(time), np.nan)
-    start_ns, end_ns, drives = held or (time[:0], time[:0], np.empty((0, 3)))
+    start_ns, end_ns, drives = held
     compiled = len(recording.ticks.end_ns) > COMPILED_FROM
     motion, count = TickPropagator(recording.scene, torque, compiled=compiled), len(start_ns)
     model = motion.dynamics.model
