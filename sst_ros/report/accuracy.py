@@ -114,17 +114,14 @@ class WorkPrecision:
         return {target: row for target, row in found.items() if row is not None}
 
 
-def study_scene(
-    scene: Scene, *, shown: bool = False, longest_s: float = LONGEST_RUN_S
-) -> WorkPrecision:
+def study_scene(scene: Scene, *, shown: bool = False) -> WorkPrecision:
     """Solve a scene with every method and setting and compare with the reference.
 
-    Progress is `shown` on the terminal; no finer settings are tried after a run that took longer
-    than `longest_s`. Raises what the problem and its reference do.
+    Progress is `shown` on the terminal. Raises what the problem and its reference do.
     """
     problem = InitialValueProblem(scene)
     grid, truth = list(list_settings(problem)), solve_reference(problem)
-    refine = partial(_refine, problem=problem, truth=truth, longest_s=longest_s)
+    refine = partial(_refine, problem=problem, truth=truth)
     # One after another: computing times are those of a core that is free.
     results = run_many(refine, grid, label=f"{scene.name:<16}" * shown)
     rows = [row for _, refined in results for row in refined]
@@ -205,10 +202,7 @@ def _list_collocation(problem: InitialValueProblem, kind: str) -> Iterator[Solve
 
 
 def _refine(
-    settings: Iterator[SolverSetting],
-    problem: InitialValueProblem,
-    truth: ReferenceSolution,
-    longest_s: float,
+    settings: Iterator[SolverSetting], problem: InitialValueProblem, truth: ReferenceSolution
 ) -> list[dict[str, Any]]:
     """Go from coarse to fine until a run takes long or two errors lie below the floor."""
     rows, below = list[dict[str, Any]](), 0
@@ -216,7 +210,7 @@ def _refine(
     for setting in settings:
         rows.append(row := _measure(setting, problem, truth))
         below += row.get(ERROR, math.inf) < floor
-        if (row["wall_min_s"] > longest_s and len(rows) >= LEAST_SETTINGS) or below > 1:
+        if (row["wall_min_s"] > LONGEST_RUN_S and len(rows) >= LEAST_SETTINGS) or below > 1:
             break
     return rows
 

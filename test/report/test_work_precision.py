@@ -51,10 +51,17 @@ def plain_python():
         yield
 
 
+def study_quickly(studied, longest_s):
+    """Study a scene, with no finer settings after a run that took longer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(accuracy, "LONGEST_RUN_S", longest_s)
+        return study_scene(studied)
+
+
 @pytest.fixture(scope="module")
 def short(plain_python):
     """Study of 0.2 s of Example 2."""
-    return study_scene(SHORT, longest_s=0.02)
+    return study_quickly(SHORT, 0.02)
 
 
 def _rows(found, method, kind=FIXED):
@@ -127,7 +134,7 @@ def test_every_target_has_a_fastest_setting(short):
 def test_a_scene_that_rests_has_no_fastest_setting_and_is_drawn(tmp_path):
     """A controller drives it; no method errs, and a logarithm of that does not exist."""
     resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
-    found = study_scene(resting, longest_s=0.002)
+    found = study_quickly(resting, 0.002)
     assert found.rests and found.best(1e-6) is None and "rests" in name_fastest(found)
     said = accuracy_page([found])
     assert "| point_to_point | at rest |" in said and "accuracy_point_to_point.png" not in said
@@ -168,14 +175,14 @@ def test_another_inertia_in_the_runs_is_seen(monkeypatch):
     star = dataclasses.replace(SHORT.star, inertia=Inertia(**inertia))
     target = InitialValueProblem(dataclasses.replace(BRIEF, star=star))
     monkeypatch.setattr(accuracy, "solve_reference", lambda _: solve_reference(target))
-    found = study_scene(BRIEF, longest_s=0.005)
+    found = study_quickly(BRIEF, 0.005)
     assert 1e-10 < found.rows[ERROR].min() < 1e-6
 
 
 @pytest.mark.slow
 def test_failures_stay_in_sight(tmp_path):
     stiff = dataclasses.replace(scene.load("stiff"), duration=0.02)
-    found = study_scene(stiff, longest_s=0.005)
+    found = study_quickly(stiff, 0.005)
     assert not any(row.failure for row in _rows(found, "rodas5p"))
     failed = found.rows[found.rows.failure != ""]
     assert len(failed) and failed[ERROR].isna().all()
