@@ -31,63 +31,6 @@ _POLL_S = 0.001
 _REPLY_S = 30.0
 
 
-OK, WARN, ERROR = range(3)
-_ROWS = 32
-
-GAUGES = {
-    "error_estimate": "estimated error of the orientation [rad]",
-    "rate_error_estimate": "estimated error of the body rate [rad/s]",
-    "hold_error_start": "estimated error of the orientation from holding torques [rad], where "
-    "they are those of the start of their hold",
-    "hold_error_middle": "the same where they are those of its middle",
-    "energy_residual_J": "energy less that of the start and the work done since [J]",
-    "closure_residual": "largest abs(r_k . t_k), 0 where the loops are closed",
-    "singularity_serial": "least sin(mu_k), 0 at a serial singularity",
-    "singularity_parallel": "det J2, 0 at a parallel singularity",
-    "stroke_margin_rad": "least distance of gamma to an end of the stroke [rad]",
-    "workspace_margin_rad": "least distance of beta to the edge of the workspace [rad]",
-    "integrator": "method in use",
-    "integrator_changes": "number of changes of the method",
-    "step_evaluations": "mean evaluations of the right-hand side per accepted step",
-    "step_budget": "evaluations that one tick may take",
-}
-"""Keys of the values that the simulation itself reports."""
-
-_COUNTS = {
-    "phase": "phase of the run",
-    "ticks": "steps done",
-    "ticks_missed": "steps dropped because the machine was late",
-    "overruns": "number of such overruns",
-    "clock_jumps": "times that the followed clock went back",
-    "samples_published": "samples of the run published",
-    "step_mean_us": "mean time of a step [us]",
-    "step_max_us": "longest step [us]",
-    "tick_time_left": "share of a tick's period that its step leaves, mean, at real-time factor 1",
-    "tick_time_left_least": "the same of the longest step",
-    "late_mean_us": "mean lateness of the steps [us]",
-    "late_std_us": "standard deviation of it: the jitter of the period [us]",
-    "late_max_us": "largest lateness [us]",
-    "real_time_factor": "simulated time per time spent running",
-    "real_time_factor_now": "the same over the last second",
-    "wall_time_s": "time spent running [s]",
-    "simulated_time_s": "simulated time of all steps [s]",
-    "commands_received": "valid commands",
-    "commands_dropped": "messages that were not used",
-    "commands_dropped_because": "reasons, with counts",
-    "commands_clamped": "commands beyond the scene's torque limit",
-    "command_timeouts": "times that the command became too old",
-    "command_age_s": "age of the last valid command [s]; none before the first",
-    "command_publishers": "publishers of commands",
-    "resets": "times that the run began anew",
-    "states_set": "times that a state was set",
-    "scheduling": "scheduling of the thread of the run",
-    "cpu_dma_latency": "largest exit latency of idle states that the machine was asked to use",
-}
-
-KEYS = {**_COUNTS, **GAUGES, "fault": "reason why the run stopped"}
-"""Keys of /diagnostics, in order."""
-
-
 class Phase(str, Enum):
     """Phase of a run."""
 
@@ -294,6 +237,63 @@ class RunLoop(TickLoop):
     @property
     def _status(self) -> str:
         return f"{self.phase.value}: {self.fault}" if self.fault else self.phase.value
+
+
+OK, WARN, ERROR = range(3)
+_ROWS = 32
+
+GAUGES = {
+    "error_estimate": "estimated error of the orientation [rad]",
+    "rate_error_estimate": "estimated error of the body rate [rad/s]",
+    "hold_error_start": "estimated error of the orientation from holding torques [rad], where "
+    "they are those of the start of their hold",
+    "hold_error_middle": "the same where they are those of its middle",
+    "energy_residual_J": "energy less that of the start and the work done since [J]",
+    "closure_residual": "largest abs(r_k . t_k), 0 where the loops are closed",
+    "singularity_serial": "least sin(mu_k), 0 at a serial singularity",
+    "singularity_parallel": "det J2, 0 at a parallel singularity",
+    "stroke_margin_rad": "least distance of gamma to an end of the stroke [rad]",
+    "workspace_margin_rad": "least distance of beta to the edge of the workspace [rad]",
+    "integrator": "method in use",
+    "integrator_changes": "number of changes of the method",
+    "step_evaluations": "mean evaluations of the right-hand side per accepted step",
+    "step_budget": "evaluations that one tick may take",
+}
+"""Keys of the values that the simulation itself reports."""
+
+_COUNTS = {
+    "phase": "phase of the run",
+    "ticks": "steps done",
+    "ticks_missed": "steps dropped because the machine was late",
+    "overruns": "number of such overruns",
+    "clock_jumps": "times that the followed clock went back",
+    "samples_published": "samples of the run published",
+    "step_mean_us": "mean time of a step [us]",
+    "step_max_us": "longest step [us]",
+    "tick_time_left": "share of a tick's period that its step leaves, mean, at real-time factor 1",
+    "tick_time_left_least": "the same of the longest step",
+    "late_mean_us": "mean lateness of the steps [us]",
+    "late_std_us": "standard deviation of it: the jitter of the period [us]",
+    "late_max_us": "largest lateness [us]",
+    "real_time_factor": "simulated time per time spent running",
+    "real_time_factor_now": "the same over the last second",
+    "wall_time_s": "time spent running [s]",
+    "simulated_time_s": "simulated time of all steps [s]",
+    "commands_received": "valid commands",
+    "commands_dropped": "messages that were not used",
+    "commands_dropped_because": "reasons, with counts",
+    "commands_clamped": "commands beyond the scene's torque limit",
+    "command_timeouts": "times that the command became too old",
+    "command_age_s": "age of the last valid command [s]; none before the first",
+    "command_publishers": "publishers of commands",
+    "resets": "times that the run began anew",
+    "states_set": "times that a state was set",
+    "scheduling": "scheduling of the thread of the run",
+    "cpu_dma_latency": "largest exit latency of idle states that the machine was asked to use",
+}
+
+KEYS = {**_COUNTS, **GAUGES, "fault": "reason why the run stopped"}
+"""Keys of /diagnostics, in order."""
 
 
 class RunDiagnostics:

@@ -41,15 +41,6 @@ _COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in 
 _BRAND = (0, 114, 178)
 _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
 
-PATH_POINTS = 400
-_POINT_PERIOD_S = 0.008
-_PATH_S = 4.0
-_LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
-"""The path lies a little outside the star, which would hide it; newer parts above older ones."""
-_OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
-ROOT = "/manipulator"
-_SIDES = 20  # corners of an arc's cross-section
-
 Show: TypeAlias = Callable[[str, float | None], None]  # controls as in a phase, at a time [s]
 _PANEL: Any = load_templates("view").get_template("panel.html").module
 
@@ -282,6 +273,16 @@ def _name(button: viser.GuiButtonHandle, label: str) -> None:
 
 def _move(slider: viser.GuiSliderHandle[float], value: float) -> None:
     slider.value = value  # type: ignore[misc]  # its setter does not follow its getter at once
+
+
+PATH_POINTS = 400
+_POINT_PERIOD_S = 0.008
+_PATH_S = 4.0
+_LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
+"""The path lies a little outside the star, which would hide it; newer parts above older ones."""
+_OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
+ROOT = "/manipulator"
+_SIDES = 20  # corners of an arc's cross-section
 
 
 class SceneDrawing:
