@@ -287,9 +287,7 @@ def bound(values: Triple, limit: Scalar) -> Triple:
     """Clamp three numbers to the interval from -limit to limit."""
     if isinstance(limit, float):
         return clamp(values, limit)
-    return triple(
-        value - gm.positive(value - limit) + gm.positive(-limit - value) for value in values
-    )
+    return triple(x - gm.positive(x - limit) + gm.positive(-limit - x) for x in values)
 
 
 def is_above(value: Scalar) -> Scalar:

@@ -109,7 +109,7 @@ def examine_motion(motion: ReferenceMotion, scene: Scene, *, exact: bool = True)
     parts = (np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in ends)
     times = np.concatenate([*parts, motion.pieces[-1:]])
     desired = tuple(map(motion.at, times.tolist()))
-    distances = tuple(_distances(motion, scene, times, desired, exact=exact))
+    distances = tuple(_distances(motion, scene, times, desired, exact))
     limits = {name: x for name in UNITS for x in values_at(scene, f"actuators.{name}_limit")}
     inverse = InverseDynamics(scene)
 
@@ -192,12 +192,7 @@ def maximum(
 
 
 def _distances(
-    motion: ReferenceMotion,
-    scene: Scene,
-    times: Array,
-    desired: Sequence[Reference],
-    *,
-    exact: bool,
+    motion: ReferenceMotion, scene: Scene, times: Array, desired: Sequence[Reference], exact: bool
 ) -> Iterator[LimitDistance]:
     geometry = Geometry.of(scene)
     space = ActuatorSpaceMap(geometry)

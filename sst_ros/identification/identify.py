@@ -277,20 +277,16 @@ def form_equations(
         times = np.stack([middle - half, middle + half], axis=1)
     rows = slice(unsettled, len(times) - unsettled)
     angles, rates, accelerations = (one(times[rows].ravel()) for one in path)
-    coordinates = ActuatorSpaceMap(Geometry.of(regressor.scene))
-    quaternion = _follow_orientations(coordinates, angles, measured)
+    space = ActuatorSpaceMap(Geometry.of(regressor.scene))
+    quaternion = _follow_orientations(space, angles, measured)
     moving = *quaternion.T, *rates.T, *accelerations.T
-    star = np.stack(coordinates.star_accelerations(*moving), axis=1)
+    star = np.stack(space.star_accelerations(*moving), axis=1)
     found = regressor(quaternion, star[:, :3], star[:, 3:])
-    known, columns = (
-        part.reshape(-1, times.shape[1], *part.shape[1:]).mean(axis=1) for part in found
-    )
+    known, columns = (x.reshape(-1, times.shape[1], *x.shape[1:]).mean(axis=1) for x in found)
     return known, columns, measured.torque[rows], band
 
 
-def _follow_orientations(
-    coordinates: ActuatorSpaceMap, gamma: Array, measured: MeasuredMotion
-) -> Array:
+def _follow_orientations(space: ActuatorSpaceMap, gamma: Array, measured: MeasuredMotion) -> Array:
     """Quaternions (n, 4) at gamma (n, 3) in the assembly mode of the first sample."""
     begin, first = measured.quaternion, measured.gamma[:1]
     start = None if begin is None else rotation_matrix(begin)
@@ -299,9 +295,9 @@ def _follow_orientations(
     points = np.vstack([first, gamma[known[known < len(gamma)]]])
     refused = "gamma", first[0].tolist(), "must be angles of this manipulator"
     with refuse_errors("identify", *refused, AssemblyError, continuation.BranchEnds):
-        coarse, _ = continuation.follow(coordinates.geometry, points, start)
+        coarse, _ = continuation.follow(space.geometry, points, start)
     nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
-    return coordinates.orientations(quaternion_of(coarse)[nearest], gamma)
+    return space.orientations(quaternion_of(coarse)[nearest], gamma)
 
 
 def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, int]:

@@ -166,9 +166,8 @@ def _list_steps(problem: InitialValueProblem, method: Method) -> Iterator[Solver
     for steps in _STEPS_PER_INTERVAL:
         h, start = problem.interval / steps, list(problem.start)
         timed = partial(machine.step_fixed, 0.0, h, steps * problem.count, start, problem.drive)
-        yield SolverSetting(
-            method.name, FIXED, h, partial(problem.run_steps, machine, steps), timed
-        )
+        solve = partial(problem.run_steps, machine, steps)
+        yield SolverSetting(method.name, FIXED, h, solve, timed)
 
 
 def _list_tolerances(problem: InitialValueProblem, method: str) -> Iterator[SolverSetting]:

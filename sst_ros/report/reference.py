@@ -165,25 +165,23 @@ def ideal(recording: Recording) -> Comparison | None:
     return _compare(recording, scene.torque, held, known=True)
 
 
-def _compare(
-    recording: Recording, torque: SineTorque | None, held: Held, *, known: bool
-) -> Comparison:
+def _compare(run: Recording, torque: SineTorque | None, held: Held, *, known: bool) -> Comparison:
     """Propagate a run with a second solution, and compare both at its samples.
 
     Its start is `known` or not. Under recorded torques, which may have gaps, the reference begins
     again at a sample after each, and after a tick that no step resolves.
     """
-    time = recording.time_ns
-    samples = recording.quaternion, recording.gamma, recording.gamma_dot
+    time = run.time_ns
+    samples = run.quaternion, run.gamma, run.gamma_dot
     distances, energy = np.full((2, len(time), 3), np.nan), np.full(len(time), np.nan)
     start_ns, end_ns, drives = held
-    compiled = len(recording.ticks.end_ns) > COMPILED_FROM
-    motion, count = TickPropagator(recording.scene, torque, compiled=compiled), len(start_ns)
+    compiled = len(run.ticks.end_ns) > COMPILED_FROM
+    motion, count = TickPropagator(run.scene, torque, compiled=compiled), len(start_ns)
     model = motion.dynamics.model
-    state = recording.states[0]
+    state = run.states[0]
     known = known and bool(count and np.isfinite(state[0]))
     if known:  # by what the first sample is off, the simulator was
-        start = recording.scene.initial
+        start = run.scene.initial
         asked = samples[0][:1], np.array([start.gamma]), np.array([start.gamma_dot])
         distances[:, 0] = 0.0
         distances[0, :1] = _measure([values[:1] for values in samples], asked)
@@ -205,7 +203,7 @@ def _compare(
             if lost[k : after[0] + 1].any():
                 begun.append(int(start_ns[after[0]]))
             k = int(after[0])
-            state = recording.states[sample[k]]
+            state = run.states[sample[k]]
             energy[sample[k]], done = residual, _energy(model, state[None])[0] - residual
         end = min(int(stops[np.searchsorted(stops, k, side="right")]), k + CHUNK)
         reached = motion.follow((start_ns[k:end], end_ns[k:end], drives[k:end]), state)
@@ -214,7 +212,7 @@ def _compare(
         first, second = (_joints(model, states) for states in (found[:, 0], found[:, 1]))
         distances[0, rows] = _measure([values[rows] for values in samples], first)
         distances[1, rows] = _measure(second, first)
-        energy[rows] = _energy(model, recording.states[rows]) - done - found[:, 0, -1]
+        energy[rows] = _energy(model, run.states[rows]) - done - found[:, 0, -1]
         residual = next((x for x in energy[rows][::-1].tolist() if np.isfinite(x)), residual)
         k += len(reached)
         known = k == end and k not in stops
@@ -224,7 +222,7 @@ def _compare(
             failed, k = failed + 1, k + 1
         bar.draw(k / count)
     error, own = (pd.DataFrame(each, columns=[*QUANTITIES]) for each in distances)
-    steps = -(-recording.ticks.period_ns // LONGEST_TICK_NS)
+    steps = -(-run.ticks.period_ns // LONGEST_TICK_NS)
     return Comparison(error, own, energy, tuple(begun), steps)
 
 

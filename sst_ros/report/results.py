@@ -29,11 +29,9 @@ if TYPE_CHECKING:
 WHOLE_RUN_S = 1.0  # length of a run [s] where the scene names no duration
 
 
-def data_frame(
-    rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
-) -> DataFrame:
+def data_frame(rows: Iterable[Mapping[str, Any]], names: Iterable[str] | None = None) -> DataFrame:
     """Return a DataFrame of rows; what is unknown stays None."""
-    listed, names = list(rows), columns and list(columns)
+    listed, names = list(rows), names and list(names)
     frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
     for name in frame.columns:  # whole numbers with gaps stay whole numbers
         known = [row[name] for row in listed if row.get(name) is not None]

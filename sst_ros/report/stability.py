@@ -107,9 +107,7 @@ def examine_stability(
     for t, state in zip(instants.t.tolist(), states.tolist(), strict=True):
         values = advised.eigenvalues(scene, state if scene.lags else state[:7], state[7:])
         fastest = {"decay": max(0.0, -values.real.min()), "oscillation": abs(values.imag).max()}
-        longest = {
-            name: advised.largest_stable_step(method, values) for name, method in METHODS.items()
-        }
+        longest = {name: advised.largest_stable_step(one, values) for name, one in METHODS.items()}
         steps.append({"t_s": t, **fastest, **longest})
 
     def run(name: str) -> dict[str, Any]:

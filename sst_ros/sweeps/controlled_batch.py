@@ -244,12 +244,7 @@ class ControlledBatch:
         return (*sent, *(number for name in self._memory_sizes for number in new[name]))
 
     def run(
-        self,
-        batch: Batch,
-        given: dict[str, Array],
-        rows: NDArray[np.int64],
-        steps: int,
-        kept: int = 0,
+        self, batch: Batch, given: dict[str, Array], rows: NDArray[np.int64], steps: int, kept: int
     ) -> tuple[BatchResult, dict[str, Array]]:
         """Run the scenarios of a batch; return their results and tracking figures.
 

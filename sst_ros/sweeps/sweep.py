@@ -304,11 +304,7 @@ class PreparedSweep:
         return scenarios, starts, faults
 
     def run(
-        self,
-        scenarios: Scenarios,
-        starts: dict[str, Array],
-        rows: NDArray[np.int64],
-        steps: int,
+        self, scenarios: Scenarios, starts: dict[str, Array], rows: NDArray[np.int64], steps: int
     ) -> tuple[BatchResult, dict[str, NDArray[Any]]]:
         """Return results of rows by a number of steps, and their extremes or tracking figures."""
         batch = self.batch.with_parameters(scenarios)
