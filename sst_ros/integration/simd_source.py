@@ -16,6 +16,7 @@ ends outside is found, and one that leaves and comes back.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 
@@ -102,6 +103,27 @@ def loop(at: Layout, body: list[str]) -> list[str]:
 def indent(spaces: int, lines: list[str]) -> list[str]:
     """Move lines to the right."""
     return [" " * spaces + line for line in lines]
+
+
+_LOCAL = re.compile(r"\b[uvg]\d+(_\d+)?\b")
+"""What a program or a loop over lanes names, and uses only below in the text."""
+
+
+def assign_once(lines: Sequence[str]) -> str:
+    """Join lines to a text in which each such name is assigned once.
+
+    Of names that are assigned in several places numba finds out which is meant, which takes half
+    of its time.
+    """
+    newest, text = dict[str, str](), ""
+    for number, line in enumerate(lines):
+        place, equals, value = line.partition(" = ")
+        value = _LOCAL.sub(lambda match: newest.get(match[0], match[0]), value)
+        if _LOCAL.fullmatch(name := place.strip()):
+            newest[name] = f"{name}_{number}"
+            place = place.replace(name, newest[name])
+        text += f"{place}{equals}{value}\n"
+    return text
 
 
 def linearise_by_columns(
@@ -255,7 +277,7 @@ def batch_source(program: Program, distances: Program, tableau: Tableau, size: i
         f"            when[lo + i] = {at.lane('when')}",
         f"            error[lo + i] = {at.lane('error')}",
     ]
-    return "\n".join(lines) + "\n"
+    return assign_once(lines)
 
 
 def over_blocks(at: Layout) -> list[str]:

@@ -31,7 +31,15 @@ from sst_ros.dynamics.traced_dynamics import MOTION, ODE, Dynamics, limit_distan
 from sst_ros.host import compiled_module
 from sst_ros.integration.compiled_method import estimate_error, orientation_distance, state_distance
 from sst_ros.integration.propagator import first_event
-from sst_ros.integration.simd_source import Layout, evaluate_lanes, flat_sin, indent, loop, put
+from sst_ros.integration.simd_source import (
+    Layout,
+    assign_once,
+    evaluate_lanes,
+    flat_sin,
+    indent,
+    loop,
+    put,
+)
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.torque_profile import ConstantTorque, SineTorque
 from sst_ros.simulation.stepped_motion import Task
@@ -447,4 +455,4 @@ def source(ode: ODE, nodes: int, limits: Program | None) -> tuple[list[str], Lay
         f"    finite = {' + '.join(f'abs({name})' for name in y)} < INFINITE",
         "    return worst if finite else INFINITE",
     ]
-    return [inspect.getsource(flat_sin), "\n".join(lines) + "\n"], at, slots.values
+    return [inspect.getsource(flat_sin), assign_once(lines)], at, slots.values

@@ -29,6 +29,7 @@ from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.integration.simd_source import (
     SIMD_WIDTH,
     Layout,
+    assign_once,
     evaluate_lanes,
     indent,
     load_lanes,
@@ -137,7 +138,7 @@ def control_source(program: Program, sizes: Mapping[str, int]) -> str:
         *(f"    {name} = {place}" for name, place in zip(names, places, strict=True)),
     ]
     head = "def control(sample, begin, end, y, d, code, memory, references, gains, rows, seed):"
-    return "\n".join([head, *over_blocks(at), *indent(8, lines)]) + "\n"
+    return assign_once([head, *over_blocks(at), *indent(8, lines)])
 
 
 class ControlledBatch:
