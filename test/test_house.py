@@ -124,12 +124,13 @@ from programs import own_domain
 from sst_ros.report.run import evaluate_run, summary_table
 
 files, counts = set(), True
+PACKAGE = str(pathlib.Path(sst_ros.__file__).parent)
 
 def profile(frame, event, argument):
-    path, own = pathlib.Path(frame.f_code.co_filename), threading.current_thread().name
-    package = pathlib.Path(sst_ros.__file__).parent
-    if counts and event == "call" and own != "watch" and package in path.parents:
-        files.add(".".join(path.parts[-2:]).removesuffix(".py"))
+    if not counts or event != "call" or not frame.f_code.co_filename.startswith(PACKAGE):
+        return
+    if threading.current_thread().name != "watch":
+        files.add(".".join(pathlib.Path(frame.f_code.co_filename).parts[-2:]).removesuffix(".py"))
 
 def passed(name, call):
     files.clear()
