@@ -65,7 +65,7 @@ def swing_torque(time):
     return inertia(EXAMPLE1, x) * acceleration + 0.5 * inertia_slope(EXAMPLE1, x) * rate**2, rate
 
 
-def summit(function, count=4000):
+def summit(function, count=400):
     """Largest size of a function of time over the swing: a fine grid, then a search."""
     times = np.linspace(0.0, TIME, count)
     top = int(np.argmax([abs(function(time)) for time in times]))
