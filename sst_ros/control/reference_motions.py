@@ -14,6 +14,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
+from operator import itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -206,27 +207,23 @@ def move_actuators(
     except continuation.BranchEnds as error:
         said = f"parallel singularity before t = {times[error.row]:.9g} s"
         raise SingularConfiguration(f"{said}, least singular value of J2", error.measure) from error
-    sigma, quaternions = sigmas.tolist(), quaternion_of(rotations)
+    quaternions = quaternion_of(rotations)
     # Their signs change as little as they can.
     turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
     signs = np.cumprod(np.where(turns < 0.0, -1.0, 1.0))
-    known = list(map(tuple, (signs[:, None] * quaternions).tolist()))
-    return ReferenceMotion(partial(_on_path, space, path, times, known, gammas, sigma), pieces)
+    known = map(tuple, (signs[:, None] * quaternions).tolist())
+    kept = list(zip(times, known, gammas, sigmas.tolist(), strict=True))
+    return ReferenceMotion(partial(_on_path, space, path, kept), pieces)
 
 
-def _on_path(
-    space: ActuatorSpaceMap,
-    path: ActuatorPath,
-    times: list[float],
-    known: list[Any],
-    gammas: list[Vector3],
-    sigma: list[float],
-    time: float,
-) -> Reference:
-    """Return the reference at a time [s]; a function of a module, which pickle takes."""
+def _on_path(space: ActuatorSpaceMap, path: ActuatorPath, kept: Any, time: float) -> Reference:
+    """Return the reference at a time [s]; a function of a module, which pickle takes.
+
+    Each of what is kept is a time, the orientation and gamma there, and the singular value of J2.
+    """
     gamma, gamma_dot, gamma_ddot = path(time)
-    index = max(bisect_right(times, time) - 1, 0)
-    q = space.follow(known[index], gammas[index], gamma, sigma[index])
+    _, known, here, sigma = kept[max(bisect_right(kept, time, key=itemgetter(0)) - 1, 0)]
+    q = space.follow(known, here, gamma, sigma)
     star: Any = space.star_motion(*q, *gamma_dot, *gamma_ddot)
     return Reference(q, star[:3], star[3:], gamma, gamma_dot, gamma_ddot)
 

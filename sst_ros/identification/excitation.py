@@ -17,7 +17,7 @@ stroke, workspace, singularities, torque, rate and acceleration of the actuators
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,9 +131,7 @@ class _Trial:
     period of the highest harmonic, n of them.
     """
 
-    def __init__(
-        self, scene: Scene, names: tuple[str, ...], duration: float, harmonics: int
-    ) -> None:
+    def __init__(self, scene: Scene, names: Sequence[str], duration: float, harmonics: int) -> None:
         self._regressor = Regressor(scene, names)
         self.base = find_base_parameters(self._regressor)
         allowed = "must determine something: no torque depends on these parameters"

@@ -214,9 +214,7 @@ def fit_torques(
     refuse_unless("identify", ("parameters", list(names), bool(base.chosen), allowed))
     given = parameters.values(scene, names)
     terms = float(np.sqrt(np.mean((np.abs(columns) @ np.abs(given)) ** 2)))
-    estimate, root, deviations = fit_weighted(
-        columns[..., base.chosen], torque, weights, terms=terms
-    )
+    estimate, root, spread = fit_weighted(columns[..., base.chosen], torque, weights, terms=terms)
     inverse = solve_triangular(root, np.eye(len(root)))
     reach = max(scene.base.radius, scene.star.radius)
     values, excess = find_consistent_values(names, given, base.transform, estimate, root, reach)
@@ -235,7 +233,7 @@ def fit_torques(
         undetermined=tuple(compress(whole.labels, lost)),
         warnings=() if sound.all() else (warning,),
         base=base,
-        noise=deviations,
+        noise=spread,
         condition=float(np.linalg.cond(root / np.linalg.norm(root, axis=0))),
         excess=excess,
         vague=tuple(compress(base.labels, vague)),

@@ -180,15 +180,13 @@ def _list_collocation(problem: InitialValueProblem, kind: str) -> Iterator[Solve
     """Yield settings of Gauss collocation, with the steps that each tolerance chooses."""
 
     def solve(make: Callable[[], PreparedRun]) -> Run:
-        motion = make().run()
-        dense = motion.at(problem.times)
-        return np.hstack([dense.quaternion, dense.body_rate]), motion.evaluations
+        run = make().run()
+        dense = run.at(problem.times)
+        return np.hstack([dense.quaternion, dense.body_rate]), run.evaluations
 
-    longest = math.inf
+    longest, motion = math.inf, (problem.scene, None, problem.seconds)
     for tolerance in (1e-2, 1e-3, *_TOLERANCES):
-        make = partial(
-            prepare, problem.scene, None, problem.seconds, method=GAUSS, tolerance=tolerance
-        )
+        make = partial(prepare, *motion, method=GAUSS, tolerance=tolerance)
         if kind == TOLERANCE:
             yield SolverSetting(GAUSS, kind, tolerance, partial(solve, make), make)
             continue
