@@ -55,7 +55,7 @@ from sst_ros.state import NANOSECONDS, Explained, clamp
 
 Span = tuple[float, float, int]  # begin, end, sign of a number in between; 0 where not known
 PARALLEL = "parallel singularity, det J2 = 0"
-LIMIT_ORDERS = 6, 20  # of expansions whose signs say where limits are; the second near one only
+LIMIT_ORDER, SPLITS = 6, 200  # of expansions whose signs say where limits are; of a step there
 TURN, REST = ("turn_x", "turn_y", "turn_z"), (0.0, 0.0, 0.0)
 ATTEMPTS = 3
 _PHYSICAL = (
@@ -272,15 +272,11 @@ class ProvenMotion(Explained):
         """Take what a step proves, up to where the motion meets an end of the scene."""
         self.steps, end = self.steps + 1, step.end
         names, run = self._equations.limits
-        for order in LIMIT_ORDERS:
-            found = [_signs(step, row) for row in step.enclose(run, order)]
-            if all(sign for spans in found for *_, sign in spans):
-                break
-        for name, spans in zip(names, found, strict=True):
-            self._signs[name] += spans
-            met = next((begin for begin, _, sign in spans if sign <= 0), end)
-            if name in self._stops and met < end:
-                self.reason, end = name, met
+        for low, high, signs in _signs(step, run):
+            for name, sign in zip(names, signs, strict=True):
+                self._signs[name].append((low, high, sign))
+                if name in self._stops and sign <= 0 and low < end:
+                    self.reason, end = name, low
         self.until = end
         while self._times and self._times[0] <= end:
             self._rows.append(self._row(step, self._times.pop(0)))
@@ -314,6 +310,11 @@ class ProvenMotion(Explained):
         return float(np.max(self.columns["angle"], initial=0.0 if self._rows else math.inf))
 
     @property
+    def error(self) -> float:
+        """Largest distance of `simulate` from the true motion [rad]; inf without one."""
+        return float(np.max(self.columns["distance"], initial=0.0 if self._rows else math.inf))
+
+    @property
     def success(self) -> bool:
         """Whether the motion is proven to its end, within the bound asked for."""
         ended = not self.reason or self.reason in self._stops
@@ -328,10 +329,10 @@ class ProvenMotion(Explained):
         until = f"to {self.until:.12g} s" + f": {self.reason}" * bool(self.reason)
         facts: dict[str, object] = {"scene": self.scene.name, "proven": until}
         if self._rows:
-            error, estimate = np.max(self.columns["distance"]), self.trajectory.error_estimate
+            estimate = self.trajectory.error_estimate
             facts["orientation"] = f"within {self.largest:.2g} rad of the table"
             facts["error of simulate"] = (
-                f"below {error:.2g} rad; its estimate is {estimate:.2g} rad"
+                f"below {self.error:.2g} rad; its estimate is {estimate:.2g} rad"
             )
             facts["limits"] = met or "no limit is reached and no singularity is passed"
         return facts | {"steps": self.steps}
@@ -344,19 +345,20 @@ def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return 4 * (min(chords, key=float) / 2).asin()
 
 
-def _signs(step: Advance, coefficients: Sequence[Any]) -> list[Span]:
-    """Split a step into spans of time in which a number is > 0 (1), < 0 (-1), or unknown (0)."""
-    number, found, todo, left = arb_poly(coefficients), [], [(step.begin.time, step.end)], 400
-    least = 1e-10 * (step.end - step.begin.time)
+def _signs(step: Advance, run: Function) -> Iterator[tuple[float, float, list[int]]]:
+    """Split a step into spans of time in which numbers are > 0 (1), < 0 (-1), or unknown (0)."""
+    begin, left = step.begin.time, SPLITS
+    todo = [(begin, step.end)]
     while todo:
         low, high = todo.pop()
-        value = number(between(low, high) - step.begin.time)
-        sign, left = int(bool(value > 0)) - int(bool(value < 0)), left - 1
-        if sign == 0 and left > 0 and high - low > least:
-            todo += [(0.5 * (low + high), high), (low, 0.5 * (low + high))]
+        span = arb(low) - begin, arb(high) - begin
+        near = between(span[0] - span[1], span[1] - span[0]) / 2
+        values = (arb_poly(row)(near) for row in step.enclose(run, LIMIT_ORDER, step.tube, span))
+        signs, left = [int(bool(x > 0)) - int(bool(x < 0)) for x in values], left - 1
+        if all(signs) or left < 0 or high - low < 1e-10 * (step.end - begin):
+            yield low, high, signs
         else:
-            found.append((low, high, sign))
-    return found
+            todo += [(0.5 * (low + high), high), (low, 0.5 * (low + high))]
 
 
 def _spans(
@@ -376,6 +378,7 @@ def certify(
     *,
     bound: float = 1e-9,
     ranges: Mapping[str, float | str] | None = None,
+    max_steps: int = 100_000,
     progress: bool = False,
     **options: Any,
 ) -> ProvenMotion:
@@ -393,6 +396,7 @@ def certify(
         ranges: how far numbers of the scene may be from those given, by key, as in
             {"star.inertia.zz": 5e-4, "initial.gamma": 1e-6}; "digits" for half a unit of the last
             digit that a number has. Keys may name bodies, loads, and initial angles and rates.
+        max_steps: number of steps after which the proof ends, some 20 ms each.
         progress: draw a bar on a terminal.
         options: of `simulate`, as initial, method, tolerance, and t_eval, the times of the table.
 
@@ -409,16 +413,17 @@ def certify(
         "certify",
         ("torque", torque, known, "must be numbers, sines, a table or polynomials"),
         ("bound", bound, 0.0 < bound < math.inf, "must be a number > 0 [rad]"),
+        ("max_steps", max_steps, max_steps > 0, "must be > 0"),
     )
     assert profile is not None and end is not None
-    end, kinks, tolerance = round(end * NANOSECONDS) / NANOSECONDS, profile.kinks(), 1e-7 * bound
+    end, kinks, tolerance = round(end * NANOSECONDS) / NANOSECONDS, profile.kinks(), 1e-6 * bound
     breaks = [0.0, *np.unique(kinks[(kinks > 0.0) & (kinks < end)]).tolist(), end]
     places = _places(given, ranges or {})
     with enclosure.precision():
         equations = _Equations(given, profile, places)
         for _ in range(ATTEMPTS):
             found = ProvenMotion(equations, bound, trajectory)
-            _prove(found, equations, breaks, tolerance, Bar("certify", progress))
+            _prove(found, equations, breaks, tolerance, max_steps, Bar("certify", progress))
             if found.largest <= bound or places or found.largest == math.inf:
                 break
             tolerance *= 0.1 * bound / found.largest
@@ -453,9 +458,14 @@ def _places(scene: Scene, ranges: Mapping[str, float | str]) -> dict[Place, floa
 
 
 def _prove(
-    found: ProvenMotion, equations: _Equations, breaks: Sequence[float], tolerance: float, bar: Bar
+    found: ProvenMotion,
+    equations: _Equations,
+    breaks: Sequence[float],
+    tolerance: float,
+    max_steps: int,
+    bar: Bar,
 ) -> None:
-    order = max(14, math.ceil(-1.4 * math.log10(tolerance)))
+    order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
     try:
         here = equations.start()
         for begin, end in pairwise(breaks):
@@ -465,6 +475,8 @@ def _prove(
                 bar.draw(step.end / breaks[-1])
                 if found.reason:
                     return
+                if found.steps >= max_steps and step.end < breaks[-1]:
+                    raise Refused(f"{max_steps} steps are not enough")
             here = enclosure.region_at_end(step)
     except Refused as refused:
         found.reason = str(refused)

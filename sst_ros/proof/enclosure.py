@@ -19,6 +19,7 @@ import contextlib
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
+from functools import reduce
 from operator import methodcaller
 from typing import Any, NamedTuple, NoReturn
 
@@ -34,7 +35,8 @@ arb, arb_mat, arb_poly, arb_series, ctx = (
 Function = Callable[..., Sequence[Any]]
 
 PRECISION, LONGEST = 128, 100  # bits; coefficients of a series
-V_ORDER = 8
+J_ORDER, V_ORDER = 8, 16  # of the Jacobian and of V
+AHEAD = 4  # coefficients of the Jacobian that p is found by
 SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogonal
 GROWTH = 0.05  # of a set by the remainder of V, largest in a step
 LEAST = 1e-9  # of a step, relative to the whole time: the proof ends
@@ -228,6 +230,11 @@ class Advance(NamedTuple):
         w = magnitude(by * self.v[0]) * self.w
         return [p(s) for p in self.p], entries(magnitude(self.begin.spread(by * self.flow(s)) + w))
 
+    @property
+    def half(self) -> Any:
+        """Half of the length [s]."""
+        return self.length / 2
+
     def expand(self, function: Function, where: Any, size: int, tube: Sequence[Any]) -> list[Any]:
         """Coefficients below `size` of a function of t and y = p + e at s = where, e in `tube`."""
         rows = (p(arb_poly([where, 1])) + e for p, e in zip(self.p, tube, strict=True))
@@ -235,52 +242,103 @@ class Advance(NamedTuple):
         found = function(time, *(_series(row, size) for row in rows))
         return [_coefficients(x, size) for x in found]
 
-    def enclose(self, function: Function, order: int) -> list[list[Any]]:
-        """Coefficients, the last one in the whole step, of polynomials that enclose a function."""
-        low = self.expand(function, arb(0), order, self.tube)
-        last = self.expand(function, between(0, self.length), order + 1, self.tube)
-        return [[*row, end[order]] for row, end in zip(low, last, strict=True)]
+    def enclose(
+        self,
+        function: Function,
+        order: int,
+        tube: Sequence[Any],
+        span: tuple[Any, Any] | None = None,
+        parts: int = 1,
+    ) -> list[list[Any]]:
+        """Coefficients of polynomials about the middle of a span that enclose a function in it.
+
+        The last one is what it is anywhere in the span: Lagrange's remainder. The span counts from
+        the begin of the step [s], and is all of it by default.
+        """
+        begin, end = span or (arb(0), self.length)
+        part = (end - begin) / parts
+        found = self.expand(function, (begin + end) / 2, order, tube)
+        spans = [between(begin + k * part, begin + (k + 1) * part) for k in range(parts)]
+        last = [self.expand(function, one, order + 1, tube) for one in spans]
+        return [
+            [*row, reduce(arb.union, (one[i][order] for one in last))]
+            for i, row in enumerate(found)
+        ]
 
 
-def expand(f: Function, at: Region, order: int) -> tuple[list[list[Any]], list[list[Any]]]:
-    """Return the coefficients of p, and bounds of those of its defect below `order`: rounding."""
-    p, defects = [[x] for x in at.centre], [list[Any]() for _ in at.centre]
-    for k in range(order):
-        slopes = f(arb_series([at.time, 1], k + 1), *(arb_series(row, k + 1) for row in p))
-        for row, defect, slope in zip(p, defects, slopes, strict=True):
-            here = _coefficients(slope, k + 1)[k]
-            row.append((here / (k + 1)).mid())
-            defect.append((row[-1] * (k + 1) - here).abs_upper())
-    return p, defects
+def shift(coefficients: Sequence[Any], by: Any) -> list[Any]:
+    """Return the coefficients of a polynomial about another point."""
+    every = range(len(coefficients))
+    return [
+        sum((coefficients[j] * (math.comb(j, k) * by ** (j - k)) for j in every[k + 1 :]), c)
+        for k, c in enumerate(coefficients)
+    ]
 
 
-def prove(
-    f: Function, jacobian: Function, step: Advance, defects: list[list[Any]], tolerance: float
-) -> Advance:
-    """Prove a step with e in its tube, or raise Refused."""
-    n, h, s = len(step.p), step.length, between(0, step.length)
-    order, zero = len(defects[0]), arb_mat(n, n, [0] * (n * n))
-    # |d(s)| <= sum |d_k| s^k + |d_N| s^N, the last coefficient anywhere in the step
-    last = step.expand(f, s, order + 1, [arb(0)] * n)
-    d = [[*low, row[order].abs_upper()] for low, row in zip(defects, last, strict=True)]
-    step = step._replace(defect=max(float(arb_poly(row).integral()(h)) for row in d))
+def approximate(f: Function, jacobian: Function, at: Region, order: int) -> list[list[Any]]:
+    """Return the coefficients of p.
+
+    A series f(t, p) gives the next coefficient of p, and nearly those that follow: what they add
+    to it is linear, by the Jacobian on what was known.
+    """
+    n, p, j = len(at.centre), [[x] for x in at.centre], list[Any]()
+
+    def run(function: Function, size: int) -> list[list[Any]]:
+        found = function(arb_series([at.time, 1], size), *(arb_series(row, size) for row in p))
+        return [_coefficients(x, size) for x in found]
+
+    while (known := len(p[0])) <= order:
+        if known == AHEAD:
+            j = _matrices(run(jacobian, AHEAD)[n:], n)
+        slopes, new = run(f, min(known + len(j), order)), list[Any]()
+        for k in range(known - 1, len(slopes[0])):
+            added = (j[k - i] * x for i, x in enumerate(new, known))
+            slope = sum(added, column([row[k] for row in slopes]))
+            new.append((slope / (k + 1)).mid())
+        for row, more in zip(p, zip(*map(entries, new), strict=True), strict=True):
+            row += more
+    return p
+
+
+def _matrices(flat: Sequence[Sequence[Any]], n: int) -> list[Any]:
+    """Return the coefficients of a Jacobian, from those of its entries column by column."""
+    rows = [[flat[n * c + r] for c in range(n)] for r in range(n)]
+    return [arb_mat([[x[k] for x in row] for row in rows]) for k in range(len(flat[0]))]
+
+
+def bound_defect(f: Function, step: Advance, order: int) -> list[list[Any]]:
+    """Return bounds of the coefficients of the defect about the middle, up to `order`."""
+    found = step.enclose(f, order, [arb(0)] * len(step.p), parts=2)
+    slopes = [p.derivative()(arb_poly([step.half, 1])) for p in step.p]
+    return [
+        [(x - slope[k]).abs_upper() for k, x in enumerate(row)]
+        for row, slope in zip(found, slopes, strict=True)
+    ]
+
+
+def prove(f: Function, jacobian: Function, step: Advance, order: int, tolerance: float) -> Advance:
+    """Prove a step with e in its tube, or raise Refused; `order` is that of the defect."""
+    n, h, half = len(step.p), step.length, step.half
+    s, u = between(0, h), between(-half, half)  # from the begin, from the middle
+    d = bound_defect(f, step, order)
+    step = step._replace(defect=max(2 * float(arb_poly(row).integral()(half)) for row in d))
     if not (excess := step.defect / tolerance) <= 1.0:
         shorter = 0.9 * excess ** (-1.0 / order) if excess < math.inf else 0.5
         raise Refused("the defect is too large", max(shorter, 0.2))
-    flat = step.enclose(jacobian, V_ORDER)
-    of_order = range(V_ORDER + 1)
-    j = [arb_mat([[flat[n + n * c + r][k] for c in range(n)] for r in range(n)]) for k in of_order]
-    middles, v = list(map(_middles, j)), [np.eye(n)]
+    j = _matrices(step.enclose(jacobian, J_ORDER, step.tube)[n:], n)
+    middles, v = shift([_middles(x) for x in j], -float(half)), [np.eye(n)]
     for k in range(V_ORDER):
-        v.append(np.sum([middles[i] @ v[k - i] for i in range(k + 1)], axis=0) / (k + 1))
+        some = range(min(k, J_ORDER) + 1)
+        v.append(np.sum([middles[i] @ v[k - i] for i in some], axis=0) / (k + 1))
     step = step._replace(v=[arb_mat(matrix.tolist()) for matrix in v])
+    about, zero = shift(step.v, half), arb_mat(n, n, [0] * (n * n))
     rest = zero  # J V - V' in the whole step
-    for k in range(2 * V_ORDER + 1):
-        some = range(max(0, k - V_ORDER), min(k, V_ORDER) + 1)
-        term = sum((j[i] * step.v[k - i] for i in some), zero)
-        rest = rest + (term - step.v[k + 1] * (k + 1) if k < V_ORDER else term) * s**k
+    for k in reversed(range(J_ORDER + V_ORDER + 1)):
+        some = range(max(0, k - V_ORDER), min(k, J_ORDER) + 1)
+        term = sum((j[i] * about[k - i] for i in some), zero)
+        rest = rest * u + (term - about[k + 1] * (k + 1) if k < V_ORDER else term)
     source = entries(step.begin.spread(rest))
-    whole = sum((matrix * s**k for k, matrix in enumerate(j)), zero)
+    whole = reduce(lambda found, matrix: found * u + matrix, reversed(j))
     size, weights = magnitude(whole), _weights(whole)
     growth, largest = arb(0), arb(0)  # logarithmic norm of J; norm of (J V - V') e(0)
     for i in range(n):
@@ -290,7 +348,7 @@ def prove(
     most = largest * h  # integral of the norm of both, which is no less than the norm of it
     for k in range(order + 1):
         sizes = [(row[k] / x).upper() for row, x in zip(d, weights, strict=True)]
-        most += max(sizes) * h ** (k + 1) / (k + 1)
+        most += 2 * max(sizes) * half ** (k + 1) / (k + 1)
     w = [((growth * h).exp() * most * x).upper() for x in weights]
     step = step._replace(w=column(w), weights=weights)
     reached = entries(step.begin.spread(step.flow(s)) + step.w)
@@ -331,6 +389,10 @@ def region_at_end(step: Advance) -> Region:
     return Region(step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b)
 
 
+def _tube(here: Region, room: int, tolerance: float) -> list[Any]:
+    return [arb(0, (room * (x + tolerance)).upper()) for x in entries(here.spread())]
+
+
 def enclose(
     f: Function, jacobian: Function, here: Region, end: float, tolerance: float, order: int
 ) -> Iterator[Advance]:
@@ -345,26 +407,27 @@ def enclose(
         order: degree of p.
 
     """
-    factor, usual, most = 0.4, end - here.time, math.inf
+    factor, usual, most, room = 0.4, end - here.time, math.inf, 3
     least = LEAST * usual
     while here.time < end:
-        p, defects = expand(f, here, order)
+        p = approximate(f, jacobian, here, order)
         sizes = [(k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)]
         longest = min([(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=usual)
         h, tries = min(factor * longest, 2.0 * usual, most), 0
-        narrow = tube = [arb(0, (3 * (x + tolerance)).upper()) for x in entries(here.spread())]
+        tube = _tube(here, room, tolerance)
         while True:
             target = end if here.time + 1.01 * h > end else here.time + h
             try:
                 step = Advance(here, target, list(map(arb_poly, p)), tube)
-                step = prove(f, jacobian, step, defects, tolerance)
+                step = prove(f, jacobian, step, order, tolerance)
                 break
             except (ArithmeticError, ValueError) as error:
                 why = error if isinstance(error, Refused) else Refused(str(error))
                 if why.wider is not None and tries < 4:
-                    tube, tries = why.wider, tries + 1
+                    tube, tries, room = why.wider, tries + 1, min(2 * room, 100)
                     continue
-                h, tube, tries, most = why.shorter * (target - here.time), narrow, 0, 0.0
+                h, tries, most, room = why.shorter * (target - here.time), 0, 0.0, 3
+                tube = _tube(here, room, tolerance)
                 if h < least or here.time + h == here.time:
                     raise why from None
         yield step

@@ -34,7 +34,7 @@ from sst_ros.report.reference_solution import (
     Run,
     solve_reference,
 )
-from sst_ros.report.results import data_frame, provenance, publish, records, render
+from sst_ros.report.results import data_frame, proven_error, provenance, publish, records, render
 from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
@@ -77,6 +77,7 @@ class WorkPrecision:
     advice: StepAdvice  # as `scene show` prints it
     measured: float | None
     """Error of `simulate` with that advice [rad]; None where a limit stops it."""
+    proven: str = "-"  # what that error is proven to be below, or why it is not
 
     @property
     def floor(self) -> float:
@@ -137,6 +138,7 @@ def study_scene(scene: Scene, *, shown: bool = False) -> WorkPrecision:
         rows=data_frame(({"scene": scene.name, **row} for row in rows), COLUMNS),
         advice=step_advice(scene),
         measured=measured,
+        proven=proven_error(scene, duration=problem.seconds, t_eval=problem.times),
     )
 
 

@@ -3,16 +3,30 @@
 
 import math
 
+import numpy as np
 import pytest
 from mpmath import mp, mpf
-from sixty_digits import Motion, angle
 
-from sst_ros import InputError, SineTorque, TorqueTable, certify, load_scene, simulate
+from sst_ros import (
+    InputError,
+    PolynomialTorque,
+    SineTorque,
+    TorqueTable,
+    certify,
+    load_scene,
+    simulate,
+)
 from sst_ros.__main__ import main
 from sst_ros.dynamics.motion_table import JOINTS
+from sst_ros.mechanism.geometry import angle_between
+from sst_ros.proof import certify as certify_module
 from sst_ros.proof import enclosure
-from sst_ros.proof.enclosure import Region, arb, arb_series
+from sst_ros.proof.enclosure import Region, arb, arb_poly, arb_series
+from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
+from studies.sixty_digits import Motion, angle
 
+REFERENCES = ("example1", "example2", "general", "gravity_payload")
+ROUNDING = 1e-15  # of a reference that is rounded to doubles [rad]
 FREE = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore"}
 SINE = SineTorque(amplitude=(1.0, -0.5, 2.0), frequency=(15.0, 12.0, 20.0), phase=(0.0, 1.0, 0.5))
 CASES = {
@@ -100,25 +114,30 @@ def test_an_oscillator_is_not_wrapped():
     assert exactly <= float(e[0]) < 1.1 * exactly
 
 
+def halve_the_defect(patch):
+    bound = enclosure.bound_defect
+    patch.setattr(enclosure, "bound_defect", lambda *given: [
+        [x / 2 for x in row] for row in bound(*given)
+    ])  # fmt: skip
+
+
 def test_a_halved_defect_misses_the_solution(monkeypatch):
-    # y' = 3 t^2 by p of order 2: the defect is all of it, and its integral is the error, t^3.
-    def f(t, y):
-        return (3 * t * t,)
+    # y' = 3 (t - h/2)^2 by p = 0: the defect is all of it, and its integral is the error, h^3 / 4.
+    h = arb(0.125)
 
     def miss():
         with enclosure.precision():
-            box = Region.box(0.0, [arb(0)])
-            step = last(f, lambda t, y: (3 * t * t, 0 * t), box, 0.125, 1.0, 2)
-            p, e = step.at(0.125)
-            return float(abs(p[0] - arb(0.125) ** 3)) / float(e[0])
+            p, tube = [enclosure.arb_poly([0])], [arb(0, 1)]
+            step = enclosure.Advance(Region.box(0.0, [arb(0)]), 0.125, p, tube)
+
+            def f(t, y):
+                return (3 * (t - h / 2) ** 2,)
+
+            step = enclosure.prove(f, lambda t, y: (*f(t, y), 0 * t), step, 2, 1.0)
+            return float(h**3 / 4) / float(step.at(0.125)[1][0])
 
     assert 0.999 < miss() <= 1.0
-    expand = enclosure.Advance.expand
-    monkeypatch.setattr(
-        enclosure.Advance, "expand", lambda *given: [
-            [x / 2 if k else x for k, x in enumerate(row)] for row in expand(*given)
-        ],
-    )  # fmt: skip
+    halve_the_defect(monkeypatch)
     assert miss() > 1.9
 
 
@@ -133,14 +152,22 @@ def test_the_norm_of_an_integral_is_no_bound(monkeypatch):
 
     with enclosure.precision():
         p = [enclosure.arb_poly([0]), enclosure.arb_poly([0, -1])]
-        defects = [[arb(0)] * order, [arb(1), *[arb(0)] * (order - 1)]]
         step = enclosure.Advance(Region.box(0.0, [arb(0)] * 2), h, p, [arb(0, 1e3)] * 2)
-        given = (lambda *y: (*f(*y), -100, 0, 100, 0)), step, defects, 1.0
+        given = (lambda *y: (*f(*y), -100, 0, 100, 0)), step, order, 1e3
         bound = float(enclosure.prove(f, *given).at(h)[1][0])
     error = mp.quad(
         lambda s: mp.exp(100 * (s - h)) * (100 * s + (order + 1) * (s / h) ** order), [0, h]
     )
     assert 1.2 * h < error < bound
+
+
+def remove_rounding(patch):
+    """Leave Lagrange's remainder of the defect alone, and take reached ends as exact."""
+    bound, end = enclosure.bound_defect, enclosure.region_at_end
+    patch.setattr(enclosure, "bound_defect", lambda *given: [
+        [*(0 * x for x in row[:-1]), row[-1]] for row in bound(*given)
+    ])  # fmt: skip
+    patch.setattr(enclosure, "region_at_end", lambda step: end(step)._replace(b=step.w))
 
 
 def test_without_rounding_the_solution_is_missed(monkeypatch):
@@ -149,19 +176,12 @@ def test_without_rounding_the_solution_is_missed(monkeypatch):
 
     def miss():
         with enclosure.precision():
-            p, e = last(*oscillator(), 1.0).at(1.0)
+            p, e = last(*oscillator(), 1.0, 1e-12, 24).at(1.0)
             return abs(float(p[0]) - math.cos(1.0)), float(e[0])
 
     error, bound = miss()
     assert 1e-16 < error < bound < 1e-9
-    expand, end = enclosure.expand, enclosure.region_at_end
-
-    def exactly(f, at, order):
-        p, defects = expand(f, at, order)
-        return p, [[0 * x for x in row] for row in defects]
-
-    monkeypatch.setattr(enclosure, "expand", exactly)
-    monkeypatch.setattr(enclosure, "region_at_end", lambda step: end(step)._replace(b=step.w))
+    remove_rounding(monkeypatch)
     error, bound = miss()
     assert error > bound
 
@@ -174,6 +194,90 @@ def test_a_wrong_jacobian_misses_a_motion_of_the_range(monkeypatch):
     # from (1.001, 0.001)
     apart = 1.001 * math.cos(1.0) + 0.001 * math.sin(1.0) - math.cos(1.0)
     assert float(wrong[0]) < apart < float(e[0])
+
+
+def ratios(step, motion):
+    """True errors of the numbers of a state at the end of a step, over their bounds."""
+    p, e = step.at(step.end)
+    with mp.workdps(40):
+        found = [mpf(x.str(40, radius=False)) for x in p]
+        return [
+            float(abs(x - y) / mpf(float(r)))
+            for x, y, r in zip(found, motion.at(step.end), e, strict=True)
+        ]
+
+
+def equations_of(scene, torque):
+    """The derivative, it with the Jacobian, and the start of a proof."""
+    equations = certify_module._Equations(scene, torque, {})
+    return *equations.between(0.0, 1.0), equations.start()
+
+
+def test_without_rounding_a_motion_of_60_digits_is_missed(monkeypatch):
+    scene, _ = case("general")
+    motion = Motion(scene, SINE)
+
+    def reach(size):
+        with monkeypatch.context() as patch:
+            patch.setattr(enclosure, "PRECISION", 40)
+            with enclosure.precision():
+                f, jacobian, here = equations_of(scene, SINE)
+                here = here._replace(a=size * here.a)
+                step = last(f, jacobian, here, 0.02, 1e-11, 24)
+        with enclosure.precision():
+            return max(ratios(step, motion))
+
+    assert 1e-3 < reach(1) < 1.0
+    remove_rounding(monkeypatch)
+    assert reach(0) > 1.0
+
+
+def test_a_halved_defect_misses_a_motion_of_60_digits(monkeypatch):
+    # In a short step p is off by 2^-20 s, so that the defect acts alike all the time.
+    scene, _ = case("general")
+    motion, h = Motion(scene, SINE), 2.0**-12
+    monkeypatch.setattr(enclosure, "_weights", lambda _: [arb(1)] * 7)
+
+    def found():
+        with enclosure.precision():
+            f, jacobian, here = equations_of(scene, SINE)
+            p = enclosure.approximate(f, jacobian, here, 20)
+            for row in p:
+                row[1] += arb(2) ** -20
+            step = enclosure.Advance(here, h, list(map(arb_poly, p)), [arb(0, 1e-3)] * 7)
+            return ratios(enclosure.prove(f, jacobian, step, 20, 1.0), motion)
+
+    assert 0.9 < min(found()) <= max(found()) <= 1.0
+    halve_the_defect(monkeypatch)
+    assert min(found()) > 1.8
+
+
+def test_a_wrong_jacobian_misses_a_motion_of_60_digits(monkeypatch):
+    scene, _ = case("general")
+    rates = tuple(x + 1e-4 * sign for x, sign in zip(scene.initial.gamma_dot, (1, -1, 1), strict=True))
+    motion = Motion(scene.with_values({"initial.gamma_dot": rates}), SINE)
+
+    def found():
+        given = {"ranges": {"initial.gamma_dot": 1e-4}, "t_eval": [0.1]}
+        return worst(certify(scene, SINE, 0.1, **given).columns, motion, 0, 0.1)
+
+    assert 0.3 < found() <= 1.0
+    matrices = enclosure._matrices
+    monkeypatch.setattr(enclosure, "_matrices", lambda *given: [x / 8 for x in matrices(*given)])
+    assert found() > 1.0
+
+
+def test_polynomials_are_followed_over_their_pieces():
+    scene, _ = case("general")
+    c = [[[30.0, 9.0, -20.0], [-4.0, 8.0, 5.0]], [[0.5, -1.0, 2.0], [-1.0, 0.1, 0.0]]]
+    begins = [0.0, 0.03, 0.06]
+    proven = certify(scene, PolynomialTorque(c, begins), 0.05, t_eval=[0.03, 0.05])
+    motion = Motion(scene)
+    for piece, time in enumerate((0.03, 0.05)):
+        rows = zip(c[0][piece], c[1][piece], strict=True)
+        lines, begin = [(mpf(slope), mpf(at)) for slope, at in rows], mpf(begins[piece])
+        motion.torque = lambda t: [slope * (t - begin) + at for slope, at in lines]  # noqa: B023
+        assert worst(proven.columns, motion, piece, time) < 1.0
 
 
 def test_the_end_of_the_stroke_is_enclosed_where_simulate_stops():
@@ -237,6 +341,25 @@ def test_held_torques_are_followed_over_their_ticks():
     assert worst(proven.columns, motion, 0, 0.03) < 1.0
     motion.torque = (0.0, -1.0, 0.5)
     assert worst(proven.columns, motion, 1, 0.05) < 1.0
+
+
+@pytest.mark.parametrize(
+    "name", ["example2_heavy", *(pytest.param(x, marks=pytest.mark.slow) for x in REFERENCES)]
+)
+def test_the_reference_of_other_tests_lies_inside(name):
+    scene = load_scene(name)
+    problem = InitialValueProblem(scene)
+    truth, times = solve_reference(problem), problem.times
+    proven = certify(scene, duration=problem.seconds, bound=1e-12, t_eval=times)
+    columns = proven.columns
+    assert proven.until == problem.seconds and proven.success
+    table = np.transpose([columns[f"quaternion_{part}"] for part in "xyzw"])
+    apart = angle_between(truth.states[:, :4].astype(float), table)
+    assert (apart <= columns["angle"] + truth.own.orientation + ROUNDING).all()
+    gamma, _ = problem.joints(truth.states)
+    for leg, found in enumerate(gamma, 1):
+        bound = columns[f"gamma_{leg}_bound"] + truth.own.gamma + ROUNDING
+        assert (abs(found - columns[f"gamma_{leg}"]) <= bound).all()
 
 
 def test_torques_at_their_limit_are_clamped_exactly():

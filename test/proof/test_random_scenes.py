@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 from mpmath import mp, mpf
-from sixty_digits import Motion, angle
 
 from sst_ros import SineTorque, certify, load_scene
+from studies.sixty_digits import Motion, angle
 
 END, COUNT = 0.05, 200  # s; the truth of a scene takes about as long as its proof
 SCENES = ("example2_heavy", "general", "gravity_payload")

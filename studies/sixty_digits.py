@@ -8,9 +8,9 @@ made from a scene's numbers in mpmath, too.
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-from lagrange import solve, unit
 from mpmath import mp, mpf
 from numpy import cross
 
@@ -24,10 +24,20 @@ DIGITS, LOCAL, STAGES = 60, mpf(10) ** -32, 11
 exact = np.frompyfunc(mpf, 1, 1)
 
 
-class Motion:
-    """A scene under a sine, or under torques that are held."""
+def unit(a: Any) -> Any:
+    """Return a vector of length 1."""
+    return a / mp.sqrt(a @ a)
 
-    def __init__(self, scene: Scene, torque=None) -> None:
+
+def solve(matrix: Any, right: Any) -> Any:
+    """Solve linear equations."""
+    return np.array(list(mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(right.tolist()))))
+
+
+class Motion:
+    """A scene under a sine, a function of time, or torques that are held."""
+
+    def __init__(self, scene: Scene, torque: Any = None) -> None:
         with mp.workdps(DIGITS):
             self.v = np.array([unit(row) for row in exact(np.array(scene.base.v))])
             self.w = np.array([unit(cross(self.v[k], self.v[(k + 1) % 3])) for k in range(3)])
@@ -36,13 +46,14 @@ class Motion:
             self.e = np.array([[-mp.sin(x), mp.cos(x), mpf(0)] for x in angles])
             numbers = {p: mpf(x) for p, x in leaves(scene).items() if x and p[0] != "torque"}
             arrays = {"v": self.v, "w": self.w, "e": self.e, "arc": [mp.pi / 2] * 3}
-            geometry = SimpleNamespace(of_leg=lambda name, k: arrays[name][k])
+            geometry: Any = SimpleNamespace(of_leg=lambda name, k: arrays[name][k])
             self.model = kernel.model_of(rebuild(scene, numbers), geometry)
             self.torque = scene.torque if torque is None else torque
             lagged = [mpf(0)] * (3 * scene.lags)
             self.known = {mpf(0): np.array([*self.start(scene), *lagged], dtype=object)}
 
-    def start(self, scene: Scene):
+    def start(self, scene: Scene) -> Any:
+        """Return quaternion and body rate, by Newton's method on the closure of the loops."""
         initial = scene.initial
         gamma, gamma_dot = exact(np.array(initial.gamma)), exact(np.array(initial.gamma_dot))
         r = np.array([
@@ -62,22 +73,25 @@ class Motion:
         rate = solve(rows, np.array(along))
         return np.array([*unit(q), *rate], dtype=object)
 
-    def slope(self, t, y):
+    def slope(self, t: Any, y: Any) -> Any:
+        """Return the derivative of the state."""
         torque = self.torque or (0.0, 0.0, 0.0)
         if isinstance(torque, SineTorque):
             rows = zip(torque.amplitude, torque.frequency, torque.phase, strict=True)
             torque = [mpf(a) * mp.sin(mpf(f) * t + mpf(p)) for a, f, p in rows]
+        elif callable(torque):
+            torque = torque(t)
         return np.array(kernel.derivative(self.model, tuple(y), tuple(map(mpf, torque))))
 
-    def at(self, end: float):
-        """State at a time [s], to about 1e-29."""
+    def at(self, end: float) -> Any:
+        """Return the state at a time [s], to about 1e-29."""
         with mp.workdps(DIGITS):
             h, end = mpf("0.02"), mpf(end)
             t = max(time for time in self.known if time <= end)
             y = self.known[t]
             while t < end:
                 h = min(h, end - t)
-                rows, first = [], self.slope(t, y)
+                rows, first = list[Any](), self.slope(t, y)
                 for n in range(2, 2 * STAGES + 1, 2):
                     small, before = h / n, y
                     here = y + small * first
@@ -97,13 +111,14 @@ class Motion:
             self.known[end] = y
             return y
 
-    def joints(self, y):
+    def joints(self, y: Any) -> list[Any]:
+        """Return angles and rates of the joints."""
         with mp.workdps(DIGITS):
             return [x for row in kernel.joints(self.model, tuple(y)) for x in row]
 
 
-def angle(q, centre) -> mpf:
-    """Angle between an orientation of 60 digits and floats [rad]."""
+def angle(q: Any, centre: Any) -> Any:
+    """Return the angle between an orientation of 60 digits and floats [rad]."""
     with mp.workdps(DIGITS):
         one, other = unit(q), unit(exact(np.array(centre)))
         chord = min(mp.sqrt((one - s * other) @ (one - s * other)) for s in (1, -1))
