@@ -4,7 +4,7 @@ VENV ?= .venv
 RUN = $(VENV)/bin/python
 # The ROS wheels: kilted (extra `ros`) or jazzy.
 ROS ?= ros
-EXTRAS = $(ROS),record,plot,fast
+EXTRAS = $(ROS),record,plot,fast,proof
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 # The tests of the nodes wait half of their time.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from sst_ros import Simulation, SineTorque, Trajectory, load_scene, simulate
+from sst_ros import Simulation, SineTorque, Trajectory, certify, load_scene, simulate
 from sst_ros.errors import AssemblyError, SstError
 from sst_ros.host.figures import BLUE, VERMILION, styled
 from sst_ros.mechanism.geometry import angle_between
@@ -26,6 +26,7 @@ from sst_ros.report.results import data_frame, publish, render
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import METHODS
 from studies import DOCS, PAGES, run, run_jobs
+from studies.sixty_digits import Motion, angle
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -203,6 +204,36 @@ def measure(job: tuple[str, int, int]) -> dict[str, Any]:
     return row | {"state": "resolved" if resolved else "not resolved"}
 
 
+def compare_bounds(job: tuple[int, int]) -> dict[str, Any]:
+    """Run a smooth case: true error by 60 digits, estimate, and proven bound of the error [rad]."""
+    seed, number = job
+    rng = np.random.default_rng([seed, number, *b"proof"])
+    method, tolerance, case = str(rng.choice(METHODS)), _log(rng, 1e-11, 1e-4), smooth(rng)
+    given: dict[str, Any] = {"method": method, "tolerance": tolerance}
+    at_end = [case.duration]
+    proven = certify(case.scene, case.torque, case.duration, t_eval=at_end, **given)
+    found = {"seed": seed, "number": number, **given}
+    if proven.reason:
+        return found | {"reason": proven.reason}
+    state, reached = Motion(case.scene, case.torque).at(case.duration), proven.trajectory
+    found["error"] = float(angle(state[:4], reached.quaternion[-1]))
+    return found | {"estimate": reached.error_estimate, "bound": proven.error, "reason": ""}
+
+
+def summarise_bounds(rows: DataFrame) -> DataFrame:
+    """Return the table of estimates and proven bounds over true errors."""
+    found = []
+    for words, column in (("estimate", "estimate"), ("proven bound", "bound")):
+        ratios = (rows[column] / rows.error).dropna()
+        quantiles = map("{:.3g}".format, ratios.quantile((0.0, 0.05, 0.5, 0.95, 1.0)))
+        heads = ("least", "5 %", "50 %", "95 %", "largest")
+        found.append({
+            "over the true error": words, "runs": len(rows), "proven": len(ratios),
+            **dict(zip(heads, quantiles, strict=True)), "below 1": (ratios < 1.0).sum(),
+        })  # fmt: skip
+    return data_frame(found)
+
+
 def summarise(rows: DataFrame) -> DataFrame:
     """Return the table of the page: quantiles of estimate over true error, by class."""
     found = []
@@ -245,14 +276,23 @@ def draw(rows: DataFrame, seeds: Sequence[int]) -> Figure:
     return figure
 
 
+def write_page(rows: DataFrame, bounds: DataFrame, seeds: Sequence[int], **given: Any) -> str:
+    """Return the page in Markdown."""
+    tables = [summarise(rows[rows.seed == seed]) for seed in seeds]
+    given |= {"tables": tables, "bounds": summarise_bounds(bounds), "methods": METHODS}
+    return render(PAGES / "estimate.md", **given)
+
+
 def report(options: argparse.Namespace) -> bool:
     """Run the cases; write docs/estimate.md, its table and its picture."""
     seeds = (options.seed, options.fresh)
     jobs = [(name, seed, k) for k in range(options.count) for name in CLASSES for seed in seeds]
     rows = data_frame(run_jobs(measure, jobs, "estimate        "))
-    tables = [summarise(rows[rows.seed == seed]) for seed in seeds]
-    page = render(PAGES / "estimate.md", tables=tables, methods=METHODS, **vars(options))
+    smooth_cases = [(options.fresh, k) for k in range(options.proofs)]
+    bounds = data_frame(run_jobs(compare_bounds, smooth_cases, "proven bounds   "))
+    page = write_page(rows, bounds, seeds, **vars(options))
     files = {".csv": rows, ".json": {}, ".md": page, ".png": draw(rows, seeds)}
+    files["estimate_bounds.csv"] = bounds
     publish(options.out, "estimate", files)
     return True
 
@@ -263,6 +303,7 @@ def main(words: Sequence[str] | None = None) -> int:
         report, "estimate", DOCS, words,
         count={"type": int, "default": 200, "help": "scenes of each class"},
         seed={"type": int, "default": 1, "help": "of the random numbers"},
+        proofs={"type": int, "default": 40, "help": "smooth scenes whose error is proven"},
         fresh={"type": int, "default": 77, "help": "of those that were not used while building"},
     )  # fmt: skip
 

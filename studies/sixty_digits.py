@@ -16,6 +16,7 @@ from numpy import cross
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
+from sst_ros.mechanism.generic_math import quaternion_rate, rotation_rows
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import leaves, rebuild
 from sst_ros.scene.torque_profile import SineTorque
@@ -45,7 +46,7 @@ class Motion:
             angles = (mpf(0), first, first + second)
             self.e = np.array([[-mp.sin(x), mp.cos(x), mpf(0)] for x in angles])
             numbers = {p: mpf(x) for p, x in leaves(scene).items() if x and p[0] != "torque"}
-            arrays = {"v": self.v, "w": self.w, "e": self.e, "arc": [mp.pi / 2] * 3}
+            arrays: dict[str, Any] = {"v": self.v, "w": self.w, "e": self.e, "arc": [mp.pi / 2] * 3}
             geometry: Any = SimpleNamespace(of_leg=lambda name, k: arrays[name][k])
             self.model = kernel.model_of(rebuild(scene, numbers), geometry)
             self.torque = scene.torque if torque is None else torque
@@ -63,11 +64,11 @@ class Motion:
         q = exact(np.array(start_of(scene)[:4]))
         for _ in range(8):  # Newton: a small turn d adds d . (e x R^T r) to r . R e
             x, y, z, w = q
-            near = np.array(kernel.rotation_rows((x, y, z, w)), dtype=object)
+            near = np.array(rotation_rows((x, y, z, w)), dtype=object)
             rows = np.array([cross(e, near.T @ one) for e, one in zip(self.e, r, strict=True)])
             off = np.array([one @ near @ e for e, one in zip(self.e, r, strict=True)])
             d = -solve(rows, off)
-            q = q + np.array(kernel.quaternion_rate(tuple(q), tuple(d)))
+            q = q + np.array(quaternion_rate(tuple(q), tuple(d)))
         legs = zip(gamma_dot, self.w, r, self.e, strict=True)
         along = [-g * (cross(w, one) @ near @ e) for g, w, one, e in legs]
         rate = solve(rows, np.array(along))

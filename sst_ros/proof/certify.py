@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal
 from functools import cached_property
 from itertools import groupby, pairwise
@@ -272,7 +273,7 @@ class ProvenMotion(Explained):
         """Take what a step proves, up to where the motion meets an end of the scene."""
         self.steps, end = self.steps + 1, step.end
         names, run = self._equations.limits
-        for low, high, signs in _signs(step, run):
+        for low, high, signs in _signs(step, run, len(names)):
             for name, sign in zip(names, signs, strict=True):
                 self._signs[name].append((low, high, sign))
                 if name in self._stops and sign <= 0 and low < end:
@@ -345,16 +346,20 @@ def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return 4 * (min(chords, key=float) / 2).asin()
 
 
-def _signs(step: Advance, run: Function) -> Iterator[tuple[float, float, list[int]]]:
+def _signs(
+    step: Advance, run: Function, count: int
+) -> Iterator[tuple[float, float, Sequence[int]]]:
     """Split a step into spans of time in which numbers are > 0 (1), < 0 (-1), or unknown (0)."""
     begin, left = step.begin.time, SPLITS
     todo = [(begin, step.end)]
     while todo:
         low, high = todo.pop()
-        span = arb(low) - begin, arb(high) - begin
+        span, left, signs = (arb(low) - begin, arb(high) - begin), left - 1, [0] * count
         near = between(span[0] - span[1], span[1] - span[0]) / 2
-        values = (arb_poly(row)(near) for row in step.enclose(run, LIMIT_ORDER, step.tube, span))
-        signs, left = [int(bool(x > 0)) - int(bool(x < 0)) for x in values], left - 1
+        with suppress(ArithmeticError, ValueError):  # a division by what may be zero
+            rows = step.enclose(run, LIMIT_ORDER, step.tube, span)
+            values = [arb_poly(row)(near) for row in rows]
+            signs = [int(bool(x > 0)) - int(bool(x < 0)) for x in values]
         if all(signs) or left < 0 or high - low < 1e-10 * (step.end - begin):
             yield low, high, signs
         else:
