@@ -37,7 +37,8 @@ def finite_vector(value: Any) -> Vector3 | None:
         return None
     try:
         first, second, third = value
-        if isinstance(first + second + third, np.complexfloating):
+        floats = type(first) is type(second) is type(third) is float  # as in each step of a run
+        if not floats and any(isinstance(x, np.complexfloating) for x in (first, second, third)):
             return None  # of which `math` takes the real part
         finite = math.isfinite(first) and math.isfinite(second) and math.isfinite(third)
     except (TypeError, ValueError, OverflowError):

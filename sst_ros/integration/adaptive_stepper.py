@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,10 +15,10 @@ from sst_ros.integration.compiled_method import (
     JACOBIAN_COST,
     CompiledMethod,
     JointRanges,
-    Linearisation,
     MethodChange,
     Periods,
     Point,
+    TorqueLaw,
     Vector,
     methods_of,
 )
@@ -90,15 +90,6 @@ _CHOOSE_EVERY = 16
 _CHOOSE_AFTER_REJECTIONS = 3
 
 
-class TorqueLaw(NamedTuple):
-    """A derivative in plain Python, under torques that are a function, in place of the ODE's."""
-
-    derivative: Function
-    linearise: Linearisation | None  # None where it is not known, and no method is implicit
-    jump: Callable[[float, float, Vector], tuple[float, float] | None]
-    """(begin, end, state): times just before and after a jump in between, if there is one."""
-
-
 class Step(NamedTuple):
     """An accepted step, or the part of it before an event."""
 
@@ -155,8 +146,6 @@ class AdaptiveStepper:
         self._methods, self._compiled = methods_of(method), compiled
         self._chooses = len(self._methods) > 1
         self._most_attempts = _CHOOSE_EVERY - 1 if self._chooses else math.inf
-        self._derivative = law.derivative if law else None
-        self._linearise = law.linearise if law else None
         self._ranges, self._joints = ranges, joints
         self._machines: dict[str, CompiledMethod] = {}
 
@@ -264,7 +253,7 @@ class AdaptiveStepper:
         """
         at = at._replace(attempts=at.attempts + 1)
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(at.method, Rosenbrock)
-        if not self._chooses or (self._law and not self._linearise):
+        if not self._chooses or (self._law and not self._law.linearise):
             return at
         if at.attempts < _CHOOSE_EVERY and not early:
             return at
@@ -290,11 +279,11 @@ class AdaptiveStepper:
         return [time for time in (found[0] - margin, found[1] + margin) if time > t]
 
     def _eigenvalues(self, t: float, y: Vector, d: Vector) -> Array:
-        if self._linearise is None:
+        if self._law is None or self._law.linearise is None:
             return self._ode.eigenvalues(t, y, d)
         size = len(y)
         matrix = [[0.0] * size for _ in range(size)]
-        self._linearise(t, y, d, (), [0.0] * size, [0.0] * size, matrix)
+        self._law.linearise(t, y, d, (), [0.0] * size, [0.0] * size, matrix)
         return np.asarray(np.linalg.eigvals(np.array(matrix)))
 
     def _machine(self, method: Method) -> CompiledMethod:
@@ -303,8 +292,7 @@ class AdaptiveStepper:
                 self._ode,
                 method,
                 compiled=self._compiled,
-                derivative=self._derivative,
-                linearise=self._linearise,
+                law=self._law,
                 ranges=self._ranges,
             )
         return self._machines[method.name]

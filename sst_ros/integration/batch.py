@@ -181,7 +181,8 @@ class Batch(Explained):
                 ends.append(part.stop)
         time[code < 0] = 0.0
         # A step in which a limit was passed is left out: its beginning is the last valid state.
-        steps = np.where(code > 0, whole_steps(time, step), count)
+        begins = np.asarray(np.ceil(time / step - 0.1 * EARLIEST) - 1.0)
+        steps = np.where(code > 0, begins, count)
         steps[code < 0] = 0
         _locate_ends(loop, step, steps, y, given, code, time)
         last = steps * step
@@ -258,11 +259,6 @@ class Batch(Explained):
         model, method = self.model, self._method
         text = batch_source(model.program, model.limit_distances, method, len(model.ode.state))
         return compiled_module.load([text], {"NODES": method.c}, numba=True, nogil=True)
-
-
-def whole_steps(time: Array, step: float) -> Array:
-    """Return how many steps ended before a time at which a limit was passed [s]."""
-    return np.asarray(np.ceil(time / step - 0.1 * EARLIEST) - 1.0)
 
 
 def _locate_ends(

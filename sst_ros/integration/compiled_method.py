@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of one scene by one method, on plain floats or compiled.
+"""The steps of one scene by one method from point to point, on plain floats or compiled.
 
 Code is made once for each method and each structure of a scene - its terms, and which numbers are 0
 or 1 - which takes seconds, and kept in `cache_folder()`; to load it takes tenths of a second.
@@ -49,8 +49,6 @@ Periods = tuple[Any, Any, Any]
 they begin, (n, size), NaN where they continue; lists in plain Python."""
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
-
-
 _MARGIN, _FLOOR = 2.0, 8 * 2.220446049250313e-16
 """Of the distance: an error that halves with the steps is twice as large; of rounding, a step."""
 
@@ -130,6 +128,15 @@ def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
     return distance if math.isfinite(distance) else math.inf
 
 
+class TorqueLaw(NamedTuple):
+    """A derivative in plain Python, under torques that are a function, in place of the ODE's."""
+
+    derivative: Function
+    linearise: Linearisation | None  # None where it is not known, and no method is implicit
+    jump: Callable[[float, float, Vector], tuple[float, float] | None]
+    """(begin, end, state): times just before and after a jump in between, if there is one."""
+
+
 class CompiledMethod:
     """Steps of a system by a method.
 
@@ -137,8 +144,7 @@ class CompiledMethod:
         system: what is integrated.
         method: how.
         compiled: by numba; otherwise, or where there is no numba, as plain Python.
-        derivative: rhs(t, state.., drive..) to use instead of the ODE's, in plain Python.
-        linearise: the derivatives of `derivative`, which a Rosenbrock method needs.
+        law: what takes the place of the ODE's derivative, in plain Python.
         ranges: joints that `step_many` looks at, see `ranges_of`.
 
     Attributes:
@@ -153,8 +159,7 @@ class CompiledMethod:
         method: Method,
         *,
         compiled: bool,
-        derivative: Function | None = None,
-        linearise: Linearisation | None = None,
+        law: TorqueLaw | None = None,
         ranges: JointRanges = (),
     ) -> None:
         self.system = system
@@ -162,14 +167,12 @@ class CompiledMethod:
         self.compiled = compiled = compiled and compiled_module.numba_version() is not None
         implicit = isinstance(method, Rosenbrock)
         self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
-        if derivative is not None and (compiled or (implicit and linearise is None)):
+        if law and (compiled or (implicit and law.linearise is None)):
             raise ValueError("a derivative of its own needs plain Python and, if implicit, its own")
         texts, constants, base, numbers = _source(system, method, by_structure=compiled)
         self._module: ModuleType = compiled_module.load(texts, constants, numba=compiled, base=base)
-        if derivative is not None:
-            self._module.__dict__["rhs"] = derivative
-        if linearise is not None and implicit:
-            self._module.__dict__["linearise"] = linearise
+        if law:
+            vars(self._module).update(rhs=law.derivative, linearise=law.linearise)
         self._vector: Callable[[Vector], Any] = np.array if compiled else list
         self._listed: Callable[[Any], list[float]] = np.ndarray.tolist if compiled else list
         self._numbers = self._vector(numbers)

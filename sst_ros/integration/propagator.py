@@ -24,8 +24,8 @@ from sst_ros.dynamics.model import (
 from sst_ros.dynamics.traced_dynamics import Dynamics, Function, recent_ode
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration import step_loops
-from sst_ros.integration.adaptive_stepper import AdaptiveStepper, EvaluationBudget, Step, TorqueLaw
-from sst_ros.integration.compiled_method import Point, compile_derivative
+from sst_ros.integration.adaptive_stepper import AdaptiveStepper, EvaluationBudget, Step
+from sst_ros.integration.compiled_method import Point, TorqueLaw, compile_derivative
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque, torque_at
@@ -220,8 +220,9 @@ class Propagator:
         if found is None:
             return step, None
         x, event = found
-        if event.error is None:
-            x = just_beyond(event, x, joints(x), step.h)
+        if event.error is None:  # just beyond the kink, where the Jacobian is that of its far side
+            beyond = x + 1e-14 / max(abs(event.slope(joints(x))), 1e-200)
+            x = min(beyond, x + 1e-3 * step.h, step.h)
         end = step.begin if x == 0.0 else stepper.part(step, x) if x < step.h else step.end
         return step._replace(h=x, end=end, last=step.last and x == step.h), event
 
@@ -393,11 +394,6 @@ def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> boo
     elif before <= GRAZING and not (before > -CONTACT_BAND and event.slope(begin) > 0.0):
         return False
     return event.distance(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
-
-
-def just_beyond(event: Limit, x: float, joints: Sequence[float], h: float) -> float:
-    """Time just after an event at x, where the Jacobian is that of the side beyond the kink."""
-    return min(x + min(1e-14 / max(abs(event.slope(joints)), 1e-200), 1e-3 * h), h)
 
 
 def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:

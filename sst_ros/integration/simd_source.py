@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text of loops for SIMD: many evaluations of one program at once, columns of a Jacobian at once.
+"""Text of loops for SIMD: columns of a Jacobian at once, a program in many lanes, a batch of runs.
 
 All numbers live in one flat array, a row of lanes each, at offsets that are constants in the text,
 and loops have a fixed length and no branches: so a compiler need not ask at run time what overlaps

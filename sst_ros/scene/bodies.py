@@ -241,15 +241,10 @@ def entries_of(inertia: Inertia | None) -> list[Any]:
     return [0.0] * 6 if inertia is None else [*vars(inertia).values()]
 
 
-def point_inertia(mass: Any, centre: Any) -> list[Any]:
-    """Return the six numbers of a point about O, which may be columns or symbols."""
-    square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
-    return [mass * (square * float(i == j) - centre[i] * centre[j]) for i, j in PLACES]
-
-
 def _shift(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
-    """Six numbers about O of an inertia about the centre of mass (parallel axes)."""
-    point = point_inertia(mass, centre)
+    """Six numbers about O of an inertia about the centre of mass (parallel axes), or columns."""
+    square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
+    point = [mass * (square * float(i == j) - centre[i] * centre[j]) for i, j in PLACES]
     return [own + part for own, part in zip(entries_of(inertia), point, strict=True)]
 
 

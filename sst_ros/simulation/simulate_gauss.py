@@ -103,7 +103,8 @@ class CollocatedMotion:
         """Compute the states at the ends of the steps, shape (steps + 1, numbers of the state)."""
         with self._lock:
             self._motion.run()
-            return np.array(self._motion.states)
+            y: Array = self._motion.states.copy()
+            return y
 
     def run(self, _progress: bool = False) -> Trajectory:
         """Compute the motion, too short for a bar; its samples when they are first asked for."""
@@ -315,10 +316,8 @@ class PreparedMotion:
         self.least: Array = least.reshape(-1, at.lanes)
         states = np.zeros((count + 1) * method.size)
         self.states: Array = states.reshape(-1, method.size)
-        self._arrays = block, states
-        self.run: Callable[[], float] = self._run_plain
-        if method.code:
-            self.run = partial(method.code, block, states)
+        code, self._arrays = method.code, (block, states)
+        self.run: Callable[[], float] = partial(code, block, states) if code else self._run_plain
 
     def _run_plain(self) -> Any:
         self._method.charge(self._evaluations)

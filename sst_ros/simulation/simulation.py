@@ -13,7 +13,7 @@ import numpy as np
 
 from sst_ros.dynamics.initial_state import derive_by_paper, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
-from sst_ros.errors import Diverged, StepBudgetExceeded, check_kinds, refuse_unless
+from sst_ros.errors import Diverged, StepBudgetExceeded, check_kinds, refusal, refuse_unless
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.integration.adaptive_stepper import BudgetSpent, CannotStep, EvaluationBudget
 from sst_ros.integration.compiled_method import MethodChange, Point
@@ -184,11 +184,8 @@ class Simulation(Explained):
     ) -> None:
         """Advance by `count` times dt_ns: the bits are those of `count` calls of `step`.
 
-        Where nothing happens but steps, all of them are one call of compiled code.
-
-        Raises:
-            as `step`: the state is then that after the last step before, at `time_ns`.
-
+        Where nothing happens but steps, all of them are one call of compiled code. Errors are those
+        of `step`: the state is then that after the last step before, at `time_ns`.
         """
         length, number = _whole(dt_ns), _whole(count)
         known = 0 < number <= _MOST and length > 0
@@ -215,8 +212,7 @@ class Simulation(Explained):
                 refuse_unless("step", ("torque", torque, count_arguments(torque) == 1, _TORQUE))
             return self._propagator.torque.acting(torque)
         except (TypeError, ValueError, OverflowError):
-            refuse_unless("step", ("torque", torque, False, _TORQUE))
-            raise
+            raise refusal("step", "torque", torque, _TORQUE) from None
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""

@@ -21,7 +21,7 @@ from sst_ros.dynamics.expression import Slots, number_constants, trace
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, recent_ode
 from sst_ros.host import compiled_module
-from sst_ros.integration.compiled_method import CompiledMethod, Point
+from sst_ros.integration.compiled_method import CompiledMethod, Point, TorqueLaw
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
@@ -139,7 +139,8 @@ def test_a_step_without_a_finite_result_has_an_infinite_error():
 
 def test_a_slope_of_its_own_needs_an_explicit_method():
     with pytest.raises(ValueError, match="needs plain Python"):
-        CompiledMethod(system_of(viscous(1.0)), RODAS5P, compiled=False, derivative=lambda *x: x)
+        law = TorqueLaw(lambda *x: x, None, lambda *_: None)
+        CompiledMethod(system_of(viscous(1.0)), RODAS5P, compiled=False, law=law)
 
 
 # Compiled code belongs to a structure: scenes that differ in numbers alone share it.
