@@ -196,7 +196,12 @@ class Simulation(Explained):
                 ("torque", torque, bool(acts), _TORQUE),
                 ("moment", moment, finite_vector(moment) is not None, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
-                ("count", count, 0 < number <= _MOST, f"must be > 0 and <= {_MOST:g}, and whole"),
+                (
+                    "count",
+                    count,
+                    0 < number <= _MOST,
+                    f"must be > 0 and <= {_MOST:g}, a whole number",
+                ),
             )
         torque = self.acting(torque)
         if callable(torque) and not self._warned:
