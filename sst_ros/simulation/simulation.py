@@ -31,11 +31,12 @@ INTEGRATORS = (AUTO, *METHODS)
 EQUATIONS = ("quaternion", "virtual_work")
 """Equations of motion: in the quaternion and the body rate, or the paper's Eqs. 1 to 92."""
 
-_THREE = "must be three finite numbers [N m]"
-_TORQUE = f"{_THREE}, a SineTorque or a function of t [s]"
-
 _MOST = 10**9
 """Steps of one call: a compiled loop cannot be interrupted."""
+
+_COUNT = f"must be > 0 and <= {_MOST:g}, a whole number"
+_THREE = "must be three finite numbers [N m]"
+_TORQUE = f"{_THREE}, a SineTorque or a function of t [s]"
 
 _PLAIN_BUDGET = 3_000_000
 """Operations a step in plain Python may take: 0.12 s at 37 ns each, on a 3 GHz core."""
@@ -196,12 +197,7 @@ class Simulation(Explained):
                 ("torque", torque, bool(acts), _TORQUE),
                 ("moment", moment, finite_vector(moment) is not None, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
-                (
-                    "count",
-                    count,
-                    0 < number <= _MOST,
-                    f"must be > 0 and <= {_MOST:g}, a whole number",
-                ),
+                ("count", count, 0 < number <= _MOST, _COUNT),
             )
         torque = self.acting(torque)
         if callable(torque) and not self._warned:
