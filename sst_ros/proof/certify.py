@@ -40,10 +40,10 @@ from sst_ros.proof.enclosure import (
     arb_poly,
     between,
     column,
+    cut,
     entries,
     magnitude,
     norm,
-    positive,
     upper,
 )
 from sst_ros.scene.scene import Scene
@@ -202,7 +202,7 @@ class _Equations:
                 return clamp(acting, limit)
             if limit is None:
                 return list(found)
-            return [limit - positive(2 * limit - positive(x + limit)) for x in found]
+            return [limit - cut(2 * limit - cut(x + limit)) for x in found]
 
         f, jacobian = self._derivatives
         return (lambda t, *y: f(*y, *torque(t))), (lambda t, *y: jacobian(*y, *torque(t)))
@@ -268,6 +268,26 @@ class ProvenMotion(Explained):
         self._signs: dict[str, list[Span]] = {name: [] for name in equations.limits[0]}
         stops = limits_of(equations.scene, Geometry.of(equations.scene))
         self._stops = {limit.reason for limit in stops}
+
+    def _follow(self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar) -> None:
+        """Prove step by step from one break in time to the next, as far as that goes."""
+        order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
+        try:
+            here = self._equations.start()
+            for begin, end in pairwise(breaks):
+                f, jacobian = self._equations.between(begin, end)
+                for step in enclosure.enclose(f, jacobian, here, end, tolerance, order):
+                    self._take(step)
+                    bar.draw(step.end / breaks[-1])
+                    if self.reason:
+                        return
+                    if self.steps >= max_steps and step.end < breaks[-1]:
+                        raise Refused(f"{max_steps} steps are not enough")
+                here = enclosure.region_at_end(step)
+        except Refused as refused:
+            self.reason = str(refused)
+        finally:
+            self._finish()
 
     def _take(self, step: Advance) -> None:
         """Take what a step proves, up to where the motion meets an end of the scene."""
@@ -428,7 +448,7 @@ def certify(
         equations = _Equations(given, profile, places)
         for _ in range(ATTEMPTS):
             found = ProvenMotion(equations, bound, trajectory)
-            _prove(found, equations, breaks, tolerance, max_steps, Bar("certify", progress))
+            found._follow(breaks, tolerance, max_steps, Bar("certify", progress))
             if found.largest <= bound or places or found.largest == math.inf:
                 break
             tolerance *= 0.1 * bound / found.largest
@@ -448,42 +468,10 @@ def _places(scene: Scene, ranges: Mapping[str, float | str]) -> dict[Place, floa
         good = width == "digits" or (isinstance(width, (int, float)) and 0.0 <= width < math.inf)
         refuse_unless(
             "certify",
-            (
-                "ranges",
-                key,
-                bool(below) and known,
-                "must name bodies, loads or the start",
-            ),
+            ("ranges", key, bool(below) and known, "must name bodies, loads or the start"),
             (f"ranges[{key}]", width, good, "must be a number >= 0, or 'digits'"),
         )
         for place in below:
             last = Decimal(repr(numbers[place])).as_tuple().exponent
             places[place] = 0.5 * 10.0 ** int(last) if width == "digits" else float(width)
     return places
-
-
-def _prove(
-    found: ProvenMotion,
-    equations: _Equations,
-    breaks: Sequence[float],
-    tolerance: float,
-    max_steps: int,
-    bar: Bar,
-) -> None:
-    order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
-    try:
-        here = equations.start()
-        for begin, end in pairwise(breaks):
-            f, jacobian = equations.between(begin, end)
-            for step in enclosure.enclose(f, jacobian, here, end, tolerance, order):
-                found._take(step)
-                bar.draw(step.end / breaks[-1])
-                if found.reason:
-                    return
-                if found.steps >= max_steps and step.end < breaks[-1]:
-                    raise Refused(f"{max_steps} steps are not enough")
-            here = enclosure.region_at_end(step)
-    except Refused as refused:
-        found.reason = str(refused)
-    finally:
-        found._finish()

@@ -141,14 +141,14 @@ def _step(x: Any) -> Any:
     return int(bool(value > 0)) if known else _Kink()
 
 
-def positive(x: Any, _zero: float = 0.0) -> Any:
+def cut(x: Any, _zero: float = 0.0) -> Any:
     """Return x where x > 0 and 0 elsewhere, or what may be both."""
     side = _step(x)
     return side if isinstance(side, _Kink) else x * side
 
 
 _ON_BALLS: dict[str, Callable[..., Any]] = {name: methodcaller(name) for name in FUNCTIONS}
-_ON_BALLS |= {"tanh": _tanh, "atan2": _atan2, "max": positive, "step": _step}
+_ON_BALLS |= {"tanh": _tanh, "atan2": _atan2, "max": cut, "step": _step}
 
 
 def compile_on_balls(program: Program, constants: Sequence[Any]) -> Function:
