@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,11 +24,12 @@ from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import METHODS, Method, Rosenbrock
-from sst_ros.report.results import data_frame, publish, records, render
+from sst_ros.report.results import data_frame, proven_error, publish, records, render
 from sst_ros.report.scene_summary import eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
+from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import Array
+from sst_ros.state import NANOSECONDS, Array
 from studies import DOCS, PAGES, run, run_jobs
 from studies.control_loop import run_in_loop
 from studies.extreme_cases import LOOSE, Case, apart, catalogue
@@ -43,6 +44,9 @@ ROUNDING = 1e-12
 """True errors below this [rad], or 100 times the estimate of the run at the default tolerance, are
 not resolved: then the estimate must not be above FACTOR times that either."""
 
+
+LONGEST_PROOF = 1000
+"""Steps of a proof after which it ends."""
 
 FAR = -1e12
 """Where the stability function of an L-stable method has vanished."""
@@ -92,6 +96,7 @@ class CaseResult:
     compiled_s: float | None = None  # time of the compiled run, compilation included [s]
     same_bits: bool | None = None  # the compiled run ended in the same bits, or error
     run_loop: bool | None = None  # so did that through the loop of the node
+    proven: str = ""  # what the error of `simulate` is proven to be below, or why it is not
     correct: bool = False  # the result is the truth, and the error estimate holds
 
     @property
@@ -223,7 +228,25 @@ def report(out: Path, *, long: bool = False) -> bool:
 
 
 def _evaluate(number: int) -> CaseResult:
-    return evaluate_case(catalogue()[number])
+    case = catalogue()[number]
+    return replace(evaluate_case(case), proven=prove_case(case))
+
+
+def prove_case(case: Case) -> str:
+    """Say what the error of `simulate` is proven to be below at twenty instants, or why not."""
+    if case.refusal and case.stop_time is None:
+        return "-: there is no motion"
+    if case.feedback or case.compiled_only:
+        return f"-: {case.estimate or 'its torques answer the motion'}"
+    torque: Any = case.torque
+    if callable(torque):
+        begins = [k * case.period_ns / NANOSECONDS for k in range(case.steps)]
+        torque = TorqueTable(begins, [torque(k, None) for k in range(case.steps)])
+    duration_ns = case.steps * case.period_ns
+    times = [round(k * duration_ns / 20) / NANOSECONDS for k in range(1, 21)]
+    return proven_error(
+        case.scene(), torque, times[-1], t_eval=times, tolerance=1e-10, max_steps=LONGEST_PROOF
+    )
 
 
 def page(cases: Sequence[CaseResult]) -> str:
@@ -233,6 +256,7 @@ def page(cases: Sequence[CaseResult]) -> str:
         for group in dict.fromkeys(case.group for case in cases)
     }
     numbers = {"factor": f"{FACTOR:g}", "loose": f"{LOOSE:g}", "looser": f"{LOOSER:g}"}
+    numbers["longest"] = f"{LONGEST_PROOF}"
     given = {"cases": cases, "groups": groups, "limits": limits_of_theory()}
     return render(PAGES / "stability.md", **given, **numbers)
 
@@ -246,6 +270,7 @@ def _row(case: CaseResult) -> dict[str, str]:
         "case": case.name,
         "why it is hard": case.difficulty,
         "truth": case.expected,
+        "proven": case.proven,
         "result": ("" if case.passed else "**FAILED** ") + case.result,
         "deviation (bound)": "-" if case.deviation is None
         else f"{case.deviation:.0e} ({case.bound:.0e})",

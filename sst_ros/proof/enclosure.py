@@ -39,6 +39,7 @@ J_ORDER, V_ORDER = 8, 16  # of the Jacobian and of V
 AHEAD = 4  # coefficients of the Jacobian that p is found by
 SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogonal
 GROWTH = 0.05  # of a set by the remainder of V, largest in a step
+UNBOUNDED = "a number is not bounded: a singularity may be near"
 LEAST = 1e-9  # of a step, relative to the whole time: the proof ends
 
 
@@ -364,7 +365,7 @@ def _weights(jacobian: Any) -> list[Any]:
     """Return weights of a norm in which |J| is small: nearly its Perron vector."""
     size, found = np.abs(_middles(jacobian)), np.ones(len(jacobian.tolist()))
     if not np.all(np.isfinite(size)):
-        raise Refused("the Jacobian is not bounded")
+        raise Refused(UNBOUNDED)
     for _ in range(20):
         found = size @ found + 1e-3 * found
         found = np.maximum(found / found.max(), 1e-9)
@@ -422,7 +423,7 @@ def enclose(
                 step = prove(f, jacobian, step, order, tolerance)
                 break
             except (ArithmeticError, ValueError) as error:
-                why = error if isinstance(error, Refused) else Refused(str(error))
+                why = error if isinstance(error, Refused) else Refused(UNBOUNDED)
                 if why.wider is not None and tries < 4:
                     tube, tries, room = why.wider, tries + 1, min(2 * room, 100)
                     continue

@@ -29,6 +29,8 @@ def stale(name, page, table):
             yield "a compiled run, or one through the run loop, differs"
         if not all(row["check"] for row in rows):
             yield "an error estimate that is neither checked nor explained"
+        if not all(row["proven"] for row in rows):
+            yield "a case that is neither proven nor has a reason"
     elif name == "accuracy":
         empty = accuracy.accuracy_page([])
         wanted, found = set(scenes.names()), {row["scene"] for row in rows}

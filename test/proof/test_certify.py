@@ -23,6 +23,7 @@ from sst_ros.proof import certify as certify_module
 from sst_ros.proof import enclosure
 from sst_ros.proof.enclosure import Region, arb, arb_poly, arb_series
 from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
+from sst_ros.report.results import proven_error
 from studies.sixty_digits import Motion, angle
 
 REFERENCES = ("example1", "example2", "general", "gravity_payload")
@@ -314,6 +315,20 @@ def test_nothing_is_said_beyond_a_kink():
     assert "kink" in proven.reason and not proven.success and proven.largest < 1e-12
     assert kink - 1e-6 < proven.until < kink + 1e-15
     assert proven.columns["t"].max() <= proven.until
+
+
+def test_a_proof_ends_after_its_steps():
+    proven = certify("example2", max_steps=2, t_eval=[0.01, 1.0])
+    assert proven.reason == "2 steps are not enough" and proven.steps == 2 and not proven.success
+    assert 0.01 < proven.until < 1.0 and list(proven.columns["t"]) == [0.01]
+
+
+def test_a_cell_of_a_table_has_the_bound_or_the_reason():
+    assert proven_error("example2", lambda t: (0.0, 0.0, 0.0), 0.01).startswith(
+        "-: certify: torque"
+    )
+    assert proven_error("example2", duration=0.01, t_eval=[0.01]).endswith("e-16 rad")
+    assert "steps are not enough" in proven_error("example2", max_steps=1)
 
 
 def test_a_range_around_a_rate_of_zero_widens_what_is_proven():

@@ -8,7 +8,7 @@ import pytest
 from sst_ros.errors import InputError, Problem, RunStopped, SingularConfiguration
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.report.results import data_frame
-from studies.estimate import CLASSES, measure
+from studies.estimate import CLASSES, compare_bounds, measure
 from studies.orders import MOTIONS, ORDER, measure_steps, measure_tolerance, order_table, truth
 
 
@@ -22,6 +22,11 @@ def test_the_estimate_holds_in_a_case_of_each_class(name):
     )
     assert row["error"] <= 3.0 * row["estimate"]
     assert row["status"] == 2 or row["error"] <= 3.0 * row["tolerance"]
+
+
+def test_a_proven_bound_is_above_the_true_error():
+    row = compare_bounds((5, 0))
+    assert row["error"] <= row["bound"] < 2.0 * row["error"]
 
 
 def test_a_case_depends_on_its_seed_and_number_alone():

@@ -3,6 +3,7 @@
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import METHODS
 from sst_ros.report.scene_summary import eigenvalues
 from sst_ros.simulation.simulation import Simulation
-from studies.extreme import draw_regions, evaluate_case, limits_of_theory, page
+from studies.extreme import draw_regions, evaluate_case, limits_of_theory, page, prove_case
 from studies.extreme_cases import catalogue
 from studies.extreme_scenes import FREE, POSE, changed, start
 
@@ -104,3 +105,17 @@ def test_the_figure_shows_every_method(tmp_path):
     pixels = image.imread(tmp_path / "regions.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.1).sum() > 2000
     assert [axes.get_title("left").partition(":")[0] for axes in figure.axes[:4]] == list(METHODS)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("time x 10", r"\d\.\de-13 rad"),  # passes no limit, which a first look cannot say
+        ("square wave of 2 N m", r"\d\.\de-15 rad"),
+        ("stops of 1000 N m/rad", r"\d\.\de-12 rad to 0\.1015 s: a kink.*"),
+        ("start at a corner that cannot be assembled", "-: there is no motion"),
+        ("sampled PD control at 0.98 of the limit of its bandwidth", "-: its torques .*"),
+    ],
+)
+def test_a_case_is_proven_or_the_reason_is_said(name, said):
+    assert re.fullmatch(said, prove_case(next(case for case in CASES if case.name == name)))
