@@ -308,17 +308,20 @@ def _matrices(flat: Sequence[Sequence[Any]], n: int) -> list[Any]:
 
 
 def bound_defect(f: Function, step: Advance, order: int) -> list[list[Any]]:
-    """Return bounds of the coefficients of the defect about the middle, up to `order`."""
+    """Return bounds of coefficients of the defect about the middle; `order` is that of p."""
     found = step.enclose(f, order, [arb(0)] * len(step.p), parts=2)
     slopes = [p.derivative()(arb_poly([step.half, 1])) for p in step.p]
-    return [
+    d = [
         [(x - slope[k]).abs_upper() for k, x in enumerate(row)]
         for row, slope in zip(found, slopes, strict=True)
     ]
+    if not all(x.is_finite() for row in d for x in row):  # max() of Python would skip a nan
+        raise Refused(UNBOUNDED)
+    return d
 
 
 def prove(f: Function, jacobian: Function, step: Advance, order: int, tolerance: float) -> Advance:
-    """Prove a step with e in its tube, or raise Refused; `order` is that of the defect."""
+    """Prove a step with e in its tube, or raise Refused; `order` is that of p."""
     n, h, half = len(step.p), step.length, step.half
     s, u = between(0, h), between(-half, half)  # from the begin, from the middle
     d = bound_defect(f, step, order)

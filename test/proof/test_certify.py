@@ -162,6 +162,19 @@ def test_the_norm_of_an_integral_is_no_bound(monkeypatch):
     assert 1.2 * h < error < bound
 
 
+@pytest.mark.parametrize("unknown", ["nan", "inf"])
+def test_a_slope_that_is_not_a_number_is_refused(unknown):
+    with enclosure.precision():
+        p, tube = [arb_poly([0])] * 2, [arb(0, 1)] * 2
+        step = enclosure.Advance(Region.box(0.0, [arb(0)] * 2), 0.125, p, tube)
+
+        def f(t, x, y):
+            return 0 * t, arb(unknown)
+
+        with pytest.raises(enclosure.Refused, match="not bounded"):
+            enclosure.prove(f, lambda *y: (*f(*y), 0, 0, 0, 0), step, 2, 1.0)
+
+
 def remove_rounding(patch):
     """Leave Lagrange's remainder of the defect alone, and take reached ends as exact."""
     bound, end = enclosure.bound_defect, enclosure.region_at_end
