@@ -156,9 +156,9 @@ class Assistant:
 
 def assist(number: int) -> None:
     """Be the process of an `Assistant` at the other end of the connection of this descriptor."""
-    os.nice(10)
     with contextlib.suppress(EOFError, OSError), Connection(number) as connection:
-        function = connection.recv()
+        function = connection.recv()  # with all that it imports: nothing is checked before
+        os.nice(10)
         while True:
             given = connection.recv()
             try:

@@ -179,6 +179,8 @@ def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(nodes, observe
     controller = nodes.run("inverse_dynamics", scene=path, mode="computed_torque", motion="topic")
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     observer.told("stage", "waiting for a trajectory")
+    publisher.publish(trajectory((0.25, HOME)))
+    observer.until(lambda: reference, "the process that checks, which may take long to start")
     begin, sent = time.monotonic(), 0
     while sent < 80:
         passed = time.monotonic() - begin
