@@ -323,7 +323,11 @@ class ProvenMotion(Explained):
         heads += [name + more for name in names for more in ("", "_bound")]
         table = np.array(self._rows).reshape(-1, len(heads))
         self.columns: dict[str, Array] = dict(zip(heads, table.T, strict=True))
-        self.limits = {name: list(_spans(known, self.until)) for name, known in self._signs.items()}
+        self.limits: dict[str, list[tuple[float, float]]] = {}
+        for name, known in self._signs.items():
+            groups = (list(spans) for _, spans in groupby(known, lambda span: span[2]))
+            unknown = (spans for spans in groups if spans[0][2] == 0 and spans[0][0] <= self.until)
+            self.limits[name] = [(spans[0][0], spans[-1][1]) for spans in unknown]
 
     @property
     def largest(self) -> float:
@@ -384,15 +388,6 @@ def _signs(
             yield low, high, signs
         else:
             todo += [(0.5 * (low + high), high), (low, 0.5 * (low + high))]
-
-
-def _spans(
-    known: Sequence[tuple[float, float, int]], until: float
-) -> Iterator[tuple[float, float]]:
-    for sign, group in groupby(known, lambda span: span[2]):
-        spans = list(group)
-        if sign == 0 and spans[0][0] <= until:
-            yield spans[0][0], spans[-1][1]
 
 
 @check_kinds

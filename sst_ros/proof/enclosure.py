@@ -221,6 +221,11 @@ class Advance(NamedTuple):
         """Length [s], exact."""
         return arb(self.end) - arb(self.begin.time)
 
+    @property
+    def half(self) -> Any:
+        """Half of the length [s]."""
+        return self.length / 2
+
     def flow(self, s: Any) -> Any:
         """Return V(s)."""
         return sum((v * s**k for k, v in enumerate(self.v[1:], 1)), self.v[0])
@@ -230,11 +235,6 @@ class Advance(NamedTuple):
         s = arb(time) - arb(self.begin.time)
         w = magnitude(by * self.v[0]) * self.w
         return [p(s) for p in self.p], entries(magnitude(self.begin.spread(by * self.flow(s)) + w))
-
-    @property
-    def half(self) -> Any:
-        """Half of the length [s]."""
-        return self.length / 2
 
     def expand(self, function: Function, where: Any, size: int, tube: Sequence[Any]) -> list[Any]:
         """Coefficients below `size` of a function of t and y = p + e at s = where, e in `tube`."""
