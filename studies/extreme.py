@@ -24,7 +24,8 @@ from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
 from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import METHODS, Method, Rosenbrock
-from sst_ros.report.results import data_frame, proven_error, publish, records, render
+from sst_ros.report.accuracy import proven_error
+from sst_ros.report.results import data_frame, publish, records, render
 from sst_ros.report.scene_summary import eigenvalues, stability_function, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.torque_profile import TorqueTable

@@ -97,5 +97,5 @@ def run_demo(options: argparse.Namespace) -> None:
         bag = demo.record(name, folder)
         summary = function("report.run:write_run_report")(bag, folder)
         print(function("report.run:summary_text")(summary, str(folder)), flush=True)
-        proven = function("report.results:proven_error")(name)
+        proven = function("report.accuracy:proven_error")(name)
         print(f"Error of simulate on {name}, proven to be below: {proven}", flush=True)

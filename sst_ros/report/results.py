@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import datetime
 import json
-import math
 import os
 import platform
 import re
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sst_ros.errors import SstError, require
+from sst_ros.errors import require
 from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import load_templates, write_into
 from sst_ros.state import Array
@@ -57,24 +56,6 @@ def markdown(frame: DataFrame) -> str:
     cells = frame.astype(object).where(frame.notna(), "-")
     lines += ["| " + " | ".join(map(str, row)) + " |" for row in cells.itertuples(index=False)]
     return "\n".join(lines)
-
-
-def proven_error(*given: Any, **options: Any) -> str:
-    """Return the proven bound of the error of `simulate` as a cell of a table.
-
-    It takes what `certify` takes. Where the proof ends early the time is named, where nothing is
-    proven there is a dash, and both have a reason.
-    """
-    try:
-        from sst_ros.proof.certify import certify  # needs python-flint, which others do not
-
-        proven = certify(*given, **options)
-    except SstError as refused:
-        return f"-: {str(refused).splitlines()[0]}"
-    if math.isinf(proven.error):
-        return f"-: {proven.reason}"
-    until = f" to {proven.until:.4g} s: {proven.reason}" if proven.reason else ""
-    return f"{proven.error:.1e} rad{until}"
 
 
 def render(template: str | Path, **values: Any) -> str:

@@ -22,8 +22,8 @@ from sst_ros.mechanism.geometry import angle_between
 from sst_ros.proof import certify as certify_module
 from sst_ros.proof import enclosure
 from sst_ros.proof.enclosure import Region, arb, arb_poly, arb_series
+from sst_ros.report.accuracy import proven_error
 from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
-from sst_ros.report.results import proven_error
 from studies.sixty_digits import Motion, angle
 
 REFERENCES = ("example1", "example2", "general", "gravity_payload")
