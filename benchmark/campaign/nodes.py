@@ -177,6 +177,10 @@ def recorder_kills(ledger: Ledger) -> None:
                 deadline = time.monotonic() + 30 * ledger.patience
                 while time.monotonic() < deadline and _size(bag) < 50_000:
                     time.sleep(0.01)
+                if (size := _size(bag)) < 50_000:
+                    states = f"simulator {simulator.poll()}, recorder {recorder.poll()}"
+                    ledger.found("hangs", f"kill {number}: {size} bytes in time, ends: {states}")
+                    continue
                 # The wait is the experiment: the moment of the kill is random.
                 time.sleep(ledger.rng.uniform(1.5, 4.0))
                 size = _size(bag)
