@@ -29,13 +29,8 @@ from sst_ros.nodes.process import AnsweringWorker, every
 from sst_ros.report.results import render
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.runtime.trajectory_following import (
-    ErrorCode,
-    Order,
-    Stage,
-    TrajectoryFollower,
-    TrajectoryGoal,
-)
+from sst_ros.runtime.trajectory_following import Order, Stage, TrajectoryFollower
+from sst_ros.runtime.trajectory_messages import ErrorCode, TrajectoryGoal
 from sst_ros.scene import scene
 from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 

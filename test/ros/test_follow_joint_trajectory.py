@@ -13,7 +13,7 @@ from ros.conftest import NAMES, Nodes, Observer, foreign_types
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from sst_ros.runtime.trajectory_following import ErrorCode
+from sst_ros.runtime.trajectory_messages import ErrorCode
 from sst_ros.state import nanoseconds
 
 from .test_inverse_dynamics import AWAY, HOME, trajectory, written

@@ -22,12 +22,8 @@ from sst_ros.errors import InputError, SstError
 from sst_ros.host import processes
 from sst_ros.runtime import trajectory_following
 from sst_ros.runtime.settings import ControllerNodeParameters
-from sst_ros.runtime.trajectory_following import (
-    ErrorCode,
-    Stage,
-    TrajectoryFollower,
-    TrajectoryGoal,
-)
+from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
+from sst_ros.runtime.trajectory_messages import ErrorCode, TrajectoryGoal
 from sst_ros.scene import scene
 from sst_ros.scene.loads import Actuators, DesiredMotion, Initial, Spiral, ToAngles
 from sst_ros.simulation.simulation import Simulation
