@@ -8,6 +8,7 @@ are.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -123,9 +124,13 @@ def take_angles(data: Measured, scene: Scene) -> tuple[torques.TorqueProfile, Ar
         return torques.TorqueTable(begins, data.ticks.torque), t, measured.gamma
     # A simulated motion as well, while its torques are known: not of the state, and not lost.
     if isinstance(data, Trajectory) and data.t[0] == 0.0 and data.scene.lags <= scene.lags:
-        law = data.law
-        if law and np.isfinite(law.values(t)).all():
-            return law, t, measured.gamma
+        law, limit = data.law, data.scene.torque_limit or np.inf
+        if law and np.isfinite(values := law.values(t)).all():
+            if limit == (scene.torque_limit or np.inf) or np.abs(values).max() <= limit:
+                return law, t, measured.gamma
+            held = isinstance(law, _HELD)  # cut off by a limit that the model has not
+            acted = np.clip(_average(law, t) if held else values, -limit, limit)
+            measured = replace(measured, torque=acted, held=held)
     if measured.held:
         return torques.TorqueTable(t[:-1], measured.torque), t, measured.gamma
     spline = CubicSpline(t, measured.torque)

@@ -149,6 +149,20 @@ def test_the_torques_of_a_trajectory_lag_once(torque):
     assert found.values == pytest.approx([0.1], rel=1e-6)
 
 
+@pytest.mark.parametrize("torque", [(3.0, -2.0, 1.0), None])
+def test_torques_that_a_limit_has_cut_off_are_those_that_acted(torque):
+    free = load_scene("example2_heavy")
+    limited = free.with_values(
+        {"actuators.torque_limit": 2.5} | ({"torque": None} if torque else {})
+    )
+    times = np.linspace(0.0, 0.3, 301)
+    motion = simulate(limited, torque, t_eval=times, duration=0.3, tolerance=1e-11)
+    assert np.abs(motion.torque).max() == 2.5 < np.abs(motion.law.values(times)).max()
+    guess = free.with_values({"star.inertia.zz": 0.3})
+    found = identify(motion, guess, ["star.inertia.zz"], method="simulation")
+    assert found.values == pytest.approx([free.star.inertia.zz], rel=1e-3)
+
+
 @pytest.mark.slow
 def test_the_standard_deviations_cover_the_errors_of_noisy_angles():
     plant = load_scene("example2_heavy")
