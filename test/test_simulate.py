@@ -89,7 +89,7 @@ def test_collocation_is_chosen_for_a_smooth_motion_under_a_profile_and_is_as_acc
 
 
 def test_collocation_that_does_not_meet_its_tolerance_says_so():
-    found = simulate(EXAMPLE2, duration=0.1, method="gauss", tolerance=1e-15)
+    found = simulate(EXAMPLE2, (1.0, 0.0, 0.0), 0.1, method="gauss", tolerance=1e-15)
     assert found.status == 2 and "exceeds the tolerance 1e-15 rad" in found.message
 
 
@@ -157,7 +157,13 @@ def test_samples_are_even_up_to_a_limit_and_the_periods_of_a_control_unless_a_nu
     assert simulate(EXAMPLE2, duration=1e-9).t.tolist() == [0.0, 1e-9]
 
 
-@pytest.mark.parametrize("arguments", RUNS.values(), ids=RUNS)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        pytest.param(given, id=name, marks=[pytest.mark.slow] * (name == "collocation"))
+        for name, given in RUNS.items()
+    ],
+)
 def test_threads_get_their_own_motions(arguments):
     run = prepare(**arguments)
     one = run.run()

@@ -64,7 +64,7 @@ def of(**arguments):
 
 
 @pytest.fixture(scope="module")
-def calls():
+def calls(interpreted_module):
     """Public functions, and methods of what they give, with arguments that are right."""
     pytest.importorskip("numba")
     pytest.importorskip("flint")

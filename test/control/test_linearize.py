@@ -75,7 +75,7 @@ def differences(scene, y, torque, coordinates, dt):
 
 
 @pytest.mark.parametrize("coordinates", ["gamma", "star"])
-@pytest.mark.parametrize("lag", [None, 0.1])
+@pytest.mark.parametrize("lag", [pytest.param(None, marks=pytest.mark.slow), 0.1])
 @pytest.mark.parametrize("dt", [None, 2e-3])
 def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):
     (sample,) = seeded_samples(341, 1)
@@ -95,7 +95,9 @@ def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):
         assert np.abs(matrix - truth).max() <= 1e-10 * np.abs(truth).max()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 6))]
+)
 def test_a_period_across_a_contact_has_the_model_of_differences(seed):
     scene = load_scene("elastic_stops").with_values({"torque": None})
     rng = np.random.default_rng(seed)

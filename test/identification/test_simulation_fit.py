@@ -75,11 +75,11 @@ def slow(*case):
         slow(rubbing, 0.08, "actuators.time_constant"),
         slow(rubbing, 0.08, "initial.gamma_dot[1]"),
         slow(rubbing, 0.08, "initial.gamma_dot"),
-        (rubbing, 0.08, "initial.gamma[0]"),
+        slow(rubbing, 0.08, "initial.gamma[0]"),
         slow(bouncing, 0.05, "star.inertia.zz"),
         slow(bouncing, 0.05, "stroke.stiffness"),
         slow(bouncing, 0.05, "stroke.damping"),
-        (rebounding, 1.0, "stroke.restitution"),
+        slow(rebounding, 1.0, "stroke.restitution"),
         (rebounding, 1.0, "stroke.impact_rate"),
     ],
 )
@@ -149,7 +149,7 @@ def test_the_torques_of_a_trajectory_lag_once(torque):
     assert found.values == pytest.approx([0.1], rel=1e-6)
 
 
-@pytest.mark.parametrize("torque", [(3.0, -2.0, 1.0), None])
+@pytest.mark.parametrize("torque", [(3.0, -2.0, 1.0), pytest.param(None, marks=pytest.mark.slow)])
 def test_torques_that_a_limit_has_cut_off_are_those_that_acted(torque):
     free = load_scene("example2_heavy")
     limited = free.with_values(

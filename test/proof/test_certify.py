@@ -55,7 +55,9 @@ def case(name):
     return load_scene(scene).with_values({**FREE, **values}), torque
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x == "friction")) for x in CASES]
+)
 def test_a_solution_of_60_digits_lies_inside(name):
     scene, torque = case(name)
     given = {"t_eval": [0.05], "method": "rk4", "tolerance": 1e-6}

@@ -128,8 +128,8 @@ def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
 
 
 SHIPPED = {
-    **dict.fromkeys(("example2", "stiff", "friction", "gravity_payload"), ()),
-    **dict.fromkeys(("elastic_stops", "fast_spin"), (pytest.mark.slow,)),
+    **dict.fromkeys(("example2", "stiff", "gravity_payload"), ()),
+    **dict.fromkeys(("elastic_stops", "fast_spin", "friction"), (pytest.mark.slow,)),
 }
 
 
@@ -150,7 +150,10 @@ def random_scenes():
 
 SCENES = [
     *(pytest.param(load(name), id=name, marks=marks) for name, marks in SHIPPED.items()),
-    *(pytest.param(scene, id=f"random {k}") for k, scene in enumerate(random_scenes())),
+    *(
+        pytest.param(scene, id=f"random {k}", marks=[pytest.mark.slow] * (k == 2))
+        for k, scene in enumerate(random_scenes())
+    ),
 ]
 
 

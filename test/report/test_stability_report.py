@@ -28,7 +28,7 @@ def found():
 
 
 def changed(name, scene=EXAMPLE2):
-    return ROWS[name][1](scene, simulate(scene, duration=0.1))
+    return ROWS[name][1](scene, simulate(scene, duration=0.02))
 
 
 def test_every_run_ends_with_a_value_within_its_estimate_or_with_a_named_fault(found):
