@@ -8,7 +8,7 @@ EXTRAS = $(ROS),record,plot,fast,proof
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
 # The tests of the nodes wait two thirds of their time.
-PARALLEL_NODES = --numprocesses $$((2 * $$(nproc) + 1)) --dist loadfile
+PARALLEL_NODES = --numprocesses $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder
 # Python compiles what is imported; pip would compile all 15,000 files.
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --no-compile
 
