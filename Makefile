@@ -52,7 +52,7 @@ test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment o
 test-ros: $(VENV)/.ros  ## run the tests of the nodes
 	$(PYTEST) $(PARALLEL_NODES) -m "not slow" test/ros
 
-test-slow: $(VENV)/.test  ## run the slow tests: sweeps, long pages, packages, fresh environments
+test-slow: $(VENV)/.test $(VENV)/.docs  ## run the slow tests: sweeps, long pages, packages, fresh environments
 	$(PYTEST) $(PARALLEL) -m slow --ignore test/ros --timeout 600
 	$(PYTEST) $(PARALLEL) -m slow test/ros --timeout 600
 
@@ -107,7 +107,7 @@ $(VENV)/.docs: $(VENV)/.python setup.py
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.python setup.py
-	$(INSTALL) --editable ".[$(EXTRAS),view,engines,cluster,docs,test]"
+	$(INSTALL) --editable ".[$(EXTRAS),view,engines,cluster,test]"
 	@touch $@
 
 clean:  ## remove environments and results

@@ -328,7 +328,7 @@ def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
              *ENERGY, 1e-9, "each contact is located; their errors add up",
              loose=None, estimate=UNSTABLE),
         Case("sharp Coulomb friction and three contacts",
-             {**make.bouncing_thrice(1e5, 3.0),
+             {**make.bouncing_thrice(1e5, 5.0),
               "friction.gamma": {"coulomb": 2.0, "smoothing": 0.01}}, REST, 30, 10 * MS, *TIGHT,
              1e-8, "friction of 2 N m changes its sign within 0.01 rad/s, at each contact"),
     ]

@@ -19,6 +19,7 @@ from sst_ros.errors import AssemblyError, RunStopped, SingularConfiguration, Sst
 from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import load
+from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
 from studies import extreme
 from studies.extreme import FACTOR, estimate_check, evaluate_case, run_case
@@ -70,6 +71,16 @@ def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
         assert done.error.state is done.simulation.state
     if case.stop_time is not None:
         assert done.error.time == pytest.approx(case.stop_time(), rel=1e-10, abs=0.0)
+
+
+@pytest.mark.parametrize(
+    "name", ["three simultaneous contacts", "sharp Coulomb friction and three contacts"]
+)
+def test_three_contacts_are_three(name):
+    (case,) = (case for case in CASES if case.name == name)
+    motion = simulate(case.scene(), case.torque, case.steps * case.period_ns / 1e9, samples=2000)
+    beyond = (motion.gamma > np.pi / 2) | (motion.gamma < 0.0)
+    assert (beyond[1:] & ~beyond[:-1]).sum(axis=0).tolist() == [1, 1, 1]
 
 
 def named(name):
