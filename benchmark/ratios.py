@@ -4,7 +4,7 @@
 python -m benchmark.ratios [--write] [--tests]    # adds a row of this version to docs/ratios.csv
 
 Each ratio is of two things that run in turn, by processor time, so that machines and loads differ
-less in them than in times. Functions have the names that asv looks for, and can be run by it, too.
+less in them than in times. Functions have the names that asv looks for: benchmark/asv.conf.json.
 """
 
 from __future__ import annotations
