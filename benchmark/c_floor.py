@@ -33,10 +33,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sst_ros.dynamics.expression import Program
 from sst_ros.integration.methods import Tableau
 from sst_ros.integration.simd_source import batch_source
 from sst_ros.integration.step_loops import explicit_step
+from sst_ros.programs.expression import Program
 
 HEAD = "#include <math.h>\n#define abs fabs\n#define max fmax\n#define nan NAN\n"
 

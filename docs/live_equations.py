@@ -7,11 +7,11 @@ import json
 
 from sst_ros import Scene, load_scene
 from sst_ros.description import robot
-from sst_ros.dynamics.expression import Program
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.programs.expression import Program
 
 _TEXT = """// SPDX-License-Identifier: Apache-2.0
 // Written by docs/live_equations.py from the scene {name}.

@@ -19,7 +19,7 @@ FLOORS = (
     {"state", "version"},
     {"errors", "host"},
     {"scene"},
-    {"mechanism"},
+    {"mechanism", "programs"},
     {"dynamics"},
     {"integration"},
     {"simulation"},

@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_program, trace
 from sst_ros.errors import SingularConfiguration, check_kinds, check_kinds_late, refuse_unless
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
+from sst_ros.programs.expression import compile_program, trace
 from sst_ros.state import ZERO, Explained, Quaternion, Vector3
 
 ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding

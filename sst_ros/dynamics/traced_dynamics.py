@@ -17,7 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import (
+from sst_ros.dynamics.model import Limit, limits_of
+from sst_ros.errors import refuse_unless
+from sst_ros.mechanism.generic_math import Scalar, positive, sin
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.programs.expression import (
     Expression,
     Program,
     compile_for_arrays,
@@ -26,10 +30,6 @@ from sst_ros.dynamics.expression import (
     number_constants,
     trace,
 )
-from sst_ros.dynamics.model import Limit, limits_of
-from sst_ros.errors import refuse_unless
-from sst_ros.mechanism.generic_math import Scalar, positive, sin
-from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import Place, leaves, rebuild
 from sst_ros.scene.torque_profile import SineTorque

@@ -25,13 +25,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_for_arrays, compile_program, mark_present, trace
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
 from sst_ros.errors import SingularConfiguration, refusal
 from sst_ros.mechanism.generic_math import quaternion_rate
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.programs.expression import compile_for_arrays, compile_program, mark_present, trace
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import build_unchecked, key_of
 from sst_ros.scene.torque_profile import (

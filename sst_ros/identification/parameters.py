@@ -28,11 +28,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_for_arrays, mark_present, trace
 from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE
 from sst_ros.errors import Check, refuse_unless, suggestion
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
+from sst_ros.programs.expression import compile_for_arrays, mark_present, trace
 from sst_ros.report.results import render
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import LINKS, Scene

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.expression import Slots
 from sst_ros.dynamics.traced_dynamics import LAG, ODE, Dynamics, Function, recent_ode
 from sst_ros.host import compiled_module
 from sst_ros.host.compiled_module import cache_folder
@@ -34,6 +33,7 @@ from sst_ros.integration.methods import (
     Tableau,
 )
 from sst_ros.integration.simd_source import linearise_by_columns
+from sst_ros.programs.expression import Slots
 from sst_ros.scene.scene import Scene
 
 Vector = Sequence[float]

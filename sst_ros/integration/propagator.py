@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.model import (
     CONTACT_BAND,
     GRAZING,
@@ -27,6 +26,7 @@ from sst_ros.integration import step_loops
 from sst_ros.integration.adaptive_stepper import AdaptiveStepper, EvaluationBudget, Step
 from sst_ros.integration.compiled_method import Point, TorqueLaw, compile_derivative
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.programs.expression import compile_program
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque, torque_at
 from sst_ros.state import NANOSECONDS, State, Vector3, clamp

@@ -20,10 +20,10 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 
-from sst_ros.dynamics.expression import Program, Slots
 from sst_ros.dynamics.model import GRAZING
 from sst_ros.integration.methods import Tableau
 from sst_ros.integration.step_loops import combination
+from sst_ros.programs.expression import Program, Slots
 
 SIMD_WIDTH = 32
 """Scenarios of a block; a multiple of what a vector unit takes, and all fit the cache."""

@@ -39,6 +39,30 @@ def positive(x: Any) -> Any:
     return np.where(np.real(x) > 0, x, 0.0) if isinstance(x, _ARRAYS) else max(x, 0)
 
 
+def absolute(x: Any) -> Any:
+    """Return the absolute value of a real number."""
+    return x.apply("abs") if hasattr(x, "apply") else abs(x)
+
+
+def larger(x: Any, y: Any) -> Any:
+    """Return the larger of two real numbers; x where they are equal or y is nan."""
+    if type(x) is float and type(y) is float:
+        return y if y > x else x
+    for number in (x, y):
+        if hasattr(number, "apply"):
+            return number.apply("max", x, y)
+    return np.where(y > x, y, x)
+
+
+def select(condition: Any, x: Any, y: Any) -> Any:
+    """Return x where the condition is > 0, and y elsewhere."""
+    if type(condition) is float:
+        return x if condition > 0.0 else y
+    if hasattr(condition, "apply"):
+        return condition.apply("select", condition, x, y)
+    return np.where(condition > 0.0, x, y)
+
+
 def atan2(y: Any, x: Any) -> Any:
     """Angle of the point (x, y); complex numbers as the analytic continuation near the reals."""
     if type(y) is float and type(x) is float:

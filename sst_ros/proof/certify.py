@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, mark_present, trace
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import JOINTS
@@ -29,6 +28,7 @@ from sst_ros.errors import check_kinds, refusal, refuse_unless, require
 from sst_ros.host.output import Bar
 from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.programs.expression import Expression, mark_present, trace
 from sst_ros.proof import enclosure
 from sst_ros.proof.enclosure import (
     Advance,

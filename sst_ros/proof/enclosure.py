@@ -25,8 +25,8 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from sst_ros.dynamics.expression import FUNCTIONS, Program
 from sst_ros.errors import require
+from sst_ros.programs.expression import FUNCTIONS, Program
 
 _flint = require("flint")
 arb, arb_mat, arb_poly, arb_series, ctx = (

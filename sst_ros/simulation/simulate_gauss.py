@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 
-from sst_ros.dynamics.expression import Program, Slots, number_constants, trace
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.traced_dynamics import MOTION, ODE, Dynamics, limit_distances
@@ -41,6 +40,7 @@ from sst_ros.integration.simd_source import (
     put,
 )
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.programs.expression import Program, Slots, number_constants, trace
 from sst_ros.scene.torque_profile import ConstantTorque, SineTorque
 from sst_ros.simulation.stepped_motion import Task
 from sst_ros.simulation.trajectory import Trajectory, check_error

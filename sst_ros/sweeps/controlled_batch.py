@@ -22,7 +22,6 @@ from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
 from sst_ros.control.controller import BAND, Controller
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.errors import refuse_unless
 from sst_ros.host import compiled_module
 from sst_ros.integration.batch import Batch, BatchResult
@@ -39,6 +38,7 @@ from sst_ros.integration.simd_source import (
 )
 from sst_ros.mechanism.generic_math import axpy, dot3, positive
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.programs.expression import Expression, Program, trace
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
 NOISE = (

@@ -11,13 +11,13 @@ from models import seeded_samples
 from scipy.spatial.transform import Rotation
 
 from sst_ros import Simulation, load_scene, simulate
-from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import AssemblyError, InputError, RunStopped
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.compiled_method import CompiledMethod
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
 from sst_ros.integration.simd_source import SIMD_WIDTH
+from sst_ros.programs.expression import compile_program
 from sst_ros.scene.loads import Initial, Moment
 from sst_ros.state import QUANTITIES
 

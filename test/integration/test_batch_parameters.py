@@ -8,7 +8,6 @@ import pytest
 from loaded_scenes import IGNORE, REST, loaded
 
 from sst_ros import load_scene
-from sst_ros.dynamics.expression import compile_program
 from sst_ros.dynamics.initial_state import NO_RATE
 from sst_ros.errors import InputError
 from sst_ros.integration import simd_source
@@ -16,6 +15,7 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.programs.expression import compile_program
 from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import Scenarios
 from sst_ros.scene.yaml_document import find_fields

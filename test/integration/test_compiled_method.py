@@ -17,12 +17,12 @@ from loaded_scenes import IGNORE, loaded, start_of, viscous
 from models import seeded_samples
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Slots, number_constants, trace
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, recent_ode
 from sst_ros.host import compiled_module
 from sst_ros.integration.compiled_method import CompiledMethod, Point, TorqueLaw
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
+from sst_ros.programs.expression import Slots, number_constants, trace
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.scene.schema import Section

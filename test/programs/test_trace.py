@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sst_ros.dynamics.expression import compile_program, trace
 from sst_ros.mechanism.generic_math import atan2, exp, positive, sqrt, tanh
+from sst_ros.programs.expression import compile_program, trace
 
 FINITE = st.floats(-10.0, 10.0)
 

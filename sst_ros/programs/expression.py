@@ -14,7 +14,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -35,9 +35,12 @@ _TEMPLATES = {
     "atan2": "atan2({}, {})",
     "positive": "max({}, 0.0)",
     "step": "(1.0 if {} > 0.0 else 0.0)",
+    "abs": "abs({})",
+    "max": "max({}, {})",
+    "select": "({1} if {0} > 0.0 else {2})",
 }
 _ON_FLOATS: dict[str, Callable[..., float]] = {
-    op: eval(f"lambda x, y=0.0: {text.format('x', 'y')}", {**FUNCTIONS})
+    op: eval(f"lambda x, y=0.0, z=0.0: {text.format('x', 'y', 'z')}", {**FUNCTIONS})
     for op, text in _TEMPLATES.items()
 }
 _SLOPES: dict[str, Callable[..., Value]] = {
@@ -54,18 +57,44 @@ _SLOPES: dict[str, Callable[..., Value]] = {
     "cos": lambda here, x: -x.apply("sin"),
     "positive": lambda here, x: x.apply("step"),
     "step": lambda here, x: 0.0,
+    "abs": lambda here, x: x.apply("select", x, 1.0, -1.0),
+    "max": lambda here, x, y, dx, dy: here.apply("select", y - x, dy, dx),
+    "select": lambda here, c, x, y, dc, dx, dy: here.apply("select", c, dx, dy),
 }
 """Slopes of here = f(x, y), whose arguments have the slopes dx and dy; of f(x) without dx."""
+
+
+@dataclass(frozen=True)
+class Routine:
+    """A program of `inputs` numbers that other programs call by its name.
+
+    A call is one operation, whose parts are its `outputs` results.
+    """
+
+    name: str
+    inputs: int
+    outputs: int
+
+    def __call__(self, *arguments: Value) -> tuple[Value, ...]:
+        """Note a call in the graph of the arguments, of which one at least is an expression."""
+        if len(arguments) != self.inputs:
+            raise TypeError(f"{self.name} takes {self.inputs} numbers, not {len(arguments)}")
+        graph = next(x.graph for x in arguments if isinstance(x, Expression))
+        call = graph.node(self, *arguments)
+        return tuple(graph.node("part", call, float(k)) for k in range(self.outputs))
+
+
+Operation: TypeAlias = "str | Routine"
 
 
 class Graph:
     """All expressions of one trace, each distinct one once."""
 
     def __init__(self) -> None:
-        self.nodes: list[tuple[str, tuple[Value, ...]]] = []
+        self.nodes: list[tuple[Operation, tuple[Value, ...]]] = []
         self._known: dict[tuple[Any, ...], Expression] = {}
 
-    def node(self, op: str, *args: Value) -> Expression:
+    def node(self, op: Operation, *args: Value) -> Expression:
         """Return the expression op(args), an old one where there is one."""
         keys = [("n", a.index) if isinstance(a, Expression) else ("c", _origin(a)) for a in args]
         key = (op, *(sorted(keys) if op in ("add", "mul") else keys))
@@ -231,14 +260,19 @@ class Program:
 
     inputs: tuple[str, ...]  #: names of the inputs
     #: (op, operands) in order; an operand is a float, or an int: the number of an input or, from
-    #: len(inputs) on, of a step
-    steps: tuple[tuple[str, tuple[float | int, ...]], ...]
+    #: len(inputs) on, of a step; "part" takes a call and the place of one of its results
+    steps: tuple[tuple[Operation, tuple[float | int, ...]], ...]
     outputs: tuple[float | int, ...]  #: operands that are the results
 
     @property
     def operations(self) -> Counter[str]:
-        """How often each operation is done."""
-        return Counter(op for op, _ in self.steps)
+        """How often each operation is done, that of routines not counted."""
+        return Counter(op for op, _ in self.steps if isinstance(op, str) and op != "part")
+
+    @property
+    def routines(self) -> tuple[Routine, ...]:
+        """The routines that are called, each once."""
+        return tuple(dict.fromkeys(op for op, _ in self.steps if isinstance(op, Routine)))
 
     def prune(self, outputs: Sequence[float | int]) -> Program:
         """Return the program of some outputs alone, without the steps that none of them needs."""
@@ -288,7 +322,13 @@ class Program:
         before, after = list[str](), list[str]()
         for i, (op, operands) in enumerate(self.steps):
             is_late.append(any(is_late[x] for x in operands if isinstance(x, int)))
-            line = f"v{i} = " + _TEMPLATES[op].format(*map(word, operands))
+            if isinstance(op, Routine):
+                text = f"{op.name}({', '.join(map(word, operands))})"
+            elif op == "part":
+                text = f"{word(operands[0])}[{int(operands[1])}]"
+            else:
+                text = _TEMPLATES[op].format(*map(word, operands))
+            line = f"v{i} = {text}"
             (after if is_late[-1] else before).append(line)
         return before, after, [word(output) for output in self.outputs]
 
@@ -303,12 +343,16 @@ class Slots:
         self.values: list[float] = []
         self._slots: dict[Any, int] = {}
 
-    def name(self, number: Number) -> str:
-        """Return the name of a number, which is new if no number of its origin was there."""
+    def slot(self, number: Number) -> int:
+        """Return the place of a number, a new one if no number of its origin was there."""
         slot = self._slots.setdefault(number.origin, len(self.values))
         if slot == len(self.values):
             self.values.append(float(number))
-        return f"c{slot}"
+        return slot
+
+    def name(self, number: Number) -> str:
+        """Return the name of a number in a text."""
+        return f"c{self.slot(number)}"
 
     def reads(self, lines: Sequence[str]) -> list[str]:
         """Lines that read what other lines name."""
@@ -340,6 +384,8 @@ def trace(
         for index, (op, args) in enumerate(nodes):
             d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
             here = Expression(graph, index)
+            if isinstance(op, Routine):
+                raise TypeError(f"the program {op.name} is called: it has no derivative here")
             if op == "input":
                 slopes.append(direction.get(args[0], 0.0))
             elif len(args) > 1:

@@ -1,0 +1,536 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machine code of straight-line programs: their text in LLVM's language, compiled.
+
+1. `write_module` writes programs that call each other as one module, an instruction an
+   operation, in their order. No operation is contracted or reordered, so machine code
+   has the bits of the same program in plain Python.
+2. A number of the scene is read from a vector: scenes of one structure share the code.
+3. A function takes floats, or, written for lanes, rows of arrays: `LANES` columns at
+   a time, each with the operations of a single run.
+4. llvmlite compiles a module in tenths of a second, once for each text in a process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import re
+import struct
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.programs.expression import FUNCTIONS, Number, Program, Routine, Slots
+
+LANES = 4
+"""Columns at a time: the doubles of a register of AVX2. On the machines that were tried
+eight are slower, as half of what is computed no longer finds place in registers."""
+
+_OPTIMISATION = 2
+"""LLVM's level; the third takes longer and gains nothing in straight-line code."""
+
+_ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
+_INTRINSIC = ("sqrt", "abs")
+"""Functions that LLVM computes itself, exactly as IEEE 754 asks; others are libm's."""
+
+Function = Callable[..., "list[float]"]
+
+
+def llvmlite_version() -> str | None:
+    """Version of llvmlite, None where it cannot be imported."""
+    try:
+        import llvmlite
+    except ImportError:
+        return None
+    return str(llvmlite.__version__)
+
+
+class Module(NamedTuple):
+    """Programs as one text of LLVM, and the vector of numbers that they take."""
+
+    text: str
+    programs: Mapping[str, Program]
+    numbers: tuple[float, ...]
+
+    def function(self, name: str) -> Function:
+        """Return a program as a function of floats, which returns its results as a list."""
+        program = self.programs[name]
+        code = compile_text(self.text)
+        # A call takes microseconds: to hand the interpreter's lock to another thread and
+        # wait for it again would take longer, up to a thousand times.
+        signature = ctypes.PYFUNCTYPE(None, _BYTES, _BYTES, ctypes.c_void_p)
+        call = signature(code.address(name))
+        call.code = code  # type: ignore[attr-defined]  # lives as long as the function
+        pack = struct.Struct(f"{len(program.inputs)}d").pack
+        numbers = struct.pack(f"{len(self.numbers)}d", *self.numbers)
+        new_results = ctypes.c_double * len(program.outputs)
+
+        def evaluate(*inputs: float) -> list[float]:
+            results = new_results()
+            call(pack(*inputs), numbers, results)
+            return results[:]
+
+        return evaluate
+
+
+_BYTES = ctypes.c_char_p
+
+
+class RowFunction:
+    """A program over the columns of arrays, compiled for `LANES` columns at a time.
+
+    It releases the interpreter's lock, and allocates nothing but for the last columns.
+
+    Args:
+        module: what `write_module` has written with `shared`.
+        name: of the program.
+        shared: how many of its first inputs are the same for all columns.
+
+    """
+
+    def __init__(self, module: Module, name: str, shared: int = 0) -> None:
+        program = module.programs[name]
+        self.shared = shared
+        self.rows = len(program.inputs) - shared
+        self.outputs = len(program.outputs)
+        code = compile_text(module.text)
+        pointer = ctypes.c_void_p
+        signature = ctypes.CFUNCTYPE(None, ctypes.c_int64, *(pointer,) * 4)
+        self._call = signature(code.address(row_name(name, shared)))
+        self._code = code
+        self._numbers = np.array([*module.numbers, 0.0])
+
+    def __call__(
+        self,
+        shared: Sequence[float],
+        inputs: Sequence[NDArray[np.float64]],
+        outputs: Sequence[NDArray[np.float64]],
+        columns: slice = slice(None),
+    ) -> None:
+        """Compute rows of outputs from rows of inputs, for some columns of them.
+
+        Args:
+            shared: inputs that all columns share, shape (shared,).
+            inputs: the other inputs, a contiguous array of shape (n,) each.
+            outputs: where the results go, alike; an output may be the row of an input.
+            columns: which are computed, a slice without a step.
+
+        """
+        if len(inputs) != self.rows or len(outputs) != self.outputs:
+            raise ValueError("as many rows as the program has inputs and outputs")
+        begin, end, _ = columns.indices(len(outputs[0]))
+        whole = begin + (end - begin) // LANES * LANES
+        scalars = np.array([*shared, 0.0], dtype=float)
+        if whole > begin:
+            ins = _addresses(inputs, begin)
+            self._run(whole - begin, scalars, ins, _addresses(outputs, begin))
+        if whole < end:  # the last columns, in rows that are as long as the lanes
+            count = end - whole
+            last = [np.resize(row[whole:end], LANES) for row in inputs]
+            results = np.empty((self.outputs, LANES))
+            self._run(LANES, scalars, _addresses(last, 0), _addresses([*results], 0))
+            for row, result in zip(outputs, results, strict=True):
+                row[whole:end] = result[:count]
+
+    def _run(self, count: int, scalars: NDArray[np.float64], ins: Any, outs: Any) -> None:
+        self._call(count, scalars.ctypes.data, self._numbers.ctypes.data, ins, outs)
+
+
+def _addresses(rows: Sequence[NDArray[np.float64]], first: int) -> Any:
+    """Return the addresses of an element of each row, as an array for C."""
+    addresses = [row.ctypes.data + first * row.itemsize for row in rows]
+    return (ctypes.c_void_p * len(rows))(*addresses)
+
+
+# The text of a module.
+
+
+def write_module(
+    programs: Mapping[str, Program], *, rows: Sequence[str] = (), shared: int = 0
+) -> Module:
+    """Write programs as one module of LLVM.
+
+    Args:
+        programs: by the names by which they call each other.
+        rows: names of those that are written for rows of arrays; others, for floats,
+            unless only these call them.
+        shared: how many of the first inputs of `rows` all columns share.
+
+    """
+    slots = Slots()
+    wide = {name for row in rows for name in _reach(programs, row)}
+    narrow = set(programs) - wide if rows else set(programs)
+    parts = [_DECLARATIONS]
+    for name, program in programs.items():
+        if name in narrow:
+            parts.append(_write_function(name, program, slots, width=1))
+        if name in wide:
+            parts.append(_write_function(name, program, slots, width=LANES))
+    for name in rows:
+        parts.append(_write_loop(name, programs[name], shared))
+    return Module("\n".join(parts), dict(programs), tuple(slots.values))
+
+
+def row_name(name: str, shared: int) -> str:
+    """Return the name of a program's loop over columns."""
+    return f"{name}_rows_{shared}"
+
+
+def _reach(programs: Mapping[str, Program], name: str) -> set[str]:
+    """Return the names of a program and of those that it calls, directly or not."""
+    names = {name}
+    for routine in programs[name].routines:
+        names |= _reach(programs, routine.name)
+    return names
+
+
+def _type_of(width: int) -> str:
+    return "double" if width == 1 else f"<{width} x double>"
+
+
+def _declare() -> str:
+    lines = []
+    for width in (1, LANES):
+        kind, suffix = _type_of(width), _suffix(width)
+        for name in ("sqrt", "fabs"):
+            lines.append(f"declare {kind} @llvm.{name}.{suffix}({kind})")
+    for name in FUNCTIONS:
+        if name not in _INTRINSIC:
+            arguments = "double, double" if name == "atan2" else "double"
+            lines.append(f"declare double @{name}({arguments})")
+    return "\n".join(lines) + "\n"
+
+
+def _suffix(width: int) -> str:
+    return "f64" if width == 1 else f"v{width}f64"
+
+
+_DECLARATIONS = _declare()
+
+
+def _function_name(name: str, width: int) -> str:
+    return f"@{name}" if width == 1 else f"@{name}_x{width}"
+
+
+def _constant(value: float, width: int) -> str:
+    """Return a number as LLVM writes it: its bits."""
+    bits = f"0x{struct.unpack('>Q', struct.pack('>d', value))[0]:016X}"
+    if width == 1:
+        return bits
+    return "<" + ", ".join([f"double {bits}"] * width) + ">"
+
+
+def _pointer(kind: str) -> str:
+    return f"{kind}*"
+
+
+def _write_function(name: str, program: Program, slots: Slots, width: int) -> str:
+    """Write a program: `void name(inputs, numbers, outputs)`, each an array."""
+    writer = _Writer(program, slots, width)
+    for number, (op, operands) in enumerate(program.steps):
+        writer.write_step(f"%v{number}", op, operands)
+    for number, output in enumerate(program.outputs):
+        writer.store(writer.word(output), "%o", number)
+    array = f"{_pointer(_type_of(width))} noalias"
+    head = f"define void {_function_name(name, width)}"
+    head += f"({array} %x, double* noalias %p, {array} %o) {{"
+    return "\n".join([head, *writer.first_lines, *writer.lines, "  ret void", "}", ""])
+
+
+class _Writer:
+    """Lines of one function; `first_lines` are those at its begin."""
+
+    def __init__(self, program: Program, slots: Slots, width: int) -> None:
+        self._slots, self._width, self._kind = slots, width, _type_of(width)
+        self._words = [f"%a{i}" for i in range(len(program.inputs))]
+        self._words += [f"%v{i}" for i in range(len(program.steps))]
+        self._numbers: dict[int, str] = {}
+        self._calls: dict[str, str] = {}
+        self._places = 0
+        self.first_lines: list[str] = []
+        self.lines: list[str] = []
+        for number in range(len(program.inputs)):
+            self.first_lines += self._load(f"%a{number}", self._kind, "%x", number)
+
+    def word(self, operand: float | int) -> str:
+        """Return how an operand is named in the text."""
+        if isinstance(operand, Number):
+            return self._number(self._slots.slot(operand))
+        if isinstance(operand, int):
+            return self._words[operand]
+        return _constant(operand, self._width)
+
+    def write_step(self, result: str, op: str | Routine, operands: Sequence[float | int]) -> None:
+        """Write one operation of a program."""
+        if isinstance(op, Routine):
+            self._write_call(result, op, operands)
+            return
+        if op == "part":
+            call, place = operands
+            results = self._calls[self._words[int(call)]]
+            self.lines += self._load(result, self._kind, results, int(place))
+            return
+        kind, words = self._kind, [self.word(operand) for operand in operands]
+        if op in _ARITHMETIC:
+            self._put(result, f"{_ARITHMETIC[op]} {kind} {words[0]}, {words[1]}")
+        elif op == "neg":
+            self._put(result, f"fneg {kind} {words[0]}")
+        elif op in _INTRINSIC:
+            name = f"@llvm.{'fabs' if op == 'abs' else op}.{_suffix(self._width)}"
+            self._put(result, f"call {kind} {name}({kind} {words[0]})")
+        elif op == "positive":
+            self._choose(result, self.word(0.0), words[0], self.word(0.0), words[0])
+        elif op == "step":
+            one, zero = self.word(1.0), self.word(0.0)
+            self._choose(result, words[0], zero, one, zero)
+        elif op == "max":
+            self._choose(result, words[1], words[0], words[1], words[0])
+        elif op == "select":
+            self._choose(result, words[0], self.word(0.0), words[1], words[2])
+        else:
+            self._call_libm(result, op, words)
+
+    def store(self, word: str, array: str, place: int) -> None:
+        """Write a number into a place of an array."""
+        address = self._address(self.lines, array, place)
+        kind = self._kind
+        self.lines.append(f"  store {kind} {word}, {_pointer(kind)} {address}, align 8")
+
+    def _put(self, result: str, text: str) -> None:
+        self.lines.append(f"  {result} = {text}")
+
+    def _choose(self, result: str, left: str, right: str, yes: str, no: str) -> None:
+        """Write: yes where left > right, else no."""
+        truth = "i1" if self._width == 1 else f"<{self._width} x i1>"
+        condition = f"%c{result[1:]}"
+        self._put(condition, f"fcmp ogt {self._kind} {left}, {right}")
+        self._put(
+            result,
+            f"select {truth} {condition}, {self._kind} {yes}, {self._kind} {no}",
+        )
+
+    def _call_libm(self, result: str, name: str, words: Sequence[str]) -> None:
+        """Call a function of libm, lane by lane: so each lane has the bits of Python."""
+        if self._width == 1:
+            arguments = ", ".join(f"double {word}" for word in words)
+            self._put(result, f"call double @{name}({arguments})")
+            return
+        vector = "undef"
+        for lane in range(self._width):
+            numbers = []
+            for k, word in enumerate(words):
+                numbers.append(f"{result}.{lane}.{k}")
+                self._put(numbers[-1], f"extractelement {self._kind} {word}, i32 {lane}")
+            arguments = ", ".join(f"double {number}" for number in numbers)
+            self._put(f"{result}.{lane}", f"call double @{name}({arguments})")
+            last = lane == self._width - 1
+            filled = result if last else f"{result}.{lane}.v"
+            self._put(
+                filled,
+                f"insertelement {self._kind} {vector}, double {result}.{lane}, i32 {lane}",
+            )
+            vector = filled
+
+    def _write_call(self, result: str, routine: Routine, operands: Sequence[float | int]) -> None:
+        """Call another program of the module; its arrays are on the stack."""
+        arguments = self._new_array(f"{result}.x", routine.inputs)
+        results = self._new_array(f"{result}.o", routine.outputs)
+        self._calls[result] = results
+        for place, operand in enumerate(operands):
+            self.store(self.word(operand), arguments, place)
+        name = _function_name(routine.name, self._width)
+        array = _pointer(self._kind)
+        self.lines.append(f"  call void {name}({array} {arguments}, double* %p, {array} {results})")
+
+    def _new_array(self, name: str, size: int) -> str:
+        self.first_lines.append(f"  {name} = alloca {self._kind}, i32 {size}, align 32")
+        return name
+
+    def _number(self, slot: int) -> str:
+        """Load a number of the scene, at the begin of the function, once."""
+        if slot not in self._numbers:
+            name = f"%n{slot}"
+            if self._width == 1:
+                self.first_lines += self._load(name, "double", "%p", slot)
+            else:
+                self.first_lines += self._load(f"{name}.s", "double", "%p", slot)
+                self.first_lines += _splat(name, f"{name}.s", self._width)
+            self._numbers[slot] = name
+        return self._numbers[slot]
+
+    def _load(self, result: str, kind: str, array: str, place: int) -> list[str]:
+        lines: list[str] = []
+        address = self._address(lines, array, place, kind)
+        return [*lines, f"  {result} = load {kind}, {_pointer(kind)} {address}, align 8"]
+
+    def _address(self, lines: list[str], array: str, place: int, kind: str | None = None) -> str:
+        address = f"%q{self._places}"
+        self._places += 1
+        kind = kind or self._kind
+        lines.append(_element(address, kind, array, place))
+        return address
+
+
+def _element(result: str, kind: str, array: str, place: int | str) -> str:
+    """Line that takes the address of an element of an array."""
+    return f"  {result} = getelementptr inbounds {kind}, {_pointer(kind)} {array}, i64 {place}"
+
+
+def _splat(result: str, scalar: str, width: int) -> list[str]:
+    """Lines that give all lanes one number."""
+    kind = _type_of(width)
+    return [
+        f"  {result}.1 = insertelement {kind} undef, double {scalar}, i32 0",
+        f"  {result} = shufflevector {kind} {result}.1, {kind} undef, "
+        f"<{width} x i32> zeroinitializer",
+    ]
+
+
+def _write_loop(name: str, program: Program, shared: int) -> str:
+    """Write the loop over columns: `void name_rows(n, shared, numbers, ins, outs)`.
+
+    `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes.
+    """
+    kind, count = _type_of(LANES), len(program.inputs)
+    array = _pointer(kind)
+    lines = [
+        f"define void @{row_name(name, shared)}"
+        "(i64 %n, double* %s, double* %p, double** %ins, double** %outs) {",
+        "entry:",
+        f"  %x = alloca {kind}, i32 {count}, align 32",
+        f"  %o = alloca {kind}, i32 {len(program.outputs)}, align 32",
+    ]
+    for i in range(shared):
+        lines.append(_element(f"%s{i}.a", "double", "%s", i))
+        lines.append(f"  %s{i}.s = load double, double* %s{i}.a, align 8")
+        lines += _splat(f"%s{i}", f"%s{i}.s", LANES)
+    for i in range(shared, count):
+        lines.append(_element(f"%r{i}.a", "double*", "%ins", i - shared))
+        lines.append(f"  %r{i} = load double*, double** %r{i}.a, align 8")
+    for i in range(len(program.outputs)):
+        lines.append(_element(f"%w{i}.a", "double*", "%outs", i))
+        lines.append(f"  %w{i} = load double*, double** %w{i}.a, align 8")
+    lines += [
+        "  br label %loop",
+        "loop:",
+        "  %k = phi i64 [0, %entry], [%next, %loop]",
+    ]
+    for i in range(count):
+        value = f"%s{i}"
+        if i >= shared:
+            value = f"%l{i}"
+            lines.append(_element(f"%l{i}.a", "double", f"%r{i}", "%k"))
+            lines.append(f"  %l{i}.v = bitcast double* %l{i}.a to {array}")
+            lines.append(f"  {value} = load {kind}, {array} %l{i}.v, align 8")
+        lines.append(_element(f"%x{i}", kind, "%x", i))
+        lines.append(f"  store {kind} {value}, {array} %x{i}, align 8")
+    call = _function_name(name, LANES)
+    lines.append(f"  call void {call}({array} %x, double* %p, {array} %o)")
+    for i in range(len(program.outputs)):
+        lines.append(_element(f"%o{i}.a", kind, "%o", i))
+        lines.append(f"  %o{i} = load {kind}, {array} %o{i}.a, align 8")
+        lines.append(_element(f"%t{i}", "double", f"%w{i}", "%k"))
+        lines.append(f"  %t{i}.v = bitcast double* %t{i} to {array}")
+        lines.append(f"  store {kind} %o{i}, {array} %t{i}.v, align 8")
+    lines += [
+        f"  %next = add i64 %k, {LANES}",
+        "  %more = icmp slt i64 %next, %n",
+        "  br i1 %more, label %loop, label %end",
+        "end:",
+        "  ret void",
+        "}",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+# Compilation.
+
+
+class MachineCode:
+    """Compiled code of one module; it is freed with the last function that uses it.
+
+    LLVM is called with `_LOCK` held alone, see there.
+    """
+
+    def __init__(self, engine: Any) -> None:
+        self._engine = engine
+
+    def __del__(self) -> None:
+        with _LOCK:
+            self._engine.close()
+
+    def address(self, name: str) -> int:
+        """Return the address of a function."""
+        with _LOCK:
+            return int(self._engine.get_function_address(name))
+
+
+_LOCK = threading.RLock()
+"""Held in each call of LLVM. A fork waits for it, for the child would find LLVM halfway
+through a module, and its locks held by a thread that it does not have."""
+
+os.register_at_fork(
+    before=_LOCK.acquire, after_in_parent=_LOCK.release, after_in_child=_LOCK.release
+)
+
+
+def compile_text(text: str) -> MachineCode:
+    """Compile a module, unless this process has done so already."""
+    with _LOCK:
+        return _compile(text)
+
+
+@lru_cache(maxsize=128)
+def _compile(text: str) -> MachineCode:
+    import llvmlite.binding as llvm
+
+    if llvm.llvm_version_info[0] >= _OPAQUE_POINTERS:
+        text = _TYPED_POINTER.sub("ptr", text)
+    module = llvm.parse_assembly(text)
+    machine = _target_machine()
+    _optimise(module, machine)
+    engine = llvm.create_mcjit_compiler(module, machine)
+    engine.finalize_object()
+    return MachineCode(engine)
+
+
+_OPAQUE_POINTERS = 15
+"""Version of LLVM from which on pointers have no type."""
+_TYPED_POINTER = re.compile(r"(?:double|<\d+ x double>)\*+")
+
+
+def _target_machine() -> Any:
+    """Return the machine that code is made for, this one; an engine takes it over."""
+    import llvmlite.binding as llvm
+
+    with contextlib.suppress(RuntimeError):  # newer versions do it by themselves
+        llvm.initialize()
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(),
+        features=llvm.get_host_cpu_features().flatten(),
+        opt=_OPTIMISATION,
+    )
+
+
+def _optimise(module: Any, machine: Any) -> None:
+    """Run LLVM's passes; versions of llvmlite differ in how they are called."""
+    import llvmlite.binding as llvm
+
+    if hasattr(llvm, "create_pass_builder"):
+        tuning = llvm.create_pipeline_tuning_options(speed_level=_OPTIMISATION)
+        builder = llvm.create_pass_builder(machine, tuning)
+        builder.getModulePassManager().run(module, builder)
+        return
+    builder = llvm.create_pass_manager_builder()
+    builder.opt_level = _OPTIMISATION
+    manager = llvm.create_module_pass_manager()
+    builder.populate(manager)
+    manager.run(module)
