@@ -18,6 +18,7 @@ import os
 import re
 import struct
 import threading
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -460,15 +461,17 @@ class MachineCode:
 
     def __init__(self, engine: Any) -> None:
         self._engine = engine
-
-    def __del__(self) -> None:
-        with _LOCK:
-            self._engine.close()
+        weakref.finalize(self, _close, engine).atexit = False
 
     def address(self, name: str) -> int:
         """Return the address of a function."""
         with _LOCK:
             return int(self._engine.get_function_address(name))
+
+
+def _close(engine: Any) -> None:
+    with _LOCK:
+        engine.close()
 
 
 _LOCK = threading.RLock()
