@@ -326,26 +326,30 @@ class ParametricModel:
     @cached_property
     def program(self) -> Program:
         """Derivative of the state; inputs t, state, drive, and the varied numbers."""
-        known = ("t", *self.ode.state, *self.ode.drive)
-        topic = Dynamics.of(self.scene).has_moment_topic
+        return trace(self.derivative, ("t", *self.ode.state, *self.ode.drive, *self.names))
 
-        def slope(*inputs: Expression) -> tuple[Any, ...]:
-            at = self.constants(inputs[len(known) :])
-            ode = ODE(Dynamics(at.model, has_moment_topic=topic), at.torque)
-            return ode.derivative(*inputs[: len(known)])
-
-        return trace(slope, (*known, *self.names))
+    def derivative(self, *inputs: Any) -> tuple[Any, ...]:
+        """Return the derivative at the inputs of `program`, of any kind."""
+        known = 1 + len(self.ode.state) + len(self.ode.drive)
+        at = self.constants(inputs[known:])
+        topic = self.ode.dynamics.has_moment_topic
+        ode = ODE(Dynamics(at.model, has_moment_topic=topic), at.torque)
+        return ode.derivative(*inputs[:known])
 
     @cached_property
     def limit_distances(self) -> Program:
         """Distances to the limits, and their rates; inputs: state (7) and the varied numbers."""
+        return trace(self.distances, (*MOTION, *self.names))
+
+    def distances(self, *inputs: Any) -> tuple[Scalar, ...]:
+        """Return the results of `limit_distances` at its inputs, of any kind."""
         limits = tuple(limits_of(self.scene, Geometry.of(self.scene)))
+        at = self.constants(inputs[7:])
+        return limit_distances(limits, at.ends, at.model, inputs[:7])
 
-        def values(*inputs: Expression) -> tuple[Any, ...]:
-            at = self.constants(inputs[7:])
-            return limit_distances(limits, at.ends, at.model, inputs[:7])
-
-        return trace(values, (*MOTION, *self.names))
+    def joints(self, *inputs: Any) -> Joints:
+        """Return angles and rates of the joints at the inputs of `limit_distances`."""
+        return kernel.joints(self.constants(inputs[7:]).model, inputs[:7])
 
     @cached_property
     def outputs(self) -> dict[str, Callable[..., tuple[Any, ...]]]:
@@ -356,7 +360,7 @@ class ParametricModel:
 
         def values(*inputs: Expression) -> tuple[Any, ...]:
             model, state = self.constants(inputs[7:]).model, inputs[:7]
-            joints = (number for kind in kernel.joints(model, state) for number in kind)
+            joints = (number for kind in self.joints(*inputs) for number in kind)
             kinetic = kernel.kinetic_energy(model, state)
             return (*joints, kinetic + kernel.potential_energy(model, state))
 

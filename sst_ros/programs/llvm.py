@@ -122,8 +122,7 @@ class RowFunction:
             columns: which are computed, a slice without a step.
 
         """
-        if len(inputs) != self.rows or len(outputs) != self.outputs:
-            raise ValueError("as many rows as the program has inputs and outputs")
+        self._check_rows(inputs, outputs)
         begin, end, _ = columns.indices(len(outputs[0]))
         whole = begin + (end - begin) // LANES * LANES
         scalars = np.array([*shared, 0.0], dtype=float)
@@ -137,6 +136,35 @@ class RowFunction:
             self._run(LANES, scalars, _addresses(last, 0), _addresses([*results], 0))
             for row, result in zip(outputs, results, strict=True):
                 row[whole:end] = result[:count]
+
+    def bind(
+        self, inputs: Sequence[NDArray[np.float64]], outputs: Sequence[NDArray[np.float64]]
+    ) -> Callable[..., None]:
+        """Return a function of the shared inputs alone, for rows of a multiple of `LANES`.
+
+        It keeps the addresses of the rows, so a call takes about a microsecond besides
+        its work. It is for one thread at a time.
+        """
+        self._check_rows(inputs, outputs)
+        count = len(outputs[0])
+        if count % LANES:
+            raise ValueError(f"{count} columns: must be a multiple of {LANES}")
+        rows = inputs, outputs  # they live as long as the function
+        ins, outs = _addresses(inputs, 0), _addresses(outputs, 0)
+        scalars = np.zeros(self.shared + 1)
+        given = scalars[: self.shared]
+        call = self._call
+        fixed = count, scalars.ctypes.data, self._numbers.ctypes.data, ins, outs
+
+        def run(*shared: float, _rows: Any = rows) -> None:
+            given[:] = shared
+            call(*fixed)
+
+        return run
+
+    def _check_rows(self, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+        if len(inputs) != self.rows or len(outputs) != self.outputs:
+            raise ValueError("as many rows as the program has inputs and outputs")
 
     def _run(self, count: int, scalars: NDArray[np.float64], ins: Any, outs: Any) -> None:
         self._call(count, scalars.ctypes.data, self._numbers.ctypes.data, ins, outs)
@@ -164,8 +192,13 @@ def write_module(
 
     """
     slots = Slots()
-    wide = {name for row in rows for name in _reach(programs, row)}
-    narrow = set(programs) - wide if rows else set(programs)
+    wide = {
+        called
+        for row in rows
+        for routine in programs[row].routines
+        for called in _reach(programs, routine.name)
+    }
+    narrow = set(programs) - wide - set(rows) if rows else set(programs)
     parts = [_DECLARATIONS]
     for name, program in programs.items():
         if name in narrow:
@@ -173,13 +206,25 @@ def write_module(
         if name in wide:
             parts.append(_write_function(name, program, slots, width=LANES))
     for name in rows:
-        parts.append(_write_loop(name, programs[name], shared))
+        # What only shared inputs go into is computed once, not in each lane.
+        before, body = programs[name].hoist(shared)
+        parts.append(_write_function(_before(name), before, slots, width=1))
+        parts.append(_write_function(_body(name), body, slots, width=LANES))
+        parts.append(_write_loop(name, len(before.outputs), body, shared))
     return Module("\n".join(parts), dict(programs), tuple(slots.values))
 
 
 def row_name(name: str, shared: int) -> str:
     """Return the name of a program's loop over columns."""
     return f"{name}_rows_{shared}"
+
+
+def _before(name: str) -> str:
+    return f"{name}_before"
+
+
+def _body(name: str) -> str:
+    return f"{name}_body"
 
 
 def _reach(programs: Mapping[str, Program], name: str) -> set[str]:
@@ -392,10 +437,11 @@ def _splat(result: str, scalar: str, width: int) -> list[str]:
     ]
 
 
-def _write_loop(name: str, program: Program, shared: int) -> str:
+def _write_loop(name: str, early: int, program: Program, shared: int) -> str:
     """Write the loop over columns: `void name_rows(n, shared, numbers, ins, outs)`.
 
-    `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes.
+    `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes. The
+    first `early` inputs of the program are what is computed before the loop.
     """
     kind, count = _type_of(LANES), len(program.inputs)
     array = _pointer(kind)
@@ -405,13 +451,17 @@ def _write_loop(name: str, program: Program, shared: int) -> str:
         "entry:",
         f"  %x = alloca {kind}, i32 {count}, align 32",
         f"  %o = alloca {kind}, i32 {len(program.outputs)}, align 32",
+        f"  %e = alloca double, i32 {early}, align 32",
+        f"  call void {_function_name(_before(name), 1)}(double* %s, double* %p, double* %e)",
     ]
-    for i in range(shared):
-        lines.append(_element(f"%s{i}.a", "double", "%s", i))
-        lines.append(f"  %s{i}.s = load double, double* %s{i}.a, align 8")
-        lines += _splat(f"%s{i}", f"%s{i}.s", LANES)
-    for i in range(shared, count):
-        lines.append(_element(f"%r{i}.a", "double*", "%ins", i - shared))
+    for i in range(early):
+        lines.append(_element(f"%e{i}.a", "double", "%e", i))
+        lines.append(f"  %e{i}.s = load double, double* %e{i}.a, align 8")
+        lines += _splat(f"%e{i}", f"%e{i}.s", LANES)
+        lines.append(_element(f"%x{i}", kind, "%x", i))
+        lines.append(f"  store {kind} %e{i}, {array} %x{i}, align 8")
+    for i in range(early, count):
+        lines.append(_element(f"%r{i}.a", "double*", "%ins", i - early))
         lines.append(f"  %r{i} = load double*, double** %r{i}.a, align 8")
     for i in range(len(program.outputs)):
         lines.append(_element(f"%w{i}.a", "double*", "%outs", i))
@@ -421,16 +471,13 @@ def _write_loop(name: str, program: Program, shared: int) -> str:
         "loop:",
         "  %k = phi i64 [0, %entry], [%next, %loop]",
     ]
-    for i in range(count):
-        value = f"%s{i}"
-        if i >= shared:
-            value = f"%l{i}"
-            lines.append(_element(f"%l{i}.a", "double", f"%r{i}", "%k"))
-            lines.append(f"  %l{i}.v = bitcast double* %l{i}.a to {array}")
-            lines.append(f"  {value} = load {kind}, {array} %l{i}.v, align 8")
+    for i in range(early, count):
+        lines.append(_element(f"%l{i}.a", "double", f"%r{i}", "%k"))
+        lines.append(f"  %l{i}.v = bitcast double* %l{i}.a to {array}")
+        lines.append(f"  %l{i} = load {kind}, {array} %l{i}.v, align 8")
         lines.append(_element(f"%x{i}", kind, "%x", i))
-        lines.append(f"  store {kind} {value}, {array} %x{i}, align 8")
-    call = _function_name(name, LANES)
+        lines.append(f"  store {kind} %l{i}, {array} %x{i}, align 8")
+    call = _function_name(_body(name), LANES)
     lines.append(f"  call void {call}({array} %x, double* %p, {array} %o)")
     for i in range(len(program.outputs)):
         lines.append(_element(f"%o{i}.a", kind, "%o", i))
