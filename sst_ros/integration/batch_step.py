@@ -36,7 +36,7 @@ from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
 from sst_ros.programs.llvm import LANES
 
-BLOCK = 512
+BLOCK = 192
 """Columns of a block at most: their numbers fit the cache of a core, and a step of all
 takes a hundred times as long as the interpreter between two steps."""
 
@@ -97,14 +97,15 @@ class ColumnStep:
         was = [next(rest) for _ in range(2 * self.limits)]
         error, running, *given = rest
 
-        def derivative(time: Scalar, *y: Scalar) -> tuple[Scalar, ...]:
-            return self._model.derivative(time, *y, *given)
+        def derivative(time: Scalar, y: Sequence[Scalar], drive: Any) -> tuple[Scalar, ...]:
+            return self._model.derivative(time, *y, *drive)
 
-        moved, errors = explicit_step(derivative, self._method, t, h, old)
+        drives = [given] * len(self._method.b)
+        moved, errors = explicit_step(derivative, self._method, t, h, old, drives)
         new = normalise(moved)
         far = self._model.distances(*new[:7], *given[self.varied])
         worst = error
-        for one in errors[:4]:
+        for one in (errors or ())[:4]:
             worst = larger(worst, absolute(one))
         flag = larger(may_cross(h, was, far), is_not_finite(reduce(add, new)))
         # A scenario that has ended stays where it is.
@@ -203,7 +204,7 @@ class Block:
                 ahead(number)
             self._advance[self._now](number * h, h)
             self._now = 1 - self._now
-            if self._flag.any():
+            if np.count_nonzero(self._flag):
                 self._end_columns(number, h, code, time)
                 if not self.running.any():
                     return

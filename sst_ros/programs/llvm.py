@@ -5,8 +5,8 @@
    operation, in their order. No operation is contracted or reordered, so machine code
    has the bits of the same program in plain Python.
 2. A number of the scene is read from a vector: scenes of one structure share the code.
-3. A function takes floats, or, written for lanes, rows of arrays: `LANES` columns at
-   a time, each with the operations of a single run.
+3. A function takes floats, or, written for lanes, rows of arrays: as many columns at a
+   time as a register has doubles, each with the operations of a single run.
 4. llvmlite compiles a module in tenths of a second, once for each text in a process.
 """
 
@@ -28,9 +28,12 @@ from numpy.typing import NDArray
 
 from sst_ros.programs.expression import FUNCTIONS, Number, Program, Routine, Slots
 
-LANES = 4
-"""Columns at a time: the doubles of a register of AVX2. On the machines that were tried
-eight are slower, as half of what is computed no longer finds place in registers."""
+LANES = 8
+"""Columns at a time, at most; a number of columns that is a multiple of it fits all machines."""
+
+_NARROW_LANES = 4
+"""Columns at a time without AVX-512. A register then has four doubles, and with eight
+lanes half of what is computed finds no place in registers."""
 
 _OPTIMISATION = 2
 """LLVM's level; the third takes longer and gains nothing in straight-line code."""
@@ -83,7 +86,7 @@ _BYTES = ctypes.c_char_p
 
 
 class RowFunction:
-    """A program over the columns of arrays, compiled for `LANES` columns at a time.
+    """A program over the columns of arrays, compiled for several columns at a time.
 
     It releases the interpreter's lock, and allocates nothing but for the last columns.
 
@@ -151,13 +154,12 @@ class RowFunction:
             raise ValueError(f"{count} columns: must be a multiple of {LANES}")
         rows = inputs, outputs  # they live as long as the function
         ins, outs = _addresses(inputs, 0), _addresses(outputs, 0)
-        scalars = np.zeros(self.shared + 1)
-        given = scalars[: self.shared]
+        scalars = (ctypes.c_double * self.shared)()
         call = self._call
-        fixed = count, scalars.ctypes.data, self._numbers.ctypes.data, ins, outs
+        fixed = count, ctypes.addressof(scalars), self._numbers.ctypes.data, ins, outs
 
         def run(*shared: float, _rows: Any = rows) -> None:
-            given[:] = shared
+            scalars[:] = shared
             call(*fixed)
 
         return run
@@ -186,32 +188,43 @@ def write_module(
 
     Args:
         programs: by the names by which they call each other.
-        rows: names of those that are written for rows of arrays; others, for floats,
-            unless only these call them.
+        rows: names of those that are written for rows of arrays, with what they call
+            and nothing else; by default all are written for floats.
         shared: how many of the first inputs of `rows` all columns share.
 
     """
     slots = Slots()
+    lanes = count_lanes() if rows else 1
     wide = {
         called
         for row in rows
         for routine in programs[row].routines
         for called in _reach(programs, routine.name)
     }
-    narrow = set(programs) - wide - set(rows) if rows else set(programs)
+    narrow = set() if rows else set(programs)
     parts = [_DECLARATIONS]
     for name, program in programs.items():
         if name in narrow:
             parts.append(_write_function(name, program, slots, width=1))
         if name in wide:
-            parts.append(_write_function(name, program, slots, width=LANES))
+            parts.append(_write_function(name, program, slots, width=lanes))
     for name in rows:
         # What only shared inputs go into is computed once, not in each lane.
         before, body = programs[name].hoist(shared)
         parts.append(_write_function(_before(name), before, slots, width=1))
-        parts.append(_write_function(_body(name), body, slots, width=LANES))
-        parts.append(_write_loop(name, len(before.outputs), body, shared))
+        parts.append(_write_function(_body(name), body, slots, width=lanes, inline=True))
+        parts.append(_write_loop(name, len(before.outputs), body, shared, lanes))
     return Module("\n".join(parts), dict(programs), tuple(slots.values))
+
+
+@lru_cache(maxsize=1)
+def count_lanes() -> int:
+    """Return how many columns this machine computes at a time."""
+    with _LOCK:
+        import llvmlite.binding as llvm
+
+        features = llvm.get_host_cpu_features()
+    return LANES if features.get("avx512f") else _NARROW_LANES
 
 
 def row_name(name: str, shared: int) -> str:
@@ -241,7 +254,7 @@ def _type_of(width: int) -> str:
 
 def _declare() -> str:
     lines = []
-    for width in (1, LANES):
+    for width in (1, _NARROW_LANES, LANES):
         kind, suffix = _type_of(width), _suffix(width)
         for name in ("sqrt", "fabs"):
             lines.append(f"declare {kind} @llvm.{name}.{suffix}({kind})")
@@ -275,16 +288,22 @@ def _pointer(kind: str) -> str:
     return f"{kind}*"
 
 
-def _write_function(name: str, program: Program, slots: Slots, width: int) -> str:
-    """Write a program: `void name(inputs, numbers, outputs)`, each an array."""
+def _write_function(
+    name: str, program: Program, slots: Slots, width: int, *, inline: bool = False
+) -> str:
+    """Write a program: `void name(inputs, numbers, outputs)`, each an array.
+
+    With `inline` it becomes part of the function that calls it.
+    """
     writer = _Writer(program, slots, width)
     for number, (op, operands) in enumerate(program.steps):
         writer.write_step(f"%v{number}", op, operands)
     for number, output in enumerate(program.outputs):
         writer.store(writer.word(output), "%o", number)
     array = f"{_pointer(_type_of(width))} noalias"
-    head = f"define void {_function_name(name, width)}"
-    head += f"({array} %x, double* noalias %p, {array} %o) {{"
+    kind, end = ("internal ", " alwaysinline") if inline else ("", "")
+    head = f"define {kind}void {_function_name(name, width)}"
+    head += f"({array} %x, double* noalias %p, {array} %o){end} {{"
     return "\n".join([head, *writer.first_lines, *writer.lines, "  ret void", "}", ""])
 
 
@@ -437,13 +456,13 @@ def _splat(result: str, scalar: str, width: int) -> list[str]:
     ]
 
 
-def _write_loop(name: str, early: int, program: Program, shared: int) -> str:
+def _write_loop(name: str, early: int, program: Program, shared: int, lanes: int) -> str:
     """Write the loop over columns: `void name_rows(n, shared, numbers, ins, outs)`.
 
     `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes. The
     first `early` inputs of the program are what is computed before the loop.
     """
-    kind, count = _type_of(LANES), len(program.inputs)
+    kind, count = _type_of(lanes), len(program.inputs)
     array = _pointer(kind)
     lines = [
         f"define void @{row_name(name, shared)}"
@@ -457,7 +476,7 @@ def _write_loop(name: str, early: int, program: Program, shared: int) -> str:
     for i in range(early):
         lines.append(_element(f"%e{i}.a", "double", "%e", i))
         lines.append(f"  %e{i}.s = load double, double* %e{i}.a, align 8")
-        lines += _splat(f"%e{i}", f"%e{i}.s", LANES)
+        lines += _splat(f"%e{i}", f"%e{i}.s", lanes)
         lines.append(_element(f"%x{i}", kind, "%x", i))
         lines.append(f"  store {kind} %e{i}, {array} %x{i}, align 8")
     for i in range(early, count):
@@ -477,7 +496,7 @@ def _write_loop(name: str, early: int, program: Program, shared: int) -> str:
         lines.append(f"  %l{i} = load {kind}, {array} %l{i}.v, align 8")
         lines.append(_element(f"%x{i}", kind, "%x", i))
         lines.append(f"  store {kind} %l{i}, {array} %x{i}, align 8")
-    call = _function_name(_body(name), LANES)
+    call = _function_name(_body(name), lanes)
     lines.append(f"  call void {call}({array} %x, double* %p, {array} %o)")
     for i in range(len(program.outputs)):
         lines.append(_element(f"%o{i}.a", kind, "%o", i))
@@ -486,7 +505,7 @@ def _write_loop(name: str, early: int, program: Program, shared: int) -> str:
         lines.append(f"  %t{i}.v = bitcast double* %t{i} to {array}")
         lines.append(f"  store {kind} %o{i}, {array} %t{i}.v, align 8")
     lines += [
-        f"  %next = add i64 %k, {LANES}",
+        f"  %next = add i64 %k, {lanes}",
         "  %more = icmp slt i64 %next, %n",
         "  br i1 %more, label %loop, label %end",
         "end:",
