@@ -27,6 +27,7 @@ from sst_ros.integration.batch_step import (
     BLOCK,
     EARLIEST,
     NOT_FINITE,
+    Block,
     ColumnStep,
     advance_blocks,
 )
@@ -254,23 +255,29 @@ class Batch(Explained):
         if rows is not None:
             threads = 1
         number = columns[0].shape[1]
-        blocks = max(-(-number // BLOCK), min(threads, -(-number // _SHARE)))
-        width = -(-number // max(blocks, 1))
-        width = -(-width // LANES) * LANES
-        begins = range(0, number, max(width, 1))
-        size = -(-len(begins) // (1 if threads == 1 else 4 * threads))
-        parts = [begins[i : i + size] for i in range(0, len(begins), max(size, 1))]
-        work = run_many(
-            lambda part: advance_blocks(self.step, width, part, first, count, step, *columns),
-            parts,
-            workers=threads,
-        )
-        deque(work, maxlen=0)
+        width = block_width(number, threads)
+        begins = range(0, number, width)
+        size = max(1, -(-len(begins) // (1 if threads == 1 else 4 * threads)))
+        parts = [begins[i : i + size] for i in range(0, len(begins), size)]
+
+        programs = self.programs  # compiled here, not by each thread
+
+        def work(part: range) -> None:
+            advance_blocks(Block(programs, width), part, first, count, step, *columns)
+
+        deque(run_many(work, parts, workers=threads), maxlen=0)
 
     @cached_property
-    def step(self) -> ColumnStep:
+    def programs(self) -> ColumnStep:
         """The programs of a step, compiled when they are first needed."""
         return ColumnStep(self.model, self._method)
+
+
+def block_width(number: int, threads: int = 1) -> int:
+    """Return how many of a number of columns are advanced together."""
+    blocks = max(-(-number // BLOCK), min(threads, -(-number // _SHARE)), 1)
+    width = -(-number // blocks)
+    return max(1, -(-width // LANES)) * LANES
 
 
 def _locate_ends(

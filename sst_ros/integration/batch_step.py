@@ -17,7 +17,7 @@ cubic in its values and rates at both ends (Hermite). Its error is at most h^4 m
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from operator import add
 from typing import Any
@@ -51,10 +51,6 @@ _NO_SHARE = 2.0
 
 _HALVINGS = 52
 """Of a step, until the share is known to all digits of a double."""
-
-Ahead = Callable[[int], None]
-"""What is done before a step, given its number."""
-
 
 class ColumnStep:
     """The programs of a step of many scenarios, compiled.
@@ -125,11 +121,12 @@ class Block:
     Attributes:
         running: 1 for a column that goes on, 0 for one that has ended, shape (width,).
         given: drive and varied numbers, shape (numbers, width).
+        width: number of columns.
 
     """
 
     def __init__(self, step: ColumnStep, width: int) -> None:
-        self._step = step
+        self._step, self.width = step, width
         self._size, self._limits = step.size, step.limits
         rows = step.size + 2 * step.limits + 1
         self._states = np.zeros((rows, width)), np.zeros((rows, width))
@@ -148,71 +145,57 @@ class Block:
         )
 
     @property
-    def state(self) -> Array:
-        """The states now, shape (size, width)."""
-        return self._states[self._now][: self._size]
+    def now(self) -> int:
+        """Which of the two arrays has the states now."""
+        return self._now
 
-    @property
-    def both_states(self) -> tuple[Array, Array]:
-        """The arrays that have the states in turn; a step goes on to the other."""
-        return self._states[0][: self._size], self._states[1][: self._size]
+    def states(self, which: int) -> Array:
+        """States in one of the two arrays, shape (size, width)."""
+        return self._states[which][: self._size]
 
-    @property
-    def error(self) -> Array:
-        """Largest local error of a quaternion until now, shape (width,)."""
-        return self._states[self._now][-1]
+    def load(self, part: slice, *columns: NDArray[Any]) -> None:
+        """Take over columns of states, drives, codes, times and errors.
 
-    def load(self, y: Array, given: Array, code: NDArray[np.int64], error: Array) -> None:
-        """Take columns over; if there are fewer than the block has, the last one is repeated."""
+        If there are fewer than the block has, the last one is repeated.
+        """
+        y, given, code, _, error = columns
         self._now = 0
-        number = y.shape[1]
-        for rows, values in (
-            (self.state, y),
-            (self.given, given[: len(self.given)]),
-            (self.error[None], error[None]),
-        ):
-            rows[:, :number] = values
-            rows[:, number:] = values[:, -1:]
-        self.running[:number] = code == 0
-        self.running[number:] = 0.0
+        first = self._states[0]
+        fill(first[: self._size], y[:, part])
+        fill(first[-1:], error[None, part])
+        fill(self.given, given[: len(self.given), part])
+        own = code[part]
+        self.running[: len(own)] = own == 0
+        self.running[len(own) :] = 0.0
         if self._limits:
             self._measure(0.0, 0.0)
 
-    def run(
-        self,
-        first: int,
-        count: int,
-        h: float,
-        code: NDArray[np.int64],
-        time: Array,
-        ahead: Ahead | None = None,
-    ) -> None:
-        """Advance by `count` steps of h [s] from step `first`.
+    def store(self, part: slice, *columns: NDArray[Any]) -> None:
+        """Put states and errors back."""
+        y, _, code, _, error = columns
+        number = len(code[part])
+        y[:, part] = self.states(self._now)[:, :number]
+        error[part] = self._states[self._now][-1, :number]
 
-        Args:
-            first: number of the first step; it begins at `first` times h.
-            count: number of steps.
-            h: length of a step [s].
-            code: changes where a column ends: 1 + the index of a limit, or NOT_FINITE.
-            time: changes where a column ends: when it did [s].
-            ahead: is called before each step.
+    def run(self, part: slice, first: int, count: int, h: float, *columns: NDArray[Any]) -> None:
+        """Advance the columns that were taken over by `count` steps.
 
+        Step `number` begins at `number` times h [s]. Codes and times of columns that end
+        change: to 1 + the index of a limit, or NOT_FINITE, and to when that was [s].
         """
+        _, _, code, time, _ = columns
         for number in range(first, first + count):
             stop_if_asked()
-            if ahead is not None:
-                ahead(number)
+            self.prepare_step(number)
             self._advance[self._now](number * h, h)
             self._now = 1 - self._now
             if np.count_nonzero(self._flag):
-                self._end_columns(number, h, code, time)
+                self._end_columns(number, h, code[part], time[part])
                 if not self.running.any():
                     return
 
-    @property
-    def now(self) -> int:
-        """Which of `both_states` has the states now."""
-        return self._now
+    def prepare_step(self, number: int) -> None:
+        """Do what is to be done before a step: nothing here."""
 
     def _end_columns(self, number: int, h: float, code: NDArray[np.int64], time: Array) -> None:
         """End the columns that have passed a limit in a step, or are not finite after it."""
@@ -303,22 +286,34 @@ def is_not_finite(x: Scalar) -> Scalar:
     return select(sys.float_info.max - absolute(x), 0.0, 1.0)
 
 
+def fill(rows: Array, values: Array) -> None:
+    """Put values into rows, which may be longer; the last column is repeated."""
+    number = values.shape[1]
+    rows[:, :number] = values
+    rows[:, number:] = values[:, -1:]
+
+
 def advance_blocks(
-    step: ColumnStep,
-    width: int,
+    block: Block,
     begins: Sequence[int],
     first: int,
     count: int,
     h: float,
     *columns: NDArray[Any],
 ) -> None:
-    """Advance blocks that begin at some columns, by `count` steps; see `Block.run`."""
-    block = Block(step, width)
-    y, given, code, time, error = columns
+    """Advance the columns of blocks by `count` steps; see `Block.run`.
+
+    Args:
+        block: the blocks are taken over by it in turn.
+        begins: the first column of each.
+        first: number of the first step.
+        count: number of steps.
+        h: length of a step [s].
+        columns: states, drives, codes, times and errors, a column a scenario.
+
+    """
     for begin in begins:
-        part = slice(begin, begin + width)
-        block.load(y[:, part], given[:, part], code[part], error[part])
-        block.run(first, count, h, code[part], time[part])
-        number = len(code[part])
-        y[:, part] = block.state[:, :number]
-        error[part] = block.error[:number]
+        part = slice(begin, begin + block.width)
+        block.load(part, *columns)
+        block.run(part, first, count, h, *columns)
+        block.store(part, *columns)
