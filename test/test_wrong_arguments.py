@@ -64,9 +64,8 @@ def of(**arguments):
 
 
 @pytest.fixture(scope="module")
-def calls(interpreted_module):
+def calls():
     """Public functions, and methods of what they give, with arguments that are right."""
-    pytest.importorskip("numba")
     pytest.importorskip("flint")
     geometry, settings = sst_ros.Geometry.of(SCENE), sst_ros.ControllerSettings()
     run, motion = simulate(**TASK), sst_ros.reference_motion(MOVING)

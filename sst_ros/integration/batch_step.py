@@ -52,6 +52,7 @@ _NO_SHARE = 2.0
 _HALVINGS = 52
 """Of a step, until the share is known to all digits of a double."""
 
+
 class ColumnStep:
     """The programs of a step of many scenarios, compiled.
 
@@ -59,6 +60,7 @@ class ColumnStep:
         size: numbers of a state.
         given: numbers of drive and varied numbers together.
         limits: number of limits.
+        traced: the programs, by name.
 
     """
 
@@ -74,12 +76,12 @@ class ColumnStep:
         shared = ("t", "h")
         inputs = (*shared, *state, *distances, "error", "running", *given)
         ends = (*shared, "before", "rate_before", "after", "rate_after")
-        programs = {
+        self.traced = {
             "advance": trace(self._advance, inputs),
             "distances": trace(self._distances, (*shared, *state[:7], *given[self.varied])),
             "crossing": trace(share_of_crossing, ends),
         }
-        functions = compile_columns(programs, len(shared))
+        functions = compile_columns(self.traced, len(shared))
         self.advance, self.distances = functions["advance"], functions["distances"]
         self.crossing = functions["crossing"]
 
