@@ -101,7 +101,7 @@ class Feedback(NamedTuple):
 
 
 class ControlledBlock(Block):
-    """Columns whose torques the control law gives at each sample, and that hold them until the next.
+    """Columns whose torques the control law gives at each sample, and holds until the next.
 
     Which columns they are is known from `load` on.
     """
