@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a step of many scenarios costs: numba, and the same text in C with SIMD.
+"""What a step of many scenarios costs: machine code in lanes, and the same program in C with SIMD.
 
 python -m benchmark.batch [--scene example2_heavy] [--scenarios 10000] [--rounds 9]
 """
 
 from __future__ import annotations
 
+import copy
 import os
 import sys
 import tempfile
@@ -18,9 +19,9 @@ import numpy as np
 
 from benchmark import c_floor
 from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
-from sst_ros.integration.batch import Batch
+from sst_ros.integration.batch import Batch, block_width
+from sst_ros.integration.batch_step import Block, ColumnStep, advance_blocks
 from sst_ros.integration.methods import DOP853, RK4, Tableau
-from sst_ros.integration.simd_source import SIMD_WIDTH
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 
@@ -33,8 +34,8 @@ FLAGS = {
     "C SIMD, no fma": (*SIMD, "-ffp-contract=off"),
     "C SIMD, -ffast-math": (*SIMD, "-ffast-math"),
 }
-ONE, ALL, FLOOR, PLAIN = "numba, 1 thread", "numba, all cores", "C SIMD", "C SIMD, no fma"
-AT_MOST_C = 1.5
+ONE, ALL, FLOOR, PLAIN = "1 thread", "all cores", "C SIMD", "C SIMD, no fma"
+AT_MOST_C = 1.2
 STEP, STEPS = 1e-3, 20
 SPREAD = 0.05
 
@@ -49,12 +50,12 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         work = _Work(scene, options.scenarios, Path(folder) if with_c else None)
         seconds = time_in_turn(work.calls, options.rounds, shortest=5e-3)
-    host = describe_machine("numpy", "numba", "llvmlite")
+    host = describe_machine("numpy", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
     counts = {key: STEPS * options.scenarios * len(METHODS[key[0]].b) for key in seconds}
     costs = Costs(seconds, counts, FLOOR)
-    print(f"Scene {options.scene}, {options.scenarios} scenarios in blocks of {SIMD_WIDTH} lanes.")
+    print(f"Scene {options.scene}, {options.scenarios} scenarios.")
     print("Time per evaluation and scenario: a step with limits and error, over its stages.")
     print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
     print("\n".join(work.notes), "\n")
@@ -80,7 +81,7 @@ class _Work:
 
     def _add(self, name: str, method: Tableau, folder: Path | None) -> None:
         batch = Batch(self._scene, method, profile=self._profile)
-        y, code = batch.start(self._gamma, (0.0, 0.0, 0.0))
+        y, code = batch.initial(self._gamma, (0.0, 0.0, 0.0))
         given = batch.drives((0.0, 0.0, 0.0), self._number)
 
         def start() -> tuple[np.ndarray, ...]:
@@ -95,33 +96,35 @@ class _Work:
         self.calls[name, ONE] = partial(run, 1)
         self.calls[name, ALL] = partial(run, len(os.sched_getaffinity(0)))
         if folder is not None:
-            self._add_c(name, method, batch, start, run(1)[0], folder)
+            self._add_c(name, batch.programs, start, run(1), folder)
 
     def _add_c(
-        self, name: str, method: Tableau, batch: Batch, start: Callable[[], Any],
-        expected: np.ndarray, folder: Path,
-    ) -> None:  # fmt: skip
-        size = len(batch.model.ode.state)
-        text, loops = c_floor.write_batch(
-            batch.model.program, batch.model.limit_distances, method, size
-        )
-        blocks = -(-self._number // SIMD_WIDTH)
+        self,
+        name: str,
+        programs: ColumnStep,
+        start: Callable[[], Any],
+        expected: tuple[np.ndarray, ...],
+        folder: Path,
+    ) -> None:
+        width = block_width(self._number)
+        begins = range(0, self._number, width)
         for index, (who, flags) in enumerate(FLAGS.items()):
-            library, done = c_floor.compile_batch(text, folder, f"{name}_{index}", *flags)
+            in_c = copy.copy(programs)
+            program = programs.traced["advance"]
+            in_c.advance = c_floor.RowsInC(program, 2, folder, f"{name}_{index}", *flags)
 
-            def run(library: Any = library) -> Any:
+            def run(in_c: ColumnStep = in_c) -> Any:
                 arrays = start()
-                pointers = (array.ctypes.data for array in arrays)
-                library.batch(STEP, 0, STEPS, 0, blocks, self._number, *pointers)
+                advance_blocks(Block(in_c, width), begins, 0, STEPS, STEP, *arrays)
                 return arrays
 
-            apart = float(np.abs(run()[0] - expected).max())
+            apart = float(np.abs(run()[0] - expected[0]).max())
             if not apart < 1e-12:
                 raise RuntimeError(f"{who} {name} is not the same program: {apart:.1e} apart")
-            same = "the bits of numba" if apart == 0.0 else f"{apart:.0e} from numba"
+            same = "the bits of the batch" if apart == 0.0 else f"{apart:.0e} from the batch"
+            loop = "vectorised" if in_c.advance.vectorised else "did NOT vectorise"
             self.notes.append(
-                f"{name}, {who} ({' '.join(flags)} -fopenmp-simd): gcc vectorised {done} of {loops}"
-                f" loops over lanes; {same}."
+                f"{name}, {who} ({' '.join(flags)} -fopenmp-simd): gcc {loop} the loop; {same}."
             )
             self.calls[name, who] = run
 

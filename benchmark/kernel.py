@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one step costs: numba, plain Python, and C from the same traced program.
+"""What one step costs: machine code by LLVM, plain Python, and C from the same traced program.
 
 python -m benchmark.kernel [--scene example2_heavy] [--rounds 15]
 """
@@ -18,15 +18,17 @@ from typing import Any
 
 from benchmark import c_floor
 from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
+from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, RK4
+from sst_ros.integration.point import Drive
 from sst_ros.scene import scene as scenes
 from sst_ros.simulation.simulation import Simulation
 
 METHODS = {"rk4": RK4, "dopri5": DORMAND_PRINCE, "dop853": DOP853}
 FLAGS = {"C -O3": ("-O3",), "C -O3 -march=native": ("-O3", "-march=native")}
-NUMBA, PLAIN = "numba", "plain Python"
+LLVM, PLAIN = "LLVM, with its call from Python", "plain Python"
 STEPS, STEP = 1000, 1e-4
 AT_MOST_C, AT_MOST_PLAIN = 1.3, 60e-6
 
@@ -44,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         calls = _calls(system, y, Path(folder) if with_c else None)
         seconds = time_in_turn(calls, options.rounds, shortest=5e-3, clock=time.process_time)
-    host = describe_machine("numpy", "numba", "llvmlite")
+    host = describe_machine("numpy", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
     counts = {key: STEPS // 10 if key[1] == PLAIN else STEPS for key in seconds}
@@ -54,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"Processor time: medians of {options.rounds} interleaved rounds, and of quotients.\n")
     costs.print()
     for work in dict.fromkeys(work for work, _ in seconds):
-        costs.judge(work, NUMBA, "C -O3", AT_MOST_C)
+        costs.judge(work, LLVM, "C -O3", AT_MOST_C)
     plain = median(seconds["rk4 step", PLAIN]) / counts["rk4 step", PLAIN]
     met = "met" if plain <= AT_MOST_PLAIN else "MISSED"
     print(f"plain rk4 step {1e6 * plain:.1f} us, target {1e6 * AT_MOST_PLAIN:g}: {met}")
@@ -68,21 +70,23 @@ def _calls(
     """What is timed, by (work, who): STEPS steps each, fewer of plain Python."""
     calls: dict[tuple[str, str], Callable[[], Any]] = {}
     for name, method in METHODS.items():
-        fast = CompiledMethod(system, method, compiled=True)
-        plain = CompiledMethod(system, method, compiled=False)
+        fast, plain = MethodSteps(system, method), MethodSteps(system, method)
+        fast.load()
+        with without_llvmlite():
+            plain.load()
         work = f"{name} step"
-        calls[work, NUMBA] = partial(fast.step_fixed, 0.0, STEP, STEPS, y, [])
-        calls[work, PLAIN] = partial(plain.step_fixed, 0.0, STEP, STEPS // 10, y, [])
+        calls[work, LLVM] = partial(fast.fixed, 0.0, STEP, STEPS, y, Drive(()))
+        calls[work, PLAIN] = partial(plain.fixed, 0.0, STEP, STEPS // 10, y, Drive(()))
         if folder is not None:
             _add_c(calls, c_floor.write_step(system.program, method), y, folder, name, fast)
     return calls
 
 
 def _add_c(
-    calls: Any, text: str, y: list[float], folder: Path, name: str, fast: CompiledMethod
+    calls: Any, text: str, y: list[float], folder: Path, name: str, fast: MethodSteps
 ) -> None:
     array = ctypes.c_double * len(y)
-    expected = fast.step_fixed(0.0, STEP, STEPS, y, [])
+    expected = fast.fixed(0.0, STEP, STEPS, y, Drive(()))
     for index, (who, flags) in enumerate(FLAGS.items()):
         library = c_floor.compile_step(text, folder, f"{name}_{index}", *flags)
         state, error = array(*y), array()

@@ -2,7 +2,7 @@
 """Bits of motions, before and after a change of the code that should change none.
 
 `python -m benchmark.motions FILE` writes a line a motion: what it is, and a hash of its numbers:
-shipped scenes by all methods, steps plain and compiled, a batch, a sweep, a lockstep run through
+shipped scenes by all methods, steps, a batch, a sweep, a lockstep run through
 the nodes and the evaluation of its recording. `diff` shows what changed.
 """
 
@@ -22,7 +22,7 @@ from sst_ros import Batch, Simulation, load_scene, read_bag, simulate, sweep
 from sst_ros.errors import SstError
 
 SCENES = sorted(path.stem for path in Path("config/scenes").glob("*.yaml"))
-METHODS = ("auto", "gauss", "dopri5", "dop853", "rk4", "rodas5p")
+METHODS = ("auto", "dopri5", "dop853", "rk4", "rodas5p")
 DURATION = 0.25
 STEPS = 50
 MEASURED = (
@@ -60,9 +60,9 @@ def whole(name: str) -> str:
     return f"{found} {motion.message}"
 
 
-def stepped(name: str, compiled: bool) -> str:
+def stepped(name: str) -> str:
     """Go step by step with held torques."""
-    run = Simulation(load_scene(name), compiled=compiled)
+    run = Simulation(load_scene(name))
     torque, found = np.array([0.3, -0.2, 0.1]), list[float]()
     for number in range(STEPS):
         run.step(tuple(torque * np.cos(0.3 * number)), 2_000_000)
@@ -116,7 +116,7 @@ def lines() -> Iterator[str]:
     jobs: dict[str, Callable[[], str]] = {}
     for name in SCENES:
         jobs |= {f"simulate {name} {m}": partial(simulated, name, m) for m in METHODS}
-        jobs |= {f"steps {name} {c}": partial(stepped, name, c) for c in (False, True)}
+        jobs[f"steps {name}"] = partial(stepped, name)
         jobs[f"whole {name}"] = partial(whole, name)
     for what, job in {**jobs, "batch": batched, "sweep": swept}.items():
         try:

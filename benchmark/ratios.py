@@ -25,10 +25,11 @@ from matplotlib.figure import Figure
 
 import sst_ros
 from benchmark import batch, kernel, sweep
+from benchmark.front_door import own_steps
 from benchmark.measure import DOCS, divide, fill_page, read_options, time_in_turn
 from benchmark.peers.floor import find_floor
 from benchmark.peers.task import Task
-from sst_ros import Simulation, load_scene, prepare, simulate
+from sst_ros import Simulation, load_scene, simulate
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.host.figures import BLUE, save_figure, styled
 from sst_ros.report.results import data_frame, markdown, processor
@@ -37,7 +38,7 @@ ROUNDS, STARTS = 9, 3
 LONGEST_S = 600.0
 """Processor time that `make test` may take: five minutes of two cores."""
 
-FIRST = "from sst_ros import Simulation; Simulation('example2', compiled=True).step((0, 0, 0), 1)"
+FIRST = "from sst_ros import Simulation; Simulation('example2').step((0, 0, 0), 1)"
 
 
 def _turns(calls: dict[str, Callable[[], Any]], clock: Any = time.process_time) -> float:
@@ -64,19 +65,20 @@ def track_kernel_over_c() -> float:
     with tempfile.TemporaryDirectory() as folder:
         y = [*start.quaternion, *start.body_rate]
         calls = kernel._calls(ODE(Dynamics.of(scene), scene.torque), y, Path(folder))
-        return _turns({who: calls["dop853 step", who] for who in (kernel.NUMBA, "C -O3")})
+        return _turns({who: calls["dop853 step", who] for who in (kernel.LLVM, "C -O3")})
 
 
-def track_prepared_run_over_bound() -> float:
-    floor, run = find_floor(Task(), (1e-9,)), prepare("example2_heavy", method="gauss").run
+def track_simulate_over_bound() -> float:
+    floor, run = find_floor(Task(), (1e-9,)), partial(simulate, load_scene("example2_heavy"))
     assert floor.seconds is not None
     taken = median(time_in_turn({"": run}, ROUNDS, clock=time.process_time)[""])
     return taken / (floor.evaluations[1e-9] * floor.seconds)
 
 
-def track_simulate_over_prepared_run() -> float:
-    given: Any = {"scene": load_scene("example2_heavy"), "method": "gauss", "tolerance": 1e-9}
-    return _turns({"simulate": partial(simulate, **given), "run": prepare(**given).run})
+def track_simulate_over_its_steps() -> float:
+    scene = load_scene("example2_heavy")
+    given: Any = {"scene": scene, "method": "dop853", "tolerance": 1e-9}
+    return _turns({"simulate": partial(simulate, **given), "steps": own_steps(**given)})
 
 
 def track_batch_over_c_simd() -> float:
@@ -102,10 +104,8 @@ def track_node_over_bare_loop() -> float:
     return node / loop
 
 
-def track_first_compiled_step_over_later() -> float:
-    with tempfile.TemporaryDirectory() as one:
-        first = _used_by("-c", FIRST, starts=1, SST_ROS_CACHE=one)
-        return first / _used_by("-c", FIRST, SST_ROS_CACHE=one)
+def track_first_step_over_import_of_numpy() -> float:
+    return _used_by("-c", FIRST) / _used_by("-c", "import numpy")
 
 
 def track_command_over_import_of_numpy() -> float:

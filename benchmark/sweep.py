@@ -43,7 +43,7 @@ def study_of(rows: int) -> SweepStudy:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print; the exit status is 0."""
     options = read_options("sweep", __doc__, arguments, rows=1_000_000)
-    found: dict[str, Any] = {"machine": describe_machine("numpy", "numba", "dask", "pyarrow")}
+    found: dict[str, Any] = {"machine": describe_machine("numpy", "llvmlite", "dask", "pyarrow")}
     began = time.perf_counter()
     sweep("example2_heavy", VARY, n=1000, progress=False)
     found["seconds of the first 1,000 rows, imports and code"] = time.perf_counter() - began
@@ -89,7 +89,7 @@ def _arrays(ready: PreparedSweep) -> tuple[Any, list[Any]]:
     values = study.draw(0, study.rows)
     scenarios, _, _ = ready.scenarios(values)
     batch = ready.batch.with_parameters(scenarios)
-    y, code = batch.start(study.scene.initial.gamma, (0.0, 0.0, 0.0))
+    y, code = batch.initial(study.scene.initial.gamma, (0.0, 0.0, 0.0))
     return batch, [y, batch.drives((0.0, 0.0, 0.0), study.rows), code]
 
 

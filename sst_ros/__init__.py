@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from sst_ros.scene.torque_profile import PolynomialTorque as PolynomialTorque
     from sst_ros.scene.torque_profile import SineTorque as SineTorque
     from sst_ros.scene.torque_profile import TorqueTable as TorqueTable
-    from sst_ros.simulation.simulate import prepare as prepare
     from sst_ros.simulation.simulate import simulate as simulate
     from sst_ros.simulation.simulation import Simulation as Simulation
     from sst_ros.simulation.trajectory import Trajectory as Trajectory
@@ -77,7 +76,7 @@ _MODULES = {
     "scene.bodies": "arc_inertia",
     "scene.scene": "Scene load_scene:scene_of",
     "scene.torque_profile": "PolynomialTorque SineTorque TorqueTable",
-    "simulation.simulate": "prepare simulate",
+    "simulation.simulate": "simulate",
     "simulation.simulation": "Simulation",
     "simulation.trajectory": "Trajectory",
     "state": "State",

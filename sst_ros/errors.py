@@ -264,11 +264,16 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
 
 EXTRAS = dict.fromkeys(("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard"), "record")
-EXTRAS |= {"distributed": "cluster", "matplotlib": "plot", "numba": "fast", "pinocchio": "engines"}
+EXTRAS |= {
+    "distributed": "cluster",
+    "llvmlite": "fast",
+    "matplotlib": "plot",
+    "pinocchio": "engines",
+}
 EXTRAS |= {"control": "control", "flint": "proof", "viser": "view", "xarray": "all"}
 """Extra of this package that installs a module."""
 
-_APT = ("lz4", "matplotlib", "numba", "pandas", "xarray", "zstandard")
+_APT = ("llvmlite", "lz4", "matplotlib", "pandas", "xarray", "zstandard")
 _PIP = {**dict.fromkeys(("mcap", "rosbags"), "mcap rosbags"), "distributed": "dask[distributed]"}
 _PIP |= {"flint": "python-flint", "pinocchio": "pin"}
 _ROS = ("ament_index_python", "rclpy", "rcl_interfaces", "builtin_interfaces", "launch")

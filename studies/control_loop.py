@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from sst_ros.control.actuator_space import Reference, ReferenceMotion
 from sst_ros.control.controller import ChannelState, Controller, ControlStopped, Track, track_of
 from sst_ros.errors import RunStopped
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime, TickLoop
 from sst_ros.runtime.torque_input import RunSettings
@@ -170,7 +169,7 @@ def run_loop(loop: ControlLoop) -> tuple[Track, NDArray[np.bool_], str]:
     """
     period = loop.period_ns / NANOSECONDS
     plant = at_start(loop.plant, loop.motion, loop.offset)
-    simulation = Simulation(plant, compiled=numba_version() is not None)
+    simulation = Simulation(plant)
     controller = Controller(loop.model, loop.motion, loop.settings, period)
     channel = ChannelState(loop.settings, loop.seed)
     rows, limited, failure = [], [], ""

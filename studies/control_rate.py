@@ -21,7 +21,6 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, VERMILION, styled
 from sst_ros.host.many_runs import run_many
 from sst_ros.integration.methods import METHODS
@@ -68,9 +67,7 @@ Run = tuple[NDArray[np.int64], Array, float, float]
 [rad], median processor time of a tick [s]."""
 
 
-def run_controlled(
-    scene: Scene, seconds: float, rate: int, method: str, hold: str, *, compiled: bool = True
-) -> Run:
+def run_controlled(scene: Scene, seconds: float, rate: int, method: str, hold: str) -> Run:
     """Run a scene with torques at a control rate [Hz], a divisor of 1e9, with a sample a tick.
 
     Raises:
@@ -86,8 +83,7 @@ def run_controlled(
             return profile
         return profile.at((simulation.time_ns + shift_ns) / NANOSECONDS)
 
-    fast = compiled and numba_version() is not None
-    simulation = Simulation(scene, method, tolerance=TOLERANCE, compiled=fast)
+    simulation = Simulation(scene, method, tolerance=TOLERANCE)
     ticks = math.floor(seconds * rate + 1e-6)
     states, times = run_in_loop(simulation, torque, period_ns, ticks, warm=True)
     times_ns = np.array([state.time_ns for state in states])
@@ -140,7 +136,6 @@ def control_study(
     *,
     rates: Sequence[int] = RATES,
     methods: Sequence[str] = tuple(METHODS),
-    compiled: bool = True,
     shown: bool = False,
 ) -> ControlStudy:
     """Run the grid, one point after another: processor times are those of a core that is free.
@@ -161,7 +156,7 @@ def control_study(
     points, rows = list(itertools.product(rates, methods, HOLDS)), []
 
     def run_one(point: tuple[int, str, str]) -> Run:
-        return run_controlled(scene, problem.seconds, *point, compiled=compiled)
+        return run_controlled(scene, problem.seconds, *point)
 
     for number, found in run_many(run_one, points, label=f"{scene.name:<16}" * shown):
         rate, method, hold = points[number]

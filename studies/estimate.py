@@ -24,15 +24,13 @@ from sst_ros.host.figures import BLUE, VERMILION, styled
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.report.results import data_frame, publish, render
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulate import METHODS
+from sst_ros.simulation.simulation import INTEGRATORS
 from studies import DOCS, PAGES, run, run_jobs
 from studies.sixty_digits import Motion, angle
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-COLLOCATED = ("smooth", "sharp_friction", "lag", "rotor")
-"""Classes that Gauss collocation takes."""
 TIGHTER = 1e-3
 FINEST, ROUNDING = 1e-13, 2e-14
 """Least tolerance of a reference, and error below which rounding decides [rad]."""
@@ -172,8 +170,7 @@ def measure(job: tuple[str, int, int]) -> dict[str, Any]:
     """Run one case; the row has its estimate and, where it can be resolved, its true error."""
     name, seed, number = job
     rng = np.random.default_rng([seed, number, *name.encode()])
-    methods = METHODS if name in COLLOCATED else [m for m in METHODS if m != "gauss"]
-    method, tolerance = str(rng.choice(methods)), _log(rng, 1e-11, 1e-4)
+    method, tolerance = str(rng.choice(INTEGRATORS)), _log(rng, 1e-11, 1e-4)
     row = {"class": name, "seed": seed, "number": number, "method": method, "tolerance": tolerance}
     try:
         case = CLASSES[name](rng)
@@ -208,7 +205,7 @@ def compare_bounds(job: tuple[int, int]) -> dict[str, Any]:
     """Run a smooth case: true error by 60 digits, estimate, and proven bound of the error [rad]."""
     seed, number = job
     rng = np.random.default_rng([seed, number, *b"proof"])
-    method, tolerance, case = str(rng.choice(METHODS)), _log(rng, 1e-11, 1e-4), smooth(rng)
+    method, tolerance, case = str(rng.choice(INTEGRATORS)), _log(rng, 1e-11, 1e-4), smooth(rng)
     given: dict[str, Any] = {"method": method, "tolerance": tolerance}
     at_end = [case.duration]
     proven = certify(case.scene, case.torque, case.duration, t_eval=at_end, **given)
@@ -279,7 +276,7 @@ def draw(rows: DataFrame, seeds: Sequence[int]) -> Figure:
 def write_page(rows: DataFrame, bounds: DataFrame, seeds: Sequence[int], **given: Any) -> str:
     """Return the page in Markdown."""
     tables = [summarise(rows[rows.seed == seed]) for seed in seeds]
-    given |= {"tables": tables, "bounds": summarise_bounds(bounds), "methods": METHODS}
+    given |= {"tables": tables, "bounds": summarise_bounds(bounds), "methods": INTEGRATORS}
     return render(PAGES / "estimate.md", **given)
 
 

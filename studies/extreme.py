@@ -18,12 +18,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
-from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import METHODS, Method, Rosenbrock
+from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET
+from sst_ros.programs.llvm import llvmlite_version
 from sst_ros.report.accuracy import proven_error
 from sst_ros.report.results import data_frame, publish, records, render
 from sst_ros.report.scene_summary import eigenvalues, stability_function, step_advice
@@ -93,9 +94,9 @@ class CaseResult:
     loose_error: float | None = None  # true error at a loose tolerance [rad]
     loose_estimate: float | None = None  # its estimate [rad]
     check: str = ""  # what the estimate was found to be, or why it cannot be checked
-    wall_s: float | None = None  # time of the interpreted run [s]
-    compiled_s: float | None = None  # time of the compiled run, compilation included [s]
-    same_bits: bool | None = None  # the compiled run ended in the same bits, or error
+    wall_s: float | None = None  # time of the run in plain Python [s]
+    compiled_s: float | None = None  # time of the run, compilation included [s]
+    same_bits: bool | None = None  # plain Python ended in the same bits, or error
     run_loop: bool | None = None  # so did that through the loop of the node
     proven: str = ""  # what the error of `simulate` is proven to be below, or why it is not
     correct: bool = False  # the result is the truth, and the error estimate holds
@@ -106,9 +107,7 @@ class CaseResult:
         return self.correct and self.same_bits is not False and self.run_loop is not False
 
 
-def run_case(
-    case: Case, *, compiled: bool = False, tolerance: float | None = None, looped: bool = False
-) -> CaseRun:
+def run_case(case: Case, *, tolerance: float | None = None, looped: bool = False) -> CaseRun:
     """Run a case, also through the tick loop of the node; refusals are results.
 
     A given tolerance allows steps of any length.
@@ -116,14 +115,14 @@ def run_case(
     simulation = None
     try:
         simulation = Simulation(
-            case.scene(), case.integrator, tolerance=tolerance or 1e-10, compiled=compiled,
+            case.scene(), case.integrator, tolerance=tolerance or 1e-10,
             step_budget=WHOLE_MOTION_BUDGET,
         )  # fmt: skip
         if looped:
             run_in_loop(simulation, case.torque_at, case.period_ns, case.steps)
         elif not callable(case.torque) and tolerance is not None:
             simulation.step(case.torque, case.steps * case.period_ns)
-        elif not callable(case.torque) and compiled:
+        elif not callable(case.torque):
             simulation.steps(case.torque, case.period_ns, case.steps)
         else:
             for _ in range(case.steps):
@@ -133,26 +132,25 @@ def run_case(
     return CaseRun(simulation, None)
 
 
-def evaluate_case(case: Case, *, compiled: bool = True) -> CaseResult:
-    """Run a case, compare it with the truth, with the tick loop, and with its compiled run."""
-    jit = numba_version() is not None and (compiled or case.compiled_only)
+def evaluate_case(case: Case, *, plain: bool = True) -> CaseResult:
+    """Run a case, compare it with the truth, with the tick loop, and with plain Python."""
     began = time.perf_counter()
-    first = run_case(case, compiled=case.compiled_only and jit)
-    clock = "compiled_s" if case.compiled_only else "wall_s"
-    found: dict[str, Any] = {clock: time.perf_counter() - began}
+    first = run_case(case)
+    found: dict[str, Any] = {"compiled_s": time.perf_counter() - began}
     deviation, correct, result = _judge(case, first)
     check = estimate_check(case, first)
     remarks = [result]
     if first.simulation is not None:
         found |= _measure_end(first.simulation)
-        if not case.compiled_only:
+        if not case.long:
             found["run_loop"] = first.same_as(run_case(case, looped=True))
             remarks += [] if found["run_loop"] else ["the run loop differs"]
-            if jit:
+            if plain and llvmlite_version() is not None:
                 began = time.perf_counter()
-                found["same_bits"] = first.same_as(run_case(case, compiled=True))
-                found["compiled_s"] = time.perf_counter() - began
-                remarks += [] if found["same_bits"] else ["the compiled run differs"]
+                with without_llvmlite():
+                    found["same_bits"] = first.same_as(run_case(case))
+                found["wall_s"] = time.perf_counter() - began
+                remarks += [] if found["same_bits"] else ["plain Python differs"]
     remarks += [] if check.holds else [f"error estimate: {check.verdict}"]
     return CaseResult(
         case.name, case.group, case.difficulty, case.expected, case.bound, "; ".join(remarks),
@@ -218,7 +216,7 @@ def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
 
 def report(out: Path, *, long: bool = False) -> bool:
     """Run all cases, with `long` those of minutes, too; write the page; whether all passed."""
-    jobs = [number for number, case in enumerate(catalogue()) if long or not case.compiled_only]
+    jobs = [number for number, case in enumerate(catalogue()) if long or not case.long]
     cases = run_jobs(_evaluate, jobs[::-1], "extreme cases   ")[::-1]
     print(page(cases))
     table = data_frame(asdict(case) | {"passed": case.passed} for case in cases)
@@ -237,7 +235,7 @@ def prove_case(case: Case) -> str:
     """Say what the error of `simulate` is proven to be below at twenty instants, or why not."""
     if case.refusal and case.stop_time is None:
         return "-: there is no motion"
-    if case.feedback or case.compiled_only:
+    if case.feedback or case.long:
         return f"-: {case.estimate or 'its torques answer the motion'}"
     torque: Any = case.torque
     if callable(torque):
@@ -279,9 +277,9 @@ def _row(case: CaseResult) -> dict[str, str]:
         "true error": number(case.loose_error),
         "estimate": ("" if case.loose_estimate is None else f"{case.loose_estimate:.0e}: ")
         + case.check,
-        "interpreted [s]": number(case.wall_s, ".2f") if case.wall_s else "compiled only",
+        "plain Python [s]": number(case.wall_s, ".2f") if case.wall_s else "-",
         "compiled [s]": number(case.compiled_s, ".2f"),
-        "bits compiled": bits[case.same_bits],
+        "bits of plain Python": bits[case.same_bits],
         "run loop": bits[case.run_loop],
     }  # fmt: skip
 

@@ -19,7 +19,7 @@ from functools import cache, partial
 from typing import Any
 
 from sst_ros.errors import RunStopped
-from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
+from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
@@ -52,7 +52,7 @@ class Case:
     base: str = "example2_heavy"
     integrator: str = "auto"
     feedback: bool = False  # the torque reads the simulation
-    compiled_only: bool = False  # too long for plain Python; run by `studies.extreme --long` alone
+    long: bool = False  # takes minutes; run by `studies.extreme --long` alone
     loose: float | None = LOOSE  # tolerance of the check of the estimate; None for none
     estimate: str = ""  # why `loose` is not LOOSE
 
@@ -363,10 +363,10 @@ def _groups() -> Iterator[tuple[str, str, Iterable[Case]]]:
         *(Case(f"1e5 s of swinging, {method}, steps of {ms} ms", {}, REST, 10**8 // ms, ms * MS,
                "energy is constant [J], of 1.14 J", residuals, bound,
                "millions of steps: rounding adds up, truncation of RK4 drifts", base="swing",
-               integrator=method, compiled_only=True, loose=None, estimate=ONE_RUN)
+               integrator=method, long=True, loose=None, estimate=ONE_RUN)
           for method, ms, bound in (("dop853", 10, 1e-10), ("rk4", 5, 1e-3))),
         Case("a thousand contacts", make.bouncing_thrice(1e4, 20.0), REST, 250, 100 * MS,
              *ENERGY, 1e-7, "each contact is located; their errors add up",
-             compiled_only=True, loose=None, estimate=UNSTABLE),
+             long=True, loose=None, estimate=UNSTABLE),
     ]
 # fmt: on

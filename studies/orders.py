@@ -18,16 +18,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros import Simulation, SineTorque, Trajectory, simulate
-from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.errors import InputError
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.figures import GREY, INK, MARKERS, styled
-from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import METHODS
-from sst_ros.mechanism.geometry import Array, Geometry, angle_between
+from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET
+from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.report.results import data_frame, publish, render
-from sst_ros.simulation.simulate_gauss import GAUSS, NODES, Collocation, PreparedMotion
 from studies import DOCS, PAGES, run, run_jobs
 from studies.extreme_scenes import FREE, Changes, bouncing, changed
 from studies.sampled_data import slope
@@ -35,8 +30,8 @@ from studies.sampled_data import slope
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-ALL = (*METHODS, GAUSS)
-ORDER = {name: method.order for name, method in METHODS.items()} | {GAUSS: 2 * NODES}
+ALL = tuple(METHODS)
+ORDER = {name: method.order for name, method in METHODS.items()}
 SINE = SineTorque(amplitude=(2.0, 1.5, 1.0), frequency=(5.0, 7.0, 9.0), phase=(0.0, 1.0, 2.0))
 LIMIT = 1.0
 """Limit of the actuators in the scene with a clamp [N m]."""
@@ -125,51 +120,31 @@ def measure_steps(job: tuple[str, str]) -> list[Row]:
     rows = []
     for count in STEPS:
         h = motion.duration / count
-        if method == GAUSS:
-            end = _collocate(motion, h, count)
-        else:  # a loose tolerance leaves the steps alone
-            found = motion.run(method, 1e3, max_step=h)
-            end = found.quaternion[-1] if found.status == 0 else None
-        if end is not None:
+        # A loose tolerance leaves the steps alone.
+        solution = motion.run(method, 1e3, max_step=h)
+        if solution.status == 0:
+            end = solution.quaternion[-1]
             error = float(angle_between(end, exact.quaternion[-1]))
             rows.append(Row("step", name, method, h, error, known))
     return rows
-
-
-def _collocate(motion: Motion, h: float, count: int) -> Array | None:
-    """Return the orientation after steps of collocation; None where it has no such motion."""
-    scene = changed(motion.changes)
-    if motion.torque is not SINE or scene.torque_limit is not None:
-        return None
-    start = *initial_state(scene, Geometry.of(scene)), *(0.0,) * (3 if scene.lags else 0)
-    method = Collocation(ODE(Dynamics.of(scene), SINE), NODES, compiled=False)
-    steps = PreparedMotion(method, count, 20)
-    steps.begin(0.0, h, start)
-    try:
-        return steps.states[-1, :4] if steps.run() < 1e-3 else None
-    except (ArithmeticError, ValueError):
-        return None
 
 
 def measure_tolerance(job: tuple[str, str, float]) -> list[Row]:
     """Run a motion by a method and a tolerance: errors of samples, or of the time it stops."""
     name, method, tolerance = job
     motion, found = MOTIONS[name], {}
-    try:
-        if name == "stop":
-            exact, other = map(_stop_time, ("dop853", "dopri5"), (TIGHTEST, TIGHTEST))
-            found["stop"] = abs(_stop_time(method, tolerance) - exact)
-            known = max(abs(exact - other), 1e-12)  # digits of the message
-        elif name == "contact":
-            end, known = truth(name)
-            found["contact"] = _largest(motion.run(method, tolerance), end)
-        else:
-            samples, known = truth(name, 300)
-            sampled = motion.run(method, tolerance, t_eval=samples.t)
-            between = motion.run(method, tolerance, t_eval=None).at(samples.t)
-            found |= {"t_eval": _largest(sampled, samples), "at": _largest(between, samples)}
-    except InputError:  # collocation does not take it
-        return []
+    if name == "stop":
+        exact, other = map(_stop_time, ("dop853", "dopri5"), (TIGHTEST, TIGHTEST))
+        found["stop"] = abs(_stop_time(method, tolerance) - exact)
+        known = max(abs(exact - other), 1e-12)  # digits of the message
+    elif name == "contact":
+        end, known = truth(name)
+        found["contact"] = _largest(motion.run(method, tolerance), end)
+    else:
+        samples, known = truth(name, 300)
+        sampled = motion.run(method, tolerance, t_eval=samples.t)
+        between = motion.run(method, tolerance, t_eval=None).at(samples.t)
+        found |= {"t_eval": _largest(sampled, samples), "at": _largest(between, samples)}
     return [Row(of, name, method, tolerance, error, known) for of, error in found.items()]
 
 
@@ -187,8 +162,7 @@ def _largest(found: Trajectory, exact: Trajectory) -> float:
 def measure_energy(job: tuple[str, float]) -> list[Row]:
     """Run `swing`, without friction, for some seconds by a method: its energy residual [J]."""
     method, seconds = job
-    simulation = Simulation("swing", method, compiled=numba_version() is not None,
-                            step_budget=WHOLE_MOTION_BUDGET)  # fmt: skip
+    simulation = Simulation("swing", method, step_budget=WHOLE_MOTION_BUDGET)
     rows, done = [], 0
     for count in np.unique(np.geomspace(10, 1e9 * seconds / PERIOD_NS, 90).astype(int)).tolist():
         simulation.steps((0.0, 0.0, 0.0), PERIOD_NS, count - done)

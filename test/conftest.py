@@ -6,15 +6,11 @@ import os
 # Before NumPy is imported: OpenBLAS's threads wait for each other where workers share the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from types import SimpleNamespace
-
 import hypothesis
 import pytest
 from bags import bags, example2, example2_bag, read, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
-from sst_ros.host import compiled_module
-from sst_ros.integration import batch, simd_source
 
 # By its default an example of 0.2 s is a failure: on a loaded machine any may take that long.
 hypothesis.settings.register_profile("untimed", deadline=None)
@@ -39,34 +35,6 @@ def browser():
 
     with browse() as started:
         yield started
-
-
-def interpret_batches(monkeypatch):
-    """Have batches and sweeps run by the interpreter, in narrow blocks: what numba compiles."""
-    from sst_ros.sweeps import controlled_batch
-
-    def load(texts, constants, **_):
-        return compiled_module.load(["import numpy as np", *texts], constants, numba=False)
-
-    plain = SimpleNamespace(load=load, numba_version=compiled_module.numba_version)
-    for module in (batch, controlled_batch):
-        monkeypatch.setattr(module, "compiled_module", plain)
-    for module in (batch, simd_source, controlled_batch):
-        monkeypatch.setattr(module, "SIMD_WIDTH", 4)
-
-
-@pytest.fixture
-def interpreted(monkeypatch):
-    """Batches and sweeps are interpreted: to compile one takes 20 s of the processor."""
-    interpret_batches(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def interpreted_module():
-    """Batches and sweeps are interpreted in a whole module."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        interpret_batches(monkeypatch)
-        yield
 
 
 @pytest.fixture

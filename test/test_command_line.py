@@ -37,7 +37,7 @@ def status(words):
 sys.exit(max(map(status, {commands!r})))
 """
 OPTIONAL = (
-    "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "numba",
+    "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "llvmlite",
 )  # fmt: skip
 
 TOP = [name for name in COMMANDS if " " not in name]
@@ -97,7 +97,7 @@ def test_the_version_is_that_of_the_package(capsys):
         *((["view", "bag", "--port", port], "must be a whole number from 1024 to 65535")
           for port in ("-1", "0", "65536", "http")),
         (["simulate", "example2", "--samples", "0"], "must be a whole number from 1 to 10000000"),
-        (["compile", "--integrator", "rk5"], "did you mean 'rk4'?"),
+        (["identify", "bag", "--method", "inverse"], "did you mean 'inverse_dynamics'?"),
         (["demo", "feedforward", "--mode", "pdd"], "did you mean 'pd'?"),
         (["demo", "--scene", "swing"], "are options of `demo feedforward`"),
     ],
@@ -199,7 +199,6 @@ NEEDED = {
     "matplotlib": ["workspace example2", "simulate example2 --plot"],
     "pyarrow": ["simulate example2 --out x.parquet"],
     "viser": ["view bag", "view --scene swing"],
-    "numba": ["compile"],
 }
 
 

@@ -41,7 +41,7 @@ def made(bag):
     )
 
 
-def test_each_object_says_in_ten_lines_what_its_table_says(example2_bag, interpreted):
+def test_each_object_says_in_ten_lines_what_its_table_says(example2_bag):
     pytest.importorskip("flint")
     objects = list(made(example2_bag))
     explained = {*Explained.__subclasses__(), *MotionTable.__subclasses__()} - {MotionTable}

@@ -4,7 +4,7 @@
 import pytest
 from programs import python
 
-HEAVY = {"scipy", "matplotlib", "numba", "rclpy", "pandas", "rosbags", "dask"}
+HEAVY = {"scipy", "matplotlib", "llvmlite", "numba", "rclpy", "pandas", "rosbags", "dask"}
 DOCUMENTS = {"cli", "description", "dynamics", "host", "mechanism", "nodes", "scene"}
 """Rooms that a command needs which prints documents; of `nodes` the handler of signals."""
 COMMAND = "from sst_ros.__main__ import main; main({!r})"
@@ -15,7 +15,7 @@ RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_0
     ("program", "rooms", "excluded"),
     [
         pytest.param("import sst_ros", set(), HEAVY | {"numpy", "yaml"}, id="package"),
-        pytest.param(RUN, None, HEAVY, id="a run"),
+        pytest.param(RUN, None, HEAVY - {"llvmlite"}, id="a run"),
         pytest.param(COMMAND.format(["scene", "list"]), DOCUMENTS, HEAVY, id="scene list"),
         pytest.param(COMMAND.format(["scene", "schema"]), DOCUMENTS, HEAVY, id="scene schema"),
         pytest.param(COMMAND.format(["describe"]), DOCUMENTS, HEAVY, id="describe"),
@@ -35,7 +35,7 @@ STEPS = """
 import sys
 from sst_ros import Simulation
 from sst_ros.errors import RunStopped
-simulation = Simulation("{scene}", compiled=False)
+simulation = Simulation("{scene}")
 simulation.load_code()
 before = set(sys.modules)
 try:

@@ -23,8 +23,9 @@ ROOT = Path(__file__).parents[1]
 
 MARKDOWN = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 RST = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
-_SAME = "argcomplete hypothesis jinja2 jsonschema matplotlib numba numpy pandas pytest scipy"
+_SAME = "argcomplete hypothesis jinja2 jsonschema matplotlib numpy pandas pytest scipy"
 PYTHON_KEYS = {name: f"python3-{name}" for name in (*_SAME.split(), "pytest-timeout")} | {
+    "llvmlite": "python3-numba",  # which needs llvmlite, that has no key
     "mpmath": "python3-sympy",  # which needs mpmath
     "PyYAML": "python3-yaml",
 }

@@ -11,11 +11,9 @@ import yaml
 from programs import python
 
 import sst_ros
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.scene.yaml_document import dump
 
 PAGES = Path(__file__).parents[1] / "docs" / "api"
-needs_numba = pytest.mark.skipif(numba_version() is None, reason="needs numba")
 NAMES = [name for name in sst_ros.__all__ if name != "__version__"]
 SCRIPT = """
 import numpy as np
@@ -53,7 +51,7 @@ def test_each_name_has_a_docstring_and_one_entry_in_the_reference(name):
         sst_ros.reference_motion,
         partial(sst_ros.distance_to_singularity, gamma=[0.8, 0.7, 0.8]),
         partial(sst_ros.equilibrium, gamma=[0.8, 0.7, 0.8]),
-        pytest.param(sst_ros.Batch, marks=needs_numba),
+        sst_ros.Batch,
     ],
 )
 def test_a_scene_is_its_name_its_document_or_a_scene(make):

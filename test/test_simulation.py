@@ -25,7 +25,6 @@ from sst_ros.errors import (
     StrokeExceeded,
     WorkspaceLeft,
 )
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.scene.bodies import Workspace
 from sst_ros.scene.loads import Actuators, Initial, Moment
@@ -203,22 +202,14 @@ def test_what_the_same_constants_move_is_traced_once():
     assert Simulation(load("swing")).dynamics is not again.dynamics
 
 
-@pytest.mark.skipif(numba_version() is None, reason="needs numba")
-def test_a_torque_function_in_a_compiled_simulation_warns_once_and_a_sine_never():
-    simulation, plain = Simulation(EXAMPLE2, compiled=True), Simulation(EXAMPLE2)
+def test_no_torque_gives_a_warning_and_a_wrong_one_is_refused():
+    simulation = Simulation(EXAMPLE2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for one in (simulation, plain):
-            one.steps(EXAMPLE2.torque, 10 * MILLISECOND, 50)
-    assert simulation.state == plain.state
-    assert simulation.error_estimate == plain.error_estimate
-    with pytest.warns(RuntimeWarning, match="a torque function runs in plain Python") as caught:
-        for one in (simulation, simulation, plain, plain):
-            one.step(lambda t: (t, 0.0, 1.0), MILLISECOND)
-    assert len(caught) == 1
-    assert simulation.state == plain.state
+        simulation.steps(EXAMPLE2.torque, 10 * MILLISECOND, 50)
+        simulation.step(lambda t: (t, 0.0, 1.0), MILLISECOND)
     with pytest.raises(InputError, match="must return three torques"):  # and not Diverged
-        plain.step(lambda t: (t, t), MILLISECOND)
+        simulation.step(lambda t: (t, t), MILLISECOND)
 
 
 LIMITED = replace(EXAMPLE2, actuators=Actuators(torque_limit=2.0))
@@ -247,10 +238,12 @@ def test_a_torque_moves_as_its_function_does(scene, torque, within):
 
 BITS = """
 import json, sys
+if %s:
+    sys.modules["llvmlite"] = None
 from sst_ros import Simulation
 found = {}
 for name in ("example2", "gravity_payload", "fast_spin"):
-    simulation = Simulation(name, "dopri5", compiled=%s)
+    simulation = Simulation(name, "dopri5")
     states = [simulation.step((0.1, -0.05, 0.02), 1_000_000) for _ in range(100)]
     found[name] = [*states[-1].quaternion, *states[-1].body_rate]
 print(json.dumps(found))
@@ -260,11 +253,9 @@ print(json.dumps(found))
 @pytest.mark.slow
 def test_bits_depend_on_the_c_library_only_as_the_page_on_lockstep_says():
     """glibc chooses sin, cos and atan2 by FMA and AVX2; LLVM's target changes nothing."""
-    if numba_version() is None:
-        pytest.skip("needs numba: pip install .[fast]")
+    pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     without = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
-    generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
-    plain, other = (json.loads(python(BITS % False, env=env).stdout) for env in ({}, without))
-    assert json.loads(python(BITS % True, env=generic).stdout) == plain
+    plain, other = (json.loads(python(BITS % True, env=env).stdout) for env in ({}, without))
+    assert json.loads(python(BITS % False, env={}).stdout) == plain
     for name, row in plain.items():
         np.testing.assert_allclose(other[name], row, rtol=1e-11, atol=1e-13)

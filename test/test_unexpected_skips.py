@@ -25,9 +25,9 @@ MODULE = "import pytest\npytest.importorskip('no_such_module')\n"
     ("source", "ci", "workers", "status"),
     [
         (TEST.format(reason="no chromium with chromedriver on the PATH"), "true", (), 0),
-        (TEST.format(reason="numba is missing"), "true", (), 1),
-        (TEST.format(reason="numba is missing"), "true", ("-n", "1"), 1),
-        (TEST.format(reason="numba is missing"), "false", (), 0),
+        (TEST.format(reason="llvmlite is missing"), "true", (), 1),
+        (TEST.format(reason="llvmlite is missing"), "true", ("-n", "1"), 1),
+        (TEST.format(reason="llvmlite is missing"), "false", (), 0),
         (MODULE, "true", (), 1),
     ],
     ids=["expected", "unexpected", "of a worker", "elsewhere", "module"],

@@ -64,9 +64,8 @@ def of(**arguments):
 
 
 @pytest.fixture(scope="module")
-def calls(interpreted_module):
+def calls():
     """Public functions, and methods of what they give, with arguments that are right."""
-    pytest.importorskip("numba")
     pytest.importorskip("flint")
     geometry, settings = sst_ros.Geometry.of(SCENE), sst_ros.ControllerSettings()
     run, motion = simulate(**TASK), sst_ros.reference_motion(MOVING)
@@ -90,7 +89,6 @@ def calls(interpreted_module):
     return [
         (simulate, TASK),
         (simulate, TASK | {"torque": lambda t: REST, "control_period": 1e-3}),
-        (sst_ros.prepare, TASK),
         (sst_ros.certify, PROOF),
         (load_scene, of(scene="example2")),
         (SCENE.with_values, of(values={"star.mass": 1.0})),

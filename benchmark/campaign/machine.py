@@ -25,7 +25,7 @@ from benchmark.campaign.ledger import Ledger
 from sst_ros import Trajectory, simulate
 from sst_ros.recording import recording
 
-RUNS = (("example2", "gauss"), ("friction", "dop853"), ("stiff", "auto"), ("elastic_stops", "auto"))
+RUNS = (("example2", "auto"), ("friction", "dop853"), ("stiff", "auto"), ("elastic_stops", "auto"))
 
 
 def run(number: int) -> bytes:

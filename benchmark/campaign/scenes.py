@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import yaml
 
 from benchmark.campaign.ledger import Ledger
+from benchmark.plain_python import without_llvmlite
 from sst_ros import Simulation
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene.scene import Scene, text_of
@@ -117,19 +118,21 @@ def estimates(ledger: Ledger) -> None:
 
 
 def bits(ledger: Ledger) -> None:
-    """Simulate random scenes interpreted and compiled: not one bit may differ."""
+    """Simulate random scenes as machine code and as plain Python: not one bit may differ."""
     rng = random.Random(ledger.seed + 1)
     for number in ledger.numbers(200):
         name = f"scene {number} (seed {ledger.seed + 1})"
-        # Compiling takes seconds, for `auto` that of three methods.
         method = rng.choice(("rk4", "dopri5", "dop853", "rodas5p")) if number % 10 else "auto"
         with ledger.case(f"{name} {method}", bound=120.0), warnings.catch_warnings():
             warnings.simplefilter("error")
             scene = random_scene(rng)
-            runs = [Simulation(scene, method, compiled=compiled) for compiled in (False, True)]
             torque = rng.uniform(-2, 2), rng.uniform(-2, 2), rng.uniform(-2, 2)
-            for _ in range(40):
-                plain, fast = (run.step(torque, PERIOD_NS) for run in runs)
+            run = Simulation(scene, method)
+            fast_states = [run.step(torque, PERIOD_NS) for _ in range(40)]
+            with without_llvmlite():
+                run = Simulation(scene, method)
+                plain_states = [run.step(torque, PERIOD_NS) for _ in range(40)]
+            for plain, fast in zip(plain_states, fast_states, strict=True):
                 if plain != fast:
                     ledger.found("silent", f"{name} {method}: bits differ at {plain.time_ns} ns")
                     break

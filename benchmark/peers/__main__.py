@@ -18,10 +18,10 @@ from benchmark.peers import results
 from benchmark.peers.floor import find_floor
 from benchmark.peers.study import TARGETS, Series, run_study, solve_task
 from benchmark.peers.task import Task
-from sst_ros.host.compiled_module import numba_version
+from sst_ros.programs.llvm import llvmlite_version
 
 MODULES = {
-    "ours": "numba",
+    "ours": "llvmlite",
     "mujoco_peer": "mujoco",
     "pinocchio_peer": "pinocchio",
     "scipy_peer": "scipy",
@@ -38,8 +38,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=DOCS, help="folder of peers.md and the rest")
     parser.add_argument("--no-page", action="store_true", help="table on the terminal only")
     options = parser.parse_args(arguments)
-    if numba_version() is None:
-        parser.error("needs numba, which compiles our side and MuJoCo's torques: pip install numba")
+    if llvmlite_version() is None:
+        parser.error("needs llvmlite, which compiles our side: pip install llvmlite")
     begin = time.monotonic()
     task = Task()
     series, missing = collect(task, options.quick, options.only)

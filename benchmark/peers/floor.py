@@ -23,8 +23,9 @@ from numpy.polynomial import legendre
 from benchmark import c_floor
 from benchmark.measure import time_in_turn
 from benchmark.peers.task import DURATION, Task
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, RK4
+from sst_ros.integration.point import Drive
 from sst_ros.mechanism.geometry import rotation_matrix
 
 _STEPS = 400
@@ -46,7 +47,7 @@ def find_floor(task: Task, targets: tuple[float, ...]) -> Floor:
 
 def _needed(task: Task, target: float) -> int:
     """Fewest nodes whose polynomial of W_dot turns the star to within the error."""
-    machine = CompiledMethod(task.system, DOP853, compiled=True)
+    machine = MethodSteps(task.system, DOP853)
     names: dict[str, Any] = {}
     exec("from math import cos, sin, sqrt, tanh\n" + task.system.program.source("rhs"), names)
     x, weights = legendre.leggauss(_MOST)
@@ -67,11 +68,11 @@ def _needed(task: Task, target: float) -> int:
     return _MOST
 
 
-def _states(machine: CompiledMethod, start: list[float], times: np.ndarray) -> np.ndarray:
+def _states(machine: MethodSteps, start: list[float], times: np.ndarray) -> np.ndarray:
     found, t, y = [], 0.0, start
     for time_ in times:
         steps = max(1, math.ceil((time_ - t) * _STEPS))
-        y = machine.step_fixed(t, (time_ - t) / steps, steps, y, [])
+        y = machine.fixed(t, (time_ - t) / steps, steps, y, Drive(()))
         t = time_
         found.append(y)
     return np.array(found)

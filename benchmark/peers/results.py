@@ -27,11 +27,11 @@ from benchmark.peers.study import TARGETS, Curve, Point, Reference, reach
 from sst_ros.host.figures import BLUE, GREEN, INK, VERMILION, Looks, save_figure, styled
 from sst_ros.report.results import markdown
 
-PACKAGES = ("numpy", "numba", "mujoco", "pin", "scipy", "mpmath")
+PACKAGES = ("numpy", "llvmlite", "mujoco", "pin", "scipy", "mpmath")
 
 README = DOCS.parent / "README.md"
 README_ROWS = {
-    "sst_ros": "sst_ros, a run of `prepare`",
+    "sst_ros": "sst_ros, `simulate` with its samples",
     "MuJoCo": "MuJoCo, best setting",
     "Pinocchio": "Pinocchio, DOP853 in a Python loop",
     "SciPy on the paper's form": "SciPy on the paper's equations in NumPy",

@@ -17,8 +17,9 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853
+from sst_ros.integration.point import Drive
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.generic_math import rotation_rows
 from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix
@@ -125,8 +126,8 @@ class Task:
     @cached_property
     def moving(self) -> list[Moving]:
         """States of the motion itself, well after its start."""
-        machine = CompiledMethod(self.system, DOP853, compiled=False)
-        return [self._moving(time, machine.step_fixed(0.0, time / 50, 50, self.start, []))
+        steps = MethodSteps(self.system, DOP853)
+        return [self._moving(time, steps.fixed(0.0, time / 50, 50, self.start, Drive(())))
                 for time in (0.21, 0.53, 0.87)]  # fmt: skip
 
     def _moving(self, time: float, y: list[float]) -> Moving:

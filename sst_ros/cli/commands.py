@@ -138,12 +138,6 @@ COMMANDS: dict[str, Subcommand | str] = {
             choices=("free", "lockstep"),
         ),
     ),
-    "compile": Subcommand(
-        "compile a scene before its first fast run",
-        "cli.runs:compile_code",
-        _scene("scene", _OF_SCENE, nargs="?", default="example2", metavar="SCENE"),
-        Arg("--integrator", "default: auto", choices=_INTEGRATORS, default="auto"),
-    ),
     "demo": Subcommand(
         "run the paper's examples or a reference motion by the nodes",
         "cli.reports:run_demo",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands on one scene or one recording: contents, faults, motion, compiled code, tables, view.
+"""Commands on one scene or one recording: contents, faults, motion, tables, view.
 
 What needs an extra is imported by name where it is asked for: the rest runs without it.
 """
@@ -15,9 +15,8 @@ from pathlib import Path
 
 from sst_ros.cli.commands import free_out, function
 from sst_ros.errors import InputError, Problem, SstError, refuse_unless, require
-from sst_ros.host import compiled_module, processes
+from sst_ros.host import processes
 from sst_ros.host.output import SUFFIXES, require_free, results_folder
-from sst_ros.integration import compiled_method
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.results import render
@@ -81,21 +80,6 @@ def implausible(scene: Scene) -> str:
         f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass = {star.mass:g} kg "
         f"within star.radius = {star.radius:g} m has at most 2 m r^2 = {most:g} kg m^2"
     )
-
-
-def compile_code(options: argparse.Namespace) -> None:
-    """Compile the code of a scene into the cache."""
-    if compiled_module.numba_version() is None:
-        require("numba")
-        raise SstError("numba is switched off by SST_ROS_NUMBA=0")
-    if (folder := compiled_module.cache_folder()) != compiled_module.configured_folder():
-        raise SstError("compiled code would not be kept; see the warning above")
-    simulated = load(options.scene)
-    compiled_method.make_code(simulated, options.integrator)
-    if not compiled_method.code_is_there(simulated, options.integrator):
-        raise SstError("another process is compiling: try again when it has ended")
-    for method in compiled_method.methods_of(options.integrator):
-        print(f"{method.name}: compiled, in {folder}")
 
 
 def map_workspace(options: argparse.Namespace) -> None:

@@ -21,6 +21,7 @@ from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.errors import refuse_unless
 from sst_ros.mechanism.generic_math import Scalar, positive, sin
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.programs.compiled import compile_functions, compile_rows
 from sst_ros.programs.expression import (
     Expression,
     Program,
@@ -35,7 +36,7 @@ from sst_ros.scene.schema import Place, leaves, rebuild
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.state import Joints
 
-Function = Callable[..., tuple[float, ...]]
+Function = Callable[..., Sequence[float]]
 
 QUATERNION = ("x", "y", "z", "w")
 RATE = ("wx", "wy", "wz")
@@ -74,8 +75,16 @@ class Dynamics:
 
     @cached_property
     def joints(self) -> Function:
-        """Angles gamma, mu, beta and rates in the same order, 18 numbers of the first seven."""
-        return compile_program(self.joints_program)
+        """Angles gamma, mu, beta and rates in the same order, 18 numbers of the first seven.
+
+        They are nan where an angle has no value.
+        """
+        return compile_functions({"joints": self.joints_program}, ("joints",))["joints"]
+
+    @cached_property
+    def joints_of_rows(self) -> Callable[[Array], Array]:
+        """The same of rows of seven numbers each, shape (n, 7) -> (n, 18)."""
+        return compile_rows({"joints": self.joints_program}, "joints")
 
     @cached_property
     def joints_program(self) -> Program:
@@ -188,22 +197,24 @@ class ODE:
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
 
-        Where it is not finite, ArithmeticError or ValueError is raised.
+        Raises ArithmeticError where the Jacobian is not finite.
         """
         size = len(self.state)
         flat = np.array(self.linearised(t, *y, *d)[2 * size :])
+        if not np.isfinite(flat).all():
+            raise ArithmeticError("the Jacobian is not finite")
         return np.asarray(np.linalg.eigvals(flat.reshape(size, size).T))
 
     @cached_property
     def linearised(self) -> Function:
-        """The program of `jacobian` as a function."""
-        return compile_program(self.jacobian)
+        """The program of `jacobian` as a function; nan where it has no value."""
+        return compile_functions({"jacobian": self.jacobian}, ("jacobian",))["jacobian"]
 
     @cached_property
     def linearised_by_torque(self) -> Function:
         """The derivative, and its derivatives by t, the state and the torques of the drive."""
-        by = ("t", *self.state, *TORQUE)
-        return compile_program(trace(self.derivative, self._inputs, by))
+        program = trace(self._of_numbers, self._inputs, ("t", *self.state, *TORQUE))
+        return compile_functions({"linearised": program}, ("linearised",))["linearised"]
 
     def derivative(self, time: Any, *inputs: Any, numbered: bool = False) -> tuple[Any, ...]:
         """Return the derivative at the time, the state and the drive given, of any kind.
@@ -326,26 +337,30 @@ class ParametricModel:
     @cached_property
     def program(self) -> Program:
         """Derivative of the state; inputs t, state, drive, and the varied numbers."""
-        known = ("t", *self.ode.state, *self.ode.drive)
-        topic = Dynamics.of(self.scene).has_moment_topic
+        return trace(self.derivative, ("t", *self.ode.state, *self.ode.drive, *self.names))
 
-        def slope(*inputs: Expression) -> tuple[Any, ...]:
-            at = self.constants(inputs[len(known) :])
-            ode = ODE(Dynamics(at.model, has_moment_topic=topic), at.torque)
-            return ode.derivative(*inputs[: len(known)])
-
-        return trace(slope, (*known, *self.names))
+    def derivative(self, *inputs: Any) -> tuple[Any, ...]:
+        """Return the derivative at the inputs of `program`, of any kind."""
+        known = 1 + len(self.ode.state) + len(self.ode.drive)
+        at = self.constants(inputs[known:])
+        topic = self.ode.dynamics.has_moment_topic
+        ode = ODE(Dynamics(at.model, has_moment_topic=topic), at.torque)
+        return ode.derivative(*inputs[:known])
 
     @cached_property
     def limit_distances(self) -> Program:
         """Distances to the limits, and their rates; inputs: state (7) and the varied numbers."""
+        return trace(self.distances, (*MOTION, *self.names))
+
+    def distances(self, *inputs: Any) -> tuple[Scalar, ...]:
+        """Return the results of `limit_distances` at its inputs, of any kind."""
         limits = tuple(limits_of(self.scene, Geometry.of(self.scene)))
+        at = self.constants(inputs[7:])
+        return limit_distances(limits, at.ends, at.model, inputs[:7])
 
-        def values(*inputs: Expression) -> tuple[Any, ...]:
-            at = self.constants(inputs[7:])
-            return limit_distances(limits, at.ends, at.model, inputs[:7])
-
-        return trace(values, (*MOTION, *self.names))
+    def joints(self, *inputs: Any) -> Joints:
+        """Return angles and rates of the joints at the inputs of `limit_distances`."""
+        return kernel.joints(self.constants(inputs[7:]).model, inputs[:7])
 
     @cached_property
     def outputs(self) -> dict[str, Callable[..., tuple[Any, ...]]]:
@@ -356,7 +371,7 @@ class ParametricModel:
 
         def values(*inputs: Expression) -> tuple[Any, ...]:
             model, state = self.constants(inputs[7:]).model, inputs[:7]
-            joints = (number for kind in kernel.joints(model, state) for number in kind)
+            joints = (number for kind in self.joints(*inputs) for number in kind)
             kinetic = kernel.kinetic_energy(model, state)
             return (*joints, kinetic + kernel.potential_energy(model, state))
 

@@ -30,7 +30,6 @@ MARKERS = {
     "dopri5": (VERMILION, "s"),
     "dop853": (GREEN, "^"),
     "rodas5p": (PURPLE, "D"),
-    "gauss": (ORANGE, "v"),
 }
 """Colour and marker of each method of integration."""
 

@@ -19,7 +19,6 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 from sst_ros.errors import SstError, refuse_errors, require
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import Bar
 from sst_ros.version import VERSION
 
@@ -32,6 +31,8 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 _LOCK = threading.Lock()
+_OWN = threading.local()
+"""What belongs to a thread of a pool: `stop`, set when its results are not wanted."""
 
 
 class SweepFailed(SstError):
@@ -80,13 +81,30 @@ def run_many(
 def _on_threads(
     function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
 ) -> Iterator[tuple[int, Result]]:
-    pool = ThreadPoolExecutor(workers)
+    stop = threading.Event()
+    pool = ThreadPoolExecutor(workers, initializer=setattr, initargs=(_OWN, "stop", stop))
     futures = {pool.submit(function, job): number for number, job in enumerate(jobs)}
     try:
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
+        stop.set()  # what still runs is of no use
         pool.shutdown(cancel_futures=True)
+
+
+class Stopped(BaseException):
+    """The results of a job are no longer wanted: its run ends at once."""
+
+
+def stop_if_asked() -> None:
+    """Raise Stopped in a thread of `run_many` whose results are no longer wanted.
+
+    So an interrupt of the main thread, or an error, ends long jobs at once. Elsewhere
+    it does nothing.
+    """
+    stop = getattr(_OWN, "stop", None)
+    if stop is not None and stop.is_set():
+        raise Stopped
 
 
 def connect(address: str) -> Any:
@@ -179,5 +197,5 @@ _unpickle = lru_cache(maxsize=1)(pickle.loads)  # where the versions are known t
 def describe_versions() -> str:
     """Versions on which the bits of results depend."""
     numpy, scipy = (require(name).__version__ for name in ("numpy", "scipy"))
-    found = f"numpy {numpy}, scipy {scipy}, numba {numba_version()}, sst_ros {VERSION}"
+    found = f"numpy {numpy}, scipy {scipy}, sst_ros {VERSION}"
     return "python {}.{}, ".format(*sys.version_info) + found

@@ -238,8 +238,7 @@ class CpuDmaLatency:
 def quiet() -> None:
     """Collect no garbage unasked, and switch threads often.
 
-    To be called when all code is loaded: what exists now is not looked through again. With numba
-    that takes 25 ms, in which no other thread runs Python.
+    To be called when all code is loaded: what exists now is not looked through again.
     A thread that wakes up waits up to the switch interval, 5 ms by default: five ticks.
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many scenarios of one scene at once, compiled, on all cores; the results as arrays.
+"""Many scenarios of one scene at once, on all cores; the results as arrays.
 
 Results have the names of a `Trajectory`, with an axis of scenarios before that of components.
 """
@@ -11,7 +11,6 @@ import os
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -21,13 +20,20 @@ from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import MotionTable
 from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
-from sst_ros.errors import check_kinds, refuse_unless, require
-from sst_ros.host import compiled_module
+from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.host.many_runs import run_many
 from sst_ros.host.output import slices
+from sst_ros.integration.batch_step import (
+    BLOCK,
+    EARLIEST,
+    NOT_FINITE,
+    Block,
+    ColumnStep,
+    advance_blocks,
+)
 from sst_ros.integration.methods import DOP853, Tableau
-from sst_ros.integration.simd_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, batch_source
 from sst_ros.mechanism.geometry import Array
+from sst_ros.programs.llvm import LANES
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import TURN
 from sst_ros.state import Explained
@@ -44,7 +50,10 @@ _BLOCK = 1024
 """States whose joints are computed at once: all numbers of the program are arrays as long."""
 
 _MOST = 10**9
-"""Steps of a run: a compiled loop cannot be interrupted."""
+"""Steps of a run."""
+
+_SHARE = 64
+"""Columns that are worth a thread of their own."""
 
 OUTSIDE = -3
 _REASONS = {
@@ -61,11 +70,14 @@ _SCENARIO = {"status": "", "message": "", "fault_time": "s", "local_error": ""}
 
 Advance = Callable[..., None]
 """(first, count, step, *arrays, rows=None): advances states by steps from step `first`, and changes
-the arrays of `batch_source`. `rows` are those whose last step is repeated; None for all."""
+`arrays`: states, drives, codes, times and errors. `rows` are those whose last step is repeated;
+None for all."""
 
 
 class Batch(Explained):
-    """A scene compiled for many scenarios, by an explicit method with fixed steps.
+    """Many scenarios of a scene, by an explicit method with fixed steps.
+
+    With llvmlite the steps are machine code; without it NumPy takes them, slower, to the same bits.
 
     Args:
         scene: what is simulated.
@@ -81,7 +93,6 @@ class Batch(Explained):
 
     Raises:
         InputError: the scene has no torque to apply, or the numbers of a scenario make no scene.
-        MissingDependency: numba is not installed.
 
     """
 
@@ -95,9 +106,6 @@ class Batch(Explained):
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         scene = scene_of(scene)
-        if compiled_module.numba_version() is None:
-            require("numba")
-            refuse_unless(scene.name, ("SST_ROS_NUMBA", "0", False, "must not be set to 0"))
         unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
         given = {key: unused.get(key.partition(".")[0], "") for key in parameters or ()}
         torque = not profile or scene.torque is not None
@@ -113,7 +121,7 @@ class Batch(Explained):
         self.columns = self.model.columns(self._scenarios)
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
-        """Return a batch of other scenarios, already checked, that shares this one's compiled code.
+        """Return a batch of other scenarios, already checked, that shares this one's programs.
 
         Numbers that do not differ in this batch must not differ in that.
         """
@@ -152,7 +160,7 @@ class Batch(Explained):
             keep_every: keep the states every so many steps, see `BatchResult.kept`; 0 keeps none.
             threads: how many; 0 takes all cores. No bit depends on it.
             progress: draw a bar on a terminal.
-            advance: a loop of one's own in place of the compiled one, see `Advance`.
+            advance: a loop of one's own in place of `Batch.advance`, see `Advance`.
 
         Raises:
             InputError: an argument is not allowed; names it and what is.
@@ -165,9 +173,9 @@ class Batch(Explained):
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
             *((name, n, 0 <= n <= _MOST, allowed) for name, n in whole.items()),
         )
-        step, count = float(step), int(count)  # compiled code is made for these
+        step, count = float(step), int(count)
         loop = advance or partial(self.advance, threads=threads)
-        y, code = self.start(gamma, gamma_dot)
+        y, code = self.initial(gamma, gamma_dot)
         number = y.shape[1]
         given = self.drives(torque, number)
         time, error = np.full(number, np.nan), np.zeros(number)
@@ -201,7 +209,7 @@ class Batch(Explained):
             "varied": [*self._scenarios.rows] or "the start and the torques alone",
         }
 
-    def start(self, gamma: ArrayLike, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+    def initial(self, gamma: ArrayLike, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
         count, columns = self._scenarios.count, self.columns
         # One start for all is solved once.
@@ -240,25 +248,36 @@ class Batch(Explained):
     ) -> None:
         """Advance by `count` steps from step `first`; y, given, code, time and error change.
 
-        Threads take whole blocks in turn, more shares than threads; the compiled code releases the
-        interpreter's lock. A few `rows` need no threads.
+        Threads take several blocks in turn, more shares than threads; the interpreter's lock is
+        released in each step. A few `rows` need no threads.
         """
         threads = threads or len(os.sched_getaffinity(0))
-        blocks, run = -(-columns[0].shape[1] // SIMD_WIDTH), self.module.batch
-        shares = 1 if threads == 1 or rows is not None else 4 * threads
-        size = max(1, -(-blocks // shares))
-        parts = [(begin, min(begin + size, blocks)) for begin in range(0, blocks, size)]
-        work = run_many(
-            lambda part: run(step, first, count, *part, *columns), parts, workers=threads
-        )
-        deque(work, maxlen=0)
+        if rows is not None:
+            threads = 1
+        number = columns[0].shape[1]
+        width = block_width(number, threads)
+        begins = range(0, number, width)
+        size = max(1, -(-len(begins) // (1 if threads == 1 else 4 * threads)))
+        parts = [begins[i : i + size] for i in range(0, len(begins), size)]
+
+        programs = self.programs  # compiled here, not by each thread
+
+        def work(part: range) -> None:
+            advance_blocks(Block(programs, width), part, first, count, step, *columns)
+
+        deque(run_many(work, parts, workers=threads), maxlen=0)
 
     @cached_property
-    def module(self) -> ModuleType:
-        """The compiled function `batch`, see `batch_source`."""
-        model, method = self.model, self._method
-        text = batch_source(model.program, model.limit_distances, method, len(model.ode.state))
-        return compiled_module.load([text], {"NODES": method.c}, numba=True, nogil=True)
+    def programs(self) -> ColumnStep:
+        """The programs of a step, compiled when they are first needed."""
+        return ColumnStep(self.model, self._method)
+
+
+def block_width(number: int, threads: int = 1) -> int:
+    """Return how many of a number of columns are advanced together."""
+    blocks = max(-(-number // BLOCK), min(threads, -(-number // _SHARE)), 1)
+    width = -(-number // blocks)
+    return max(1, -(-width // LANES)) * LANES
 
 
 def _locate_ends(

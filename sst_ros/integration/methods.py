@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -128,17 +127,6 @@ class Rosenbrock:
     c: tuple[tuple[float, ...], ...]  # of the stages in the right-hand sides, over h
     alpha: tuple[float, ...]  # nodes
     d: tuple[float, ...]  # of the derivative by time
-
-    @property
-    def constants(self) -> dict[str, Any]:
-        """Constants of `step_loops.attempt_linearly_implicit`; numba wants rows of one length."""
-        stages = len(self.alpha)
-        a, c = (
-            tuple((*row, *(0.0,) * (stages - len(row))) for row in table)
-            for table in (self.a, self.c)
-        )
-        names = ("STAGES", "GAMMA", "STAGE_A", "STAGE_C", "STAGE_ALPHA", "STAGE_D")
-        return dict(zip(names, (stages, self.gamma, a, c, self.alpha, self.d), strict=True))
 
 
 _RODAS5P_LAST = _row(

@@ -27,7 +27,7 @@ def _function(name: str) -> Callable[[Any], Any]:
     return lambda x: of_float(x) if type(x) is float else _other(name, x)
 
 
-sqrt, tanh, exp, sin, cos = map(_function, ("sqrt", "tanh", "exp", "sin", "cos"))
+sqrt, tanh, exp, log, sin, cos = map(_function, ("sqrt", "tanh", "exp", "log", "sin", "cos"))
 
 
 def positive(x: Any) -> Any:

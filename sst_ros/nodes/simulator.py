@@ -4,9 +4,6 @@
 from __future__ import annotations
 
 import gc
-import os
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -15,12 +12,10 @@ from typing import Any
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, SstError
-from sst_ros.host import compiled_module, processes
-from sst_ros.integration import compiled_method
+from sst_ros.host import processes
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
@@ -57,13 +52,10 @@ class Simulator(Worker[SimulatorParameters]):
         source = FollowedClock(self.node) if followed else SteadyTime()
         longest_ns = FOLLOWED_STEP_NS if followed else 0
         self._pacer = Pacer(run.period_ns, given.real_time_factor, source, longest_ns)
-        compiles = given.compiled and given.equations == "quaternion"
-        self._code = CodeCompiler(self.node, simulated, given) if compiles else None
         build = partial(
             Simulation,
             integrator=given.integrator,
             tolerance=given.tolerance,
-            compiled=self._code is not None and self._code.available,
             equations=given.equations,
         )
         self._latency = processes.CpuDmaLatency()
@@ -86,8 +78,6 @@ class Simulator(Worker[SimulatorParameters]):
         if not self._thread.is_alive():
             self._read_gauges()
         self._report()
-        if self._code is not None:
-            self._code.start()
         print("\n".join(self._diagnostics.table()), flush=True)
         if self._loop.failed:
             raise SstError(self._loop.fault)
@@ -203,47 +193,6 @@ def serve(node: Node, loop: RunLoop) -> None:
         one, qos = topics.SIMULATOR[name], topics.SERVICE_QOS
         node.create_service(one.kind, one.name, partial(answer, act=act), qos_profile=qos)
     topics.subscribe(node, topics.SIMULATOR, set_state=set_state)
-
-
-class CodeCompiler:
-    """Finds the compiled code of a scene, which is `available`, or has it made for the next start.
-
-    To compile in this process would delay the run by half a minute, at the start or when the
-    integrator changes its method.
-    """
-
-    def __init__(self, node: Node, simulated: scene.Scene, given: SimulatorParameters) -> None:
-        self._node, self._given = node, given
-        self._timer: Timer | None = None
-        self.available = False
-        log = node.get_logger()
-        if compiled_module.numba_version() is None:
-            log.info("plain Python: numba is not installed (or SST_ROS_NUMBA=0)")
-        elif compiled_method.code_is_there(simulated, given.integrator):
-            self.available = True
-            log.info(f"compiled code from {compiled_module.cache_folder()}")
-        else:
-            log.info("plain Python, the same bits but slower: the scene is not compiled yet")
-            self._timer = every(node, _DELAY_S, self.start)
-
-    def start(self) -> None:
-        """Start the compiler once, also at the end of the node; it ends where another compiles."""
-        if self._timer is None:
-            return
-        self._node.destroy_timer(self._timer)
-        self._timer = None
-        given = self._given
-        words = ["compile", given.scene, "--integrator", given.integrator]
-        compiler = subprocess.Popen(
-            [sys.executable, "-m", "sst_ros", *words],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # the next start needs the code, even if this run has ended
-            preexec_fn=lambda: os.nice(19),
-        )
-        text = f"process {compiler.pid} compiles the scene for the next start"
-        self._node.get_logger().info(text)
 
 
 class FollowedClock(SteadyTime):

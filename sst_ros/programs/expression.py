@@ -23,7 +23,7 @@ from sst_ros.scene.schema import Place, leaves, rebuild
 Value = Any  # an Expression, a Number or a float
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
-    name: getattr(math, name) for name in ("sqrt", "tanh", "exp", "sin", "cos", "atan2")
+    name: getattr(math, name) for name in ("sqrt", "tanh", "exp", "log", "sin", "cos", "atan2")
 }
 _TEMPLATES = {
     "add": "{} + {}",
@@ -39,6 +39,11 @@ _TEMPLATES = {
     "max": "max({}, {})",
     "select": "({1} if {0} > 0.0 else {2})",
 }
+_ON_ARRAYS = _TEMPLATES | {
+    "step": "where({} > 0.0, 1.0, 0.0)",
+    "select": "where({} > 0.0, {}, {})",
+}
+"""Choices between arrays are made element by element."""
 _ON_FLOATS: dict[str, Callable[..., float]] = {
     op: eval(f"lambda x, y=0.0, z=0.0: {text.format('x', 'y', 'z')}", {**FUNCTIONS})
     for op, text in _TEMPLATES.items()
@@ -53,6 +58,7 @@ _SLOPES: dict[str, Callable[..., Value]] = {
     "sqrt": lambda here, x: 0.5 / here,
     "tanh": lambda here, x: 1.0 - here * here,
     "exp": lambda here, x: here,
+    "log": lambda here, x: 1.0 / x,
     "sin": lambda here, x: x.apply("cos"),
     "cos": lambda here, x: -x.apply("sin"),
     "positive": lambda here, x: x.apply("step"),
@@ -281,21 +287,58 @@ class Program:
             if number in needed:
                 needed.update(x for x in self.steps[number - inputs][1] if isinstance(x, int))
         kept = sorted(number for number in needed if number >= inputs)
-        numbers = {old: new for new, old in enumerate([*range(inputs), *kept])}
+        return self._part(self.inputs, range(inputs), kept, outputs)
+
+    def hoist(self, shared: int) -> tuple[Program, Program]:
+        """Return what depends on the first `shared` inputs alone, and all the rest.
+
+        The results of the first program are the first inputs of the second one, in place
+        of those that are shared. Calls of routines are part of the second one.
+        """
+        inputs = len(self.inputs)
+        is_late = [number >= shared for number in range(inputs)]
+        for op, given in self.steps:
+            calls = isinstance(op, Routine) or op == "part"
+            is_late.append(calls or any(is_late[x] for x in given if isinstance(x, int)))
+        numbers = range(inputs, inputs + len(self.steps))
+        before = [number for number in numbers if not is_late[number]]
+        after = [number for number in numbers if is_late[number]]
+        operands = [x for number in after for x in self.steps[number - inputs][1]]
+        used = {x for x in (*operands, *self.outputs) if isinstance(x, int)}
+        early = sorted(x for x in used if not is_late[x])
+        names = (*(f"shared_{i}" for i in range(len(early))), *self.inputs[shared:])
+        first = self._part(self.inputs[:shared], range(shared), before, early)
+        rest = self._part(names, [*early, *range(shared, inputs)], after, self.outputs)
+        return first, rest
+
+    def _part(
+        self,
+        names: tuple[str, ...],
+        given: Sequence[int],
+        kept: Sequence[int],
+        outputs: Sequence[float | int],
+    ) -> Program:
+        """Return the program of the steps `kept`, whose inputs are the operands `given`."""
+        places = {old: new for new, old in enumerate([*given, *kept])}
 
         def renumber(operands: Sequence[float | int]) -> tuple[float | int, ...]:
-            return tuple(numbers[x] if isinstance(x, int) else x for x in operands)
+            return tuple(places[x] if isinstance(x, int) else x for x in operands)
 
-        steps = (self.steps[number - inputs] for number in kept)
+        steps = (self.steps[number - len(self.inputs)] for number in kept)
         renumbered = tuple((op, renumber(operands)) for op, operands in steps)
-        return Program(self.inputs, renumbered, renumber(outputs))
+        return Program(names, renumbered, renumber(outputs))
 
-    def source(self, name: str, slots: Slots | None = None) -> str:
+    def source(
+        self,
+        name: str,
+        slots: Slots | None = None,
+        templates: Mapping[str, str] = _TEMPLATES,
+    ) -> str:
         """Source of a flat function of all inputs that returns the tuple of outputs.
 
         With `slots` its last argument is the vector p, which it takes its numbers from.
         """
-        lines, _, results = self.split((), slots)
+        lines, _, results = self.split((), slots, templates=templates)
         given = self.inputs
         if slots is not None:
             given, lines = (*given, "p"), [*slots.reads([*lines, *results]), *lines]
@@ -303,7 +346,11 @@ class Program:
         return "\n".join([*lines, f"    return ({', '.join(results)},)\n"])
 
     def split(
-        self, late: Container[int], slots: Slots | None = None, names: Sequence[str] = ()
+        self,
+        late: Container[int],
+        slots: Slots | None = None,
+        names: Sequence[str] = (),
+        templates: Mapping[str, str] = _TEMPLATES,
     ) -> tuple[list[str], list[str], list[str]]:
         """Lines v0 = .., v1 = .., a step each, that depend on no `late` input; the others; outputs.
 
@@ -327,7 +374,7 @@ class Program:
             elif op == "part":
                 text = f"{word(operands[0])}[{int(operands[1])}]"
             else:
-                text = _TEMPLATES[op].format(*map(word, operands))
+                text = templates[op].format(*map(word, operands))
             line = f"v{i} = {text}"
             (after if is_late[-1] else before).append(line)
         return before, after, [word(output) for output in self.outputs]
@@ -416,7 +463,35 @@ def compile_program(
     return function
 
 
-def compile_for_arrays(program: Program) -> Callable[..., tuple[Any, ...]]:
-    """Turn a program into a function of NumPy arrays, element by element."""
-    names = {name: getattr(np, name) for name in FUNCTIONS if name != "atan2"}
-    return compile_program(program, names | {"atan2": np.arctan2, "max": np.maximum})
+def compile_for_arrays(program: Program, *, exact: bool = False) -> Callable[..., tuple[Any, ...]]:
+    """Turn a program into a function of NumPy arrays, element by element.
+
+    NumPy's own sine and others may differ from libm's in the last bit: `exact` takes
+    libm's for each element, which takes ten times as long.
+    """
+    names: dict[str, Any] = {"where": np.where, "max": _larger, "sqrt": np.sqrt}
+    for name, of_floats in FUNCTIONS.items():
+        of_arrays = getattr(np, {"atan2": "arctan2"}.get(name, name))
+        if name != "sqrt":  # IEEE 754 leaves it no choice
+            names[name] = _by_element(of_floats) if exact else of_arrays
+    exec(program.source("function", templates=_ON_ARRAYS), names)
+    function: Callable[..., tuple[Any, ...]] = names["function"]
+    return function
+
+
+def _larger(x: Any, y: Any) -> Any:
+    """Return the larger number; x where they are equal or y is nan."""
+    return np.where(y > x, y, x)
+
+
+def _by_element(function: Callable[..., float]) -> Callable[..., Any]:
+    """Return a function of floats as one of arrays; nan where it has no value."""
+
+    def of_floats(*numbers: float) -> float:
+        try:
+            return function(*numbers)
+        except (ArithmeticError, ValueError):
+            return math.nan
+
+    of_objects = np.frompyfunc(of_floats, 2 if function is math.atan2 else 1, 1)
+    return lambda *arrays: np.asarray(of_objects(*arrays), dtype=float)

@@ -5,8 +5,8 @@
    operation, in their order. No operation is contracted or reordered, so machine code
    has the bits of the same program in plain Python.
 2. A number of the scene is read from a vector: scenes of one structure share the code.
-3. A function takes floats, or, written for lanes, rows of arrays: `LANES` columns at
-   a time, each with the operations of a single run.
+3. A function takes floats, or, written for lanes, rows of arrays: as many columns at a
+   time as a register has doubles, each with the operations of a single run.
 4. llvmlite compiles a module in tenths of a second, once for each text in a process.
 """
 
@@ -28,9 +28,12 @@ from numpy.typing import NDArray
 
 from sst_ros.programs.expression import FUNCTIONS, Number, Program, Routine, Slots
 
-LANES = 4
-"""Columns at a time: the doubles of a register of AVX2. On the machines that were tried
-eight are slower, as half of what is computed no longer finds place in registers."""
+LANES = 8
+"""Columns at a time, at most; a number of columns that is a multiple of it fits all machines."""
+
+_NARROW_LANES = 4
+"""Columns at a time without AVX-512. A register then has four doubles, and with eight
+lanes half of what is computed finds no place in registers."""
 
 _OPTIMISATION = 2
 """LLVM's level; the third takes longer and gains nothing in straight-line code."""
@@ -83,7 +86,7 @@ _BYTES = ctypes.c_char_p
 
 
 class RowFunction:
-    """A program over the columns of arrays, compiled for `LANES` columns at a time.
+    """A program over the columns of arrays, compiled for several columns at a time.
 
     It releases the interpreter's lock, and allocates nothing but for the last columns.
 
@@ -122,8 +125,7 @@ class RowFunction:
             columns: which are computed, a slice without a step.
 
         """
-        if len(inputs) != self.rows or len(outputs) != self.outputs:
-            raise ValueError("as many rows as the program has inputs and outputs")
+        self._check_rows(inputs, outputs)
         begin, end, _ = columns.indices(len(outputs[0]))
         whole = begin + (end - begin) // LANES * LANES
         scalars = np.array([*shared, 0.0], dtype=float)
@@ -137,6 +139,34 @@ class RowFunction:
             self._run(LANES, scalars, _addresses(last, 0), _addresses([*results], 0))
             for row, result in zip(outputs, results, strict=True):
                 row[whole:end] = result[:count]
+
+    def bind(
+        self, inputs: Sequence[NDArray[np.float64]], outputs: Sequence[NDArray[np.float64]]
+    ) -> Callable[..., None]:
+        """Return a function of the shared inputs alone, for rows of a multiple of `LANES`.
+
+        It keeps the addresses of the rows, so a call takes about a microsecond besides
+        its work. It is for one thread at a time.
+        """
+        self._check_rows(inputs, outputs)
+        count = len(outputs[0])
+        if count % LANES:
+            raise ValueError(f"{count} columns: must be a multiple of {LANES}")
+        rows = inputs, outputs  # they live as long as the function
+        ins, outs = _addresses(inputs, 0), _addresses(outputs, 0)
+        scalars = (ctypes.c_double * self.shared)()
+        call = self._call
+        fixed = count, ctypes.addressof(scalars), self._numbers.ctypes.data, ins, outs
+
+        def run(*shared: float, _rows: Any = rows) -> None:
+            scalars[:] = [*shared]
+            call(*fixed)
+
+        return run
+
+    def _check_rows(self, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+        if len(inputs) != self.rows or len(outputs) != self.outputs:
+            raise ValueError("as many rows as the program has inputs and outputs")
 
     def _run(self, count: int, scalars: NDArray[np.float64], ins: Any, outs: Any) -> None:
         self._call(count, scalars.ctypes.data, self._numbers.ctypes.data, ins, outs)
@@ -158,28 +188,56 @@ def write_module(
 
     Args:
         programs: by the names by which they call each other.
-        rows: names of those that are written for rows of arrays; others, for floats,
-            unless only these call them.
+        rows: names of those that are written for rows of arrays, with what they call
+            and nothing else; by default all are written for floats.
         shared: how many of the first inputs of `rows` all columns share.
 
     """
     slots = Slots()
-    wide = {name for row in rows for name in _reach(programs, row)}
-    narrow = set(programs) - wide if rows else set(programs)
+    lanes = count_lanes() if rows else 1
+    wide = {
+        called
+        for row in rows
+        for routine in programs[row].routines
+        for called in _reach(programs, routine.name)
+    }
+    narrow = set() if rows else set(programs)
     parts = [_DECLARATIONS]
     for name, program in programs.items():
         if name in narrow:
             parts.append(_write_function(name, program, slots, width=1))
         if name in wide:
-            parts.append(_write_function(name, program, slots, width=LANES))
+            parts.append(_write_function(name, program, slots, width=lanes))
     for name in rows:
-        parts.append(_write_loop(name, programs[name], shared))
+        # What only shared inputs go into is computed once, not in each lane.
+        before, body = programs[name].hoist(shared)
+        parts.append(_write_function(_before(name), before, slots, width=1))
+        parts.append(_write_function(_body(name), body, slots, width=lanes, inline=True))
+        parts.append(_write_loop(name, len(before.outputs), body, shared, lanes))
     return Module("\n".join(parts), dict(programs), tuple(slots.values))
+
+
+@lru_cache(maxsize=1)
+def count_lanes() -> int:
+    """Return how many columns this machine computes at a time."""
+    with _LOCK:
+        import llvmlite.binding as llvm
+
+        features = llvm.get_host_cpu_features()
+    return LANES if features.get("avx512f") else _NARROW_LANES
 
 
 def row_name(name: str, shared: int) -> str:
     """Return the name of a program's loop over columns."""
     return f"{name}_rows_{shared}"
+
+
+def _before(name: str) -> str:
+    return f"{name}_before"
+
+
+def _body(name: str) -> str:
+    return f"{name}_body"
 
 
 def _reach(programs: Mapping[str, Program], name: str) -> set[str]:
@@ -196,7 +254,7 @@ def _type_of(width: int) -> str:
 
 def _declare() -> str:
     lines = []
-    for width in (1, LANES):
+    for width in (1, _NARROW_LANES, LANES):
         kind, suffix = _type_of(width), _suffix(width)
         for name in ("sqrt", "fabs"):
             lines.append(f"declare {kind} @llvm.{name}.{suffix}({kind})")
@@ -230,16 +288,22 @@ def _pointer(kind: str) -> str:
     return f"{kind}*"
 
 
-def _write_function(name: str, program: Program, slots: Slots, width: int) -> str:
-    """Write a program: `void name(inputs, numbers, outputs)`, each an array."""
+def _write_function(
+    name: str, program: Program, slots: Slots, width: int, *, inline: bool = False
+) -> str:
+    """Write a program: `void name(inputs, numbers, outputs)`, each an array.
+
+    With `inline` it becomes part of the function that calls it.
+    """
     writer = _Writer(program, slots, width)
     for number, (op, operands) in enumerate(program.steps):
         writer.write_step(f"%v{number}", op, operands)
     for number, output in enumerate(program.outputs):
         writer.store(writer.word(output), "%o", number)
     array = f"{_pointer(_type_of(width))} noalias"
-    head = f"define void {_function_name(name, width)}"
-    head += f"({array} %x, double* noalias %p, {array} %o) {{"
+    kind, end = ("internal ", " alwaysinline") if inline else ("", "")
+    head = f"define {kind}void {_function_name(name, width)}"
+    head += f"({array} %x, double* noalias %p, {array} %o){end} {{"
     return "\n".join([head, *writer.first_lines, *writer.lines, "  ret void", "}", ""])
 
 
@@ -392,12 +456,13 @@ def _splat(result: str, scalar: str, width: int) -> list[str]:
     ]
 
 
-def _write_loop(name: str, program: Program, shared: int) -> str:
+def _write_loop(name: str, early: int, program: Program, shared: int, lanes: int) -> str:
     """Write the loop over columns: `void name_rows(n, shared, numbers, ins, outs)`.
 
-    `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes.
+    `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes. The
+    first `early` inputs of the program are what is computed before the loop.
     """
-    kind, count = _type_of(LANES), len(program.inputs)
+    kind, count = _type_of(lanes), len(program.inputs)
     array = _pointer(kind)
     lines = [
         f"define void @{row_name(name, shared)}"
@@ -405,13 +470,17 @@ def _write_loop(name: str, program: Program, shared: int) -> str:
         "entry:",
         f"  %x = alloca {kind}, i32 {count}, align 32",
         f"  %o = alloca {kind}, i32 {len(program.outputs)}, align 32",
+        f"  %e = alloca double, i32 {early}, align 32",
+        f"  call void {_function_name(_before(name), 1)}(double* %s, double* %p, double* %e)",
     ]
-    for i in range(shared):
-        lines.append(_element(f"%s{i}.a", "double", "%s", i))
-        lines.append(f"  %s{i}.s = load double, double* %s{i}.a, align 8")
-        lines += _splat(f"%s{i}", f"%s{i}.s", LANES)
-    for i in range(shared, count):
-        lines.append(_element(f"%r{i}.a", "double*", "%ins", i - shared))
+    for i in range(early):
+        lines.append(_element(f"%e{i}.a", "double", "%e", i))
+        lines.append(f"  %e{i}.s = load double, double* %e{i}.a, align 8")
+        lines += _splat(f"%e{i}", f"%e{i}.s", lanes)
+        lines.append(_element(f"%x{i}", kind, "%x", i))
+        lines.append(f"  store {kind} %e{i}, {array} %x{i}, align 8")
+    for i in range(early, count):
+        lines.append(_element(f"%r{i}.a", "double*", "%ins", i - early))
         lines.append(f"  %r{i} = load double*, double** %r{i}.a, align 8")
     for i in range(len(program.outputs)):
         lines.append(_element(f"%w{i}.a", "double*", "%outs", i))
@@ -421,16 +490,13 @@ def _write_loop(name: str, program: Program, shared: int) -> str:
         "loop:",
         "  %k = phi i64 [0, %entry], [%next, %loop]",
     ]
-    for i in range(count):
-        value = f"%s{i}"
-        if i >= shared:
-            value = f"%l{i}"
-            lines.append(_element(f"%l{i}.a", "double", f"%r{i}", "%k"))
-            lines.append(f"  %l{i}.v = bitcast double* %l{i}.a to {array}")
-            lines.append(f"  {value} = load {kind}, {array} %l{i}.v, align 8")
+    for i in range(early, count):
+        lines.append(_element(f"%l{i}.a", "double", f"%r{i}", "%k"))
+        lines.append(f"  %l{i}.v = bitcast double* %l{i}.a to {array}")
+        lines.append(f"  %l{i} = load {kind}, {array} %l{i}.v, align 8")
         lines.append(_element(f"%x{i}", kind, "%x", i))
-        lines.append(f"  store {kind} {value}, {array} %x{i}, align 8")
-    call = _function_name(name, LANES)
+        lines.append(f"  store {kind} %l{i}, {array} %x{i}, align 8")
+    call = _function_name(_body(name), lanes)
     lines.append(f"  call void {call}({array} %x, double* %p, {array} %o)")
     for i in range(len(program.outputs)):
         lines.append(_element(f"%o{i}.a", kind, "%o", i))
@@ -439,7 +505,7 @@ def _write_loop(name: str, program: Program, shared: int) -> str:
         lines.append(f"  %t{i}.v = bitcast double* %t{i} to {array}")
         lines.append(f"  store {kind} %o{i}, {array} %t{i}.v, align 8")
     lines += [
-        f"  %next = add i64 %k, {LANES}",
+        f"  %next = add i64 %k, {lanes}",
         "  %more = icmp slt i64 %next, %n",
         "  br i1 %more, label %loop, label %end",
         "end:",

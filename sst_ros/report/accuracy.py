@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work-precision study: error and computing time of every method and setting on a scene.
 
-Each method has settings from coarse to fine. Fixed steps use no error estimate; those of Gauss
-collocation are of a motion that was prepared. Tolerances go to `Simulation`, whose estimate of the
-global error is counted and timed with it, and for collocation to `prepare`. The report shows the
+Each method has settings from coarse to fine. Fixed steps use no error estimate. Tolerances go to
+`Simulation`, whose estimate of the global error is counted and timed with it. The report shows the
 studies on the terminal, in files, and as one page.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import timeit
 from collections.abc import Callable, Iterator, Sequence
@@ -26,8 +24,9 @@ from pandas import DataFrame, Series
 from sst_ros.errors import SstError
 from sst_ros.host.figures import INK, MARKERS, Looks, note, styled
 from sst_ros.host.many_runs import run_many
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.method_steps import steps_of
 from sst_ros.integration.methods import METHODS, RK4, Method
+from sst_ros.integration.point import Drive
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
     ReferenceSolution,
@@ -38,8 +37,7 @@ from sst_ros.report.results import data_frame, provenance, publish, records, ren
 from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
-from sst_ros.simulation.simulate import PreparedRun, prepare, simulate
-from sst_ros.simulation.simulate_gauss import GAUSS
+from sst_ros.simulation.simulate import simulate
 
 FIXED, TOLERANCE = "fixed steps", "tolerance"
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
@@ -177,15 +175,13 @@ def list_settings(problem: InitialValueProblem) -> Iterator[Iterator[SolverSetti
             yield _list_steps(problem, method)
         if method is not RK4:  # its steps in a run are fixed
             yield _list_tolerances(problem, method.name)
-    if not problem.kinked:
-        yield from (_list_collocation(problem, kind) for kind in (FIXED, TOLERANCE))
 
 
 def _list_steps(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
-    machine = CompiledMethod(problem.system, method, compiled=True)
+    machine, drive = steps_of(problem.system, method), Drive(tuple(problem.drive))
     for steps in _STEPS_PER_INTERVAL:
         h, start = problem.interval / steps, list(problem.start)
-        timed = partial(machine.step_fixed, 0.0, h, steps * problem.count, start, problem.drive)
+        timed = partial(machine.fixed, 0.0, h, steps * problem.count, start, drive)
         solve = partial(problem.run_steps, machine, steps)
         yield SolverSetting(method.name, FIXED, h, solve, timed)
 
@@ -194,28 +190,6 @@ def _list_tolerances(problem: InitialValueProblem, method: str) -> Iterator[Solv
     for tolerance in _TOLERANCES:
         run = partial(problem.run_simulation, problem.simulation(method, tolerance))
         yield SolverSetting(method, TOLERANCE, tolerance, run, run)
-
-
-def _list_collocation(problem: InitialValueProblem, kind: str) -> Iterator[SolverSetting]:
-    """Yield settings of Gauss collocation, with the steps that each tolerance chooses."""
-
-    def solve(make: Callable[[], PreparedRun]) -> Run:
-        run = make().run()
-        dense = run.at(problem.times)
-        return np.hstack([dense.quaternion, dense.body_rate]), run.evaluations
-
-    longest, motion = math.inf, (problem.scene, None, problem.seconds)
-    for tolerance in (1e-2, 1e-3, *_TOLERANCES):
-        make = partial(prepare, *motion, method=GAUSS, tolerance=tolerance)
-        if kind == TOLERANCE:
-            yield SolverSetting(GAUSS, kind, tolerance, partial(solve, make), make)
-            continue
-        with contextlib.suppress(SstError):
-            ready = make()
-            step = ready.run().step
-            if step < longest:
-                longest = step
-                yield SolverSetting(GAUSS, kind, step, partial(solve, make), ready.run)
 
 
 def _refine(

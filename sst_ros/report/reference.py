@@ -13,22 +13,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
 
 from sst_ros.dynamics import kernel
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import Bar
-from sst_ros.integration.adaptive_stepper import CannotStep, EvaluationBudget
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.propagator import LimitReached, Propagator
+from sst_ros.integration.point import Point
+from sst_ros.integration.stepper import CannotStep, EvaluationBudget, Stepper
 from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import SineTorque
+from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import NANOSECONDS
 
 Held: TypeAlias = tuple[Integers, Integers, Array]
@@ -39,63 +38,49 @@ LONGEST_TICK_NS = 1_000_000  # longer ticks are divided [ns]
 TICK_TOLERANCE = 1e-13  # largest local error estimate of a step
 TICK_BUDGET = 3600  # evaluations that a tick may take on average: a hundred steps
 UNRESOLVED = 100  # so many ticks may take more: then the scene is too stiff, and tries take long
-COMPILED_FROM = 10_000  # from this number of ticks on compilation costs less than it saves
 CHUNK = 25_000  # so many ticks at a time, which bounds the memory
 SAME_START = 1e-9
 """Largest difference [rad], [rad/s] between a first sample and the start that its scene asks for,
 where samples are lost and the first one may belong to a later time."""
 
 
-class TickPropagator(Propagator):
-    """Propagates a scene by DOP853 through ticks, all of one call in compiled code.
+class TickStepper(Stepper):
+    """Advances a scene by DOP853 through ticks.
 
     Limits of the scene do not end the motion. Torques over time are within the limit of the
     actuators; without them they are those of each tick.
     """
 
-    def __init__(self, scene: Scene, torque: SineTorque | None, *, compiled: bool) -> None:
-        self.compiled, self._sine = compiled and numba_version() is not None, torque
-        super().__init__(
-            scene, DOP853.name, TICK_TOLERANCE, compiled=self.compiled,
-            budget=EvaluationBudget(TICK_BUDGET), limits=False,
-        )  # fmt: skip
+    def __init__(self, scene: Scene, torque: SineTorque | None) -> None:
+        self._sine = torque
+        budget = EvaluationBudget(TICK_BUDGET)
+        super().__init__(scene, DOP853.name, TICK_TOLERANCE, budget=budget, limits=False)
 
     def follow(self, ticks: Held, start: Array) -> Array:
-        """Propagate through m ticks from a state (quaternion, body rate, lagged torques).
+        """Advance through m ticks from a state (quaternion, body rate, lagged torques).
 
         Returns solution and second solution at the end of each tick, with the work since the start
         [J], shape (m, 2, 8 or 11); of fewer ticks where no step resolves the next one.
         """
-        start_ns, end_ns, drives = ticks
-        parts = np.maximum(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
-        ends = np.cumsum(parts)
-        length = np.repeat((end_ns - start_ns) / NANOSECONDS / parts, parts)
-        begin = np.repeat(start_ns / NANOSECONDS, parts)
-        begin += length * (np.arange(len(length)) - np.repeat(ends - parts, parts))
-        if self._sine is not None:  # phases of sines, or torques within the limit
-            held = np.fmod(np.outer(begin, self._sine.frequency) + self._sine.phase, 2.0 * np.pi)
-        else:
-            held = np.repeat(drives, parts, axis=0)
-            limit = np.inf if self.torque.limit is None else self.torque.limit
-            held[:, :3] = np.clip(held[:, :3], -limit, limit)
-        begins = np.full((len(length), len(self.ode.state)), np.nan)  # nowhere but at the start
-        reached: Any = np.stack([begins, begins], axis=1)
-        given: Any = (length, held, begins)
-        if not self.compiled:
-            reached, given = reached.tolist(), tuple(array.tolist() for array in given)
-        stepper, _ = self._begin_period(self._sine or (0.0, 0.0, 0.0), 0.0, ())
-        k, at = 0, stepper.begin(start.tolist())
-        with suppress(LimitReached, CannotStep, ArithmeticError, ValueError):
-            while k < len(length):
-                k, at = stepper.step_through(k, len(length), given, at, len(length) - k, reached)
-                if k == len(length):
-                    break
-                torque = self._sine or (float(held[k, 0]), float(held[k, 1]), float(held[k, 2]))
-                moment = tuple(held[k, 3:].tolist())
-                at, _ = self.advance(at, float(begin[k]), float(length[k]), 1, torque, moment)
-                reached[k][0][:], reached[k][1][:] = at.y, at.z
-                k += 1
-        return np.asarray(np.asarray(reached)[ends[ends <= k] - 1])
+        ends: list[tuple[list[float], list[float]]] = []
+        at = self.begin(start.tolist())
+        with suppress(CannotStep), np.errstate(all="ignore"):
+            for start_ns, end_ns, drive in zip(*ticks, strict=True):
+                at = self._follow_tick(at, int(start_ns), int(end_ns), drive.tolist())
+                ends.append((at.y, at.z))
+        return np.array(ends).reshape(len(ends), 2, len(self.ode.state))
+
+    def _follow_tick(self, at: Point, start_ns: int, end_ns: int, drive: Sequence[float]) -> Point:
+        """Advance through one tick; a long one is divided."""
+        torque: Torque = self._sine or (drive[0], drive[1], drive[2])
+        acting, moment = self.torque.acting(torque), tuple(drive[3:])
+        if self._sine is not None:  # the limit of the actuators is part of the program
+            acting = self._sine
+        parts = max(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
+        length = (end_ns - start_ns) / NANOSECONDS / parts
+        for part in range(parts):
+            at = self.advance(at, start_ns / NANOSECONDS + length * part, length, acting, moment)
+        return at
 
 
 def begins(recording: Recording) -> bool:
@@ -175,8 +160,7 @@ def _compare(run: Recording, torque: SineTorque | None, held: Held, *, known: bo
     samples = run.quaternion, run.gamma, run.gamma_dot
     distances, energy = np.full((2, len(time), 3), np.nan), np.full(len(time), np.nan)
     start_ns, end_ns, drives = held
-    compiled = len(run.ticks.end_ns) > COMPILED_FROM
-    motion, count = TickPropagator(run.scene, torque, compiled=compiled), len(start_ns)
+    motion, count = TickStepper(run.scene, torque), len(start_ns)
     model = motion.dynamics.model
     state = run.states[0]
     known = known and bool(count and np.isfinite(state[0]))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any, NamedTuple, TypeAlias
@@ -23,12 +24,13 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import refuse_unless
-from sst_ros.host import compiled_module
-from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.step_loops import explicit_step
+from sst_ros.integration.point import Drive
+from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET
+from sst_ros.integration.steps import Derivative, explicit_step
 from sst_ros.mechanism.geometry import Array, Geometry, angle_between
+from sst_ros.programs.expression import compile_for_arrays
 from sst_ros.report.results import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
@@ -105,23 +107,21 @@ class InitialValueProblem:
             found = kernel.joints(self.dynamics.model, tuple(solution[:, :7].astype(float).T))
         return np.array([found.gamma, found.gamma_dot])
 
-    def run_steps(self, machine: CompiledMethod, steps: int) -> Run:
+    def run_steps(self, method: MethodSteps, steps: int) -> Run:
         """Run with `steps` steps an interval; nan after the last finite state."""
         result = np.full((self.count + 1, len(self.start)), np.nan)
         result[0] = y = list(self.start)
-        h = self.interval / steps
-        with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
-            for k in range(self.count):
-                result[k + 1] = y = machine.step_fixed(k * self.interval, h, steps, y, self.drive)
-        return result, len(machine.method.a) * steps * self.count
+        h, drive = self.interval / steps, Drive(tuple(self.drive))
+        for k in range(self.count):
+            y = method.fixed(k * self.interval, h, steps, y, drive)
+            if not np.isfinite(y).all():
+                break
+            result[k + 1] = y
+        return result, len(method.method.a) * steps * self.count
 
     def simulation(self, method: str, tolerance: float) -> Simulation:
-        """Return a simulation, compiled where the torques can be."""
-        compiled = compiled_module.numba_version() is not None and not self.clamped
-        return Simulation(
-            self.scene, method, tolerance=tolerance, compiled=compiled,
-            step_budget=WHOLE_MOTION_BUDGET,
-        )  # fmt: skip
+        """Return a simulation whose steps may take long."""
+        return Simulation(self.scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET)
 
     def run_simulation(self, simulation: Simulation) -> Run:
         """Begin a simulation again and run it; raises RunStopped at a limit."""
@@ -178,15 +178,15 @@ def _halve_steps(problem: InitialValueProblem) -> tuple[LongArray, LongArray, in
     return (before, after, steps) if change < 1e-12 else None
 
 
-def load_exact_step(problem: InitialValueProblem) -> Any:
-    """Load `attempt`, a step of EXACT, whose functions take any numbers that NumPy takes."""
-    step = explicit_step(EXACT, len(problem.start), len(problem.drive))
-    texts = [problem.system.program.source("rhs"), step]
-    code: Any = compiled_module.load(texts, {}, numba=False)
-    for name in ("sqrt", "sin", "cos", "tanh", "exp"):
-        vars(code)[name] = getattr(np, name)
-    code.atan2 = np.arctan2
-    return code
+def exact_derivative(problem: InitialValueProblem) -> Derivative:
+    """Return the derivative of a problem for any numbers that NumPy takes."""
+    slope = compile_for_arrays(problem.system.program)
+    drive = problem.drive
+
+    def derivative(t: Any, y: Sequence[Any], _: Any) -> Sequence[Any]:
+        return slope(t, *y, *drive)
+
+    return derivative
 
 
 def run_extended(problem: InitialValueProblem, steps: int) -> LongArray:
@@ -194,15 +194,14 @@ def run_extended(problem: InitialValueProblem, steps: int) -> LongArray:
 
     The quaternion is kept at length 1. A row of nan stands where there is no finite state.
     """
-    code, number = load_exact_step(problem), np.longdouble
+    derivative, number = exact_derivative(problem), np.longdouble
     result = np.full((problem.count + 1, len(problem.start)), np.nan, dtype=number)
     result[0] = problem.start
     y, h = result[0].copy(), number(problem.interval) / steps
-    new_y, error = y.copy(), y.copy()
+    stages = [None] * len(EXACT.a)
     with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
         for k in range(problem.count * steps):
-            code.attempt(k * h, h, y, y, problem.drive, (), new_y, error)
-            y[:] = new_y
+            y = np.array(explicit_step(derivative, EXACT, k * h, h, [*y], stages).state)
             y[:4] /= np.sqrt(y[:4] @ y[:4])
             if (k + 1) % steps == 0:
                 result[(k + 1) // steps] = y

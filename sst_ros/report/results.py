@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sst_ros.errors import require
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import load_templates, write_into
+from sst_ros.programs.llvm import llvmlite_version
 from sst_ros.state import Array
 from sst_ros.version import VERSION
 
@@ -96,9 +96,9 @@ def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
 def provenance(made: Mapping[str, Any] | None = None) -> str:
     """Return versions, machine and date of a report in one line: of `made_on`, by default now."""
     made = made or made_on()
-    numba = f"numba {made['numba']}" if made["numba"] else "plain Python"
+    compiler = f"llvmlite {made['llvmlite']}" if made["llvmlite"] else "plain Python"
     return (
-        f"sst_ros {made['sst_ros']}, Python {made['python']}, {numba}, NumPy {made['numpy']}, "
+        f"sst_ros {made['sst_ros']}, Python {made['python']}, {compiler}, NumPy {made['numpy']}, "
         f"{made['processor']}, {made['processors']} cores, {made['platform']}, {made['date']}"
     )
 
@@ -109,7 +109,7 @@ def made_on() -> dict[str, Any]:
         "sst_ros": VERSION,
         "python": platform.python_version(),
         **{name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")},
-        "numba": numba_version(),
+        "llvmlite": llvmlite_version(),
         "processor": processor(),
         "platform": platform.platform(),
         "processors": os.cpu_count(),

@@ -31,7 +31,6 @@ from sst_ros.scene.scene import TERMS, Scene, terms
 from sst_ros.scene.schema import build, drop_idle
 from sst_ros.scene.yaml_document import replace_values
 from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.simulate_gauss import GAUSS
 
 WIDTH = 100
 
@@ -111,8 +110,7 @@ def step_advice(scene: Scene) -> StepAdvice:
     except SstError as error:
         return StepAdvice(f"none, the scene cannot start: {error}")
     text = f"for an error of {TOLERANCE:g} rad over {seconds:g} s: {motion.method}"
-    if not motion.method.startswith(GAUSS):  # which gives its steps itself
-        text += f"; its steps have {motion.step:.2g} s on average"
+    text += f"; its steps have {motion.step:.2g} s on average"
     limit, fastest = largest_stable_step(DORMAND_PRINCE, rates), float(np.abs(rates).max())
     text += f". The fastest rate at the start is {fastest:.3g} 1/s"
     if math.isfinite(limit):

@@ -101,11 +101,6 @@ class SimulatorParameters(Section):
         "92, which give the same motion by explicit methods in plain Python, about 20 times slower",
         EQUATIONS,
     )
-    compiled: bool = entry(
-        "run machine code where numba is installed; the first run of a scene is plain Python, with "
-        "the same bits, and a process of low priority compiles the scene for the next",
-        default=True,
-    )
     encoder_counts: int = _whole(
         "steps per turn of the encoders that joint_states come from, whose rates are differences "
         "of angles; 0 for exact angles and rates",

@@ -310,7 +310,7 @@ class TickLoop:
     def to_next_sample(self, *, paced: bool) -> bool:
         """Tick to the next sample and publish it; False if it was interrupted before.
 
-        Ticks between which nothing changes are one call. With deadlines compiled ticks are done
+        Ticks between which nothing changes are one call. With deadlines ticks are done
         together at the deadline of the last of them, at most 2 ms later than its own; a command
         acts from the tick on that begins after its arrival. Without deadlines samples that nothing
         receives are passed over, up to 64 ticks.
@@ -330,7 +330,7 @@ class TickLoop:
         while True:
             ticks, unread = self._ticks_left(), 0
             if interval_ns:
-                ticks = min(ticks, self._pacer.together if self.simulation.compiled else 1)
+                ticks = min(ticks, self._pacer.together)
             elif paced and not self._lockstep and self._output.unread:
                 # Samples behind the one that these ticks lead to, within what is done at once.
                 if (self._tick + ticks) % self._ticks_per_sample == 0:

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
@@ -15,8 +14,8 @@ from numpy.typing import ArrayLike
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.variational import Sensitivities
 from sst_ros.errors import check_kinds, refusal, refuse_unless
-from sst_ros.integration.adaptive_stepper import WHOLE_MOTION_BUDGET
 from sst_ros.integration.methods import DORMAND_PRINCE
+from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET, EvaluationBudget
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import SceneInput, scene_of, with_initial
@@ -30,13 +29,10 @@ from sst_ros.scene.torque_profile import (
     ascend,
     profile_of,
 )
-from sst_ros.simulation.simulate_gauss import GAUSS, CollocatedMotion, NotSmooth
-from sst_ros.simulation.simulation import AUTO, INTEGRATORS, describe_conditioning
+from sst_ros.simulation.simulation import INTEGRATORS, describe_conditioning
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.trajectory import Trajectory, check_error
 from sst_ros.state import NANOSECONDS, Array
-
-METHODS = (*INTEGRATORS, GAUSS)
 
 _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
 """Control periods that the budget of a motion reaches: a step and its check are three steps."""
@@ -44,12 +40,23 @@ _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
 _SAMPLES, _MOST_SAMPLES = 200, 10_000_000
 """Even intervals of a motion by default, and the most."""
 
-_ATTEMPTS, _FINEST = 4, 1e-14
-"""Runs until the error estimate is at most the tolerance, and the least tolerance of a step."""
+_ATTEMPTS = 4
+"""Runs until the error estimate is at most the tolerance."""
+_FINEST = 1e-14
+"""Least tolerance of a step: below it rounding decides."""
+_FUNCTION_BUDGET = 1_000_000
+"""Evaluations where each calls a function of the state: half a minute."""
+_ADVICE = (
+    "; if the torque function switches with the state, give control_period, as a controller "
+    "has it, or smooth the switch"
+)
 
 _UNSEEN = 10.0
 """Factor of the error estimate where it cannot see how a controller answers the error: of 170
 random runs one has an error of more than ten times the estimate without that answer."""
+
+_METHODS = "must be one of " + ", ".join(INTEGRATORS)
+_METHOD = {"gauss": f"has left: auto and dop853 are as accurate and faster; {_METHODS}"}
 
 TorqueInput: TypeAlias = (
     Sequence[float] | SineTorque | TorqueProfile | TorqueFunction | FeedbackFunction | None
@@ -75,7 +82,7 @@ def simulate(
     sensitivities: Sequence[str] = (),
     progress: bool = False,
 ) -> Trajectory:
-    """Simulate a motion from the initial state of a scene: `prepare(...).run()`.
+    """Simulate a motion from the initial state of a scene.
 
     Where a limit of the scene ends the motion, or no step resolves it, the trajectory has the part
     that is valid, and its `status` and `message` give the reason.
@@ -93,8 +100,9 @@ def simulate(
             200, or the control periods where there are some. The steps do not depend on them.
         t_eval: the times of the samples instead [s], ascending, in whole nanoseconds (others are
             rounded).
-        method: "gauss" (Gauss collocation), "dopri5", "dop853", "rk4" (explicit Runge-Kutta of
-            order 5, 8, 4), "rodas5p" (Rosenbrock, order 5, for stiff scenes) or "auto".
+        method: "dopri5", "dop853", "rk4" (explicit Runge-Kutta of order 5, 8, 4), "rodas5p"
+            (Rosenbrock, order 5, for stiff scenes) or "auto", which changes between them as the
+            motion asks for.
         tolerance: error of the orientation at the end that is allowed [rad]. A motion whose
             `error_estimate` exceeds it is run again by smaller steps, up to three times; if it
             still does, `status` is 2. A function that may have a memory runs once.
@@ -108,7 +116,7 @@ def simulate(
             as large.
         breaks: times at which a function jumps or has a kink [s], ascending. Jumps in time are
             found without it, unless a pulse is shorter than a step.
-        max_step: longest step [s]; by default the error alone decides. Not for collocation.
+        max_step: longest step [s]; by default the error alone decides.
         sensitivities: numbers by which `Trajectory.sensitivities` differentiates the motion: keys
             of the scene but its geometry, as "star.inertia.zz", "initial.gamma" (three numbers) or
             "stroke.stiffness", and "torque" for all numbers of the torques. Not with a function of
@@ -119,49 +127,6 @@ def simulate(
         InputError: an argument is not allowed; names it and the allowed values.
         AssemblyError: the initial gamma has no unique admissible assembly.
         SingularConfiguration: the motion starts from a parallel singularity.
-
-    """
-    return prepare(
-        scene,
-        torque,
-        duration,
-        initial=initial,
-        samples=samples,
-        t_eval=t_eval,
-        method=method,
-        tolerance=tolerance,
-        control_period=control_period,
-        memoryless=memoryless,
-        breaks=breaks,
-        max_step=max_step,
-        sensitivities=sensitivities,
-    ).run(progress=progress)
-
-
-@check_kinds
-def prepare(
-    scene: SceneInput,
-    torque: TorqueInput = None,
-    duration: float | None = None,
-    *,
-    initial: InitialInput = None,
-    samples: int | None = None,
-    t_eval: ArrayLike | None = None,
-    method: str = "auto",
-    tolerance: float = 1e-9,
-    control_period: float | None = None,
-    memoryless: bool = False,
-    breaks: ArrayLike = (),
-    max_step: float | None = None,
-    sensitivities: Sequence[str] = (),
-) -> PreparedRun:
-    """Prepare a motion that is run many times, by the arguments of `simulate`.
-
-    All that does not change from run to run is done once: the scene's equations, the choice of the
-    method, and for collocation of its steps.
-
-    Raises:
-        InputError, AssemblyError, SingularConfiguration: as `simulate`.
 
     """
     given = with_initial(scene_of(scene), initial)
@@ -178,7 +143,7 @@ def prepare(
     shortest = f"must be > 0 s, at least {least:.3g} s for this duration"
     refuse_unless(
         "simulate",
-        ("method", method, method in METHODS, "must be one of " + ", ".join(METHODS)),
+        ("method", method, method in INTEGRATORS, _METHOD.get(str(method), _METHODS)),
         ("tolerance", tolerance, 0.0 < tolerance < math.inf, "must be a number > 0 [rad]"),
         ("max_step", max_step, longest >= least, shortest),
         ("breaks", breaks, ascend(jumps), "must be ascending times [s]"),
@@ -193,72 +158,70 @@ def prepare(
         given, profile, (0.0, end), times, method, tolerance, period, memoryless, inside,
         float(longest), parameters,
     )  # fmt: skip
-    reason = ""
-    if method in (AUTO, GAUSS):
-        try:
-            return PreparedRun(CollocatedMotion(task).run)
-        except NotSmooth as error:
-            if method == GAUSS:
-                _refuse("method", method, str(error))
-            reason = f" (auto: {error})"
-    return PreparedRun(partial(_integrate, task, reason))
+    return _integrate(task, progress=progress)
 
 
-class PreparedRun:
-    """A motion that can be run any number of times, by several threads at once.
-
-    A torque function is called anew in each run.
-    """
-
-    def __init__(self, run: Callable[[bool], Trajectory]) -> None:
-        self._run = run
-
-    def run(self, *, progress: bool = False) -> Trajectory:
-        """Compute the motion; the trajectory has arrays of its own."""
-        if progress is not False and not isinstance(progress, (bool, np.bool_)):
-            _refuse("progress", progress, "must be True or False")
-        return self._run(progress)
-
-
-def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:
+def _integrate(task: Task, *, progress: bool) -> Trajectory:
     """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
 
-    A function whose torques are held, and which may have a memory, runs once.
-    `reason` says why this method was chosen, "" where the caller chose it.
+    A function whose torques are held, and which may have a memory, runs once. All runs share one
+    budget; of two that do not meet the tolerance the one that reached the end is kept.
     """
-    local, spent = task.tolerance, 0
+    budget = EvaluationBudget(_budget_of(task), whole_run=True)
     remembers = task.period is not None and not task.memoryless
-    factor = _UNSEEN if remembers and task.torque.feedback else 1.0
+    local, kept = task.tolerance, None
     for _ in range(_ATTEMPTS):
         attempt = replace(task, tolerance=local)
-        motion = SteppedMotion(attempt, start_of(task.scene), spent=spent, progress=progress).run()
-        spent += motion.budget.spent
+        motion = SteppedMotion(attempt, start_of(task.scene), budget, progress=progress).run()
+        if kept is not None and motion.status < 0:
+            break
+        kept = motion
         excess = motion.at.error / task.tolerance
         if remembers or motion.status < 0 or not excess > 1.0:
             break
         local = max(local / (5.0 * excess), _FINEST)
-    message, point, error = motion.message, motion.at, factor * motion.at.error
+    assert kept is not None
+    unseen = remembers and task.torque.feedback
+    return _trajectory(task, kept, budget.spent, factor=_UNSEEN if unseen else 1.0)
+
+
+def _budget_of(task: Task) -> int:
+    """Return how many evaluations a motion may take: fewer where they call a function."""
+    calls = task.period is None and task.torque.feedback
+    return _FUNCTION_BUDGET if calls else WHOLE_MOTION_BUDGET
+
+
+def _trajectory(task: Task, motion: SteppedMotion, spent: int, *, factor: float) -> Trajectory:
+    """Return a run as a trajectory; its error estimate is `factor` times that of the steps."""
+    point, error, message = motion.at, factor * motion.at.error, motion.message
     if motion.status < 0:
         numbers = describe_conditioning(Geometry.of(task.scene), motion.state())
         message = f"{message} ({numbers})"
+        if task.period is None and task.torque.feedback:
+            message = f"{message}{_ADVICE}"
     status, message = check_error(error, task.tolerance, motion.status, message)
     if factor > 1.0 and error > task.tolerance:
         message = f"{message} ({factor:g} times wider, as the function may have a memory)"
-    rows = np.array(motion.rows).reshape(-1, 29)
+    samples = motion.samples.table()
     changes = [f"{to} from {at:g} s ({why})" for at, to, why in point.changes]
-    energy = motion.propagator.dynamics.total_energy
+    energy = motion.stepper.dynamics.total_energy
     return Trajectory(
-        task.scene, rows[:, 0], rows[:, 1:5], rows[:, 5:8], rows[:, 8:11], joints=rows[:, 11:],
+        task.scene,
+        samples.t,
+        samples.quaternion,
+        samples.body_rate,
+        samples.torque,
+        joints=samples.joints,
         status=status,
         message=message,
-        method=", then ".join([motion.start.method.name, *changes]) + reason,
+        method=", then ".join([motion.start.method.name, *changes]),
         error_estimate=error,
         energy_residual=energy(point.y) - energy(motion.start.y) - point.y[-1],
-        evaluations=spent,
+        evaluations=spent + motion.samples.evaluations,
         step=motion.time / max(point.steps, 1),
         law=TorqueTable(*zip(*motion.held, strict=True)) if motion.held else task.torque,
         parameters=task.parameters,
-    )  # fmt: skip
+    )
 
 
 def _refuse(name: str, value: object, allowed: str) -> NoReturn:

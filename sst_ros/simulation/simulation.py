@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import operator
 import sys
-import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -14,13 +13,18 @@ import numpy as np
 from sst_ros.dynamics.initial_state import derive_by_paper, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.errors import Diverged, StepBudgetExceeded, check_kinds, refusal, refuse_unless
-from sst_ros.host.compiled_module import numba_version
-from sst_ros.integration.adaptive_stepper import BudgetSpent, CannotStep, EvaluationBudget
-from sst_ros.integration.compiled_method import MethodChange, Point
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
-from sst_ros.integration.propagator import LimitReached, Propagator
+from sst_ros.integration.point import MethodChange, Point
+from sst_ros.integration.stepper import (
+    BudgetSpent,
+    CannotStep,
+    EvaluationBudget,
+    LimitReached,
+    Stepper,
+)
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
+from sst_ros.programs.llvm import llvmlite_version
 from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.scene.torque_profile import SineTorque, Torque, count_arguments
 from sst_ros.state import NANOSECONDS, Explained, State, Vector3, finite_vector
@@ -32,7 +36,7 @@ EQUATIONS = ("quaternion", "virtual_work")
 """Equations of motion: in the quaternion and the body rate, or the paper's Eqs. 1 to 92."""
 
 _MOST = 10**9
-"""Steps of one call: a compiled loop cannot be interrupted."""
+"""Steps of one call."""
 
 _COUNT = f"must be > 0 and <= {_MOST:g}, a whole number"
 _THREE = "must be three finite numbers [N m]"
@@ -43,16 +47,16 @@ _PLAIN_BUDGET = 3_000_000
 _STAGE_OPERATIONS = 100
 """Operations of a stage beside the scene's equations, which have 140 to 450."""
 _COMPILED_BUDGET = 120_000
-"""Evaluations a compiled step may take: 0.12 s, for an accepted step of 36 takes 36 us in all."""
+"""Evaluations a step in machine code may take: 0.12 s, at most 1 us each with the loop."""
 _VIRTUAL_WORK_BUDGET = 1000
 """Evaluations of the paper's equations that a step may take: 0.3 s, at 0.3 ms each."""
 
 
-def default_budget(dynamics: Dynamics, equations: str, *, compiled: bool) -> int:
+def default_budget(dynamics: Dynamics, equations: str) -> int:
     """Return evaluations that keep a step below about 0.2 s: 5,000 to 12,000 in plain Python."""
     if equations == "virtual_work":
         return _VIRTUAL_WORK_BUDGET
-    if compiled:
+    if llvmlite_version() is not None:
         return _COMPILED_BUDGET
     return _PLAIN_BUDGET // (len(recent_ode(dynamics, work=True).program.steps) + _STAGE_OPERATIONS)
 
@@ -88,12 +92,8 @@ class Simulation(Explained):
         integrator: auto, or a method of `integration.methods.METHODS`.
         tolerance: largest local error of a step: of the quaternion, and of the rate relative to
             its length. RK4 has no error estimate; it takes one step a call.
-        compiled: run under numba; the digits are the same, the first step of a new scene takes
-            seconds. Without numba a RuntimeWarning is raised and plain Python runs. Torque
-            functions, and sines that the actuators clamp, run in plain Python, with one
-            RuntimeWarning.
         equations: "quaternion", the equations of motion in the quaternion and the body rate, or
-            "virtual_work", the paper's Eqs. 1 to 92: the same motion, about 20 times slower, by
+            "virtual_work", the paper's Eqs. 1 to 92: the same motion, a thousand times slower, by
             explicit methods in plain Python, without the terms that the paper does not have.
         step_budget: evaluations of the right-hand side that one `step` may take. The default keeps
             a step below about 0.2 s, see `default_budget`. Long steps of a stiff or fast
@@ -102,7 +102,6 @@ class Simulation(Explained):
     Attributes:
         geometry: constant vectors of the scene.
         dynamics: traced functions of the scene.
-        compiled: whether numba is used.
         step_budget: evaluations that one step may take.
 
     Raises:
@@ -120,11 +119,10 @@ class Simulation(Explained):
         integrator: str = AUTO,
         *,
         tolerance: float = 1e-10,
-        compiled: bool = False,
         equations: str = "quaternion",
         step_budget: int | None = None,
     ) -> None:
-        explicit = not (compiled or isinstance(METHODS.get(integrator), Rosenbrock))
+        explicit = not isinstance(METHODS.get(integrator), Rosenbrock)
         refuse_unless(
             "simulation",
             ("integrator", integrator, integrator in INTEGRATORS, _one_of(INTEGRATORS)),
@@ -132,30 +130,23 @@ class Simulation(Explained):
             ("step_budget", step_budget, step_budget is None or step_budget > 0, "must be > 0"),
             ("equations", equations, equations in EQUATIONS, _one_of(EQUATIONS)),
             ("equations", equations, explicit or equations != "virtual_work",
-             "needs an explicit integrator and compiled = False"),
+             "needs an explicit integrator"),
         )  # fmt: skip
         self.scene = scene = scene_of(scene)
         derivative = derive_by_paper(scene) if equations == "virtual_work" else None
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
-        self.compiled = compiled and numba_version() is not None
-        if compiled and not self.compiled:
-            text = "no numba (or SST_ROS_NUMBA=0): running plain Python, slower, the same digits"
-            warnings.warn(text, RuntimeWarning, stacklevel=3)
-        self.step_budget = step_budget or default_budget(
-            self.dynamics, equations, compiled=self.compiled
-        )
-        self._propagator = Propagator(
+        self.step_budget = step_budget or default_budget(self.dynamics, equations)
+        self._stepper = Stepper(
             scene,
             integrator,
             # A call of RK4 is one step, whatever its error.
             sys.float_info.max if integrator == RK4.name else tolerance,
-            compiled=self.compiled,
             budget=EvaluationBudget(self.step_budget),
             derivative=derivative,
         )
-        self._warned, self._lags = not self.compiled, scene.lags
-        self._start = self._propagator.begin(list(start_of(scene)))
+        self._lags = scene.lags
+        self._start = self._stepper.begin(list(start_of(scene)))
         self._now = self._before = _Instant(0, self._start)
         self.reset()
 
@@ -164,7 +155,7 @@ class Simulation(Explained):
 
         Args:
             torque: commanded torques [N m], held constant; a `SineTorque`; or a function of
-                t [s], for which plain Python is used.
+                t [s].
             dt_ns: length [ns], > 0.
             moment: external moment on the star in {B} [N m], used where the scene takes it from
                 a topic.
@@ -185,8 +176,7 @@ class Simulation(Explained):
     ) -> None:
         """Advance by `count` times dt_ns: the bits are those of `count` calls of `step`.
 
-        Where nothing happens but steps, all of them are one call of compiled code. Errors are those
-        of `step`: the state is then that after the last step before, at `time_ns`.
+        Errors are those of `step`: the state is then that after the last step before, at `time_ns`.
         """
         length, number = _whole(dt_ns), _whole(count)
         known = 0 < number <= _MOST and length > 0
@@ -199,42 +189,35 @@ class Simulation(Explained):
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
                 ("count", count, 0 < number <= _MOST, _COUNT),
             )
-        torque = self.acting(torque)
-        if callable(torque) and not self._warned:
-            self._warned = True
-            text = "a torque function runs in plain Python, slower than compiled=True; same digits"
-            warnings.warn(text, RuntimeWarning, stacklevel=3)
-        self.advance(torque, length, number, moment)
+        self.advance(self.acting(torque), length, number, moment)
 
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
         try:
             if callable(torque) and not getattr(torque, "feedback", False):
                 refuse_unless("step", ("torque", torque, count_arguments(torque) == 1, _TORQUE))
-            return self._propagator.torque.acting(torque)
+            return self._stepper.torque.acting(torque)
         except (TypeError, ValueError, OverflowError):
             raise refusal("step", "torque", torque, _TORQUE) from None
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""
-        propagator, h = self._propagator, dt_ns / NANOSECONDS
+        h, began = dt_ns / NANOSECONDS, self._now
         held = tuple(map(float, moment)) if self.dynamics.has_moment_topic else ()
-        while count > 0:
-            at = self._now
-            start = at.time_ns / NANOSECONDS
+        for _ in range(count):
+            time_ns, at, *_ = self._now
+            start = time_ns / NANOSECONDS
             try:
-                point, done = propagator.advance(at.point, start, h, count, torque, held)
+                point = self._stepper.advance(at, start, h, torque, held)
             except LimitReached as reached:
                 assert reached.limit.error is not None
                 raise reached.limit.error(reached.limit.reason, reached.time, self.state) from None
-            except (CannotStep, ArithmeticError, ValueError) as error:
+            except CannotStep as error:
                 kind = StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
                 near = describe_conditioning(self.geometry, self.state)
-                reason = f"{error or 'not finite'} ({near})"
-                raise kind(reason, start, self.state) from None
-            self._before = at
-            self._now = _Instant(at.time_ns + done * dt_ns, point, torque, held)
-            count -= done
+                raise kind(f"{error} ({near})", start, self.state) from None
+            self._before = began
+            self._now = _Instant(time_ns + dt_ns, point, torque, held)
 
     @check_kinds
     def within(self, time_ns: int) -> State:
@@ -253,7 +236,7 @@ class Simulation(Explained):
             return self._as_state(self._before)
         start, h = began / NANOSECONDS, (time_ns - began) / NANOSECONDS
         _, _, torque, moment = self._now
-        point, _ = self._propagator.advance(self._before.point, start, h, 1, torque, moment)
+        point = self._stepper.advance(self._before.point, start, h, torque, moment)
         return self._as_state(_Instant(time_ns, point, torque, moment))
 
     def reset(self) -> State:
@@ -264,12 +247,12 @@ class Simulation(Explained):
         return self.state
 
     def load_code(self) -> None:
-        """Have the code of all methods loaded that steps under constant torques may turn to.
+        """Have the code of all methods compiled that steps under constant torques may turn to.
 
-        Otherwise the step that changes the method loads it, which takes tenths of a second, or
-        compiles it, which takes seconds. The state does not change.
+        Otherwise the first step, and one that changes the method, compiles it, which takes tenths
+        of a second. The state does not change.
         """
-        self._propagator.load()
+        self._stepper.load()
 
     @property
     def state(self) -> State:
@@ -308,7 +291,7 @@ class Simulation(Explained):
     @property
     def evaluations(self) -> int:
         """Evaluations of the derivative, those of rejected steps too; a Jacobian counts as 30."""
-        return self._propagator.budget.spent
+        return self._stepper.budget.spent
 
     @property
     def error_estimate(self) -> float:
@@ -346,7 +329,7 @@ class Simulation(Explained):
         return {
             "scene": self.scene.name,
             "time [s]": self.time_ns / NANOSECONDS,
-            "method": self.method + (", compiled" if self.compiled else ", plain Python"),
+            "method": self.method,
             "accepted steps": self.accepted_steps,
             "error estimate [rad]": self.error_estimate,
             "gamma [rad]": self.state.joints.gamma,
@@ -360,7 +343,7 @@ class Simulation(Explained):
     def _torque(self, at: _Instant) -> Vector3:
         if type(at.torque) is tuple and not self._lags:
             return at.torque
-        return self._propagator.acting(at.torque, at.time_ns / NANOSECONDS, at.point)
+        return self._stepper.acting(at.torque, at.time_ns / NANOSECONDS, at.point)
 
 
 def conditioning(geometry: Geometry, state: State) -> dict[str, float]:

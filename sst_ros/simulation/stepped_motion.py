@@ -5,37 +5,41 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.host.compiled_module import numba_version
 from sst_ros.host.output import Bar
-from sst_ros.integration.adaptive_stepper import (
-    WHOLE_MOTION_BUDGET,
+from sst_ros.integration.methods import DOP853, Method
+from sst_ros.integration.point import Point, state_distance
+from sst_ros.integration.stepper import (
+    ACCURATE,
     CannotStep,
     EvaluationBudget,
+    LimitReached,
     Step,
+    Stepper,
 )
-from sst_ros.integration.compiled_method import CompiledMethod, Point, has_step_code, state_distance
-from sst_ros.integration.propagator import LimitReached, Propagator
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import Torque, TorqueProfile, torque_at
+from sst_ros.scene.torque_profile import SineTorque, Torque, TorqueProfile, torque_at
+from sst_ros.simulation.samples import Samples
 from sst_ros.state import NANOSECONDS, Array, State, Vector3, clamp
 
-_WORTH_LOADING, _WORTH_COMPILING = 20_000, 100_000
-"""Evaluations after which a run goes on with compiled code that is there, and makes it: in plain
-Python they take one second and five; to compile the steps of a method takes four."""
+AUTO = "auto"
 
-_WARN_AFTER, _HOPELESS = WHOLE_MOTION_BUDGET // 100, 3.0
-"""Evaluations, a second of work, after which a motion is looked at that will not reach its end by
-three times its budget: a warning then, and not a stop after half a minute."""
+_WARN_AFTER = 100_000
+"""Evaluations, a second of work where a function gives the torques, after which a motion is
+looked at that will not reach its end: a warning then, and not a stop after half a minute."""
+_HOPELESS = 3.0
+"""...by so many times its budget."""
 
-_MANY, _WORST = 8, 0.07
-"""Samples in a step from which on a polynomial costs less than a step for each; the share of the
-step at which its error is largest."""
+_MANY = 8
+"""Samples in a step from which on a polynomial costs less than a step for each, where a function
+gives the torques."""
+_WORST = 0.07
+"""Share of the step at which the error of that polynomial is largest."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +65,16 @@ class SteppedMotion:
     Args:
         task: what is simulated.
         y: state at the begin; numbers that it lacks at its end are zero.
+        budget: evaluations that it may take, those of earlier runs of the same motion included.
         limits: whether the limits of the scene end the motion.
-        spent: evaluations of earlier runs of the same motion.
         progress: draw a bar on a terminal.
 
     Attributes:
-        rows: of each sample time, quaternion, body rate, torques, angles and rates of the joints.
+        samples: those that were taken.
         held: times of control [s] and the torques from then on.
         start, at, time: first and last valid point, and time of the last [s].
         status, message: 0 at the end, 1 at a limit, -1 where no step resolves the motion; why.
-        propagator: what made the steps.
-        budget: `budget.spent` counts evaluations of the derivative.
+        stepper: what made the steps.
 
     """
 
@@ -79,48 +82,43 @@ class SteppedMotion:
         self,
         task: Task,
         y: Sequence[float] | Array,
+        budget: EvaluationBudget,
         *,
         limits: bool = True,
-        spent: int = 0,
         progress: bool = False,
     ) -> None:
-        self._task, self._spent = task, spent
-        self.budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
-        self.propagator = Propagator(
-            task.scene, task.method, task.tolerance, compiled=False, budget=self.budget,
-            limits=limits, max_step=task.max_step,
+        self._task, self._budget = task, budget
+        self.stepper = Stepper(
+            task.scene, task.method, task.tolerance, budget=budget, limits=limits,
+            max_step=task.max_step,
         )  # fmt: skip
-        self.start = self.at = self.propagator.begin(list(y))
+        self.start = self.at = self.stepper.begin(list(y), _first_method(task))
         self.time, self.status, self.message = task.span[0], 0, "reached the end"
         self.held: list[tuple[float, Vector3]] = []
-        self.rows: list[tuple[float, ...]] = []
+        self.samples = Samples(self.stepper)
         self._wanted: list[float] = task.times[::-1].tolist()
         self._torque: Torque = (0.0, 0.0, 0.0)
         self._other: Vector3 | None = None  # on the second solution, where they differ
         self._segment = task.span
+        self._moment = (0.0,) * len(self.stepper.dynamics.drive[3:])
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
-        self._compile_after = _WORTH_LOADING if numba_version() else math.inf
         self._warn_after: float = _WARN_AFTER
 
     def run(self) -> SteppedMotion:
-        """Go to the end or a limit: through segments of a smooth torque, by steps, to events."""
-        moment = (0.0, 0.0, 0.0) if self.propagator.dynamics.has_moment_topic else ()
+        """Go to the end or a limit."""
         try:
-            for begin, h, end, torque in self._segments():
-                self._segment = begin, end
-                self._torque = self.propagator.torque.acting(torque)
-                self._take_if_wanted(begin, self.at.y)
-                with np.errstate(all="ignore"):
-                    for step in self.propagator.steps(
-                        self.at, begin, h, self._torque, moment, self._other
-                    ):
-                        self._pass(step)
+            with np.errstate(all="ignore"):
+                if self._task.period is None:
+                    self._follow_profile()
+                else:
+                    self._hold_periods(self._task.period)
         except LimitReached as reached:
             self.status, stop = 1, reached.limit.reason
-            self._take(math.floor(reached.time * NANOSECONDS) / NANOSECONDS, None)
+            end = math.floor(reached.time * NANOSECONDS) / NANOSECONDS
+            self._take_inside(end)
             self.time = reached.time
-        except (CannotStep, ArithmeticError, ValueError) as error:
-            self.status, stop = -1, str(error) or "not finite"
+        except CannotStep as error:
+            self.status, stop = -1, str(error)
             self._take(self.time, self.at.y)
         if self.status:
             self.message = f"stopped at t = {self.time:.12f} s: {stop}"
@@ -131,75 +129,77 @@ class SteppedMotion:
         return self._state_of(self.at, self._torque)
 
     def _state_of(self, at: Point, torque: Torque) -> State:
-        acting = self.propagator.acting(torque, self.time, at)
+        acting = self.stepper.acting(torque, self.time, at)
         return State.of(round(self.time * NANOSECONDS), at.y, at.joints, acting)
 
-    def _segments(self) -> Iterator[tuple[float, float, float, Torque]]:
-        """Yield begin, length and end of segments [s], and the torque, smooth in each."""
+    def _follow_profile(self) -> None:
+        """Go through segments in each of which the torque is smooth."""
         task, (begin, end) = self._task, self._task.span
-        if task.period is not None:
-            last = round(end * NANOSECONDS)
-            for start in range(0, last, task.period):
-                time = start / NANOSECONDS
-                self._take_if_wanted(time, self.at.y)
-                state = (self.state(),) if task.torque.feedback else ()
-                held = torque_at(task.torque, time, *state)
-                self.held.append((time, held))
-                if task.torque.feedback and task.memoryless:
-                    self._other = self._answer_second(time)
-                stop = min(start + task.period, last)
-                yield time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held
-            return
         kinks = np.union1d(task.breaks, task.torque.kinks(task.scene.torque_limit, end))
         inside = kinks[(kinks > begin) & (kinks < end)].tolist()
         for start, stop in pairwise([begin, *inside, end]):
-            acting = task.torque.acting(start, stop)
-            yield start, stop - start, stop, acting
+            self._advance(start, stop - start, stop, task.torque.acting(start, stop))
+
+    def _hold_periods(self, period: int) -> None:
+        """Go through control periods, in each of which the torques of a function are held."""
+        task, end = self._task, round(self._task.span[1] * NANOSECONDS)
+        for start in range(0, end, period):
+            time = start / NANOSECONDS
+            self._take_if_wanted(time, self.at.y)
+            state = (self.state(),) if task.torque.feedback else ()
+            held = torque_at(task.torque, time, *state)
+            self.held.append((time, held))
+            if task.torque.feedback and task.memoryless:
+                self._other = self._answer_second(time)
+            stop = min(start + period, end)
+            self._advance(time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held)
 
     def _answer_second(self, time: float) -> Vector3:
         """Return what a function without memory gives to the second solution [N m]."""
-        at = self.propagator.begin(self.at.z)
+        at = self.stepper.begin(self.at.z)
         before = self._torque if self._other is None else self._other
-        found = torque_at(self._task.torque, time, self._state_of(at, before))
-        return clamp(found, self.propagator.torque.limit)
+        torque = torque_at(self._task.torque, time, self._state_of(at, before))
+        return clamp(torque, self.stepper.torque.limit)
+
+    def _advance(self, begin: float, h: float, end: float, torque: Torque) -> None:
+        """Go through a segment under a torque, from `begin` to `end` [s], whose length is h."""
+        self._segment = begin, end
+        self._torque = self.stepper.torque.acting(torque)
+        self._take_if_wanted(begin, self.at.y)
+        self.stepper.advance(
+            self.at, begin, h, self._torque, self._moment, other=self._other, visit=self._pass
+        )
 
     def _pass(self, step: Step) -> None:
-        """Take samples in an accepted step."""
-        if self._spent + self.budget.spent > self._compile_after:
-            self._compile(step.machine)
+        """Take the samples in a step, and note where the motion stands."""
         self._last, self._last_begin = step, self._segment[0] + step.t
         end = self._segment[1] if step.last else self._last_begin + step.h
         inside = []
         while self._wanted and self._wanted[-1] < end:
             inside.append(self._wanted.pop())
-        polynomial = self._interpolate(step) if len(inside) >= _MANY else None
+        is_function = callable(self._torque) and not isinstance(self._torque, SineTorque)
+        polynomial = self._interpolate(step) if is_function and len(inside) >= _MANY else None
         for time in inside:
-            y = None if polynomial is None else polynomial(time - self._last_begin)
-            self._take(time, y)
+            if polynomial is None:
+                self._take_inside(time)
+            else:
+                self._take(time, polynomial(time - self._last_begin).tolist())
         self.time, self.at = end, step.end
         self._take_if_wanted(end, step.end.y)
         begin, last = self._task.span
         share = (end - begin) / (last - begin)
         self._bar.draw(share)
-        if self.budget.spent > self._warn_after:
-            self._warn_after = math.inf
-            if _HOPELESS * WHOLE_MOTION_BUDGET * share < self.budget.spent:
-                done = f"{self.budget.spent:,} evaluations for {100.0 * share:.2g} % of the motion"
-                most = f"it stops at {WHOLE_MOTION_BUDGET:,}: shorten it, or change its method"
-                text = f"{self._task.scene.name}: {done}; {most}"
-                warnings.warn(text, RuntimeWarning, stacklevel=2)
+        if self._budget.spent > self._warn_after:
+            self._warn_if_hopeless(share)
 
-    def _compile(self, machine: CompiledMethod) -> None:
-        """Take compiled steps from now on, if their code is there or the run is long.
-
-        Under a function only the derivative is compiled, which takes a second.
-        """
-        there = callable(self._torque) or has_step_code(machine.system, machine.method)
-        if there or self._spent + self.budget.spent > _WORTH_COMPILING:
-            self.propagator.compile()
-            self._compile_after = math.inf
-        else:
-            self._compile_after = _WORTH_COMPILING
+    def _warn_if_hopeless(self, share: float) -> None:
+        """Warn once where the rest of the motion would take far more than the budget."""
+        self._warn_after, most = math.inf, self._budget.per_period
+        if _HOPELESS * most * share < self._budget.spent:
+            done = f"{self._budget.spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+            advice = f"it stops at {most:,}: shorten it, or change its method"
+            text = f"{self._task.scene.name}: {done}; {advice}"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     def _interpolate(self, step: Step) -> Callable[[float], Array] | None:
         """Return a polynomial of the time in a step, through states and slopes at its quarters.
@@ -209,30 +209,37 @@ class SteppedMotion:
         from scipy.interpolate import KroghInterpolator  # many runs have few samples
 
         times = [0.25 * k * step.h for k in range(5)]
-        states = [step.begin.y, *(step.inside(x).y for x in times[1:-1]), step.end.y]
+        states = [step.begin.y, *(step.inside(x) for x in times[1:-1]), step.end.y]
         slopes = [
-            step.machine.slope(step.t + x, y, step.drive)
-            for x, y in zip(times, states, strict=True)
+            step.steps.slope(step.t + x, y, step.drive) for x, y in zip(times, states, strict=True)
         ]
         data = [row for pair in zip(states, slopes, strict=True) for row in pair]
+        self._budget.charge(4 * step.steps.cost + len(times))
+        if not np.isfinite(data).all():
+            return None
         polynomial = KroghInterpolator(np.repeat(times, 2), data)
         worst = _WORST * step.h
-        found, exact = polynomial(worst).tolist(), step.inside(worst).y
-        self.budget.charge(4 * step.machine.cost + len(times))
-        return polynomial if state_distance(found, exact) <= self._task.tolerance else None
+        distance = state_distance(polynomial(worst).tolist(), step.inside(worst))
+        return polynomial if distance <= self._task.tolerance else None
 
     def _take_if_wanted(self, time: float, y: Sequence[float]) -> None:
         if self._wanted and self._wanted[-1] == time:
             self._take(self._wanted.pop(), y)
 
-    def _take(self, time: float, y: Sequence[float] | Array | None) -> None:
-        """Take a sample at a time; a state that is not given is stepped to."""
-        if self.rows and self.rows[-1][0] >= time:
-            return
-        if y is None:
-            x = time - self._last_begin
-            self.budget.charge(self._last.machine.cost)
-            y = (self._last.inside(x) if x > 0.0 else self._last.begin).y
-        at = self.propagator.begin(list(y))
-        acting = self.propagator.acting(self._torque, time, at)
-        self.rows.append((time, *at.y[:7], *acting, *at.joints))
+    def _take_inside(self, time: float) -> None:
+        """Take a sample in the last step."""
+        x = time - self._last_begin
+        if x > 0.0:
+            self.samples.add_inside(time, self._torque, self._last, x)
+        else:
+            self._take(time, self._last.begin.y)
+
+    def _take(self, time: float, y: Sequence[float]) -> None:
+        """Take a sample at a time and a state."""
+        self.samples.add(time, self._torque, y)
+
+
+def _first_method(task: Task) -> Method | None:
+    """Return the method that `auto` begins a long and accurate motion with, else None."""
+    accurate = task.period is None and task.tolerance < ACCURATE
+    return DOP853 if task.method == AUTO and accurate else None

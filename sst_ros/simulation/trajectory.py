@@ -31,6 +31,7 @@ from sst_ros.errors import (
 )
 from sst_ros.host.output import SUFFIXES, load_table, write_table
 from sst_ros.integration.methods import DOP853
+from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET, EvaluationBudget
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix, unwrap_zyz
@@ -147,20 +148,6 @@ class Trajectory(MotionTable):
         """Return what a copy or another process gets: `at` integrates there from the samples."""
         arrays = {name: getattr(self, name) for name in ("quaternion", "body_rate", "torque")}
         return vars(self) | arrays | {"dense": None, "_residual": self.energy_residual}
-
-    def repeater(self) -> Callable[[Callable[[Array], Array]], Trajectory]:
-        """Return a function from another `dense` to the same run by it: nothing is checked again.
-
-        A prepared run makes its results by it.
-        """
-        about = dict(vars(self))
-
-        def repeat(dense: Callable[[Array], Array]) -> Trajectory:
-            again = object.__new__(Trajectory)
-            again.__dict__ = about | {"dense": dense}
-            return again
-
-        return repeat
 
     @cached_property
     def _states(self) -> Array:
@@ -425,8 +412,11 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
         law = trajectory.law or profile_of(trajectory.torque[k + 1])
         span = float(t[k]), float(asked[-1])
         task = Task(trajectory.scene, law, span, asked, DOP853.name, _ACCURACY)
-        motion = SteppedMotion(task, samples[k, :size], limits=False).run()
+        budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
+        motion = SteppedMotion(task, samples[k, :size], budget, limits=False).run()
         if motion.status:
             raise Diverged(motion.message, motion.time, motion.state())
-        found[rows] = np.array(motion.rows)[places, 1:11]
+        table = motion.samples.table()
+        states = np.hstack([table.quaternion, table.body_rate, table.torque])
+        found[rows] = states[places]
     return found

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A batch under feedback: the control law, compiled for all scenarios, acts once a period.
+"""A batch under feedback: the control law acts on all scenarios once a period.
 
 At a sample the law and its channel are a function of the state of the plant and of a memory: the
 integral, the queue of delayed commands, the last encoder angles, the observed orientation, and sums
 of tracking errors. It is traced, without branches: what the settings do not use has no operation.
+It becomes machine code as the step does, and is called before the steps of a period, in which the
+torques are held.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import cached_property
 from itertools import islice
-from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,46 +25,13 @@ from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, Referenc
 from sst_ros.control.controller import BAND, Controller
 from sst_ros.dynamics import kernel
 from sst_ros.errors import refuse_unless
-from sst_ros.host import compiled_module
-from sst_ros.integration.batch import Batch, BatchResult
-from sst_ros.integration.simd_source import (
-    SIMD_WIDTH,
-    Layout,
-    assign_once,
-    evaluate_lanes,
-    indent,
-    load_lanes,
-    loop,
-    over_blocks,
-    replace_valid,
-)
-from sst_ros.mechanism.generic_math import axpy, dot3, positive
+from sst_ros.integration.batch import Batch, BatchResult, block_width
+from sst_ros.integration.batch_step import Block, ColumnStep, advance_blocks, fill
+from sst_ros.mechanism.generic_math import axpy, cos, dot3, log, positive, select, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.programs.expression import Expression, Program, trace
+from sst_ros.programs.columns import ColumnFunction, compile_columns
+from sst_ros.programs.expression import Expression, trace
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
-
-NOISE = (
-    """\
-def mixed(x):
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
-""",
-    """\
-def gaussian(seed, row, counter):
-    step = np.uint64(0x9E3779B97F4A7C15)
-    stream = mixed(mixed(np.uint64(seed) + step) + np.uint64(row) * step)
-    first = mixed(stream + np.uint64(2 * counter + 1) * step)
-    second = mixed(stream + np.uint64(2 * counter + 2) * step)
-    u = (np.float64(first >> np.uint64(11)) + 0.5) * 1.1102230246251565e-16
-    v = (np.float64(second >> np.uint64(11)) + 0.5) * 1.1102230246251565e-16
-    return sqrt(-2.0 * np.log(u)) * cos(6.283185307179586 * v)
-""",
-)
-"""Normal noise from a counter: number c of row i depends on the seed, i and c alone.
-
-The bits are those of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), started anew for each number;
-a pair of them becomes a normal number by the method of Box and Muller (1958)."""
 
 NEWTON_STEPS = 5
 """Of the observer at a sample. They square the error; from one sample to the next it is small."""
@@ -76,8 +45,7 @@ GAINS = {"kp": 3, "kd": 3, "inertia": 3, "rate": 1, "limit": 1, "plant_limit": 1
 """Sizes of what may differ between scenarios; `rate` is that of the integral."""
 
 _NOISE = 6
-_BLOCKS = 32
-"""Blocks of scenarios that are advanced from sample to sample together: they fit the cache."""
+"""Normal numbers that a sample takes: of three angles and three rates."""
 
 
 def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
@@ -86,59 +54,97 @@ def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
     return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
 
 
-def control_source(program: Program, sizes: Mapping[str, int]) -> str:
-    """Text of `control(sample, begin, end, y, d, code, memory, references, gains, rows, seed)`.
+# Normal noise from a counter: number c of row i depends on the seed, i and c alone. The bits are
+# those of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), started anew for each number; a pair of
+# them becomes a normal number by the method of Box and Muller (1958).
 
-    At a sample it gives scenarios whose code is 0, in the blocks begin to end, the torques in
-    d (numbers, N) and the new memory (numbers, N). All share the references (samples, numbers);
-    `gaussian(seed, row, counter)` gives the noise of each. The outputs of the program are three
-    torques and the new memory; `sizes` are those of its inputs: references, state y, memory, noise,
-    the rest of d behind the torques, gains. Ten lines of it:
+_STEP = np.uint64(0x9E3779B97F4A7C15)
 
-        def control(sample, begin, end, y, d, code, memory, references, gains, rows, seed):
-            block = vector(2976)
-            for b in range(begin, end):
-                lo = b * 32
-                for i in range(32):
-                    n = lo + min(i, last)
-                    block[0 + i] = y[0, n]
-                u0 = references[sample, 0]
-                for i in range(last + 1):
-                    d[0, lo + i] = block[704 + i]
+
+def streams(seed: int, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Return where the random bits of rows begin, shape (N,)."""
+    first = _mix(np.array([seed], dtype=np.uint64) + _STEP)
+    return _mix(first + rows.astype(np.uint64) * _STEP)
+
+
+def uniform_numbers(starts: NDArray[np.uint64], sample: int, normal: int = _NOISE) -> Array:
+    """Return what `normal` numbers a row are made of at a sample, shape (2 normal, N).
+
+    They are uniform between 0 and 1, a pair for each normal number.
     """
-    state, memory, noise, drive = sizes["y"], sizes["memory"], sizes["noise"], 3 + sizes["rest"]
-    at = Layout(
-        SIMD_WIDTH, y=state, memory=memory, noise=noise, d=drive, gains=sizes["gains"],
-        command=3 + memory, code=1,
-    )  # fmt: skip
-    given = [
-        *(f"references[sample, {j}]" for j in range(sizes["references"])),
-        *at.rows("y", state),
-        *at.rows("memory", memory),
-        *at.rows("noise", noise),
-        *at.rows("d", drive)[3:],
-        *at.rows("gains", sizes["gains"]),
-    ]
-    drawn = [
-        f"    {at.lane('noise', j)} = gaussian(seed, rows[n], {noise} * sample + {j})"
-        for j in range(noise)
-    ]
-    places = at.rows("d", 3) + at.rows("memory", memory)
-    names = [f"d[{j}, lo + i]" for j in range(3)] + [f"memory[{j}, lo + i]" for j in range(memory)]
-    accepted = [f"now = {at.lane('code')}"]
-    for j, place in enumerate(places):
-        accepted += replace_valid(place, at.lane("command", j))
-    lines = [
-        *load_lanes(at, y=state, d=drive, memory=memory, gains=sizes["gains"]),
-        f"    {at.lane('code')} = code[n]",
-        *(load_lanes(at) + drawn if drawn else ()),
-        *evaluate_lanes(program, given, at, "command"),
-        *loop(at, accepted),
-        "for i in range(last + 1):",
-        *(f"    {name} = {place}" for name, place in zip(names, places, strict=True)),
-    ]
-    head = "def control(sample, begin, end, y, d, code, memory, references, gains, rows, seed):"
-    return assign_once([head, *over_blocks(at), *indent(8, lines)])
+    numbers = np.arange(1, 2 * normal + 1, dtype=np.uint64) + np.uint64(2 * normal * sample)
+    bits = _mix(starts + (numbers * _STEP)[:, None])
+    uniform: Array = ((bits >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
+    return uniform
+
+
+def normal_number(u: Any, v: Any) -> Any:
+    """Return a normal number of mean 0 and deviation 1, of two uniform ones."""
+    return sqrt(-2.0 * log(u)) * cos(2.0 * math.pi * v)
+
+
+def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    mixed: NDArray[np.uint64] = x ^ (x >> np.uint64(31))
+    return mixed
+
+
+class Feedback(NamedTuple):
+    """What the control of some scenarios needs; arrays have a column a scenario."""
+
+    answer: ColumnFunction  # the control law, see `ControlledBatch.answer`
+    references: Sequence[tuple[float, ...]]  # of each sample
+    hold: int  # steps from a sample to the next
+    memory: Array  # changes
+    gains: Array
+    starts: NDArray[np.uint64]  # of the noise; none without noise
+
+
+class ControlledBlock(Block):
+    """Columns whose torques the control law gives at each sample, and holds until the next.
+
+    Which columns they are is known from `load` on.
+    """
+
+    def __init__(self, step: ColumnStep, width: int, feedback: Feedback) -> None:
+        super().__init__(step, width)
+        self._feedback = feedback
+        self._memory = np.zeros((len(feedback.memory), width))
+        self._gains = np.zeros((len(feedback.gains), width))
+        noise = 2 * _NOISE if len(feedback.starts) else 0
+        self._uniform = np.zeros((noise, width))
+        self._starts = np.zeros((1, width), dtype=np.uint64)
+        others = [*self._memory, *self._uniform, *self.given, *self._gains, self.running]
+        results = [*self.given[:3], *self._memory]
+        self._answer = [
+            feedback.answer.bind([*self.states(which), *others], results) for which in (0, 1)
+        ]
+
+    def load(self, part: slice, *columns: NDArray[Any]) -> None:
+        """Take over columns, their memory, gains and noise too."""
+        super().load(part, *columns)
+        fill(self._memory, self._feedback.memory[:, part])
+        fill(self._gains, self._feedback.gains[:, part])
+        if len(self._uniform):
+            fill(self._starts, self._feedback.starts[None, part])
+
+    def store(self, part: slice, *columns: NDArray[Any]) -> None:
+        """Put states, errors, torques and memory back."""
+        super().store(part, *columns)
+        given, memory = columns[1], self._feedback.memory
+        number = len(columns[2][part])
+        given[:3, part] = self.given[:3, :number]
+        memory[:, part] = self._memory[:, :number]
+
+    def prepare_step(self, number: int) -> None:
+        """Give new torques where a step begins at a sample."""
+        sample, since = divmod(number, self._feedback.hold)
+        if since:
+            return
+        if len(self._uniform):
+            self._uniform[:] = uniform_numbers(self._starts[0], sample)
+        self._answer[self.now](*self._feedback.references[sample])
 
 
 class ControlledBatch:
@@ -183,26 +189,33 @@ class ControlledBatch:
         }
 
     @cached_property
-    def module(self) -> ModuleType:
-        """The compiled function `control`, see `control_source`."""
-        state, drive = len(self._batch.model.ode.state), len(self._batch.model.ode.drive)
+    def answer(self) -> ColumnFunction:
+        """The control law and its channel: torques and new memory at a sample.
+
+        The reference is shared by all columns. A column that has ended keeps what it has.
+        """
+        model = self._batch.model
+        known = len(model.ode.drive)
         sizes = {
             "references": sum(REFERENCES.values()),
-            "y": state,
+            "y": len(model.ode.state),
             "memory": sum(self._memory_sizes.values()),
-            "noise": self._noise,
-            "rest": drive - 3 + len(self._batch.model.names),
+            "uniform": 2 * self._noise,
+            "given": known + len(model.names),
             "gains": sum(GAINS.values()),
+            "running": 1,
         }
 
-        def answer(*inputs: Expression) -> tuple[Any, ...]:
+        def respond(*inputs: Expression) -> tuple[Any, ...]:
             of = divide(sizes, inputs)
-            plant = self._batch.model.constants(of["rest"][drive - 3 :]).model
-            return self._command(kernel.joints(plant, of["y"]), of)
+            plant = model.constants(of["given"][known:]).model
+            new = self._command(kernel.joints(plant, of["y"]), of)
+            old = (*of["given"][:3], *of["memory"])
+            running = of["running"][0]
+            return tuple(select(running, *both) for both in zip(new, old, strict=True))
 
-        program = trace(answer, [f"i{j}" for j in range(sum(sizes.values()))])
-        texts = [*NOISE, control_source(program, sizes)]
-        return compiled_module.load(texts, {}, numba=True, nogil=True)
+        program = trace(respond, [f"i{j}" for j in range(sum(sizes.values()))])
+        return compile_columns({"answer": program}, sizes["references"])["answer"]
 
     def _command(self, joints: Any, of: Mapping[str, Any]) -> tuple[Any, ...]:
         """Return what the law and its channel send, three torques, and the new memory."""
@@ -211,7 +224,9 @@ class ControlledBatch:
         memory = divide(self._memory_sizes, of["memory"])
         new = dict(memory)
         angle, rate = gains["noise"]
-        scaled = [n * by for n, by in zip(of["noise"], (angle,) * 3 + (rate,) * 3, strict=False)]
+        pairs = zip(of["uniform"][::2], of["uniform"][1::2], strict=True)
+        noise = (normal_number(u, v) for u, v in pairs)
+        scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
         exact = joints.gamma, joints.gamma_dot
         gamma, gamma_dot, new["before"] = control.measure(*exact, memory["before"], scaled)
         if observed := memory["observed"]:  # in the last assembly mode
@@ -252,7 +267,7 @@ class ControlledBatch:
         Initial states and gains that differ are given by key. The noise depends on the rows of the
         scenarios in their study; `steps` is a multiple of `samples`.
         """
-        count, hold, drawn_for = len(rows), steps // self.samples, rows
+        count, hold = len(rows), steps // self.samples
         start, control = self._motion.at(0.0), self._control
         gamma = given.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
@@ -262,22 +277,18 @@ class ControlledBatch:
         for name, values in (("observed", start.quaternion), ("before", earlier)):
             for row, value in zip(blocks[name], values, strict=False):
                 row[:] = value
+        noise = streams(self._seed, rows) if self._noise else np.zeros(0, dtype=np.uint64)
+        samples = [tuple(row) for row in self._references.tolist()]
         gains = self._make_gains(batch, given, count)
+        feedback = Feedback(self.answer, samples, hold, memory, gains, noise)
+        width = block_width(count)
 
-        def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
+        def advance(first: int, number: int, step: float, *arrays: Any, rows: Any) -> None:
             if rows is not None:  # torques are held while a step is repeated
-                batch.advance(first, count, step, *arrays, threads=1)
+                batch.advance(first, number, step, *arrays, threads=1)
                 return
-            blocks, end = -(-arrays[0].shape[1] // SIMD_WIDTH), first + count
-            own = *arrays[:3], memory, self._references, gains, drawn_for, self._seed
-            for begin in range(0, blocks, _BLOCKS):
-                part, now = (begin, min(begin + _BLOCKS, blocks)), first
-                while now < end:
-                    if now % hold == 0:
-                        self.module.control(now // hold, *part, *own)
-                    span = min(hold - now % hold, end - now)
-                    batch.module.batch(step, now, span, *part, *arrays)
-                    now += span
+            block = ControlledBlock(batch.programs, width, feedback)
+            advance_blocks(block, range(0, count, width), first, number, step, *arrays)
 
         step = self.samples * control.period / steps
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
@@ -289,9 +300,9 @@ class ControlledBatch:
         largest = np.maximum(np.stack(blocks["largest"], axis=1), np.abs(last))
         squares = np.stack(blocks["squares"], axis=1) + last**2
         begun = np.floor(result.t / control.period + 1e-9)[:, None]
-        samples = np.hstack([begun + 1.0] * 3 + [begun + ~complete] * 3)
-        figures = {"rms": np.sqrt(squares / samples), "max": largest}
-        columns = {
+        sample_counts = np.hstack([begun + 1.0] * 3 + [begun + ~complete] * 3)
+        figures = {"rms": np.sqrt(squares / sample_counts), "max": largest}
+        table = {
             f"{what}_{name}_{k + 1}": x[:, 3 * part + k]
             for part, what in enumerate(("error", "torque"))
             for name, x in figures.items()
@@ -299,8 +310,8 @@ class ControlledBatch:
         }
         settled = result.success & (np.abs(final).max(axis=1) <= self._band)
         since = blocks["unsettled"][0] * control.period
-        columns["settling_time"] = np.where(settled, since, np.nan)
-        return result, columns | {"limited_samples": blocks["limited"][0]}
+        table["settling_time"] = np.where(settled, since, np.nan)
+        return result, table | {"limited_samples": blocks["limited"][0]}
 
     @cached_property
     def _band(self) -> float:

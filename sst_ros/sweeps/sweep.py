@@ -92,7 +92,7 @@ def sweep(
     Raises:
         InputError: an argument or a value in the study is not allowed; nothing has run then.
         SweepFailed: chunks could not be computed or written; those that are done remain.
-        MissingDependency: pandas, pyarrow or numba is not installed.
+        MissingDependency: pandas or pyarrow is not installed.
 
     """
     fits = client is None or hasattr(client, "scheduler_info")
@@ -177,7 +177,7 @@ def run_chunk(ready: PreparedSweep, out: Path | None, index: int) -> tuple[dict[
 
 
 class PreparedSweep:
-    """A study ready to run: its compiled code and its number of steps, which may be known already.
+    """A study ready to run: its programs and its number of steps, which may be known already.
 
     Refuses one whose ranges end in no scene, and one whose tolerance no number of steps reaches.
     """
@@ -193,8 +193,8 @@ class PreparedSweep:
         profile = study.model_scene.torque is not None
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
         self.controlled = None if study.control is None else ControlledBatch(self.batch, study)
-        for one in (self.batch, self.controlled):
-            _ = one and one.module  # compiled here, before several threads want it
+        # Compiled here, before several threads want it.
+        _ = self.batch.programs, self.controlled and self.controlled.answer
         self._quantities = [name for name in study.outputs if name != "extremes"]  # of a state
         self.pilot_error = math.nan
         self.steps = steps or study.steps or self._choose_steps()

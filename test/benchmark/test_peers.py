@@ -50,7 +50,7 @@ def test_gate_sees_a_wrong_inertia(task):
 @pytest.mark.slow
 def test_our_headline_is_the_public_call(task):
     """Every setting ends within its tolerance of the finest one, and no other series counts."""
-    pytest.importorskip("numba")
+    pytest.importorskip("llvmlite")
     ours = peer("ours")
     first, *others = ours.series(task, quick=True)
     assert first.name.startswith(ours.PUBLIC)

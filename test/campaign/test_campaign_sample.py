@@ -22,7 +22,7 @@ def test_nothing_is_found_in_a_share_of(part):
     if part in ROS:
         pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
     if part == "bits":
-        pytest.importorskip("numba", reason="needs numba: pip install .[fast]")
+        pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     # Other tests run at the same time: only what takes ten times its bound is a hang here.
     ledger = run_part(part, 0.02, seed=7, patience=10.0)
     assert ledger.tried > 0

@@ -54,7 +54,6 @@ def test_loads_that_fit_into_the_equations_are_there():
         ("stiff", {}, "springs = "),
         ("elastic_stops", {}, r"stroke\.at_end = 'elastic'"),
         ("example1", {"integrator": "rodas5p"}, "needs an explicit integrator"),
-        ("example1", {"compiled": True}, "compiled = False"),
         ("example1", {"equations": "lagrange"}, "must be one of quaternion, virtual_work"),
     ],
 )

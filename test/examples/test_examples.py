@@ -51,8 +51,6 @@ def run(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_an_example_draws_its_picture(name, run):
-    if "Batch" in (EXAMPLES / f"{name}.py").read_text():
-        pytest.importorskip("numba", reason="needs numba: pip install .[fast]")
     names = run(name)
     drawn = Path(f"{name}.png").read_bytes()
     assert drawn.startswith(b"\x89PNG") and len(drawn) > 10_000

@@ -14,18 +14,18 @@ from sst_ros import Simulation, load_scene, simulate
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import AssemblyError, InputError, RunStopped
 from sst_ros.integration.batch import Batch
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
-from sst_ros.integration.simd_source import SIMD_WIDTH
+from sst_ros.integration.point import Drive
 from sst_ros.programs.expression import compile_program
+from sst_ros.programs.llvm import LANES
 from sst_ros.scene.loads import Initial, Moment
 from sst_ros.state import QUANTITIES
 
-pytest.importorskip("numba", reason="a batch needs numba")
-
 EXAMPLE2 = load_scene("example2_heavy")
 N = 100
-FEW = SIMD_WIDTH + 5
+MANY = 4 * LANES
+FEW = MANY + 5
 TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 
@@ -148,21 +148,21 @@ def test_threads_change_no_bit(rows):
 
 
 def test_a_scenario_has_the_bits_of_steps_of_its_own(rows):
-    """SIMD, blocks and slices of time change none: the same operations in the same order."""
+    """Lanes, blocks and slices of time change none: the same operations in the same order."""
     batch, result = rows.batch, rows.result
-    y, _ = batch.start(rows.gamma, rows.gamma_dot)
-    done = np.flatnonzero(result.success)[: SIMD_WIDTH + 1].tolist()
-    assert len(done) > (SIMD_WIDTH if rows.torque is None else 4)
+    y, _ = batch.initial(rows.gamma, rows.gamma_dot)
+    done = np.flatnonzero(result.success)[: MANY + 1].tolist()
+    assert len(done) > (MANY if rows.torque is None else 4)
     for n in done:
         scene, torque, method, drive = batch.scenario(n), EXAMPLE2.torque, DOP853, []
         if rows.torque is not None:
             torque, method, drive = None, DORMAND_PRINCE, rows.torque[n].tolist()
-        machine = CompiledMethod(ODE(Dynamics.of(scene), torque), method, compiled=False)
-        ended = machine.step_fixed(0.0, rows.step, 100, y[:, n].tolist(), drive)
+        machine = MethodSteps(ODE(Dynamics.of(scene), torque), method)
+        ended = machine.fixed(0.0, rows.step, 100, y[:, n].tolist(), Drive(tuple(drive)))
         assert ended == [*result.quaternion[n], *result.body_rate[n]]
 
 
-def test_rest_at_an_end_of_the_stroke_is_no_fault(interpreted):
+def test_rest_at_an_end_of_the_stroke_is_no_fault():
     """Rounding puts gamma_3 below 0 by 5e-16 rad; `Simulation` stays at rest there."""
     batch = Batch(EXAMPLE2)
     found = batch.run([(0.0,) * 3, (0.7, 0.7, 0.0)], REST, step=1e-3, count=10)
@@ -214,7 +214,7 @@ def test_profiles_that_a_batch_cannot_follow_are_refused(scene, said):
         Batch(scene, profile=True)
 
 
-def test_a_start_outside_the_stroke_is_a_fault_of_its_scenario(interpreted):
+def test_a_start_outside_the_stroke_is_a_fault_of_its_scenario():
     """Where a simulation refuses it: between gamma_1 = -0.01 and 0 there is an assembly."""
     outside = np.array([[0.8, 0.8, 0.8], [-0.01, 0.5, 0.6], [0.8, 0.8, 1.6]])
     for gamma in outside[1:]:
@@ -240,7 +240,7 @@ ELASTIC = {"stroke.at_end": "elastic", "stroke.stiffness": 100.0}
 
 
 @pytest.mark.parametrize("changes", [{}, LAGGING, ELASTIC])
-def test_the_result_has_the_quantities_of_simulate(changes, interpreted):
+def test_the_result_has_the_quantities_of_simulate(changes):
     """Scenario by scenario, with another inertia and amplitude in each."""
     scene = EXAMPLE2.with_values({"duration": 0.1, **changes})
     parameters = {"star.inertia.zz": [0.25, 0.3], "torque.amplitude": [[1, 2, 3], [2, 0.1, 1]]}
@@ -257,7 +257,7 @@ def test_the_result_has_the_quantities_of_simulate(changes, interpreted):
     np.testing.assert_allclose(found.kept.t, [[0.0] * 2, [0.05] * 2, [0.1] * 2], rtol=1e-15)
 
 
-def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation(interpreted):
+def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation():
     """The actuator turns near its end in the first of two steps, which end inside again."""
     scene = replace(EXAMPLE2, torque=None)
     depth = np.random.default_rng(5).uniform(3.2e-3, 4.8e-3, N)

@@ -10,7 +10,6 @@ from loaded_scenes import IGNORE, REST, loaded
 from sst_ros import load_scene
 from sst_ros.dynamics.initial_state import NO_RATE
 from sst_ros.errors import InputError
-from sst_ros.integration import simd_source
 from sst_ros.integration.batch import Batch
 from sst_ros.integration.methods import RK4
 from sst_ros.mechanism import workspace
@@ -19,8 +18,6 @@ from sst_ros.programs.expression import compile_program
 from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import Scenarios
 from sst_ros.scene.yaml_document import find_fields
-
-pytest.importorskip("numba", reason="a batch needs numba")
 
 EXAMPLE2 = load_scene("example2_heavy")
 HOME = np.pi / 4
@@ -104,13 +101,11 @@ def test_what_is_the_same_in_all_rows_costs_nothing():
 
 
 def test_other_values_are_the_same_code():
-    def text(low, high):
+    def programs(low, high):
         batch = Batch(EXAMPLE2, RK4, parameters={"star.inertia.zz": [low, high]})
-        return simd_source.batch_source(
-            batch.model.program, batch.model.limit_distances, RK4, len(batch.model.ode.state)
-        )
+        return batch.programs.traced
 
-    assert text(0.2, 0.3) == text(0.25, 0.4)
+    assert programs(0.2, 0.3) == programs(0.25, 0.4)
 
 
 def test_commands_are_limited_as_those_of_a_simulation():
@@ -132,10 +127,10 @@ def test_a_singular_start_stops_no_other():
     chart = workspace.over_orientations(geometry, workspace.triangle_directions(geometry, 12)[0])
     gamma = workspace.parallel_singularities(chart).gamma[0]
     batch = Batch(scene, RK4, parameters={"star.alpha_deg": [odd, scene.star.alpha_deg]})
-    y, code = batch.start(gamma, REST)
+    y, code = batch.initial(gamma, REST)
     assert code.tolist() == [0, 0]
     assert np.all(y[4:7] == 0.0)
-    assert batch.start(gamma, (1.0, 0.0, 0.0))[1].tolist() == [NO_RATE, 0]
+    assert batch.initial(gamma, (1.0, 0.0, 0.0))[1].tolist() == [NO_RATE, 0]
 
 
 def test_valid_rows_are_prepared_without_a_scene_for_each(monkeypatch):

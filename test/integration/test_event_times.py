@@ -18,7 +18,7 @@ from models import inertia_of
 
 from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.errors import SingularityReached, StrokeExceeded, WorkspaceLeft
-from sst_ros.integration.propagator import first_crossing
+from sst_ros.integration.events import first_crossing
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.bodies import Link, Stroke, Workspace

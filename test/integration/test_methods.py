@@ -9,7 +9,6 @@ Explicit coefficients are rounded in their last digit and sums of DOP853 pass th
 
 from __future__ import annotations
 
-import inspect
 import math
 from itertools import combinations_with_replacement
 
@@ -19,9 +18,8 @@ import pytest
 from loaded_scenes import start_of
 
 from sst_ros.dynamics import kernel
-from sst_ros.host import compiled_module
-from sst_ros.integration import step_loops
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS5P, Tableau
+from sst_ros.integration.steps import Linearisation, explicit_step, rosenbrock_step
 from sst_ros.scene.scene import load
 
 CONDITION, ROSENBROCK_CONDITION = 1e-13, 1e-12
@@ -127,18 +125,15 @@ TORQUE = SCENE.torque.at
 SPAN = 0.4
 
 
-def rates(t, *y):
+def rates(t, y, _):
     return kernel.derivative(MODEL, y, TORQUE(t))
 
 
 def stepper(tableau):
-    """One step by the text that runs: the new state, and its error estimate by number."""
-    names = {"rhs": rates, "sqrt": math.sqrt}
-    exec(step_loops.explicit_step(tableau, 7, 0), names)
+    """One step by the function that is traced: the new state, and its error estimate."""
 
     def step(t, h, y):
-        moved, error = list(y), list(y)
-        names["attempt"](t, h, y, y, (), (), moved, error)
+        moved, error = explicit_step(rates, tableau, t, h, y, [None] * len(tableau.a))
         return moved, np.linalg.norm(error)
 
     return step
@@ -220,22 +215,12 @@ def test_it_is_a_stable_and_its_stability_function_vanishes_at_infinity():
 
 
 def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
-    """Take steps of a scalar equation through the very text that a simulation runs."""
-
-    def linearise(t, y, d, p, slope, by_t, matrix):
-        slope[0], by_t[0], matrix[0][0] = slope_of(t, y[0]), by_time(t), matrix_of(y[0])
-
-    def evaluate(t, y, d, p, slope):
-        slope[0] = slope_of(t, y[0])
-
-    parts = (step_loops.factorise, step_loops.substitute, step_loops.attempt_linearly_implicit)
-    known = {"SIZE": 1, **RODAS5P.constants}
-    module = compiled_module.load([inspect.getsource(part) for part in parts], known, numba=False)
-    vars(module).update(linearise=linearise, evaluate=evaluate)
-    y, new, error = [y0], [0.0], [0.0]
+    """Take steps of a scalar equation by the very function that a simulation traces."""
+    y = [y0]
     for k in range(count):
-        module.attempt_linearly_implicit(k * h, h, y, y, (), (), new, error)
-        y[0] = new[0]
+        t = k * h
+        at = Linearisation([slope_of(t, y[0])], [by_time(t)], [[matrix_of(y[0])]])
+        y = rosenbrock_step(lambda t, y, _: [slope_of(t, y[0])], at, RODAS5P, t, h, y, None).state
     return y[0]
 
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from matplotlib import image
 
+from benchmark.plain_python import without_llvmlite
 from sst_ros import __main__ as cli
 from sst_ros.errors import InputError
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.recording import recording
 from sst_ros.report import reference
-from sst_ros.report.reference import TickPropagator
+from sst_ros.report.reference import TickStepper
 from sst_ros.report.results import render
 from sst_ros.report.run import (
     draw_overview,
@@ -381,7 +382,6 @@ def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
 
 @pytest.fixture(scope="module")
 def long_run(tmp_path_factory):
-    pytest.importorskip("numba")
     pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
     from benchmark import long_bag
 
@@ -389,10 +389,10 @@ def long_run(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_long_run_is_reported_whole_and_integrated_compiled(long_run, monkeypatch):
+def test_a_long_run_is_reported_whole(long_run, monkeypatch):
     """The work that a report does for it, which is what its time and memory come from."""
-    follow, calls = TickPropagator.follow, []
-    monkeypatch.setattr(TickPropagator, "follow", lambda *given: calls.append(0) or follow(*given))
+    follow, calls = TickStepper.follow, []
+    monkeypatch.setattr(TickStepper, "follow", lambda *given: calls.append(0) or follow(*given))
     integration, ideal, summary = evaluate_run(long_run)[1:]
     assert len(calls) == 2  # both references, in one call each
     assert summary["samples_recorded"] == summary["samples_compared"] == 10_001
@@ -403,10 +403,11 @@ def test_a_long_run_is_reported_whole_and_integrated_compiled(long_run, monkeypa
 
 
 @pytest.mark.slow
-def test_compiled_and_plain_tell_the_same(long_run, monkeypatch):
+def test_machine_code_and_plain_python_tell_the_same(long_run):
+    pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     compiled = reference.integration(long_run)
-    monkeypatch.setenv("SST_ROS_NUMBA", "0")
-    plain = reference.integration(long_run)
+    with without_llvmlite():
+        plain = reference.integration(long_run)
     assert plain.compared == compiled.compared == 10_001
     # Rounding differs, and grows with the motion.
     one, other = (found.error.gamma[:201].to_numpy() for found in (plain, compiled))

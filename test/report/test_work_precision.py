@@ -13,6 +13,9 @@ from matplotlib import image
 
 from sst_ros.errors import InputError
 from sst_ros.host.figures import save_figure
+from sst_ros.integration.methods import METHODS
+from sst_ros.integration.steps import explicit_step
+from sst_ros.programs.expression import compile_program
 from sst_ros.report import accuracy
 from sst_ros.report.accuracy import (
     ABOVE_REFERENCE,
@@ -29,15 +32,16 @@ from sst_ros.report.accuracy import (
     write_accuracy_report,
 )
 from sst_ros.report.reference_solution import (
+    EXACT as EXACT_STEP,
+)
+from sst_ros.report.reference_solution import (
     InitialValueProblem,
-    load_exact_step,
     run_extended,
     solve_reference,
 )
 from sst_ros.report.results import data_frame
 from sst_ros.scene import scene
 from sst_ros.scene.bodies import Inertia
-from sst_ros.simulation.simulate import METHODS
 
 SHORT = dataclasses.replace(scene.load("example2_heavy"), duration=0.2)
 BRIEF = dataclasses.replace(SHORT, duration=0.1)
@@ -75,12 +79,17 @@ def test_the_reference_is_better_than_doubles_can_be_and_what_mpmath_finds(short
     assert short.reference.own.orientation < 1e-16
     assert short.floor == ABOVE_REFERENCE * short.reference.own.orientation
     problem, library = InitialValueProblem(SHORT), pytest.importorskip("mpmath").mp.clone()
-    library.dps, code = 30, load_exact_step(problem)
-    vars(code).update({name: getattr(library, name) for name in ("sqrt", "sin", "cos", "atan2")})
+    library.dps = 30
+    names = ("sqrt", "sin", "cos", "atan2")
+    slope = compile_program(
+        problem.system.program, {name: getattr(library, name) for name in names}
+    )
     y, h = [library.mpf(x) for x in problem.start], library.mpf(problem.interval) / 2
     for k in range(4):
-        new_y, error = list(y), list(y)
-        code.attempt(k * h, h, y, y, problem.drive, (), new_y, error)
+        step = explicit_step(
+            lambda t, y, _: slope(t, *y, *problem.drive), EXACT_STEP, k * h, h, y, [None] * 12
+        )
+        new_y = step.state
         length = library.sqrt(sum(x * x for x in new_y[:4]))
         y = [*(x / length for x in new_y[:4]), *new_y[4:]]
     theirs = [np.longdouble(str(x)) for x in y]  # as text: with all digits

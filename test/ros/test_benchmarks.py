@@ -28,7 +28,7 @@ def rows(text):
 
 
 def test_realtime():
-    pytest.importorskip("numba", reason="what is measured is compiled")
+    pytest.importorskip("llvmlite", reason="what is measured is compiled")
     found = rows(printed("realtime", "--minutes", "0.05", "--rounds", "0"))
     for recorded in found["recorded"]:
         one, other = map(int, re.findall(r"\d+", recorded))
@@ -40,7 +40,7 @@ def test_realtime():
 
 
 def test_bare_loops():
-    pytest.importorskip("numba", reason="what is measured is compiled")
+    pytest.importorskip("llvmlite", reason="what is measured is compiled")
     tables = printed("bare_loops", "--seconds", "1", "--rounds", "1").strip().split("\n\n")
     assert len(tables) == 2
     for text in tables:

@@ -62,7 +62,7 @@ import gc, time
 import rclpy
 from sensor_msgs.msg import JointState
 from sst_ros.nodes.simulator import Simulator
-rclpy.init(args=["simulator", "--ros-args", "-p", "scene:=swing", "-p", "compiled:=true"])
+rclpy.init(args=["simulator", "--ros-args", "-p", "scene:=swing"])
 simulator, samples = Simulator(), []
 node = rclpy.create_node("observer")
 node.create_subscription(JointState, "joint_states", samples.append, 10)

@@ -11,7 +11,7 @@ import pytest
 from runtime.bench import Bench, HandClock, plain, run_here, stamped
 
 from sst_ros.errors import RunStopped
-from sst_ros.host import compiled_module
+from sst_ros.integration import method_steps
 from sst_ros.runtime import tick_loop
 from sst_ros.runtime.run_loop import OK, WARN, Phase, Reply, RunDiagnostics
 from sst_ros.simulation.simulation import Simulation
@@ -83,15 +83,11 @@ def test_a_run_that_is_stepped_to_its_end_is_finished_and_has_no_fault(start):
     assert bench.output.unpublished["finished"] == 0
 
 
-def test_compiled_ticks_between_samples_are_done_together_and_commands_keep_their_tick(at_once):
+def test_ticks_between_samples_are_done_together_and_commands_keep_their_tick(at_once):
     """The command comes between the beginnings of two ticks that are done together."""
-
-    class Compiled(Simulation):  # plain Python here, done together all the same
-        compiled = property(lambda _: True, lambda *_: None)
-
     torque = (1.0, 2.0, 3.0)
     given = {"real_time_factor": 1.0, "duration": 0.02, "publish_rate": 500}
-    bench = Bench(build=Compiled, commands=[torque], **given)
+    bench = Bench(commands=[torque], **given)
     bench.queue.after_requests = 3
     bench.loop.run()
     assert bench.output.acted == 3 * [ZERO] + 17 * [torque]
@@ -112,14 +108,15 @@ def test_a_free_run_passes_over_samples_that_nothing_receives(at_once):
 
 
 def test_a_change_of_method_loads_no_code_inside_a_tick(monkeypatch):
-    begun, load = [], compiled_module.load
+    begun, compile_functions = [], method_steps.compile_functions
 
-    def loading(*args, **named):
+    def compiling(*arguments):
         begun.append(bench.loop.begun)
-        return load(*args, **named)
+        return compile_functions(*arguments)
 
+    method_steps.steps_of.cache_clear()
     bench = Bench(scene="stiff", duration=0.1)
-    monkeypatch.setattr(compiled_module, "load", loading)
+    monkeypatch.setattr(method_steps, "compile_functions", compiling)
     bench.loop.run()
     assert bench.loop.phase is Phase.FINISHED and bench.loop.simulation.changes
     assert begun and not any(begun)

@@ -30,7 +30,7 @@ RATES, METHODS = (100, 200, 500), ("rk4", "dop853")
 
 @pytest.fixture(scope="module")
 def brief():
-    return control_study(BRIEF, rates=RATES, methods=METHODS, compiled=False)
+    return control_study(BRIEF, rates=RATES, methods=METHODS)
 
 
 def test_the_orders_are_those_of_the_theory_and_the_method_does_not_matter(brief):
@@ -41,7 +41,7 @@ def test_the_orders_are_those_of_the_theory_and_the_method_does_not_matter(brief
     exact = brief.rows[(brief.rows.hold == EXACT) & (brief.rows.method == "dop853")]
     assert exact.largest_rad.max() < 1e-12
     rows = brief.rows
-    times_ns, states, *_ = run_controlled(BRIEF, 0.2, 500, "rk4", EXACT, compiled=False)
+    times_ns, states, *_ = run_controlled(BRIEF, 0.2, 500, "rk4", EXACT)
     truth = simulate(BRIEF, tolerance=1e-12, t_eval=times_ns / NANOSECONDS)
     at_ticks = angle_between(states[:, :4], truth.quaternion)
     row = rows[(rows.rate_Hz == 500) & (rows.method == "rk4") & (rows.hold == EXACT)]
@@ -77,4 +77,4 @@ def test_a_rate_counts_only_if_every_higher_one_does(brief):
 
 def test_a_scene_without_torques_is_refused():
     with pytest.raises(InputError, match="torque"):
-        control_study(scene.load("swing"), rates=(100,), compiled=False)
+        control_study(scene.load("swing"), rates=(100,))

@@ -32,7 +32,7 @@ from studies.extreme_scenes import (
     singular_pose,
 )
 
-CASES = [case for case in catalogue() if not case.compiled_only]
+CASES = [case for case in catalogue() if not case.long]
 EXAMPLE2 = load("example2_heavy")
 LONGEST = 60.0
 """Seconds for any case on a busy machine: what must not happen is an endless loop."""
@@ -101,12 +101,12 @@ def test_forty_contacts_multiply_differences():
 
 def test_an_error_estimate_that_is_far_off_fails_a_case(monkeypatch):
     case = named("time x 10")
-    good = evaluate_case(case, compiled=False)
+    good = evaluate_case(case, plain=False)
     assert good.passed and good.run_loop and good.loose_error > 1e-3 * LOOSE
     distance = extreme.apart
     for factor in (0.01, 100.0):
         monkeypatch.setattr(extreme, "apart", lambda *ends, f=factor: f * distance(*ends))
-        bad = evaluate_case(case, compiled=False)
+        bad = evaluate_case(case, plain=False)
         assert not bad.passed and "of the true error" in bad.result
 
 
@@ -141,7 +141,7 @@ def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
     monkeypatch.setattr(
         extreme, "run_case", lambda case, looped=False, **_: run_case(shorter if looped else case)
     )
-    bad = evaluate_case(case, compiled=False)
+    bad = evaluate_case(case, plain=False)
     assert not bad.passed and bad.run_loop is False and "the run loop differs" in bad.result
 
 

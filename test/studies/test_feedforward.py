@@ -54,7 +54,7 @@ def by_bandwidth(loop, bandwidth):
 @pytest.fixture(scope="module")
 def small():
     """A study of 0.4 s with one failure in it: delay 5 at 180 rad/s."""
-    pytest.importorskip("numba", reason="takes minutes without numba: pip install .[fast]")
+    pytest.importorskip("llvmlite", reason="takes minutes without: pip install .[fast]")
     plan = FeedforwardPlan(
         SHORT, bandwidths=(180.0,), errors=errors("inertia +20%", "inertia -20%", "delay 5"),
         delays=(0,),

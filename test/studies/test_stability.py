@@ -11,8 +11,9 @@ from matplotlib import image
 
 from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.host.figures import save_figure
-from sst_ros.integration.compiled_method import CompiledMethod
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import METHODS
+from sst_ros.integration.point import Drive
 from sst_ros.report.scene_summary import eigenvalues
 from sst_ros.simulation.simulation import Simulation
 from studies.extreme import draw_regions, evaluate_case, limits_of_theory, page, prove_case
@@ -42,10 +43,10 @@ def oscillating(stiffness):
 def growth(scene, method, product):
     """Largest rate after 400 steps whose length times the fastest eigenvalue is `product`."""
     simulation, rate = Simulation(scene), np.abs(eigenvalues(scene)).max()
-    integrator = CompiledMethod(ODE(simulation.dynamics), METHODS[method], compiled=False)
+    integrator = MethodSteps(ODE(simulation.dynamics), METHODS[method])
     begin = [*simulation.state.quaternion, *simulation.state.body_rate]
     try:
-        end = integrator.step_fixed(0.0, product / rate, 400, begin, (0.0,) * 3)
+        end = integrator.fixed(0.0, product / rate, 400, begin, Drive((0.0,) * 3))
     except (ArithmeticError, ValueError):
         return math.inf
     return np.nan_to_num(math.hypot(*end[4:7]), nan=math.inf)
@@ -80,18 +81,18 @@ def test_the_implicit_method_is_stable_everywhere():
 
 def test_right_and_wrong_results_are_distinguished():
     case = next(case for case in CASES if case.deviation is not None and case.bound)
-    good = evaluate_case(case, compiled=False)
+    good = evaluate_case(case, plain=False)
     assert good.passed and good.deviation <= case.bound and good.closure < 1e-12
     bad = evaluate_case(
-        dataclasses.replace(case, deviation=lambda *_: 2.0 * case.bound), compiled=False
+        dataclasses.replace(case, deviation=lambda *_: 2.0 * case.bound), plain=False
     )
     assert not bad.passed
     for run in ("same_bits", "run_loop"):
         assert not dataclasses.replace(good, **{run: False}).passed
     refused = next(case for case in CASES if case.refusal)
-    assert evaluate_case(refused, compiled=False).passed
+    assert evaluate_case(refused, plain=False).passed
     wrong = dataclasses.replace(refused, refusal="Diverged")
-    assert not evaluate_case(wrong, compiled=False).passed
+    assert not evaluate_case(wrong, plain=False).passed
     text = page([good, bad])
     assert "2 cases, 1 failed" in text and "**FAILED**" in text
     off = dataclasses.replace(good, same_bits=False)
@@ -110,9 +111,9 @@ def test_the_figure_shows_every_method(tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("time x 10", r"\d\.\de-13 rad"),  # passes no limit, which a first look cannot say
-        ("square wave of 2 N m", r"\d\.\de-15 rad"),
-        ("stops of 1000 N m/rad", r"\d\.\de-12 rad to 0\.1015 s: a kink.*"),
+        ("time x 10", r"\d\.\de-12 rad"),  # passes no limit, which a first look cannot say
+        ("square wave of 2 N m", r"\d\.\de-16 rad"),
+        ("stops of 1000 N m/rad", r"\d\.\de-16 rad to 0\.1015 s: a kink.*"),
         ("start at a corner that cannot be assembled", "-: there is no motion"),
         ("sampled PD control at 0.98 of the limit of its bandwidth", "-: its torques .*"),
     ],

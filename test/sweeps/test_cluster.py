@@ -21,7 +21,7 @@ from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from test.sweeps.test_sweep import same
 
-for module in ("numba", "distributed", "pandas", "pyarrow"):
+for module in ("distributed", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a cluster needs it")
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.usefixtures("cache")]

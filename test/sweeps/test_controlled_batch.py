@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedback in the compiled loop: at each sample the torque of the Python controller."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,12 +10,18 @@ from sst_ros.control.controller import Controller, Measurement, TrackingMetrics
 from sst_ros.control.law import MODES, ControlChannel, ControllerSettings
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.sweeps.controlled_batch import NOISE
+from sst_ros.programs import llvm
+from sst_ros.sweeps.controlled_batch import (
+    ControlledBlock,
+    normal_number,
+    streams,
+    uniform_numbers,
+)
 from sst_ros.sweeps.sweep import PreparedSweep, run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 from studies.control_loop import ChannelState, ControlLoop, run_loop
 
-for module in ("numba", "pandas", "pyarrow"):
+for module in ("pandas", "pyarrow"):
     pytest.importorskip(module, reason="a sweep needs it")
 
 SCENE = load_scene("reach")
@@ -38,32 +42,32 @@ CHANNEL = ("delay", "counts", "angle_noise", "rate_noise")
 
 
 def gaussian(seed, rows, counter):
-    """Standard normal numbers `counter` of rows, as the kernel computes them."""
-    names = {"np": np, "sqrt": np.sqrt, "cos": np.cos}
-    text = NOISE[1].replace("np.float64(", "np.asarray(").replace("np.uint64(row)", "row")
-    exec(NOISE[0] + text, names)
-    with np.errstate(over="ignore"):
-        return np.asarray(names["gaussian"](seed, np.asarray(rows).astype(np.uint64), counter))
+    """Standard normal numbers `counter` of rows."""
+    sample, number = divmod(counter, 6)
+    uniform = uniform_numbers(streams(seed, np.asarray(rows)), sample)
+    return normal_number(*uniform[2 * number : 2 * number + 2])
 
 
-@pytest.mark.filterwarnings("ignore:overflow encountered")
-@pytest.mark.parametrize("by", ["interpreted", pytest.param("numba", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("by", ["NumPy", "machine code"])
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case.values())))
-def test_each_torque_is_that_of_the_python_controller(request, case, by):
-    if by == "interpreted":
-        request.getfixturevalue(by)
+def test_each_torque_is_that_of_the_python_controller(monkeypatch, case, by):
+    if by == "NumPy":
+        monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+    else:
+        pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     study = SweepStudy(
         SCENE, VARY, n=3, seed=11, steps=2 * SAMPLES, control={"period": PERIOD, **case},
         duration=SAMPLES * PERIOD,
     )  # fmt: skip
     ready = PreparedSweep(study)
-    torques, compiled = [], ready.controlled.module
+    torques, prepare_step = [], ControlledBlock.prepare_step
 
-    def one_period(*arguments):
-        compiled.control(*arguments)
-        torques.append(arguments[4][:3].copy())
+    def one_step(block, number):
+        prepare_step(block, number)
+        if number % 2 == 0:
+            torques.append(block.given[:3, :3].copy())
 
-    ready.controlled.__dict__["module"] = SimpleNamespace(control=one_period)
+    monkeypatch.setattr(ControlledBlock, "prepare_step", one_step)
     rows = np.arange(5, 8)
     scenarios, starts, _ = ready.scenarios(study.draw(0, 3))
     start = study.motion.at(0.0)

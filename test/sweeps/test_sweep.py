@@ -13,7 +13,7 @@ from sst_ros.sweeps import sweep as engine
 from sst_ros.sweeps.sweep import PreparedSweep, SweepFailed, run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
-for module in ("numba", "pandas", "pyarrow"):
+for module in ("pandas", "pyarrow"):
     pytest.importorskip(module, reason="a sweep needs it")
 
 SCENE = load_scene("example2_heavy")
@@ -89,7 +89,7 @@ def test_extremes_are_those_of_a_run():
     assert found["gamma_min_2"].tolist() == gamma.min(axis=0).tolist()
 
 
-def test_constant_torques_take_the_place_of_the_scenes(interpreted):
+def test_constant_torques_take_the_place_of_the_scenes():
     found = sst_ros.sweep(
         SCENE, {"star.inertia.zz": [0.26, 0.3]}, torque=(0.1, 0.2, -0.1), duration=0.2, steps=20
     )
@@ -98,7 +98,7 @@ def test_constant_torques_take_the_place_of_the_scenes(interpreted):
     np.testing.assert_allclose(found["gamma_1"][0], simulation.state.joints.gamma[0], atol=1e-11)
 
 
-def test_rows_that_make_no_scene_are_reported_and_stop_no_other(interpreted):
+def test_rows_that_make_no_scene_are_reported_and_stop_no_other():
     vary = {"star.inertia.zz": ("normal", 0.26, 0.2), "star.inertia.xx": ("uniform", 0.38, 0.39)}
     found = sst_ros.sweep(SCENE, vary, n=40, steps=20)
     zz, xx = found["star.inertia.zz"], found["star.inertia.xx"]
@@ -174,7 +174,7 @@ def test_a_full_disk_leaves_whole_files_and_the_study_resumes(table, tmp_path, m
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value")
-def test_a_scenario_that_diverges_keeps_to_itself(interpreted):
+def test_a_scenario_that_diverges_keeps_to_itself():
     """Friction that fixed explicit steps cannot resolve makes its numbers infinite."""
     scene = SCENE.with_values({"friction.gamma.viscous": 0.1})
     vary = {"friction.gamma.viscous": [0.1, 1e8, 0.2]}

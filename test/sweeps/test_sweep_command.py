@@ -7,7 +7,7 @@ from scipy.stats import spearmanr
 from sst_ros.cli.commands import run_command
 from sst_ros.sweeps.sweep import correlate, read_sweep
 
-for module in ("numba", "pandas", "pyarrow", "matplotlib"):
+for module in ("pandas", "pyarrow", "matplotlib"):
     pytest.importorskip(module, reason="the command needs it")
 
 STUDY = """
@@ -22,7 +22,7 @@ vary:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, interpreted_module):
+def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("sweep")
     (path / "study.yaml").write_text(STUDY)
     assert run_command(["sweep", str(path / "study.yaml"), "--out", str(path / "out")]) == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps: choice of method, work bounds, budgets, and many ticks in a call with the bits of each."""
+"""The loop: choice of method, work bounds, budgets, many ticks in a call with the bits of each."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 from loaded_scenes import IGNORE, REST, loaded, run, viscous
 
+from benchmark.plain_python import without_llvmlite
 from sst_ros.errors import Diverged, InputError, RunStopped, StepBudgetExceeded, StrokeExceeded
-from sst_ros.host.compiled_module import numba_version
-from sst_ros.integration.adaptive_stepper import AdaptiveStepper
-from sst_ros.integration.compiled_method import CompiledMethod
-from sst_ros.integration.methods import DORMAND_PRINCE
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.scene.bodies import Inertia, Link, Workspace
 from sst_ros.scene.loads import Friction, Initial, JointFriction
 from sst_ros.scene.scene import load
@@ -29,13 +27,13 @@ MILLISECOND = 1_000_000
 def pairs(monkeypatch):
     """Count attempts by method; a pair of Rodas5P makes 3 Jacobians and 24 evaluations."""
     counts = {}
-    attempt = CompiledMethod.step_pair
+    attempt = MethodSteps.pair
 
     def counted(self, *arguments, **options):
         counts[self.method.name] = counts.get(self.method.name, 0) + 1
         return attempt(self, *arguments, **options)
 
-    monkeypatch.setattr(CompiledMethod, "step_pair", counted)
+    monkeypatch.setattr(MethodSteps, "pair", counted)
     return counts
 
 
@@ -45,9 +43,7 @@ def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pair
     simulation = Simulation(viscous(coefficient), tolerance=1e-10, step_budget=10**6)
     simulation.step(REST, 1_000_000_000)
     assert simulation.method == "rodas5p"
-    fastest = np.abs(
-        simulation._propagator.ode.eigenvalues(0.0, simulation._now.point.y, REST)
-    ).max()
+    fastest = np.abs(simulation._stepper.ode.eigenvalues(0.0, simulation._now.point.y, REST)).max()
     explicit = fastest / 3.3  # DOPRI5 is stable on the negative axis up to about 3.3
     assert explicit > 0.6 * coefficient
     assert pairs["rodas5p"] < min(350, explicit / 2)
@@ -80,24 +76,16 @@ def rubbing(coulomb, smoothing):
 
 
 TOO_FAST = {
-    "light star": (light(1e-12), (0.01, 0.01, 0.01), False),
-    "huge torque": (light(0.2, 0.3), (1e9, 1e9, 1e9), False),
-    "light star, compiled": (light(1e-12, 1e-6), (0.01, 0.01, 0.01), True),
+    "light star": (light(1e-12), (0.01, 0.01, 0.01)),
+    "huge torque": (light(0.2, 0.3), (1e9, 1e9, 1e9)),
+    "light, thin star": (light(1e-12, 1e-6), (0.01, 0.01, 0.01)),
 }
 
 
-@pytest.mark.parametrize(
-    ("scene", "torque", "compiled"),
-    [
-        pytest.param(*given, id=name, marks=(pytest.mark.slow,) * given[2])
-        for name, given in TOO_FAST.items()
-    ],
-)
-def test_a_step_that_takes_too_much_ends_with_the_last_valid_state(scene, torque, compiled):
+@pytest.mark.parametrize(("scene", "torque"), TOO_FAST.values(), ids=[*TOO_FAST])
+def test_a_step_that_takes_too_much_ends_with_the_last_valid_state(scene, torque):
     """These steps took 73, 10 and 2.7 s before there was a budget."""
-    if compiled and numba_version() is None:
-        pytest.skip("needs numba")
-    simulation = Simulation(scene, compiled=compiled)
+    simulation = Simulation(scene)
     before = simulation.state
     for _ in range(2):  # the first one compiles
         began = time.process_time()
@@ -150,24 +138,6 @@ CASES = {
     "rk4": (EXAMPLE2, {"integrator": "rk4"}),
     "steps in a tick": (load("swing"), {"tick": 20 * MILLISECOND}),
 }
-needs_numba = pytest.mark.skipif(numba_version() is None, reason="numba is missing")
-BY_NUMBA = [
-    pytest.param(name, marks=() if name == "example2_heavy" else pytest.mark.slow) for name in CASES
-]
-
-
-@pytest.fixture
-def glided(monkeypatch):
-    """Count the ticks that were done without a look at each."""
-    counts, step_many = [], AdaptiveStepper.step_many
-
-    def counted(self, h, count, *more):
-        found = step_many(self, h, count, *more)
-        counts.append((count, found[0]))
-        return found
-
-    monkeypatch.setattr(AdaptiveStepper, "step_many", counted)
-    return counts
 
 
 def told(simulation):
@@ -194,37 +164,27 @@ def run_ticks(scene, at_once, ticks, tick=MILLISECOND, **how):
     return told(simulation), None, None
 
 
-def held_against_single_ticks(name, ticks, glided, *, compiled):
+@pytest.mark.parametrize("name", CASES)
+def test_the_bits_do_not_depend_on_how_many_ticks_go_into_a_call(name):
     scene, how = CASES[name]
-    one = run_ticks(scene, 1, ticks, compiled=compiled, **how)
-    assert max(done for _, done in glided) == 1
-    glided.clear()
+    single = run_ticks(scene, 1, 120, **how)
     for at_once in (20, 60):
-        assert run_ticks(scene, at_once, ticks, compiled=compiled, **how) == one
-    if name in ("example2_heavy", "loaded", "rk4"):
-        assert (60, 60) in glided
-    if name in ("elastic", "steps in a tick"):
-        assert any(0 < done < count for count, done in glided)
-    return one
+        assert run_ticks(scene, at_once, 120, **how) == single
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_bits_do_not_depend_on_how_many_ticks_go_into_a_call(name, glided):
-    held_against_single_ticks(name, 120, glided, compiled=False)
+def test_machine_code_gives_the_bits_of_plain_python(name):
+    pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
+    scene, how = CASES[name]
+    fast = run_ticks(scene, 60, 120, **how)
+    with without_llvmlite():
+        assert run_ticks(scene, 60, 120, **how) == fast
 
 
-@needs_numba
-@pytest.mark.parametrize("name", BY_NUMBA)
-def test_numba_gives_the_bits_of_plain_python_however_many_ticks(name, glided):
-    fast = held_against_single_ticks(name, 120, glided, compiled=True)
-    assert fast == run_ticks(CASES[name][0], 20, 120, compiled=False, **CASES[name][1])
-
-
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_numba)])
-def test_a_fault_comes_at_its_tick_with_the_last_valid_state(compiled):
+def test_a_fault_comes_at_its_tick_with_the_last_valid_state():
     ends = []
     for at_once in (1, 50):
-        simulation = Simulation(EXAMPLE2, compiled=compiled)
+        simulation = Simulation(EXAMPLE2)
         with pytest.raises(StrokeExceeded) as caught:
             for _ in range(10_000):
                 simulation.steps((8.0, 0.0, 0.0), MILLISECOND, at_once)
@@ -235,17 +195,16 @@ def test_a_fault_comes_at_its_tick_with_the_last_valid_state(compiled):
     assert ends[0][0][0].time_ns % (50 * MILLISECOND)
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_numba)])
-def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside(compiled):
+def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside():
     scene = replace(
         EXAMPLE2,
         initial=Initial(gamma=(math.pi / 2 - 0.005, 0.4, 1.0), gamma_dot=(0.5, 0.0, 0.0)),
         workspace=Workspace(at_edge="ignore"),
     )
-    fine = Simulation(scene, "dop853", compiled=compiled)
+    fine = Simulation(scene, "dop853")
     with pytest.raises(StrokeExceeded) as expected:
         fine.steps((-10.0, 0.0, 0.0), MILLISECOND, 45)
-    whole = Simulation(scene, "dop853", tolerance=1e-6, compiled=compiled)
+    whole = Simulation(scene, "dop853", tolerance=1e-6)
     with pytest.raises(StrokeExceeded) as found:
         whole.step((-10.0, 0.0, 0.0), 45 * MILLISECOND)
     assert found.value.time == pytest.approx(expected.value.time, abs=1e-6)
@@ -258,11 +217,3 @@ def test_a_state_within_ticks_that_were_done_at_once_is_on_the_way():
     found = one.within(7 * MILLISECOND)
     assert found.joints.gamma == pytest.approx(other.state.joints.gamma, abs=1e-12)
     assert one.state.time_ns == 20 * MILLISECOND
-
-
-@needs_numba
-def test_many_steps_in_one_call_return_to_python_within_the_budget(glided):
-    simulation = Simulation(EXAMPLE2, compiled=True, step_budget=1000)
-    simulation.steps(REST, MILLISECOND, 200)
-    assert max(done for _, done in glided) == 1000 // (3 * len(DORMAND_PRINCE.a))
-    assert simulation.time_ns == 200 * MILLISECOND

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of every method: the same bits compiled, by code of a structure, order, Jacobians."""
+"""Steps of every method: the same bits as machine code and as plain Python, order, Jacobians."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ import pytest
 from loaded_scenes import IGNORE, loaded, start_of, viscous
 from models import seeded_samples
 
+from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, recent_ode
-from sst_ros.host import compiled_module
-from sst_ros.integration.compiled_method import CompiledMethod, Point, TorqueLaw
+from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.method_steps import FunctionSteps, MethodSteps
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
-from sst_ros.programs.expression import Slots, number_constants, trace
+from sst_ros.integration.point import Drive, Point
+from sst_ros.programs.expression import compile_program, number_constants, trace
+from sst_ros.programs.llvm import write_module
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
 from sst_ros.scene.schema import Section
-from sst_ros.simulation import simulate_gauss
 
 DRIVE = (3.0, -2.0, 1.0)
 MOMENT = (0.1, 0.2, 0.3)
@@ -35,9 +37,6 @@ EXAMPLE2 = load("example2_heavy")
 
 def system_of(scene, torque=None, work=False):
     return ODE(Dynamics.of(scene), torque, work=work)
-
-
-needs_numba = pytest.mark.skipif(compiled_module.numba_version() is None, reason="numba is missing")
 
 
 SINE = (replace(EXAMPLE2, **IGNORE), 0.4, EXAMPLE2.torque)
@@ -54,8 +53,8 @@ def truth_of(scene, span, torque):
     """DOP853 in steps that err below rounding, for two lengths of them agree."""
     system = system_of(scene, torque)
     y, drive = start_of(scene), () if torque else (1000.0, -500.0, 700.0)
-    machine = CompiledMethod(system, DOP853, compiled=False)
-    few, many = (machine.step_fixed(0.0, span / n, n, y, drive) for n in (100, 200))
+    steps = MethodSteps(system, DOP853)
+    few, many = (steps.fixed(0.0, span / n, n, y, Drive(drive)) for n in (100, 200))
     assert math.dist(few[:4], many[:4]) < 2e-14
     return system, y, drive, many
 
@@ -68,10 +67,10 @@ def truth_of(scene, span, torque):
 def test_measured_order_is_that_of_the_theory(case, method, steps):
     """Errors stay well above rounding. Under sine torques the d/dt of Rodas5P is at work."""
     system, y, drive, truth = truth_of(*case)
-    machine = CompiledMethod(system, method, compiled=False)
+    machine = MethodSteps(system, method)
     errors = []
     for count in (steps, 2 * steps):
-        end = machine.step_fixed(0.0, case[1] / count, count, y, drive)
+        end = machine.fixed(0.0, case[1] / count, count, y, Drive(drive))
         size = 7 if case is SINE else 4  # rates of 100 rad/s have rounding of their own
         errors.append(math.dist(end[:size], truth[:size]))
     assert errors[1] > 2e-14
@@ -80,10 +79,10 @@ def test_measured_order_is_that_of_the_theory(case, method, steps):
 
 def linearised(scene, torque, t, y, drive):
     system = system_of(scene, torque, work=True)
-    machine, size = CompiledMethod(system, RODAS5P, compiled=False), len(system.state)
-    slope, by_time, matrix = np.zeros(size), np.zeros(size), np.zeros((size, size))
-    machine._module.linearise(t, y, drive[: len(system.drive)], (), slope, by_time, matrix)
-    return slope, by_time, matrix
+    size = len(system.state)
+    results = system.linearised(t, *y, *drive[: len(system.drive)])
+    slope, by_time, *columns = np.array(results).reshape(size + 2, size)
+    return slope, by_time, np.array(columns).T
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -131,16 +130,17 @@ def test_the_derivative_by_time_is_exact():
 
 
 def test_a_step_without_a_finite_result_has_an_infinite_error():
-    machine = CompiledMethod(system_of(EXAMPLE2), DORMAND_PRINCE, compiled=False)
+    steps = MethodSteps(system_of(EXAMPLE2), DORMAND_PRINCE)
     y = start_of(EXAMPLE2)
     at = Point(y, y, (0.0,) * 18, DORMAND_PRINCE)
-    assert machine.step_pair(0.0, 1e-3, at, (1e308, 1e308, 0.0))[1] == math.inf
+    assert steps.pair(0.0, 1e-3, at, Drive((1e308, 1e308, 0.0)))[1] == math.inf
 
 
 def test_a_slope_of_its_own_needs_an_explicit_method():
-    with pytest.raises(ValueError, match="needs plain Python"):
-        law = TorqueLaw(lambda *x: x, None, lambda *_: None)
-        CompiledMethod(system_of(viscous(1.0)), RODAS5P, compiled=False, law=law)
+    system = system_of(viscous(1.0))
+    with pytest.raises(ValueError, match="has no Jacobian, which the method needs"):
+        torque = AppliedTorque(system.dynamics, None)
+        FunctionSteps(system, RODAS5P, torque, derivative=lambda *x: x)
 
 
 # Compiled code belongs to a structure: scenes that differ in numbers alone share it.
@@ -171,11 +171,11 @@ def ode_of(scene, torque=None, **options):
 
 def text_of(ode, *, implicit=False):
     """What is compiled, and the numbers that it takes."""
-    slots = Slots()
-    programs = {"rhs": ode.program, "joints": ode.dynamics.joints_program}
+    programs = {"slope": ode.program, "joints": ode.dynamics.joints_program}
     if implicit:
-        programs["directional"] = ode.directional
-    return "".join(one.source(name, slots) for name, one in programs.items()), slots.values
+        programs["linearise"] = ode.jacobian
+    module = write_module(programs)
+    return module.text, module.numbers
 
 
 @pytest.mark.parametrize("name", [*SCENES, "loaded"])
@@ -198,23 +198,14 @@ def test_a_term_or_a_zero_more_is_another_structure():
     assert text_of(ode_of(rubbing))[0] != text != text_of(ode_of(replace(EXAMPLE2, star=skew)))[0]
 
 
-def text_of_steps(ode):
-    return text_of(ode)[0]
-
-
-def text_of_collocation(ode):
-    return "".join(simulate_gauss.source(ode, 4, None)[0])
-
-
-@pytest.mark.parametrize("text", [text_of_steps, text_of_collocation])
-def test_the_torques_of_a_scene_are_numbers_too(text):
+def test_the_torques_of_a_scene_are_numbers_too():
     rng, scene = np.random.default_rng(3), EXAMPLE2
     texts = {
-        text(ode_of(one, one.torque, limit=2.5 * rng.uniform(0.5, 2.0)))
+        text_of(ode_of(one, one.torque, limit=2.5 * rng.uniform(0.5, 2.0)))[0]
         for one in (scene, *(perturb(scene, rng) for _ in range(3)))
     }
     assert len(texts) == 1
-    assert text is text_of_collocation or len(re.findall(r"= sin\(", texts.pop())) == 3
+    assert len(re.findall(r"= call double @sin\(", texts.pop())) == 3
 
 
 def test_coincidences_of_numbers_change_no_text():
@@ -230,12 +221,11 @@ def test_coincidences_of_numbers_change_no_text():
     texts, given = set(), [(3.0, 5.0, 7.0), (4.0, 5.0, 5.0), (0.5, 2.0, 0.3), (2.0, 0.25, -0.25)]
     for values in given:
         program = trace(function(*number_constants(values)), ("x", "y"))
-        slots = Slots()
-        texts.add(program.source("f", slots))
-        names = {}
-        exec(program.source("f") + program.source("g", slots).replace("f(", "g("), names)
+        module = write_module({"f": program})
+        texts.add(module.text)
         expected = function(*values)(0.7, -1.3)
-        assert names["f"](0.7, -1.3) == names["g"](0.7, -1.3, slots.values) == expected
+        assert compile_program(program)(0.7, -1.3) == expected
+        assert tuple(module.function("f")(0.7, -1.3)) == expected
     assert len(texts) == 1
 
 
@@ -246,16 +236,12 @@ def like_loaded():
     return [loaded(), *(perturb(loaded(), rng, 0.03) for _ in range(5))]
 
 
-def machine_of(scene, method, *, compiled):
-    return CompiledMethod(ode_of(scene), method, compiled=compiled)
-
-
-def march(machine, y):
+def march(scene, method, y):
     """Two pairs, then 200 steps through contact and sliding."""
-    drive = (*DRIVE, *MOMENT)
-    first = machine.step_pair(0.0, 1e-3, Point(y, y, (0.0,) * 18, machine.method), drive)
-    second = machine.step_pair(1e-3, 2e-3, first[0], drive)
-    return first, second, machine.step_fixed(0.0, 1e-3, 200, y, drive)
+    steps, drive = MethodSteps(ode_of(scene), method), Drive((*DRIVE, *MOMENT))
+    first = steps.pair(0.0, 1e-3, Point(y, y, (0.0,) * 18, method), drive)
+    second = steps.pair(1e-3, 2e-3, first[0], drive)
+    return first, second, steps.fixed(0.0, 1e-3, 200, y, drive)
 
 
 @pytest.fixture(scope="module")
@@ -263,31 +249,39 @@ def start():
     return start_of(loaded(), 11)
 
 
-@needs_numba
-@pytest.mark.parametrize(
-    "method",
-    [
-        pytest.param(method, id=name, marks=() if name == "dopri5" else pytest.mark.slow)
-        for name, method in METHODS.items()
-    ],
-)
+@pytest.mark.parametrize("method", METHODS.values(), ids=[*METHODS])
 def test_one_code_gives_the_bits_of_plain_python_for_each_scene(method, start):
-    machines = [machine_of(scene, method, compiled=True) for scene in like_loaded()]
-    assert len({machine._module.__name__ for machine in machines}) == 1
-    ends = [march(machine, start) for machine in machines]
-    plain = [machine_of(scene, method, compiled=False) for scene in like_loaded()]
-    assert ends == [march(machine, start) for machine in plain]
+    pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
+    scenes = like_loaded() if method is not RODAS5P else like_loaded()[:2]
+    ends = [march(scene, method, start) for scene in scenes]
+    with without_llvmlite():
+        assert ends == [march(scene, method, start) for scene in scenes]
     assert len({str(end) for end in ends}) == len(ends)
 
 
-@needs_numba
 def test_scenes_take_turns_and_threads_and_keep_their_own_numbers(start):
-    machines = [machine_of(scene, DORMAND_PRINCE, compiled=True) for scene in like_loaded()[:2]]
-    alone = [march(machine, start) for machine in machines]
-    assert [march(machine, start) for machine in machines * 3] == alone * 3
+    scenes = like_loaded()[:2]
+    alone = [march(scene, DORMAND_PRINCE, start) for scene in scenes]
+    assert [march(scene, DORMAND_PRINCE, start) for scene in scenes * 3] == alone * 3
+
+    def repeat(scene):
+        return [march(scene, DORMAND_PRINCE, start) for _ in range(20)]
+
     with ThreadPoolExecutor(2) as pool:
-        found = pool.map(lambda machine: [march(machine, start) for _ in range(20)], machines)
-        assert [*found] == [[end] * 20 for end in alone]
+        assert [*pool.map(repeat, scenes)] == [[end] * 20 for end in alone]
+
+
+def test_many_steps_at_once_have_the_bits_of_each(start):
+    scene = loaded()
+    steps, rng = MethodSteps(ode_of(scene), DOP853), np.random.default_rng(5)
+    rows = [
+        [t, h, *np.array(start) * (1.0 + 1e-3 * rng.uniform(-1, 1, len(start))), *DRIVE, *MOMENT]
+        for t, h in rng.uniform(1e-4, 1e-2, (11, 2))
+    ]
+    size, after = len(start), steps.states_after(np.array(rows))
+    for row, state in zip(rows, after.tolist(), strict=True):
+        y, drive = row[2 : 2 + size], Drive(tuple(row[2 + size :]))
+        assert state == steps.single(row[0], row[1], y, drive)
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torques that act at the actuators: those that were given, within the limit of the actuators."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.errors import InputError, Problem
+from sst_ros.integration.point import Drive
+from sst_ros.mechanism.geometry import Array
+from sst_ros.scene.torque_profile import SineTorque, Torque, torque_at
+from sst_ros.state import NANOSECONDS, State, Vector3, clamp
+
+_SEARCHED = 8
+"""Parts of a step in which a jump is looked for."""
+_TIME_STEP = 1e-7
+"""For the derivative of a torque by time [s]: an error of 1e-9 where it changes within 1 ms."""
+_STATE_STEP = 1e-7
+"""For its derivatives by the state, relative to numbers above 1: half of the digits remain."""
+_NOT_FINITE = (math.nan, math.nan, math.nan)
+
+
+class AppliedTorque:
+    """What the actuators give of a torque.
+
+    Args:
+        dynamics: of the scene.
+        limit: largest torque of an actuator [N m], or None.
+        traced: whether sines may be part of the traced equations.
+
+    """
+
+    def __init__(self, dynamics: Dynamics, limit: float | None, *, traced: bool = True) -> None:
+        self._dynamics, self.limit, self._traced = dynamics, limit, traced
+        self._lags = len(dynamics.state) > 7
+
+    def acting(self, torque: Torque) -> Torque:
+        """Return what acts: numbers within the limit of the actuators; functions as they are.
+
+        A sine becomes a function where it is no part of the program: the actuators clamp it, or
+        the equations are not traced.
+        """
+        if isinstance(torque, SineTorque):
+            return torque if self._traced and self.limit_of(torque) is None else torque.at
+        if callable(torque):
+            return torque
+        first, second, third = map(float, torque)
+        return clamp((first, second, third), self.limit)
+
+    def limit_of(self, torque: SineTorque) -> float | None:
+        """Return the limit of the actuators where it clamps a sine [N m]."""
+        limit = self.limit
+        return None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
+
+    def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
+        """Torques that act at a time [s] and a state y, within the limit [N m].
+
+        In the state that a function is given are the lagged torques of the actuators; without lag
+        zero, for torques of this instant are what it returns. Where the state is not finite, as in
+        a trial step that is too long, the function is not called, and the torques are nan.
+
+        Raises:
+            InputError: what the function returns is not three numbers.
+
+        """
+        arguments: tuple[Any, ...] = (time,)
+        if has_feedback(torque):
+            if not math.isfinite(sum(y)):
+                return _NOT_FINITE
+            lagged = (y[7], y[8], y[9]) if self._lags else (0.0, 0.0, 0.0)
+            joints = self._dynamics.joints(*y[:7])
+            arguments = time, State.of(round(time * NANOSECONDS), y, joints, lagged)
+        return clamp(_three_numbers(torque_at(torque, *arguments), time), self.limit)
+
+    def of_drive(self, drive: Drive, t: float, y: Sequence[float]) -> Vector3:
+        """Torques of a drive with a function at a time of the steps [s] and a state [N m]."""
+        return self.at(drive.function, drive.start + t, y)
+
+    def locate_jump(
+        self, drive: Drive, begin: float, end: float, y: Sequence[float]
+    ) -> tuple[float, float] | None:
+        """Locate a jump of a function's torques: the last time before it and the first one after.
+
+        Bisection keeps the half with the larger change: that of a jump stays, any other shrinks
+        (Gear & Osterby, ACM Trans. Math. Softw. 10 (1984) 23-44, locate them for the same purpose).
+
+        Between two times of the steps [s], at the same state y.
+        """
+        times = np.linspace(begin, end, _SEARCHED + 1).tolist()
+        torques = [self.of_drive(drive, time, y) for time in times]
+        changes = [math.dist(before, after) for before, after in pairwise(torques)]
+        largest = max(changes)
+        k = changes.index(largest)
+        low, high = times[k], times[k + 1]
+        before, after = torques[k], torques[k + 1]
+        while low < (middle := 0.5 * (low + high)) < high:
+            torque = self.of_drive(drive, middle, y)
+            if math.dist(before, torque) >= math.dist(torque, after):
+                high, after = middle, torque
+            else:
+                low, before = middle, torque
+            if not math.dist(before, after) > 0.5 * largest:
+                return None
+        return low, high
+
+    def rate(self, drive: Drive, t: float, y: Sequence[float], torque: Vector3) -> Array:
+        """Differentiate a function's torques by time, forward from `torque` [N m/s], shape (3,).
+
+        Forward, as a step may begin at a kink, behind which the torque has another rate.
+        """
+        near, far = (np.array(self.of_drive(drive, t + k * _TIME_STEP, y)) for k in (1, 2))
+        return np.asarray((4.0 * near - far - 3.0 * np.array(torque)) / (2.0 * _TIME_STEP))
+
+    def by_state(self, drive: Drive, t: float, y: Sequence[float], torque: Vector3) -> Array:
+        """Differentiate a function's torques by each number of the state, shape (3, size)."""
+        slopes = np.zeros((3, len(y)))
+        if has_feedback(drive.function):
+            for i in range(len(y) - 1):  # the last number is the work, which no torque sees
+                step = _STATE_STEP * max(1.0, abs(y[i]))
+                moved = [*y[:i], y[i] + step, *y[i + 1 :]]
+                change = np.array(self.of_drive(drive, t, moved)) - torque
+                slopes[:, i] = change / step
+        return slopes
+
+
+def has_feedback(torque: Torque) -> bool:
+    """Return whether a torque is a function of the state, too."""
+    return bool(getattr(torque, "feedback", False))
+
+
+def _three_numbers(value: Any, time: float) -> Vector3:
+    """Return what a torque function returned as three floats, finite or not, or refuse it."""
+    try:
+        first, second, third = value
+        if isinstance(first + second + third, np.complexfloating):
+            raise TypeError
+        return float(first), float(second), float(third)
+    except (TypeError, ValueError):
+        allowed = "a torque function must return three torques [N m]"
+        raise InputError("torque", [Problem(f"f({time:g})", value, allowed)]) from None

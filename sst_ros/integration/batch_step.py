@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One step of many scenarios at once, a column each, and the loop over the steps.
+
+1. The step of a method is traced with the distances to the limits at its end and a test
+   whether a limit may have been passed: one program from the numbers of a column to its
+   new ones. The operations of a column are those of a run of its own in the same order.
+2. A block of columns that fits the cache takes its steps one after another. Columns do
+   not depend on each other, so neither blocks nor threads change a bit.
+3. What is rare is done for the few columns concerned: which limit was passed first, and
+   when. A column that has ended keeps its last valid state; the others continue.
+
+Which limit a step passes first is found from the distances to all: over a step each is a
+cubic in its values and rates at both ends (Hermite). Its error is at most h^4 max|d^(4)|
+/ 384. A step that ends outside is found, and one that leaves and comes back.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from functools import reduce
+from operator import add
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.dynamics.model import GRAZING
+from sst_ros.dynamics.traced_dynamics import ParametricModel
+from sst_ros.host.many_runs import stop_if_asked
+from sst_ros.integration.methods import Tableau
+from sst_ros.integration.steps import explicit_step, normalise
+from sst_ros.mechanism.generic_math import Scalar, absolute, larger, positive, select, sqrt
+from sst_ros.mechanism.geometry import Array
+from sst_ros.programs.columns import compile_columns
+from sst_ros.programs.expression import trace
+from sst_ros.programs.llvm import LANES
+
+BLOCK = 192
+"""Columns of a block at most: their numbers fit the cache of a core, and a step of all
+takes a hundred times as long as the interpreter between two steps."""
+
+NOT_FINITE = 1000
+"""Code of a scenario whose numbers are no longer finite; others are 1 + the limit's index."""
+
+EARLIEST = 1e-8
+"""Least share of a step at which a crossing is reported, so that its time lies in this step."""
+
+_NO_SHARE = 2.0
+"""In place of the share of a step at which a limit is passed, where none is."""
+
+_HALVINGS = 52
+"""Of a step, until the share is known to all digits of a double."""
+
+
+class ColumnStep:
+    """The programs of a step of many scenarios, compiled.
+
+    Attributes:
+        size: numbers of a state.
+        given: numbers of drive and varied numbers together.
+        limits: number of limits.
+        traced: the programs, by name.
+
+    """
+
+    def __init__(self, model: ParametricModel, method: Tableau) -> None:
+        self._model, self._method = model, method
+        self.size = len(model.ode.state)
+        self.given = len(model.ode.drive) + len(model.names)
+        self.varied = slice(len(model.ode.drive), self.given)
+        self.limits = len(model.limit_distances.outputs) // 2
+        state = [f"y{j}" for j in range(self.size)]
+        distances = [f"was{j}" for j in range(2 * self.limits)]
+        given = [f"g{j}" for j in range(self.given)]
+        shared = ("t", "h")
+        inputs = (*shared, *state, *distances, "error", "running", *given)
+        ends = (*shared, "before", "rate_before", "after", "rate_after")
+        self.traced = {
+            "advance": trace(self._advance, inputs),
+            "distances": trace(self._distances, (*shared, *state[:7], *given[self.varied])),
+            "crossing": trace(share_of_crossing, ends),
+        }
+        functions = compile_columns(self.traced, len(shared))
+        self.advance, self.distances = functions["advance"], functions["distances"]
+        self.crossing = functions["crossing"]
+
+    def _advance(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
+        """Return state, distances and their rates, and largest error after a step; and a flag.
+
+        The flag is positive where a limit may have been passed or a number is not finite.
+        """
+        rest = iter(inputs)
+        old = [next(rest) for _ in range(self.size)]
+        was = [next(rest) for _ in range(2 * self.limits)]
+        error, running, *given = rest
+
+        def derivative(time: Scalar, y: Sequence[Scalar], drive: Any) -> tuple[Scalar, ...]:
+            return self._model.derivative(time, *y, *drive)
+
+        drives = [given] * len(self._method.b)
+        moved, errors = explicit_step(derivative, self._method, t, h, old, drives)
+        new = normalise(moved)
+        far = self._model.distances(*new[:7], *given[self.varied])
+        worst = error
+        for one in (errors or ())[:4]:
+            worst = larger(worst, absolute(one))
+        flag = larger(may_cross(h, was, far), is_not_finite(reduce(add, new)))
+        # A scenario that has ended stays where it is.
+        kept = [select(running, after, before) for before, after in zip(old, new, strict=True)]
+        return (*kept, *far, select(running, worst, error), select(running, flag, 0.0))
+
+    def _distances(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
+        return self._model.distances(*inputs)
+
+
+class Block:
+    """Columns that are advanced together, in arrays of their own.
+
+    There are two arrays of states, which take turns: a step goes from one to the other,
+    so a step that is not valid can be taken back.
+
+    Attributes:
+        running: 1 for a column that goes on, 0 for one that has ended, shape (width,).
+        given: drive and varied numbers, shape (numbers, width).
+        width: number of columns.
+
+    """
+
+    def __init__(self, step: ColumnStep, width: int) -> None:
+        self._step, self.width = step, width
+        self._size, self._limits = step.size, step.limits
+        rows = step.size + 2 * step.limits + 1
+        self._states = np.zeros((rows, width)), np.zeros((rows, width))
+        self._now = 0  # which of the two has the state
+        self.running, self._flag = np.zeros(width), np.zeros(width)
+        self.given = np.zeros((step.given, width))
+        first, second = self._states
+        fixed = [self.running, *self.given]
+        self._advance = (
+            step.advance.bind([*first, *fixed], [*second, self._flag]),
+            step.advance.bind([*second, *fixed], [*first, self._flag]),
+        )
+        self._measure = step.distances.bind(
+            [*first[:7], *self.given[step.varied]],
+            [*first[step.size : -1]],
+        )
+
+    @property
+    def now(self) -> int:
+        """Which of the two arrays has the states now."""
+        return self._now
+
+    def states(self, which: int) -> Array:
+        """States in one of the two arrays, shape (size, width)."""
+        return self._states[which][: self._size]
+
+    def load(self, part: slice, *columns: NDArray[Any]) -> None:
+        """Take over columns of states, drives, codes, times and errors.
+
+        If there are fewer than the block has, the last one is repeated.
+        """
+        y, given, code, _, error = columns
+        self._now = 0
+        first = self._states[0]
+        fill(first[: self._size], y[:, part])
+        fill(first[-1:], error[None, part])
+        fill(self.given, given[: len(self.given), part])
+        own = code[part]
+        self.running[: len(own)] = own == 0
+        self.running[len(own) :] = 0.0
+        if self._limits:
+            self._measure(0.0, 0.0)
+
+    def store(self, part: slice, *columns: NDArray[Any]) -> None:
+        """Put states and errors back."""
+        y, _, code, _, error = columns
+        number = len(code[part])
+        y[:, part] = self.states(self._now)[:, :number]
+        error[part] = self._states[self._now][-1, :number]
+
+    def run(self, part: slice, first: int, count: int, h: float, *columns: NDArray[Any]) -> None:
+        """Advance the columns that were taken over by `count` steps.
+
+        Step `number` begins at `number` times h [s]. Codes and times of columns that end
+        change: to 1 + the index of a limit, or NOT_FINITE, and to when that was [s].
+        """
+        _, _, code, time, _ = columns
+        for number in range(first, first + count):
+            stop_if_asked()
+            self.prepare_step(number)
+            self._advance[self._now](number * h, h)
+            self._now = 1 - self._now
+            if np.count_nonzero(self._flag):
+                self._end_columns(number, h, code[part], time[part])
+                if not self.running.any():
+                    return
+
+    def prepare_step(self, number: int) -> None:
+        """Do what is to be done before a step: nothing here."""
+
+    def _end_columns(self, number: int, h: float, code: NDArray[np.int64], time: Array) -> None:
+        """End the columns that have passed a limit in a step, or are not finite after it."""
+        before, after = self._states[1 - self._now], self._states[self._now]
+        columns = np.flatnonzero(self._flag > 0.0)
+        found, share = self._first_crossings(before, after, h, columns)
+        with np.errstate(all="ignore"):
+            total = reduce(add, after[: self._size, columns])
+            found[~np.isfinite(total)] = NOT_FINITE
+        ends = found > 0
+        ended = columns[ends]
+        code[ended], time[ended] = found[ends], (number + share[ends]) * h
+        self.running[ended] = 0.0
+        after[:, ended] = before[:, ended]
+
+    def _first_crossings(
+        self, before: Array, after: Array, h: float, columns: NDArray[np.intp]
+    ) -> tuple[NDArray[np.int64], Array]:
+        """Find 1 + the index of the limit that each column passes first in a step, and when.
+
+        Returns 0 where none is passed, and the share of the step, 1 where none is.
+        """
+        count, limits, size = len(columns), self._limits, self._size
+        found, share = np.zeros(count, dtype=np.int64), np.ones(count)
+        padded = np.resize(columns, -(-count // LANES) * LANES)
+        ends = [
+            np.ascontiguousarray(states[rows, padded]).ravel()
+            for states in (before[size:, :], after[size:, :])
+            for rows in (np.arange(limits)[:, None], np.arange(limits, 2 * limits)[:, None])
+        ]
+        shares = np.full((limits, len(padded)), _NO_SHARE)
+        if limits:
+            self._step.crossing((0.0, h), ends, [shares.reshape(-1)])
+        for limit in np.flatnonzero((shares < _NO_SHARE).any(axis=1)):
+            own = shares[limit, :count]
+            earlier = (own < _NO_SHARE) & ((found == 0) | (own < share))
+            found[earlier] = limit + 1
+            share[earlier] = np.maximum(own[earlier], EARLIEST)
+        return found, share
+
+
+def may_cross(h: Scalar, was: Sequence[Scalar], far: Sequence[Scalar]) -> Scalar:
+    """Return a number > 0 if a step of h may pass a limit.
+
+    `was` and `far` are distances and their rates at both ends. It compares the tangents
+    there, which lie below a curve that turns.
+    """
+    limits = len(was) // 2
+    hit: Scalar = 0.0
+    for j in range(limits):
+        before, falling = was[j], h * was[limits + j]
+        after, rising = far[j], h * far[limits + j]
+        tangents = before * rising - falling * after + falling * rising
+        dips = select(-falling, select(rising, -tangents, -1.0), -1.0)
+        hit = larger(larger(hit, dips), -GRAZING - after)
+    return hit
+
+
+def share_of_crossing(
+    t: Scalar, h: Scalar, before: Scalar, rate_before: Scalar, after: Scalar, rate_after: Scalar
+) -> tuple[Scalar]:
+    """Return the share of a step of h at which a distance becomes negative, _NO_SHARE if not.
+
+    Given are the distance and its rate at both ends, between which it is a cubic.
+    """
+    falling, rising = h * rate_before, h * rate_after
+    square = 3.0 * (after - before) - 2.0 * falling - rising
+    cube = falling + rising - 2.0 * (after - before)
+    root = sqrt(positive(square * square - 3.0 * cube * falling))
+
+    def value(share: Scalar) -> Scalar:
+        return before + share * (falling + share * (square + share * cube))
+
+    lowest = select(-falling, select(rising, -falling / (square + root), 1.0), 1.0)
+    high = select(-GRAZING - after, 1.0, lowest)
+    least = value(high)
+    least = select(-after, after, least)
+    end, low = high, 0.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + end)
+        outside = -value(middle)
+        low, end = select(outside, low, middle), select(outside, middle, end)
+    return (select(-GRAZING - least, end, _NO_SHARE),)
+
+
+def is_not_finite(x: Scalar) -> Scalar:
+    """Return 1 where a number is not finite, else 0."""
+    return select(sys.float_info.max - absolute(x), 0.0, 1.0)
+
+
+def fill(rows: NDArray[Any], values: NDArray[Any]) -> None:
+    """Put values into rows, which may be longer; the last column is repeated."""
+    number = values.shape[1]
+    rows[:, :number] = values
+    rows[:, number:] = values[:, -1:]
+
+
+def advance_blocks(
+    block: Block,
+    begins: Sequence[int],
+    first: int,
+    count: int,
+    h: float,
+    *columns: NDArray[Any],
+) -> None:
+    """Advance the columns of blocks by `count` steps; see `Block.run`.
+
+    Args:
+        block: the blocks are taken over by it in turn.
+        begins: the first column of each.
+        first: number of the first step.
+        count: number of steps.
+        h: length of a step [s].
+        columns: states, drives, codes, times and errors, a column a scenario.
+
+    """
+    for begin in begins:
+        part = slice(begin, begin + block.width)
+        block.load(part, *columns)
+        block.run(part, first, count, h, *columns)
+        block.store(part, *columns)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events inside a step: when a joint reaches a limit, or meets or leaves an elastic stop.
+
+The force of a stop has a kink where contact begins and ends, so steps end there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any
+
+from sst_ros.dynamics.model import CONTACT_BAND, GRAZING, Limit
+
+Signal = Callable[[float], float]
+Joints = Callable[[float], Sequence[float]]
+"""Angles and rates of the joints at a time in a step [s]."""
+JointRanges = Sequence[tuple[int, float, float]]
+"""A joint, and the least and largest angle inside of all its limits [rad]."""
+
+TIME_TOLERANCE = 1e-15
+"""Accuracy of a located time [s], above the rounding of the time itself."""
+_REACH = 10.0
+"""A joint whose rate has turned comes at most this many times as far as its rates allow."""
+
+
+def all_far(ranges: JointRanges, begin: Sequence[float], end: Sequence[float], h: float) -> bool:
+    """Test quickly that no limit may have been crossed in h.
+
+    That is so where a joint is inside before and after, and its rate has not turned, or the joint
+    is farther from the limits than it would come in ten times h.
+    """
+    for joint, least, most in ranges:
+        if not (least < begin[joint] < most and least <= end[joint] <= most):
+            return False
+        before, after = begin[joint + 9], end[joint + 9]
+        if before * after < 0.0:
+            reach = _REACH * h * max(abs(before), abs(after))
+            lower, upper = min(begin[joint], end[joint]), max(begin[joint], end[joint])
+            if not (least + reach < lower and upper < most - reach):
+                return False
+    return True
+
+
+def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:
+    """Test cheaply whether an event may lie in a step, given the joints at both ends.
+
+    A limit counts where the step starts on it; a contact that the step starts on does not.
+    """
+    before = event.distance(begin)
+    if event.error is not None:
+        if before <= 0.0:
+            return True
+    elif before <= GRAZING and not (before > -CONTACT_BAND and event.slope(begin) > 0.0):
+        return False
+    return event.distance(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
+
+
+def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
+    """Time x in [0, h] at which `distance` becomes negative, or None.
+
+    Both signals are smooth functions of the time since the step began and `slope` is the rate of
+    `distance`. A dip below zero and back inside the step is found where the slope changes sign
+    once. A distance that starts at zero counts if it shrinks, and not if it grows.
+    """
+    begin, end = 0.0, h
+    rising, falling = slope(0.0) > 0.0, slope(h) < 0.0
+    if distance(0.0) <= GRAZING:
+        if not rising:
+            leaves = slope(0.0) < 0.0 or distance(h) < -GRAZING  # from rest, the latter
+            return 0.0 if distance(0.0) < -GRAZING or leaves else None
+        if distance(h) >= 0.0 or (distance(h) >= -GRAZING and not falling):
+            return None
+        # It grew first: the crossing lies behind the maximum.
+        begin = _root(slope, 0.0, h) if falling else 0.0
+    elif distance(h) >= 0.0:
+        if rising or falling:
+            return None
+        end = _root(slope, 0.0, h)
+        if distance(end) >= 0.0:
+            return None
+    return _root(distance, begin, end)
+
+
+def first_event(limits: Iterable[Limit], joints: Joints, h: float) -> tuple[float, Limit] | None:
+    """Return time in [0, h] and limit of the first event, None where there is none."""
+    first: tuple[float, Limit] | None = None
+    for limit in limits:
+        x = first_crossing(
+            partial(_evaluate, limit.distance, joints), partial(_evaluate, limit.slope, joints), h
+        )
+        if x is not None and (first is None or x < first[0]):
+            first = (x, limit)
+    return first
+
+
+def _evaluate(signal: Callable[[Any], float], joints: Joints, x: float) -> float:
+    return signal(joints(x))
+
+
+def _root(signal: Signal, begin: float, end: float) -> float:
+    if signal(begin) == 0.0 or signal(begin) * signal(end) > 0.0:
+        return begin
+    from scipy.optimize import brentq  # takes 0.4 s, and many runs have no event
+
+    return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))

@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps of one scene by one method, as functions of floats.
+
+`steps.py` has the steps as ordinary functions. Here they are traced, as programs that call
+the derivative of the scene, and become machine code where llvmlite is installed, else flat
+Python with the same bits. Torques that are numbers, or a function of time, go in as inputs. A
+function of the state is called in each stage: those steps run as they are read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from sst_ros.dynamics.traced_dynamics import LAG, ODE
+from sst_ros.integration.applied_torque import AppliedTorque, has_feedback
+from sst_ros.integration.methods import Method, Rosenbrock, Tableau
+from sst_ros.integration.point import Drive, Point
+from sst_ros.integration.steps import (
+    Linearisation,
+    NewState,
+    add_up,
+    explicit_step,
+    normalise,
+    rosenbrock_step,
+    step_pair,
+)
+from sst_ros.mechanism.geometry import Array
+from sst_ros.programs.compiled import (
+    RowsFunction,
+    compile_functions,
+    compile_rows,
+    without_errors,
+)
+from sst_ros.programs.expression import Program, Routine, trace
+from sst_ros.programs.llvm import Function
+
+JACOBIAN_COST = 30
+"""Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
+
+_JOINTS = 18
+"""Numbers of `joints`: nine angles and nine rates."""
+
+
+class MethodSteps:
+    """Steps of an ODE under torques that are numbers, a sine, or a function of time.
+
+    Args:
+        ode: what is integrated; its drive is the numbers of a `Drive`.
+        method: how.
+
+    Attributes:
+        method: as given.
+        cost: evaluations of a step; `pair` takes three.
+
+    """
+
+    def __init__(self, ode: ODE, method: Method) -> None:
+        self.method, self._ode = method, ode
+        implicit = isinstance(method, Rosenbrock)
+        self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
+        self._size = len(ode.state)
+
+    @cached_property
+    def _programs(self) -> dict[str, Program]:
+        """`pair`, `single` and `slope` of this scene, and what they call."""
+        ode, method = self._ode, self.method
+        programs = {
+            "slope": ode.program,
+            "joints": ode.dynamics.joints_program,
+            **trace_steps(method, self._size, len(ode.drive), _lagged(ode)),
+        }
+        if isinstance(method, Rosenbrock):
+            programs["linearise"] = ode.jacobian
+        return programs
+
+    @cached_property
+    def _functions(self) -> dict[str, Function]:
+        return compile_functions(self._programs, ("pair", "single", "slope"))
+
+    @cached_property
+    def _single_of_rows(self) -> RowsFunction:
+        return compile_rows(self._programs, "single")
+
+    def load(self) -> None:
+        """Have the code compiled that a run calls."""
+        _ = self._functions
+
+    def pair(
+        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+    ) -> tuple[Point, float]:
+        """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
+
+        The second one has the drive `other`, by default that of the first. Returns where they end,
+        and the local error estimate in units of the tolerance; infinite where a number of the step
+        is not finite.
+        """
+        second = drive if other is None else other
+        numbers = self._functions["pair"](t, h, *at.y, *at.z, *drive.numbers, *second.numbers)
+        return _read_pair(numbers, at, self._size)
+
+    def single(self, t: float, h: float, y: Sequence[float], drive: Drive) -> list[float]:
+        """Advance a state alone by h; its error is not looked at. Where it has no value: nan."""
+        return self._functions["single"](t, h, *y, *drive.numbers)
+
+    def fixed(
+        self, t: float, h: float, count: int, y: Sequence[float], drive: Drive
+    ) -> list[float]:
+        """Advance a state by `count` steps of h; their errors are not looked at."""
+        single, numbers, state = self._functions["single"], drive.numbers, [*y]
+        for k in range(count):
+            state = single(t + k * h, h, *state, *numbers)
+        return state
+
+    def states_after(self, rows: Array) -> Array:
+        """Return what `single` gives for rows of t, h, state and drive, shape (n, size)."""
+        return self._single_of_rows(rows)
+
+    def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
+        """Return the derivative of the state."""
+        return self._functions["slope"](t, *y, *drive.numbers)
+
+    def eigenvalues(self, t: float, y: Sequence[float], drive: Drive) -> Array:
+        """Eigenvalues of the exact Jacobian [1/s], shape (size,); ArithmeticError: not finite."""
+        return self._ode.eigenvalues(t, y, drive.numbers)
+
+
+class FunctionSteps:
+    """Steps of an ODE under torques that are a function, or whose derivative is given.
+
+    Args:
+        ode: what is integrated; the first three numbers of its drive are the torques.
+        method: how.
+        torque: evaluates the functions.
+        derivative: of the state in place of that of the ODE, with the same inputs.
+
+    Attributes: see `MethodSteps`.
+
+    """
+
+    def __init__(
+        self,
+        ode: ODE,
+        method: Method,
+        torque: AppliedTorque,
+        derivative: Callable[..., Sequence[float]] | None = None,
+    ) -> None:
+        if derivative is not None and isinstance(method, Rosenbrock):
+            raise ValueError("a derivative of its own has no Jacobian, which the method needs")
+        self.method, self._ode, self._torque, self._given = method, ode, torque, derivative
+        self.cost = len(method.a) + (JACOBIAN_COST if isinstance(method, Rosenbrock) else 0)
+        self._size = len(ode.state)
+
+    @cached_property
+    def _rhs(self) -> Function:
+        """The derivative under torques that are numbers."""
+        if self._given is not None:
+            return without_errors(self._given, self._size)
+        return compile_functions({"slope": self._ode.program}, ("slope",))["slope"]
+
+    @cached_property
+    def _by_stage(self) -> dict[str, Function]:
+        """Steps that take the torques of each stage, as functions of time give them."""
+        assert isinstance(self.method, Tableau)
+        ode = self._ode
+        programs = {
+            "slope": ode.program,
+            "joints": ode.dynamics.joints_program,
+            **trace_steps(self.method, self._size, len(ode.drive), _lagged(ode), by_stage=True),
+        }
+        return compile_functions(programs, ("pair", "single"))
+
+    def load(self) -> None:
+        """Have the code compiled that a run calls."""
+        _ = self._rhs
+
+    def pair(
+        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+    ) -> tuple[Point, float]:
+        """See `MethodSteps.pair`."""
+        if self._is_of_time(drive) and other is None:
+            half = 0.5 * h
+            stages = [
+                *self._stage_drives(t, h, drive),
+                *self._stage_drives(t, half, drive),
+                *self._stage_drives(t + half, half, drive),
+            ]
+            numbers = self._by_stage["pair"](t, h, *at.y, *at.z, *stages)
+            return _read_pair(numbers, at, self._size)
+        drives = (drive, other or drive, other or drive)
+
+        def step(part: int, t: float, h: float, y: Sequence[float], near: Any) -> NewState:
+            return self._step(t, h, y, near, drives[part])
+
+        pair = step_pair(step, t, h, at.y, at.z, _lagged(self._ode))
+        joints = self._ode.dynamics.joints(*pair.y[:7])
+        total = pair.total + add_up(joints)
+        return _read_pair([*pair.y, *pair.z, *joints, pair.size, total], at, self._size)
+
+    def single(self, t: float, h: float, y: Sequence[float], drive: Drive) -> list[float]:
+        """See `MethodSteps.single`."""
+        if self._is_of_time(drive):
+            return self._by_stage["single"](t, h, *y, *self._stage_drives(t, h, drive))
+        return normalise(self._step(t, h, y, y, drive).state)
+
+    def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
+        """See `MethodSteps.slope`."""
+        torque = self._torque.of_drive(drive, t, y)
+        return self._rhs(t, *y, *torque, *drive.numbers[3:])
+
+    def eigenvalues(self, t: float, y: Sequence[float], drive: Drive) -> Array:
+        """See `MethodSteps.eigenvalues`."""
+        columns: Array = np.array(self._linearise(t, y, drive).columns)
+        if not np.isfinite(columns).all():
+            raise ArithmeticError("the Jacobian is not finite")
+        return np.asarray(np.linalg.eigvals(columns.T))
+
+    def _is_of_time(self, drive: Drive) -> bool:
+        return (
+            self._given is None
+            and isinstance(self.method, Tableau)
+            and callable(drive.function)
+            and not has_feedback(drive.function)
+        )
+
+    def _stage_drives(self, t: float, h: float, drive: Drive) -> list[float]:
+        """Return what acts in each stage of a step, one stage after the other."""
+        assert isinstance(self.method, Tableau)
+        numbers: list[float] = []
+        for node in self.method.c:
+            time = t + node * h if node else t
+            numbers += [*self._torque.of_drive(drive, time, ()), *drive.numbers[3:]]
+        return numbers
+
+    def _step(
+        self, t: float, h: float, y: Sequence[float], near: Sequence[float], drive: Drive
+    ) -> NewState:
+        method = self.method
+        if isinstance(method, Tableau):
+            return explicit_step(self.slope, method, t, h, y, [drive] * len(method.a))
+        linearisation = self._linearise(t, near, drive)
+        return rosenbrock_step(self.slope, linearisation, method, t, h, y, drive)
+
+    def _linearise(self, t: float, y: Sequence[float], drive: Drive) -> Linearisation:
+        """Linearise: exact by the state, by differences of the torque."""
+        size, torque = self._size, self._torque.of_drive(drive, t, y)
+        numbers = self._ode.linearised_by_torque(t, *y, *torque, *drive.numbers[3:])
+        rows = np.array(numbers).reshape(size + 5, size)
+        slope, by_time, by_state, by_torque = rows[0], rows[1], rows[2 : size + 2], rows[size + 2 :]
+        rate = self._torque.rate(drive, t, y, torque)
+        columns = by_state + self._torque.by_state(drive, t, y, torque).T @ by_torque
+        return Linearisation(
+            slope.tolist(), (by_time + rate @ by_torque).tolist(), columns.tolist()
+        )
+
+
+@lru_cache(maxsize=64)
+def steps_of(ode: ODE, method: Method) -> MethodSteps:
+    """Return the steps of an ODE by a method, compiled once for all runs of the same ODE."""
+    return MethodSteps(ode, method)
+
+
+@lru_cache(maxsize=64)
+def trace_steps(
+    method: Method, size: int, drive: int, lagged: int, *, by_stage: bool = False
+) -> dict[str, Program]:
+    """Trace the programs `step`, `pair` and `single` of a method.
+
+    They call the programs `slope` (t, state, drive), `joints` (first seven numbers of the state)
+    and, of a Rosenbrock method, `linearise`, which has the outputs of `ODE.jacobian`. Inputs of
+    `pair` are t, h, both solutions and their drives; outputs both new solutions, the joints of the
+    first, the size of its error, and a total that is finite where all numbers are. Inputs of
+    `single` are t, h, state and drive; its outputs are the new state.
+
+    Args:
+        method: how.
+        size: numbers of the state.
+        drive: numbers of the drive.
+        lagged: numbers of the state that are lagging torques.
+        by_stage: whether an explicit step takes a drive for each stage.
+
+    """
+    implicit = isinstance(method, Rosenbrock)
+    slope = Routine("slope", 1 + size + drive, size)
+    joints = Routine("joints", 7, _JOINTS)
+    stages = len(method.a) if by_stage else 1
+    state = [f"y{i}" for i in range(size)]
+    near = [f"near{i}" for i in range(size)] if implicit else []
+    second = [f"z{i}" for i in range(size)]
+    drives = [f"d{i}" for i in range(stages * drive)]
+    others = [f"e{i}" for i in range((2 if by_stage else 1) * stages * drive)]
+    step = Routine(
+        "step", 2 + size + len(near) + len(drives), size * (2 if _has_error(method) else 1)
+    )
+
+    def derivative(t: Any, y: Sequence[Any], numbers: Sequence[Any]) -> Sequence[Any]:
+        return slope(t, *y, *numbers)
+
+    def take_step(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+        y, point, numbers = (
+            inputs[:size],
+            inputs[size : size + len(near)],
+            inputs[size + len(near) :],
+        )
+        if isinstance(method, Rosenbrock):
+            linearisation = _linearise(t, point, numbers)
+            new = rosenbrock_step(derivative, linearisation, method, t, h, y, numbers)
+        else:
+            held = [numbers[drive * k : drive * (k + 1)] for k in range(stages)]
+            each = held if by_stage else held * len(method.a)
+            new = explicit_step(derivative, method, t, h, y, each)
+        return (*new.state, *(new.error or ()))
+
+    def _linearise(t: Any, y: Sequence[Any], numbers: Sequence[Any]) -> Linearisation:
+        results = Routine("linearise", 1 + size + drive, (size + 2) * size)(t, *y, *numbers)
+        rows = [results[size * k : size * (k + 1)] for k in range(size + 2)]
+        return Linearisation(rows[0], rows[1], rows[2:])
+
+    def take_pair(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+        y, z = inputs[:size], inputs[size : 2 * size]
+        given = inputs[2 * size :]
+        first, rest = given[: len(drives)], given[len(drives) :]
+        by_part = (first, rest[: len(drives)], rest[-len(drives) :])
+
+        def call(part: int, t: Any, h: Any, y: Sequence[Any], near: Sequence[Any]) -> NewState:
+            results = step(t, h, *y, *(near if implicit else ()), *by_part[part])
+            return NewState([*results[:size]], [*results[size:]] or None)
+
+        pair = step_pair(call, t, h, y, z, lagged)
+        angles = joints(*pair.y[:7])
+        total = pair.total + add_up(angles)
+        return (*pair.y, *pair.z, *angles, pair.size, total)
+
+    def take_single(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+        y, numbers = inputs[:size], inputs[size:]
+        results = step(t, h, *y, *(y if implicit else ()), *numbers)
+        return tuple(normalise(results[:size]))
+
+    return {
+        "step": trace(take_step, ("t", "h", *state, *near, *drives)),
+        "pair": trace(take_pair, ("t", "h", *state, *second, *drives, *others)),
+        "single": trace(take_single, ("t", "h", *state, *drives)),
+    }
+
+
+def _has_error(method: Method) -> bool:
+    return isinstance(method, Rosenbrock) or bool(method.error)
+
+
+def _lagged(ode: ODE) -> int:
+    """Numbers of the state that are lagging torques."""
+    return 3 if set(LAG) <= set(ode.state) else 0
+
+
+def _read_pair(numbers: Sequence[float], at: Point, size: int) -> tuple[Point, float]:
+    """Read the outputs of `pair`."""
+    *_, error, total = numbers
+    finite = total - total == 0.0
+    after = at._replace(
+        y=[*numbers[:size]],
+        z=[*numbers[size : 2 * size]],
+        joints=tuple(numbers[2 * size : 2 * size + _JOINTS]),
+        steps=at.steps + 1,
+    )
+    return after, error if finite else math.inf

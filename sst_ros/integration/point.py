@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a run stands, how far it can be trusted, and what a step takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from sst_ros.integration.methods import Method
+
+_MARGIN = 2.0
+"""Of the distance of both solutions: an error that only halves with the steps is twice as large."""
+_ROUNDING = 8 * 2.220446049250313e-16
+"""Error of a step by rounding, which a run of n steps has at least sqrt(n) times."""
+
+
+class MethodChange(NamedTuple):
+    """A change of method."""
+
+    time: float  # [s]
+    method: str  # the new one
+    reason: str
+
+
+class Point(NamedTuple):
+    """Where a run stands: all that its next step depends on; and how far it can be trusted.
+
+    A second solution goes through each step by two of half the length: its distance is the error.
+    No order is assumed, as none holds where a torque jumps, a clamp or a contact bends the motion,
+    or friction is sharp. Where the method has its order, the second solution is nearly exact, and
+    the distance is the error; where each step loses its order, the error halves, and the distance
+    is half of the error.
+    """
+
+    y: list[float]  # the solution
+    z: list[float]  # the second one, by steps of half the length
+    joints: tuple[float, ...]  # nine angles and nine rates of y
+    method: Method
+    h: float = math.inf  # longest next step [s]
+    attempts: int = 0  # since the method was chosen
+    steps: int = 0  # accepted since the start
+    changes: tuple[MethodChange, ...] = ()
+
+    @property
+    def error(self) -> float:
+        """Estimated global error of the orientation [rad]."""
+        return estimate_error(orientation_distance(self.y, self.z), self.steps)
+
+    @property
+    def rate_error(self) -> float:
+        """Estimated global error of the body rate [rad/s]."""
+        speed = max(1.0, math.hypot(*self.y[4:7]))
+        distance = math.dist(self.y[4:7], self.z[4:7]) / speed
+        return speed * estimate_error(distance, self.steps)
+
+
+def estimate_error(distance: float, steps: int) -> float:
+    """Estimate the error of a solution by that of a second one, by steps of half the length."""
+    return max(_MARGIN * distance, _ROUNDING * math.sqrt(steps + 1.0))
+
+
+def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
+    """Angle between the orientations of two states that are near [rad]; q and -q are the same."""
+    return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
+
+
+def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
+    """Distance of orientations [rad], or that of the rest relative to the rate if it is larger.
+
+    Rates below 1 rad/s count as 1 rad/s; infinite where a number is not finite.
+    """
+    speed = max(1.0, math.hypot(*z[4:7]))
+    distance = max(orientation_distance(y, z), math.dist(y[4:], z[4:]) / speed)
+    return distance if math.isfinite(distance) else math.inf
+
+
+class Drive(NamedTuple):
+    """What acts from outside over a period."""
+
+    numbers: tuple[float, ...]
+    """Torques [N m], or phases of a sine [rad], or zero where a function gives the torques; then
+    the moment on the star in {B} [N m] where the scene takes one."""
+    function: Any = None  # torques as a function of the time, or of it and the state
+    start: float = 0.0  # time of the run at which that of the steps is zero [s]

@@ -1,0 +1,474 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop that advances a scene: periods, steps, their length and method, and events.
+
+1. A period has torques that are numbers, a sine, or a function; it is a tick of a node, a
+   period of a controller, or a whole motion.
+2. Its steps are as long as the error estimate of the last one allows; one whose error exceeds
+   the tolerance is taken again, shorter. Where a function jumps, a step ends.
+3. `auto` looks at the eigenvalues of the Jacobian now and then, and takes the method whose
+   steps would be longer.
+4. A step that may pass a limit, or meet or leave an elastic stop, ends at the first of them.
+5. A limit ends the motion: LimitReached. So does a motion that no step resolves: CannotStep.
+
+What a step computes is in `steps.py`; what it starts from and ends with is a `Point`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sst_ros.dynamics.model import Limit, contact_events_of, free_range, limits_of, ranges_of
+from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
+from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.events import all_far, first_event, may_occur
+from sst_ros.integration.method_steps import JACOBIAN_COST, FunctionSteps, MethodSteps, steps_of
+from sst_ros.integration.methods import (
+    DOP853,
+    DORMAND_PRINCE,
+    METHODS,
+    RODAS5P,
+    Method,
+    Rosenbrock,
+)
+from sst_ros.integration.point import Drive, MethodChange, Point
+from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.torque_profile import SineTorque, Torque
+from sst_ros.state import Vector3
+
+Moment = tuple[float, ...]
+"""External moment on the star in {B} [N m] where the scene takes it from a topic, else empty."""
+Steps = MethodSteps | FunctionSteps
+
+WHOLE_MOTION_BUDGET = 10_000_000
+"""Evaluations where a period may be a whole motion, offline: minutes in plain Python."""
+
+_LARGEST_GROWTH, _LARGEST_SHRINKAGE, _SAFETY = 5.0, 0.2, 0.9
+"""Factors by which a step changes at most; share of the step that the error allows."""
+_LAST_SLIVER = 1e-3
+"""A step takes the rest of a period, too, where it is shorter than this share of the step."""
+_SHORTEST_STEP = 1e-15
+"""Relative to the time: below it, the rounding of time is as long as a step."""
+_SHORTEST_SEARCH = 1e-13
+"""Relative to the time: in a shorter step no jump is looked for, it would lie within rounding."""
+_JUMP_MARGIN = 4e-16
+"""Relative to the time: a step ends so long before a jump, and the next one so long after it."""
+_BEHIND_A_KINK = 1e-14
+"""A step goes beyond a kink by this angle [rad], to where the Jacobian is that of its far side."""
+_LARGEST_SHARE_BEHIND = 1e-3
+"""...but by no more than this share of the step, where the joint hardly moves."""
+
+_CHOOSE_EVERY = 16
+"""Attempts after which `auto` looks at the method."""
+_CHOOSE_AFTER_REJECTIONS = 3
+"""...or so many rejections in a row: a Coulomb torque that changes sign sharply would otherwise
+shrink explicit steps below its time constant before it is seen."""
+_STIFF = 2.0
+"""Step times fastest decay above which an explicit method is left: it is stable to about 3."""
+_EASY = 0.5
+"""Step times fastest rate below which an implicit method is left."""
+ACCURATE = 1e-7
+"""Tolerance below which order 8 takes fewer evaluations than order 5."""
+
+
+class LimitReached(Exception):
+    """A limit of the scene ends the motion at a time [s]."""
+
+    def __init__(self, limit: Limit, time: float) -> None:
+        self.limit, self.time = limit, time
+        super().__init__(limit.reason)
+
+
+class CannotStep(Exception):
+    """No step is small enough to resolve the motion."""
+
+
+class BudgetSpent(CannotStep):
+    """The evaluations that a period may take are used up."""
+
+
+class _NoState(Exception):
+    """A state inside an accepted step is not finite."""
+
+
+class EvaluationBudget:
+    """Evaluations of the right-hand side that a period, or a whole run, may take.
+
+    `spent` counts those of a run.
+    """
+
+    def __init__(self, per_period: int, *, whole_run: bool = False) -> None:
+        self.per_period, self._whole_run = per_period, whole_run
+        self.spent, self._end = 0, per_period
+
+    def begin(self) -> None:
+        """Begin a period."""
+        if not self._whole_run:
+            self._end = self.per_period + self.spent
+
+    def charge(self, evaluations: int) -> None:
+        """Count evaluations before they are made; BudgetSpent: the period has none left."""
+        if self.spent + evaluations > self._end:
+            span = "motion" if self._whole_run else "step"
+            raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the {span}")
+        self.spent += evaluations
+
+
+class Step(NamedTuple):
+    """An accepted step, or the part of it before an event."""
+
+    t: float  # when it begins, from the begin of the period [s]
+    h: float  # its length [s]
+    begin: Point
+    end: Point
+    drive: Drive  # what acts
+    other: Drive | None  # on the second solution, None where it is the same
+    steps: Steps  # what has taken it
+    last: bool  # whether it ends with the period
+
+    @property
+    def cost(self) -> int:
+        """Evaluations of both solutions."""
+        return (3 if self.other is None else 6) * self.steps.cost
+
+    def inside(self, x: float) -> list[float]:
+        """Return the state x [s] after its begin, by one shorter step; nan where not finite."""
+        return self.steps.single(self.t, x, self.begin.y, self.drive)
+
+
+class Stepper:
+    """Advances a scene through periods.
+
+    Nothing changes in it as a run goes on but what its budget has spent: the run is its points.
+
+    Args:
+        scene: what is simulated.
+        method: a method of `methods.METHODS`, or auto.
+        tolerance: largest local error estimate of a step: of the quaternion, and of the rate
+            relative to its length.
+        budget: counts evaluations, and ends a period that takes too many.
+        derivative: of the state in plain Python, in place of the traced one and with its inputs;
+            for explicit methods.
+        limits: whether the limits of the scene end the motion.
+        max_step: longest step [s].
+
+    Attributes:
+        dynamics, ode: of the scene.
+        torque: clamps torques, and evaluates those that are a function.
+        budget: as given; `budget.spent` counts evaluations.
+
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        method: str,
+        tolerance: float,
+        *,
+        budget: EvaluationBudget,
+        derivative: Callable[..., Sequence[float]] | None = None,
+        limits: bool = True,
+        max_step: float = math.inf,
+    ) -> None:
+        geometry = Geometry.of(scene)
+        self.dynamics = Dynamics.of(scene)
+        self.ode = recent_ode(self.dynamics, work=True)
+        self.budget = budget
+        ends = tuple(limits_of(scene, geometry)) if limits else ()
+        contacts = tuple(contact_events_of(scene, geometry))
+        self._events = (*ends, *contacts)
+        self._ranges = ranges_of([*ends, *free_range(contacts)])
+        traced = derivative is None
+        self.torque = AppliedTorque(self.dynamics, scene.torque_limit, traced=traced)
+        self._derivative = derivative
+        self._tolerance, self._max_step = tolerance, max_step
+        self._methods = methods_of(method)
+        # A derivative of its own has no Jacobian to choose a method by.
+        self._chooses = len(self._methods) > 1 and traced
+        self._steps: dict[tuple[object, str], Steps] = {}
+
+    def begin(self, y: Sequence[float], method: Method | None = None) -> Point:
+        """Complete quaternion, body rate and lagged torques, zero by default, to a point.
+
+        A run begins with `method`, by default the first of those that it may use.
+        """
+        full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
+        joints = tuple(self.dynamics.joints(*full[:7]))
+        return Point(full, list(full), joints, method or self._methods[0])
+
+    def load(self) -> None:
+        """Have the code compiled that periods under constant torques may need."""
+        import scipy.optimize  # noqa: F401  # takes 0.4 s, too long for a step in real time
+
+        held = self._hold((0.0, 0.0, 0.0), 0.0, (0.0,) * len(self.dynamics.drive[3:]))
+        for method in self._methods:
+            self._steps_of(held, method).load()
+        if self._chooses:
+            _ = self.ode.linearised
+
+    def acting(self, torque: Torque, time: float, at: Point) -> Vector3:
+        """Torques that the actuators give at a time [s] and a point [N m]."""
+        if len(self.dynamics.state) > 7:  # they lag
+            return at.y[7], at.y[8], at.y[9]
+        return self.torque.at(torque, time, at.y)
+
+    def advance(
+        self,
+        at: Point,
+        start: float,
+        h: float,
+        torque: Torque,
+        moment: Moment = (),
+        *,
+        other: Vector3 | None = None,
+        visit: Callable[[Step], None] | None = None,
+    ) -> Point:
+        """Advance through a period, by steps up to the first event in each.
+
+        Args:
+            at: where it begins.
+            start: when it begins [s].
+            h: its length [s].
+            torque: one of `AppliedTorque.acting`.
+            moment: from a topic.
+            other: constant torques of the second solution, by default those of the first [N m].
+            visit: called with each step that is done.
+
+        Raises:
+            LimitReached: a limit of the scene ends the motion, after the last step.
+            CannotStep: steps shrink below the rounding of time.
+            BudgetSpent: the period takes more evaluations than it may.
+
+        """
+        drive = self._hold(torque, start, moment)
+        second = None if other is None else Drive((*other, *moment))
+        self.budget.begin()
+        x, stops = 0.0, list[float]()
+        while x < h:
+            step = self._take_step(x, h, at, drive, second, stops)
+            event = None
+            if not all_far(self._ranges, step.begin.joints, step.end.joints, step.h):
+                try:
+                    step, event = self._until_event(step)
+                except _NoState:  # the step has leapt over a singularity
+                    at = step.begin._replace(h=0.5 * step.h)
+                    stops.clear()
+                    continue
+            if visit is not None:
+                visit(step)
+            at = step.end
+            if event is not None:
+                x = step.t + step.h
+                stops.clear()
+                if event.error is not None:
+                    raise LimitReached(event, start + x)
+            elif step.last:
+                break
+            elif stops and step.h == stops[0] - x:
+                x = stops.pop(0)
+            else:
+                x += step.h
+        return at
+
+    def _hold(self, torque: Torque, start: float, moment: Moment) -> Drive:
+        """Return what acts in a period that begins at `start` [s]."""
+        if isinstance(torque, SineTorque):
+            rows = zip(torque.frequency, torque.phase, strict=True)
+            phases = (math.fmod(f * start + phase, math.tau) for f, phase in rows)
+            return Drive((*phases, *moment), torque, start)
+        if callable(torque) or self._derivative is not None:
+            return Drive((0.0, 0.0, 0.0, *moment), torque, start)
+        first, second, third = torque
+        return Drive((first, second, third, *moment), None, start)
+
+    def _steps_of(self, drive: Drive, method: Method) -> Steps:
+        """Return the steps of a method under a drive."""
+        sine = drive.function if isinstance(drive.function, SineTorque) else None
+        kind: object = sine if drive.function is None or sine else "function"
+        key = kind, method.name
+        if key not in self._steps:
+            if kind == "function":
+                steps: Steps = FunctionSteps(self.ode, method, self.torque, self._derivative)
+            elif sine is None:
+                steps = steps_of(self.ode, method)
+            else:
+                limit = self.torque.limit_of(sine)
+                ode = recent_ode(self.dynamics, sine, limit=limit, work=True, phases=True)
+                steps = steps_of(ode, method)
+            self._steps[key] = steps
+        return self._steps[key]
+
+    def _take_step(
+        self,
+        t: float,
+        end: float,
+        at: Point,
+        drive: Drive,
+        other: Drive | None,
+        stops: list[float],
+    ) -> Step:
+        """Take one step that is accepted, from t to `end` at most.
+
+        `stops` are the times just before and after a jump that was found, where steps end.
+        """
+        rejected = 0
+        while True:
+            left = end - t
+            h = min(at.h, self._max_step, left)
+            if left - h < _LAST_SLIVER * h:
+                h = left
+            if stops:  # a step ends before a jump, the next one steps over it
+                h = min(h, stops[0] - t)
+            steps = self._steps_of(drive, at.method)
+            self.budget.charge((3 if other is None else 6) * steps.cost)
+            after, size = steps.pair(t, h, at, drive, other)
+            error = size / self._tolerance
+            if size <= self._tolerance:
+                stopped = bool(stops) and h == stops[0] - t
+                longest = _next_length(at, h, error, cut=stopped or h == left)
+                end_point = after._replace(h=longest, attempts=at.attempts)
+                if h < left or isinstance(at.method, Rosenbrock):
+                    end_point = self._choose_method(steps, t + h, h, end_point, drive, 0)
+                return Step(t, h, at, end_point, drive, other, steps, h == left)
+            stops[:] = self._jump_in(t, h, at.y, drive)
+            if stops:
+                at = at._replace(h=h)
+                continue
+            at = at._replace(h=h * min(_step_factor(error, at.method), 1.0))
+            if at.h < _SHORTEST_STEP * max(abs(t), end - t) or at.h < 1e-200:
+                raise CannotStep(f"steps of {at.h:.1e} s do not resolve it")
+            rejected += 1
+            at = self._choose_method(steps, t, h, at, drive, rejected)
+
+    def _choose_method(
+        self, steps: Steps, t: float, h: float, at: Point, drive: Drive, rejected: int
+    ) -> Point:
+        """Change the method if, by the eigenvalues of the Jacobian, another takes longer steps.
+
+        `rejected` counts the attempts in a row that were rejected.
+        """
+        at = at._replace(attempts=at.attempts + 1)
+        early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(at.method, Rosenbrock)
+        if not self._chooses or (at.attempts < _CHOOSE_EVERY and not early):
+            return at
+        if not early:
+            at = at._replace(attempts=0)
+        self.budget.charge(JACOBIAN_COST)
+        try:
+            eigenvalues = steps.eigenvalues(t, at.y, drive)
+        except ArithmeticError:
+            return at  # no finite Jacobian here; the step size has to do
+        method, reason = better_method(
+            at.method, self._tolerance, h * eigenvalues, only_stiff=early
+        )
+        if method is at.method:
+            return at
+        change = MethodChange(drive.start + t, method.name, reason)
+        return at._replace(method=method, changes=(*at.changes, change))
+
+    def _jump_in(self, t: float, h: float, y: Sequence[float], drive: Drive) -> list[float]:
+        """Return times just before and after a jump of the torques in a step, if there is one."""
+        if not callable(drive.function) or isinstance(drive.function, SineTorque):
+            return []
+        time = drive.start + t
+        if h < _SHORTEST_SEARCH * max(abs(time), h):
+            return []
+        jump = self.torque.locate_jump(drive, t, t + h, y)
+        if jump is None:
+            return []
+        margin = _JUMP_MARGIN * max(abs(drive.start + jump[1]), h)
+        return [stop for stop in (jump[0] - margin, jump[1] + margin) if stop > t]
+
+    def _until_event(self, step: Step) -> tuple[Step, Limit | None]:
+        """Return an accepted step up to the first event in it, and that, or all of it.
+
+        Raises _NoState where a state inside is not finite.
+        """
+        begin, end = step.begin.joints, step.end.joints
+        near = [event for event in self._events if may_occur(event, begin, end)]
+        if not near:
+            return step, None
+
+        @cache
+        def joints(x: float) -> Sequence[float]:
+            if x == 0.0:
+                return begin
+            if x == step.h:
+                return end
+            self.budget.charge(step.steps.cost)
+            state = step.inside(x)
+            inside = self.dynamics.joints(*state[:7])
+            if not math.isfinite(sum(state) + sum(inside)):
+                raise _NoState
+            return inside
+
+        first = first_event(near, joints, step.h)
+        if first is None:
+            return step, None
+        x, event = first
+        if event.error is None:
+            beyond = x + _BEHIND_A_KINK / max(abs(event.slope(joints(x))), 1e-200)
+            x = min(beyond, x + _LARGEST_SHARE_BEHIND * step.h, step.h)
+        last = step.last and x == step.h
+        return step._replace(h=x, end=self._part(step, x), last=last), event
+
+    def _part(self, step: Step, x: float) -> Point:
+        """Return the point x [s] after the begin of an accepted step, by a shorter one."""
+        if x == 0.0:
+            return step.begin
+        if x == step.h:
+            return step.end
+        self.budget.charge(step.cost)
+        part, _ = step.steps.pair(step.t, x, step.begin, step.drive, step.other)
+        return step.end._replace(y=part.y, z=part.z, joints=part.joints)
+
+
+def methods_of(name: str) -> tuple[Method, ...]:
+    """Methods that a run by a method, or by auto, may use, the one it begins with first."""
+    method = METHODS.get(name)
+    return (method,) if method else (DORMAND_PRINCE, DOP853, RODAS5P)
+
+
+def better_method(
+    method: Method, tolerance: float, steps: Array, *, only_stiff: bool
+) -> tuple[Method, str]:
+    """Choose the method that would take longer steps, the one in use if none is, and state why.
+
+    `steps` is the length of a step times the eigenvalues of the Jacobian; `only_stiff` looks for
+    stiffness alone.
+    """
+    radius, decay = np.abs(steps).max(), -steps.real.min()
+    implicit = isinstance(method, Rosenbrock)
+    if not implicit and decay > _STIFF and decay > 0.5 * radius:
+        return RODAS5P, f"stiff: step times fastest decay is {decay:.2g}"
+    if only_stiff:
+        return method, ""
+    if implicit and radius < _EASY:
+        return DORMAND_PRINCE, f"no longer stiff: step times rate is {radius:.2g}"
+    if method is DORMAND_PRINCE and tolerance < ACCURATE and decay <= _STIFF:
+        return DOP853, "many small steps that accuracy asks for"
+    return method, ""
+
+
+def _next_length(at: Point, h: float, error: float, *, cut: bool) -> float:
+    """Longest step after an accepted one of h with a local error, relative to the tolerance.
+
+    A step that was cut does not say that the next must be shorter than the longest of before.
+    """
+    length = h * _step_factor(error, at.method)
+    return max(at.h, length) if cut else length
+
+
+def _step_factor(error: float, method: Method) -> float:
+    """Factor for the next step after one with a local error, relative to the tolerance."""
+    if error == 0.0:
+        return _LARGEST_GROWTH
+    if not error < math.inf:
+        return _LARGEST_SHRINKAGE
+    factor: float = _SAFETY * error ** (-1.0 / (method.error_order + 1))
+    return min(max(factor, _LARGEST_SHRINKAGE), _LARGEST_GROWTH)

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One step of a method, as ordinary functions on numbers of any kind.
+
+On floats they compute a step. On expressions they are traced to the straight-line program
+that runs as machine code: what is read here is what runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from sst_ros.integration.methods import Rosenbrock, Tableau
+from sst_ros.mechanism.generic_math import absolute, larger, select, sqrt
+
+Number = Any
+Numbers = Sequence[Any]
+Derivative = Callable[[Number, Numbers, Any], Numbers]
+"""(time [s], state, drive) -> the derivative of the state; what a drive is, the caller knows."""
+
+_RADIANS_PER_STEP = 1e-3
+"""Below so much in a step a rate counts as so large: else rest could not be reached [rad]."""
+_NO_DIVISION_BY_ZERO = 1e-300
+"""Added where all may be zero; less than what rounding takes off any other number."""
+
+
+class NewState(NamedTuple):
+    """Where a step ends, and what the method knows of its error; None where it knows nothing."""
+
+    state: list[Number]
+    error: list[Number] | None
+
+
+def explicit_step(
+    derivative: Derivative,
+    method: Tableau,
+    t: Number,
+    h: Number,
+    y: Numbers,
+    drives: Sequence[Any],
+) -> NewState:
+    """Take one step of an explicit Runge-Kutta method.
+
+    Args:
+        derivative: of the state.
+        method: its coefficients.
+        t: time at which the step begins [s].
+        h: its length [s].
+        y: state at its begin.
+        drives: what acts in each stage.
+
+    """
+    slopes: list[Numbers] = []
+    for node, weights, drive in zip(method.c, method.a, drives, strict=True):
+        time = t + node * h if node else t
+        point = _move(y, h, weights, slopes) if slopes else y
+        slopes.append(derivative(time, point, drive))
+    state = _move(y, h, method.b, slopes)
+    return NewState(state, _estimate_error(method, h, slopes))
+
+
+def _move(y: Numbers, h: Number, weights: Sequence[float], slopes: Sequence[Numbers]) -> list[Any]:
+    """Return y + h (sum of weights times slopes)."""
+    return [
+        number + h * _weigh(weights, [slope[i] for slope in slopes]) for i, number in enumerate(y)
+    ]
+
+
+def _weigh(weights: Sequence[float], numbers: Numbers) -> Number:
+    """Return the sum of weights times numbers, from the first to the last."""
+    total = None
+    for weight, number in zip(weights, numbers, strict=True):
+        if weight:
+            term = weight * number
+            total = term if total is None else total + term
+    return 0.0 if total is None else total
+
+
+def _estimate_error(method: Tableau, h: Number, slopes: Sequence[Numbers]) -> list[Number] | None:
+    """Return the error estimate of each number of the state, None where there is none."""
+    if not method.error:
+        return None
+    errors = []
+    for column in zip(*slopes, strict=True):
+        fine = _weigh(method.error, column)
+        if method.damping:
+            # Hairer's estimate for DOP853, each number of the state for itself.
+            coarse = _weigh(method.damping, column)
+            both = fine * fine + 0.01 * (coarse * coarse) + _NO_DIVISION_BY_ZERO
+            errors.append(h * fine * absolute(fine) / sqrt(both))
+        else:
+            errors.append(h * fine)
+    return errors
+
+
+class Linearisation(NamedTuple):
+    """The derivative at a point, and its derivatives by the time and by each number of the state.
+
+    `columns[j][i]` is that of the i-th number by the j-th.
+    """
+
+    slope: Numbers
+    by_time: Numbers
+    columns: Sequence[Numbers]
+
+
+def rosenbrock_step(
+    derivative: Derivative,
+    linearisation: Linearisation,
+    method: Rosenbrock,
+    t: Number,
+    h: Number,
+    y: Numbers,
+    drive: Any,
+) -> NewState:
+    """Take one step of a Rosenbrock method (Hairer & Wanner, Solving ODEs II, section IV.7).
+
+    The last stage is what the solution adds to the embedded one. The Jacobian may be that of a
+    point near y. See `explicit_step` for the arguments.
+    """
+    size = len(y)
+    matrix = [[-column[i] for column in linearisation.columns] for i in range(size)]
+    for i in range(size):
+        matrix[i][i] = matrix[i][i] + 1.0 / (method.gamma * h)
+    decomposition = factorise(matrix)
+    stages: list[Numbers] = []
+    point = list(y)
+    for weights, couplings, node, by_time in zip(
+        method.a, method.c, method.alpha, method.d, strict=True
+    ):
+        point = list(y)
+        for weight, stage in zip(weights, stages, strict=True):
+            point = [number + weight * x for number, x in zip(point, stage, strict=True)]
+        slope = derivative(t + node * h, point, drive)
+        right = [
+            number + h * by_time * rate
+            for number, rate in zip(slope, linearisation.by_time, strict=True)
+        ]
+        for coupling, stage in zip(couplings, stages, strict=True):
+            right = [number + coupling / h * x for number, x in zip(right, stage, strict=True)]
+        stages.append(substitute(decomposition, right))
+    error = list(stages[-1])
+    return NewState([number + x for number, x in zip(point, error, strict=True)], error)
+
+
+class Decomposition(NamedTuple):
+    """L and U of a matrix with exchanged rows, and where rows were exchanged.
+
+    `exchanges[k]` has a number for each row below the k-th: where it is > 0 they changed places.
+    """
+
+    rows: list[list[Number]]
+    exchanges: list[list[Number]]
+
+
+def factorise(matrix: Sequence[Numbers]) -> Decomposition:
+    """Decompose a matrix with partial pivoting.
+
+    Without a branch: each row below changes places with the k-th where it has the larger number,
+    so the largest comes to stand in the k-th row, and which rows change is data.
+    """
+    rows = [list(row) for row in matrix]
+    size = len(rows)
+    exchanges = []
+    for k in range(size):
+        larger_below = []
+        for i in range(k + 1, size):
+            condition = absolute(rows[i][k]) - absolute(rows[k][k])
+            larger_below.append(condition)
+            for j in range(k, size):
+                upper, lower = rows[k][j], rows[i][j]
+                rows[k][j] = select(condition, lower, upper)
+                rows[i][j] = select(condition, upper, lower)
+        exchanges.append(larger_below)
+        for i in range(k + 1, size):
+            factor = rows[i][k] / (rows[k][k] + _NO_DIVISION_BY_ZERO)
+            rows[i][k] = factor
+            for j in range(k + 1, size):
+                rows[i][j] = rows[i][j] - factor * rows[k][j]
+    return Decomposition(rows, exchanges)
+
+
+def substitute(decomposition: Decomposition, right: Numbers) -> list[Number]:
+    """Solve a decomposed system for a right side."""
+    rows, exchanges = decomposition
+    size = len(rows)
+    x = list(right)
+    for k in range(size):
+        for i, condition in enumerate(exchanges[k], start=k + 1):
+            upper, lower = x[k], x[i]
+            x[k] = select(condition, lower, upper)
+            x[i] = select(condition, upper, lower)
+        for i in range(k + 1, size):
+            x[i] = x[i] - rows[i][k] * x[k]
+    for k in reversed(range(size)):
+        for j in range(k + 1, size):
+            x[k] = x[k] - rows[k][j] * x[j]
+        x[k] = x[k] / (rows[k][k] + _NO_DIVISION_BY_ZERO)
+    return x
+
+
+def normalise(y: Numbers) -> list[Number]:
+    """Return a state whose quaternion has length 1."""
+    x, y_, z, w = y[:4]
+    factor = 1.0 / sqrt(x * x + y_ * y_ + z * z + w * w)
+    return [*(number * factor for number in y[:4]), *y[4:]]
+
+
+def size_of_error(error: Numbers, old: Numbers, new: Numbers, h: Number, lagged: int) -> Number:
+    """Return the largest error of a step relative to what it is an error of.
+
+    Quaternion: absolute. Rate: relative to its length, but not below 1e-3 rad a step, so that
+    rest can be reached. Lagging torques, which are `lagged` numbers: relative to the largest of
+    them. The work is not looked at.
+    """
+    largest: Number = 0.0
+    for number in error[:4]:
+        largest = larger(largest, absolute(number))
+    rate, worst = _compare(error, old, new, slice(4, 7), least=0.0)
+    least_rate = _RADIANS_PER_STEP / absolute(h)
+    largest = larger(largest, worst / larger(rate, least_rate))
+    if lagged:
+        torques = slice(7, 7 + lagged)
+        torque, worst = _compare(error, old, new, torques, least=_NO_DIVISION_BY_ZERO)
+        largest = larger(largest, worst / torque)
+    return largest
+
+
+def _compare(
+    error: Numbers, old: Numbers, new: Numbers, part: slice, least: float
+) -> tuple[Number, Number]:
+    """Return the largest absolute number of a part of two states, and its largest error."""
+    length: Number = least
+    worst: Number = 0.0
+    for before, after, change in zip(old[part], new[part], error[part], strict=True):
+        length = larger(larger(length, absolute(before)), absolute(after))
+        worst = larger(worst, absolute(change))
+    return length, worst
+
+
+class Pair(NamedTuple):
+    """Both solutions after a step, and its error.
+
+    `total` is finite where all numbers of the step are.
+    """
+
+    y: list[Number]
+    z: list[Number]
+    size: Number  # of the error of y
+    total: Number
+
+
+def step_pair(
+    step: Callable[[int, Number, Number, Numbers, Numbers], NewState],
+    t: Number,
+    h: Number,
+    y: Numbers,
+    z: Numbers,
+    lagged: int,
+) -> Pair:
+    """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
+
+    Args:
+        step: (part, time, length, state, near) -> the new state: part 0 is the step of y, and 1
+            and 2 are those of z. A Jacobian is that of the state `near`, which is y for the first
+            step of z: beside a kink of a force both solutions then have the same.
+        t: time at which the step begins [s].
+        h: its length [s].
+        y: first solution.
+        z: second one.
+        lagged: numbers of the state that are lagging torques.
+
+    """
+    half = 0.5 * h
+    new_y, error_y = step(0, t, h, y, y)
+    middle, _ = step(1, t, half, z, y)
+    new_z, error_z = step(2, t + half, half, middle, middle)
+    if error_y is None:  # the method has no estimate of its own
+        error_y = [
+            (after_z - before_z) - (after_y - before_y)
+            for after_z, before_z, after_y, before_y in zip(new_z, z, new_y, y, strict=True)
+        ]
+    size = size_of_error(error_y, y, new_y, h, lagged)
+    total = add_up([*new_y, *error_y, *new_z, *(error_z or ())])
+    return Pair(normalise(new_y), normalise(new_z), size, total)
+
+
+def add_up(numbers: Numbers) -> Number:
+    """Return the sum of numbers, from the first to the last."""
+    total: Number = 0.0
+    for number in numbers:
+        total = total + number
+    return total
