@@ -91,8 +91,8 @@ calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
 [torque_player]
 subscribes joint_states sensor_msgs/msg/JointState 1000
     samples that are answered, from the first on
-subscribes {simulator}/phase std_msgs/msg/String 1 latched
-    ends the player at a fault
+subscribes {simulator}/phase std_msgs/msg/String 10 latched
+    ends the player at a fault and at the end of the run
 
 [inverse_dynamics]
 publishes ~/reference sensor_msgs/msg/JointState 1000
