@@ -171,6 +171,7 @@ class SimulatorParameters(Section):
             own_clock=self.publish_clock,
             waits=self.wait_for_command or self.sync == "lockstep",
             partial_commands=self.partial_commands,
+            base_frame=self.base_frame,
             command_timeout_ns=self.command_timeout * NANOSECONDS,
             lockstep_timeout=self.lockstep_timeout,
             subscriber_timeout=self.subscriber_timeout,

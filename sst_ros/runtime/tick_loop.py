@@ -370,17 +370,23 @@ class TickLoop:
         """Publish the state of a run that does not advance, marked as idle.
 
         Its stamp is the ROS time at which the state holds: that of the last sample where samples
-        will follow it, else the present time. Stamps never go back; where time stands still they
-        differ by 1 ns, because tf2 warns of transforms that have the stamp of the one before.
+        will follow it, else the present time; 0 before the first time of a followed clock. Stamps
+        never go back or repeat; where time stands still they differ by 1 ns, because tf2 warns of
+        transforms that have the stamp of the one before.
 
         In lockstep our /clock moves by a control period where the run waits: controllers that are
         updated by it can become active, and the run begins one update after what a command answers.
         """
         moves = waits and self._idle_step_ns > 0
-        stamp_ns = min(max(self._stamp_ns, self._idle_ns) + 1, self._stamp_ns + self._period_ns - 1)
+        later_ns = max(self._stamp_ns, self._idle_ns) + 1
         if fault or not self.begun:
-            now = self._output.now_ns() + moves * self._idle_step_ns
-            stamp_ns = max(now, self._stamp_ns + 1, self._idle_ns) if now else self._idle_ns
+            now_ns = self._output.now_ns()
+            if moves:
+                now_ns += self._idle_step_ns
+            has_time = max(now_ns, self._stamp_ns, self._idle_ns) > 0
+            stamp_ns = max(now_ns, later_ns) if has_time else 0
+        else:
+            stamp_ns = min(later_ns, self._stamp_ns + self._period_ns - 1)
         self._output.idle(self.simulation.state, stamp_ns, at_rest=fault, moves=moves)
         self._idle_ns = stamp_ns
         self._input.accept_idle(stamp_ns, alone=moves)

@@ -348,7 +348,7 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
         return [stamp for _, _, stamp in output.idles]
 
     bench.until(lambda: len(idle_stamps()) > 1)
-    output.now += 5
+    output.now += 10**6
     bench.until(lambda: idle_stamps()[-1] == output.now)
     bench.queue.append(plain(ZERO))
     bench.until(lambda: len(output.samples) > 3)
@@ -363,6 +363,33 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
     output.now += 10**9
     bench.until(lambda: idle_stamps()[-1] == output.now)
     assert idle_stamps() == sorted(idle_stamps())
+
+
+@pytest.mark.parametrize("sync", ["free", "lockstep"])
+@pytest.mark.parametrize("publish_clock", [True, False])
+def test_no_two_states_have_one_stamp_though_the_clock_stands_still(start, publish_clock, sync):
+    """Before the run, in a pause, in a fault and after a reset."""
+    bench = start("swing", wait_for_command=True, sync=sync, publish_clock=publish_clock)
+    output = bench.output
+
+    def show_more():
+        shown = len(output.idles)
+        bench.until(lambda: len(output.idles) > shown + 2)
+
+    show_more()
+    if sync == "free":
+        bench.queue.append(plain(ZERO))
+        bench.until(lambda: len(output.samples) > 2)
+    assert bench.ask("pause", True).success
+    show_more()
+    bench.loop.post(lambda: bench.loop._fail("as a test wants it"))
+    bench.to(Phase.FAULT)
+    show_more()
+    assert bench.ask("reset").success
+    show_more()
+    stamps = [stamp for _, _, stamp in output.idles]
+    assert min(np.diff(stamps)) > 0
+    assert not set(stamps) & set(output.stamps)
 
 
 @pytest.mark.parametrize(("of_the_run_before", "starts"), [(True, False), (False, True)])
