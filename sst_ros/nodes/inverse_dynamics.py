@@ -34,11 +34,6 @@ from sst_ros.runtime.trajectory_messages import ErrorCode, TrajectoryGoal
 from sst_ros.scene import scene
 from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 
-try:
-    from control_msgs.action import FollowJointTrajectory
-except ImportError:  # not part of every installation, nor of the wheels
-    FollowJointTrajectory = None
-
 KEYS = {
     "stage": "stage of the motion",
     "mode": "control law",
@@ -76,14 +71,17 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._goal: tuple[TrajectoryGoal, Order] | None = None  # the active one, or accepted last
         render("tracking.txt", found=TrackingMetrics())  # later it would delay the control
         self._feedback: Any = None
+        self._action_type: Any = None  # FollowJointTrajectory, where that is installed
         self.connect(own, joint_trajectory=self._replace)
         every(self.node, 1.0, self._report)
-        if FollowJointTrajectory is not None:
-            name = own["follow_joint_trajectory"].name
+        action = own["follow_joint_trajectory"]
+        types = topics.optional_types(self.node, [action.type_name])
+        if types is not None:
+            self._action_type = types["FollowJointTrajectory"]
             topics.ActionGoal.serve(
                 self.node,
-                FollowJointTrajectory,
-                name,
+                self._action_type,
+                action.name,
                 self._begin,
                 goal_callback=self._check,
                 cancel_callback=self._cancel,
@@ -281,7 +279,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         active, self._active = self._active, None
         assert active is not None
         self.node.get_logger().info(f"follow_joint_trajectory: {message}")
-        result = FollowJointTrajectory.Result(error_code=int(code), error_string=message)
+        result = self._action_type.Result(error_code=int(code), error_string=message)
         active.end(result, success=code is ErrorCode.SUCCESSFUL)
 
     def _report_goal(self) -> None:
@@ -290,7 +288,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             return
         (stamp, index, time, measured, command), self._feedback = self._feedback, None
         desired = command.desired
-        message = FollowJointTrajectory.Feedback(joint_names=list(ACTUATORS))
+        message = self._action_type.Feedback(joint_names=list(ACTUATORS))
         message.header.stamp, message.index = stamp, index
         message.desired = _point(time, desired.gamma, desired.gamma_dot, command.feedforward)
         message.desired.accelerations = array("d", desired.gamma_ddot)

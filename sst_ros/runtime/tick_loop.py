@@ -23,6 +23,9 @@ from sst_ros.state import ZERO, State, Vector3
 _LONGEST_SLEEP_S = 0.05
 _TOGETHER_NS = 2_000_000  # bounds the ticks that one sleep ends in, so that few commands wait
 _POLL_S = 0.001
+IDLE_PERIOD_S = 0.1
+"""Period in which the state of a run that does not advance is shown."""
+_LOAD_S = 0.02  # loading what has been loaded takes less; then nothing is shown
 _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
@@ -262,9 +265,28 @@ class TickLoop:
     def warm_up(self) -> None:
         """Load the code of every method, take the first step and go back.
 
-        Later steps take no longer, also where they change the method.
+        Later steps take no longer, also where they change the method. To load the code takes a
+        second, and twenty on a machine with many busy processes. Meanwhile the state is shown: who
+        waits for joint_states would take the silence for the end of the simulator.
         """
-        self.simulation.load_code()  # may take a second, and is no step
+        failures: list[BaseException] = []
+
+        def load() -> None:
+            try:
+                self.simulation.load_code()
+            except BaseException as error:
+                failures.append(error)
+
+        loader = threading.Thread(target=load, name="load code", daemon=True)
+        loader.start()
+        loader.join(_LOAD_S)
+        while loader.is_alive():
+            if self.stopped.is_set():
+                return
+            self.show(fault=False, waits=True)
+            loader.join(IDLE_PERIOD_S)
+        if failures:
+            raise failures[0]
         with contextlib.suppress(RunStopped):
             self.simulation.step(ZERO, self._period_ns)
         self.simulation.reset()

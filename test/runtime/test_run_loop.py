@@ -365,6 +365,44 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
     assert idle_stamps() == sorted(idle_stamps())
 
 
+def test_the_state_is_shown_while_the_code_is_loaded(start):
+    """On a busy machine that took 20 s, and a controller gave up after 10 s without a state."""
+    loaded = threading.Event()
+
+    class Slow(Simulation):
+        def load_code(self):
+            assert loaded.wait(40.0)
+            super().load_code()
+
+    bench = start(build=Slow, duration=0.01)
+    output = bench.output
+    bench.until(lambda: len(output.idles) > 3)
+    assert not output.samples and output.phases == ["waiting"]
+    loaded.set()
+    bench.to(Phase.FINISHED)
+    assert output.stamps[0] > output.idles[-1][2]
+
+
+def test_a_run_is_stopped_while_its_code_is_loaded(start):
+    class Hanging(Simulation):
+        def load_code(self):
+            threading.Event().wait(40.0)
+
+    bench = start(build=Hanging)
+    bench.until(lambda: bench.output.idles)
+    bench.end()
+
+
+def test_code_that_cannot_be_loaded_is_a_fault(start):
+    class Broken(Simulation):
+        def load_code(self):
+            raise OSError("no such code")
+
+    bench = start(build=Broken)
+    bench.to(Phase.FAULT)
+    assert "internal error: OSError: no such code" in bench.loop.fault
+
+
 @pytest.mark.parametrize("sync", ["free", "lockstep"])
 @pytest.mark.parametrize("publish_clock", [True, False])
 def test_no_two_states_have_one_stamp_though_the_clock_stands_still(start, publish_clock, sync):
