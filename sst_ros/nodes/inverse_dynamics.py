@@ -34,17 +34,13 @@ from sst_ros.runtime.trajectory_messages import ErrorCode, TrajectoryGoal
 from sst_ros.scene import scene
 from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 
-try:
-    from control_msgs.action import FollowJointTrajectory
-except ImportError:  # not part of every installation, nor of the wheels
-    FollowJointTrajectory = None
-
 KEYS = {
     "stage": "stage of the motion",
     "mode": "control law",
     "samples": "samples answered",
     "samples_irregular": "samples that came at another period than that of rate",
     "samples_limited": "samples of the motion in which a torque was limited",
+    "foreign_states": "messages on joint_states of other robots, which are ignored",
     "error_rms_rad": "root of the mean square of the error of gamma_1..3 since the motion began",
     "error_max_rad": "largest error of gamma_1..3 since then",
     "trajectories_refused": "trajectories that were refused",
@@ -70,19 +66,22 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._seen: Measurement | None = None
         self._seen_ns = 0
         self._refused, self._last_refusal = 0, ""
-        self._finished = self._has_heard = False
+        self._has_heard = False
         self._active: topics.ActionGoal | None = None
         self._goal: tuple[TrajectoryGoal, Order] | None = None  # the active one, or accepted last
         render("tracking.txt", found=TrackingMetrics())  # later it would delay the control
         self._feedback: Any = None
+        self._action_type: Any = None  # FollowJointTrajectory, where that is installed
         self.connect(own, joint_trajectory=self._replace)
         every(self.node, 1.0, self._report)
-        if FollowJointTrajectory is not None:
-            name = own["follow_joint_trajectory"].name
+        action = own["follow_joint_trajectory"]
+        types = topics.optional_types(self.node, [action.type_name])
+        if types is not None:
+            self._action_type = types["FollowJointTrajectory"]
             topics.ActionGoal.serve(
                 self.node,
-                FollowJointTrajectory,
-                name,
+                self._action_type,
+                action.name,
                 self._begin,
                 goal_callback=self._check,
                 cancel_callback=self._cancel,
@@ -94,7 +93,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         """Abort a goal, leave the actuators without torque, and print the tracking errors."""
         executor = self.node.executor
         if self._active is not None and executor is not None:
-            self._interrupt("the controller ends")
+            reason = f": {self.failure}" if self.failure is not None else ""
+            self._interrupt(f"the controller ends{reason}")
             for _ in range(_SPINS_AT_END):
                 with contextlib.suppress(SstError):  # of other callbacks: the node ends already
                     executor.spin_once(timeout_sec=_SPIN_S)
@@ -111,7 +111,6 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         """
         super().hear(phase)
         news, self._has_heard = self._has_heard, True
-        self._finished = self._finished or (phase.data == "finished" and self.begun)
         if phase.data == "waiting" and self.begun and news:
             self.node.get_logger().info("the simulator was reset: beginning anew")
             self._interrupt("the simulator was reset")
@@ -119,9 +118,12 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             self.follower.restart()
             self.begun = False
 
-    def receive(self, state: JointState) -> None:
-        """Answer a state where there is a motion; trajectories begin at the last one."""
+    def see(self, state: JointState) -> None:
+        """Measure a state: trajectories begin at the last one."""
         self._seen, self._seen_ns = _measure(state), nanoseconds(state.header.stamp)
+
+    def receive(self, state: JointState) -> None:
+        """Answer a state where there is a motion."""
         super().receive(state)
         self.follower.proceed()
 
@@ -199,15 +201,12 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
     def watch(self) -> None:
         """End after the run, when its last samples have been answered."""
         self.follower.proceed()
-        if self._finished:
-            self.done.set()
-        else:
-            super().watch()
+        super().watch()
 
     def _report(self) -> None:
         follower = self.follower
         stage = "waiting for joint_states" if self._seen is None else follower.stage.value
-        counts = follower.samples, follower.irregular, follower.limited
+        counts = follower.samples, follower.irregular, follower.limited, self.foreign_states
         refusals = self._refused, self._last_refusal
         row = (stage, self.parameters.mode, *counts, *follower.errors, *refusals)
         doubts = {
@@ -280,7 +279,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         active, self._active = self._active, None
         assert active is not None
         self.node.get_logger().info(f"follow_joint_trajectory: {message}")
-        result = FollowJointTrajectory.Result(error_code=int(code), error_string=message)
+        result = self._action_type.Result(error_code=int(code), error_string=message)
         active.end(result, success=code is ErrorCode.SUCCESSFUL)
 
     def _report_goal(self) -> None:
@@ -289,7 +288,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             return
         (stamp, index, time, measured, command), self._feedback = self._feedback, None
         desired = command.desired
-        message = FollowJointTrajectory.Feedback(joint_names=list(ACTUATORS))
+        message = self._action_type.Feedback(joint_names=list(ACTUATORS))
         message.header.stamp, message.index = stamp, index
         message.desired = _point(time, desired.gamma, desired.gamma_dot, command.feedforward)
         message.desired.accelerations = array("d", desired.gamma_ddot)
@@ -299,10 +298,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
 
 def _measure(state: JointState) -> Measurement:
-    """Read the actuators, which may come in any order, among others; refuse what has not all."""
+    """Read the actuators, which may come in any order, among others."""
     names = list(state.name)
-    if absent := [name for name in ACTUATORS if name not in names]:
-        raise SstError(f"joint_states has no {', '.join(absent)}: its names are {names}")
     if not len(names) == len(state.position) == len(state.velocity):
         raise SstError("joint_states must have a position and a velocity for each name")
     i, j, k = map(names.index, ACTUATORS)

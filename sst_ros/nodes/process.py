@@ -74,10 +74,12 @@ class Worker(Generic[P]):
 
     Fields of `cls` are read-only, except those of `cls.CHANGEABLE`; some defaults depend on the
     values given at the start. An InputError lists all that are refused, and all unknown names.
+    Where a callback has raised an error, that is its `failure`.
     """
 
     def __init__(self, node: str, cls: type[P], more: Defaults = lambda given: {}) -> None:
         self.node, self.done = Node(node), threading.Event()
+        self.failure: BaseException | None = None
         self.parameters = _declare(self.node, cls, more)
         self.node.add_on_set_parameters_callback(self._set)
 
@@ -153,13 +155,24 @@ def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
 class AnsweringWorker(Worker[A]):
     """A node that answers the joint states of a simulator with torques.
 
-    It has `begun` with its first answer to a sample of the run. It fails where the simulator stops
-    by a fault, or says nothing for longer than the parameter `timeout`.
+    The phase and the joint states are two topics, whose messages come in any order.
+
+    Attributes:
+        begun: a sample of the run has been answered.
+        commanded: a torque has been sent, or was about to be: the simulator is this node's concern.
+        phase: what the simulator said last of its run; empty before.
+        heard_s: monotonic time of the last joint states of this robot [s].
+        foreign_states: messages on joint_states of other robots, which are ignored.
+
     """
 
     def connect(self, own: dict[str, topics.Endpoint], **more: Callable[[Any], None]) -> None:
         """Publish commands, and listen to topics of its own table, as soon as it can answer."""
-        given, self.begun, self.heard_s = self.parameters, False, time.monotonic()
+        given = self.parameters
+        self.begun = self.commanded = False
+        self.phase = ""
+        self.heard_s = time.monotonic()
+        self.foreign_states = 0
         topic, torques = own["commands_stamped" if given.stamped else "commands"], array("d", ZERO)
         if given.stamped:
             self._message: Any = topic.kind(name=list(ACTUATORS), effort=torques)
@@ -179,8 +192,8 @@ class AnsweringWorker(Worker[A]):
 
     def close(self) -> None:
         """Leave the actuators without torque where the work is not done."""
-        if self.begun and not self.done.is_set():
-            self.send(ZERO)
+        if self.commanded and not self.done.is_set():
+            self._publish_torque(ZERO)
 
     def answer(self, state: JointState, stamp_ns: int) -> None:
         """Answer a sample of the run by `send`."""
@@ -195,13 +208,31 @@ class AnsweringWorker(Worker[A]):
         return self._commands.get_subscription_count() >= self.parameters.min_subscribers
 
     def hear(self, phase: String) -> None:
-        """End with the simulator."""
-        if self.begun and phase.data.startswith("fault"):
-            raise SstError(f"the simulator stopped: {phase.data}")
+        """Remember the phase; end with a simulator that stops by a fault.
+
+        Raises:
+            SstError: the simulator, which this node has commanded, is in a fault.
+
+        """
+        self.phase = phase.data
+        self._end_at_fault()
 
     def receive(self, state: JointState) -> None:
-        """Have a state answered: one of the run, or shown before it."""
+        """Have a state of this robot answered: one of the run, or shown before it.
+
+        Raises:
+            SstError: some actuators are missing, or the simulator is in a fault.
+
+        """
+        absent = [name for name in ACTUATORS if name not in state.name]
+        if len(absent) == len(ACTUATORS):
+            self._ignore(state)
+            return
+        if absent:
+            names = list(state.name)
+            raise SstError(f"joint_states has no {', '.join(absent)}: its names are {names}")
         self.heard_s = time.monotonic()
+        self.see(state)
         # Once begun, the simulator may end before its last sample has arrived.
         if not (self.begun or self.may_begin()):
             return
@@ -213,13 +244,25 @@ class AnsweringWorker(Worker[A]):
         elif not self.begun and (torque := self.preview()) is not None:
             self.send(torque)
 
+    def see(self, state: JointState) -> None:
+        """Look at a state of this robot before it is answered, or where it is not."""
+
     def send(self, torque: Vector3) -> None:
-        """Publish torques [N m], with the stamp of the state that they answer."""
-        self._torques[0], self._torques[1], self._torques[2] = torque
-        self._commands.publish(self._message)
+        """Publish torques [N m], with the stamp of the state that they answer.
+
+        Raises:
+            SstError: the simulator is in a fault.
+
+        """
+        self.commanded = True
+        self._end_at_fault()
+        self._publish_torque(torque)
 
     def watch(self) -> None:
-        """Raise an SstError where no joint_states came for too long, or no answer is taken."""
+        """End with the run; raise SstError after a long silence, or where no answer is taken."""
+        if self.commanded and self.phase == "finished":
+            self.done.set()
+            return
         if self._sync is None:
             if self._simulator is not None and self._simulator.service_is_ready():
                 self._sync = self._simulator.call_async(GetParameters.Request(names=["sync"]))
@@ -230,7 +273,26 @@ class AnsweringWorker(Worker[A]):
                 raise SstError(f"stamped = false: {text}: give stamped:=true")
         silent = time.monotonic() - self.heard_s
         if silent > self.parameters.timeout:
-            raise SstError(f"no joint_states for {silent:.1f} s: is the simulator running?")
+            foreign = f"{self.foreign_states} messages without {', '.join(ACTUATORS)} were ignored"
+            reason = foreign if self.foreign_states else "is the simulator running?"
+            raise SstError(f"no joint_states for {silent:.1f} s: {reason}")
+
+    def _end_at_fault(self) -> None:
+        if self.commanded and self.phase.startswith("fault"):
+            raise SstError(f"the simulator stopped: {self.phase}")
+
+    def _ignore(self, state: JointState) -> None:
+        """Count a message of another robot; say so the first time."""
+        if self.foreign_states == 0:
+            self.node.get_logger().warning(
+                f"joint_states without {', '.join(ACTUATORS)} are ignored: another robot publishes "
+                f"there, too (its names are {list(state.name)})"
+            )
+        self.foreign_states += 1
+
+    def _publish_torque(self, torque: Vector3) -> None:
+        self._torques[0], self._torques[1], self._torques[2] = torque
+        self._commands.publish(self._message)
 
 
 def run(words: Sequence[str]) -> int:
@@ -314,6 +376,7 @@ def spin(worker: Worker[Any]) -> None:
         wake.trigger()
         callbacks.join(_CALLBACK_S)
         if errors:
+            worker.failure = errors[0]
             raise errors[0]
     finally:
         try:

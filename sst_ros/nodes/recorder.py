@@ -15,25 +15,57 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rosbags import interfaces
+from sensor_msgs.msg import JointState
 
 from sst_ros.errors import SstError
 from sst_ros.nodes import topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.runtime.settings import RecorderParameters
+from sst_ros.scene.loads import JOINTS
 
 _DEPTH = 10000
 _TAKE_PERIOD_S = 0.02
 _LOOK_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
-_DECLARED = {
-    name: one
-    for name, one in {**topics.CONTROLLER, **topics.SIMULATOR}.items()
-    if one.use in (topics.PUBLISHES, topics.SUBSCRIBES)
-}
+_OF_A_RUN = ": run"  # end of the name of a simulator's status in /diagnostics
+
+
+def own_topics(requested: Iterable[str], default: Iterable[str]) -> dict[str, topics.Endpoint]:
+    """Return the topics of our nodes, by their full names.
+
+    The nodes are those whose private topics are requested (NODE/scene, NODE/reference, ...), and
+    those of these full names: a last word such as `commands` alone says nothing.
+    """
+    tables = (topics.CONTROLLER, topics.SIMULATOR)
+    nodes = set(default)
+    for topic in requested:
+        node, _, word = topic.rpartition("/")
+        for table in tables:
+            one = table.get(word)
+            if one is not None and one.use == topics.PUBLISHES and one.name.startswith("~"):
+                nodes.add(node)
+    return {
+        one.at(node): one
+        for node in nodes
+        for table in tables
+        for one in table.values()
+        if one.use in (topics.PUBLISHES, topics.SUBSCRIBES)
+    }
+
+
+def _is_of_simulator(message: Any) -> bool:
+    """Whether a message of a topic that others publish on, too, can be that of a simulator."""
+    if isinstance(message, JointState):
+        return set(JOINTS) <= set(message.name)
+    if isinstance(message, DiagnosticArray):
+        return any(status.name.endswith(_OF_A_RUN) for status in message.status)
+    return True
 
 
 @dataclass
@@ -41,19 +73,25 @@ class RecordedTopic:
     """A topic that is recorded; the connection is where its messages go in the bag.
 
     A gap in the sequence numbers is a loss where it is `counted`: a latched topic, of which only
-    the last message matters, and /diagnostics may have gaps.
+    the last message matters, and /diagnostics may have gaps. It is `heard` with its first message,
+    of a topic that is `shared` with other robots with the first of a simulator.
     """
 
     subscription: Subscription[Any]
     connection: interfaces.Connection
     counted: bool
+    shared: bool
+    heard: bool = False
     messages: int = 0
     lost: int = 0
     _last: dict[bytes, int] = field(default_factory=dict)
 
-    def count(self, info: dict[str, Any]) -> None:
+    def count(self, data: bytes, info: dict[str, Any]) -> None:
         """Count a message; sequence numbers are those of its publisher, None on some middleware."""
         self.messages += 1
+        if not self.heard:
+            kind = self.subscription.msg_type
+            self.heard = not self.shared or _is_of_simulator(deserialize_message(data, kind))
         number, publisher = info.get("publication_sequence_number"), info.get("publisher_gid")
         if self.counted and number and publisher:
             last = self._last.get(publisher["data"], number - 1)
@@ -68,9 +106,11 @@ class Recorder(Worker[RecorderParameters]):
         super().__init__("sst_recorder", RecorderParameters)
         given = self.parameters
         self._requested = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
-        self._foreign = {topic for topic in self._requested if _last(topic) not in _DECLARED}
-        sampled = set(map(_last, topics.SAMPLED))
-        self._required = {topic for topic in self._requested if _last(topic) in sampled}
+        default = (f"sst_{command}" for command in ("simulator", "inverse_dynamics"))
+        self._own = own_topics(self._requested, map(self.node.resolve_topic_name, default))
+        self._foreign = self._requested - self._own.keys()
+        sampled = {topic for topic, one in self._own.items() if one.name in topics.SAMPLED}
+        self._required = self._requested & sampled
         self._recorded: dict[str, RecordedTopic] = {}
         self._unknown: set[str] = set()
         self._ready = False
@@ -98,7 +138,7 @@ class Recorder(Worker[RecorderParameters]):
             raise SstError(f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})")
 
     def _missing(self) -> set[str]:
-        heard = {topic for topic, recorded in self._recorded.items() if recorded.messages}
+        heard = {topic for topic, recorded in self._recorded.items() if recorded.heard}
         return (self._required | self._foreign) - heard
 
     def _look(self) -> None:
@@ -112,7 +152,7 @@ class Recorder(Worker[RecorderParameters]):
         for topic, types in self.node.get_topic_names_and_types():
             if topic in self._requested and topic not in self._recorded.keys() | self._unknown:
                 new = True
-                own = _DECLARED.get(_last(topic))
+                own = self._own.get(topic)
                 own = own if own and own.type_name in types else None
                 if not (silent and own and own.use == topics.SUBSCRIBES):
                     self._subscribe(topic, own.type_name if own else types[0], own)
@@ -152,7 +192,8 @@ class Recorder(Worker[RecorderParameters]):
         )
         counted = own is not None and not (own.latched or own.name.startswith("/"))
         connection = self._bag.connect(topic, type_name, [_bag_qos(qos)])
-        self._recorded[topic] = RecordedTopic(subscription, connection, counted)
+        shared = own is not None and not own.name.startswith("~")
+        self._recorded[topic] = RecordedTopic(subscription, connection, counted, shared)
 
     def _take(self) -> None:
         try:
@@ -160,7 +201,7 @@ class Recorder(Worker[RecorderParameters]):
                 while (taken := topics.take(topic.subscription)) is not None:
                     data, info = taken
                     self._bag.write(topic.connection, info["received_timestamp"], data)
-                    topic.count(info)
+                    topic.count(data, info)
             self._bag.save()
         except SstError as error:
             self._failure = error
@@ -186,6 +227,3 @@ def _bag_qos(asked: QoSProfile) -> interfaces.Qos:
 def _join(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
 
-
-def _last(name: str) -> str:
-    return name.rpartition("/")[2]

@@ -29,11 +29,6 @@ from sst_ros.nodes import topics
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.state import NANOSECONDS, ZERO, Quaternion, Vector3
 
-try:
-    from simulation_interfaces import action, msg, srv
-except ImportError:  # not part of every installation, nor of the wheels
-    action = msg = srv = None
-
 NAME = "star"
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 """Codes of Result."""
@@ -53,6 +48,12 @@ SERVICES = (
     *("reset_simulation", "step_simulation", "spawn_entity"),
 )
 """Names of the services, and of the methods that answer them."""
+_KINDS = {name: name.title().replace("_", "") for name in SERVICES}
+_TYPES = (
+    *(f"simulation_interfaces/srv/{kind}" for kind in _KINDS.values()),
+    "simulation_interfaces/action/SimulateSteps",
+    "simulation_interfaces/msg/EntityState",
+)
 INFORMATION = (
     "sst_ros: the entity `star` has the state of the joints, which joint_states publishes and "
     "~/set_state takes; ROS time continues over a reset"
@@ -61,21 +62,24 @@ INFORMATION = (
 
 def offer(node: Node, loop: RunLoop, leave: Callable[[], None], base_frame: str) -> None:
     """Create the services and the action if the package is installed; `leave` ends the node."""
-    if srv is None:
+    types = topics.optional_types(node, _TYPES)
+    if types is None:
         return
-    answers = SimulationInterfaces(loop, leave, base_frame)
-    for name in SERVICES:
-        kind = getattr(srv, name.title().replace("_", ""))
-        qos = topics.SERVICE_QOS
-        node.create_service(kind, f"~/{name}", getattr(answers, name), qos_profile=qos)
-    topics.ActionGoal.serve(node, action.SimulateSteps, "~/simulate_steps", answers.begin_steps)
+    answers = SimulationInterfaces(loop, leave, base_frame, types)
+    qos = topics.SERVICE_QOS
+    for name, kind in _KINDS.items():
+        node.create_service(types[kind], f"~/{name}", getattr(answers, name), qos_profile=qos)
+    topics.ActionGoal.serve(node, types["SimulateSteps"], "~/simulate_steps", answers.begin_steps)
 
 
 class SimulationInterfaces:
     """Answers the services; each takes a request and fills a response."""
 
-    def __init__(self, loop: RunLoop, leave: Callable[[], None], base_frame: str) -> None:
+    def __init__(
+        self, loop: RunLoop, leave: Callable[[], None], base_frame: str, types: dict[str, Any]
+    ) -> None:
         self._loop, self._leave, self._base_frame = loop, leave, base_frame
+        self._types = types
         self._space = ActuatorSpaceMap(loop.simulation.geometry)
 
     def get_simulator_features(self, _: Any, response: Any) -> Any:
@@ -85,13 +89,18 @@ class SimulationInterfaces:
         return response
 
     def get_simulation_state(self, _: Any, response: Any) -> Any:
-        """Return the state of the simulation."""
+        """Return the state of the simulation; there is none for a fault, which is a failure."""
         response.state.state = self._state()
+        if self._loop.phase is Phase.FAULT:
+            return answer(response, FAILED, f"fault: {self._loop.fault}")
         return answer(response, OK)
 
     def set_simulation_state(self, request: Any, response: Any) -> Any:
-        """Change the state of the simulation."""
+        """Change the state of the simulation; out of a fault it can be stopped, or quit."""
         requested = request.state.state
+        if self._loop.phase is Phase.FAULT and requested in (PLAYING, PAUSED):
+            text = f"fault, reset or stop first: {self._loop.fault}"
+            return answer(response, INCORRECT_TRANSITION, text)
         if requested == self._state():
             return answer(response, ALREADY_THERE)
         if requested == PAUSED and self._state() == STOPPED:
@@ -145,7 +154,7 @@ class SimulationInterfaces:
         """List the star and its state."""
         self.get_entities(request, response)
         if response.entities:
-            response.states = [self._fill(msg.EntityState())]
+            response.states = [self._fill(self._types["EntityState"]())]
         return response
 
     def get_entity_state(self, request: Any, response: Any) -> Any:
@@ -189,6 +198,8 @@ class SimulationInterfaces:
         A thread asks for the steps, so that the node answers meanwhile.
         """
 
+        kind = self._types["SimulateSteps"]
+
         def run() -> None:
             steps, reply = int(handle.request.steps), Reply(True, "")
             for done in range(1, steps + 1):
@@ -198,9 +209,9 @@ class SimulationInterfaces:
                 if not reply.success:
                     break
                 left = steps - done
-                feedback = action.SimulateSteps.Feedback(completed_steps=done, remaining_steps=left)
+                feedback = kind.Feedback(completed_steps=done, remaining_steps=left)
                 handle.publish_feedback(feedback)
-            goal.end(answer_with(action.SimulateSteps.Result(), reply), success=reply.success)
+            goal.end(answer_with(kind.Result(), reply), success=reply.success)
 
         goal = topics.ActionGoal(handle)
         threading.Thread(target=run, daemon=True).start()

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import gc
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from rclpy.clock import JumpThreshold
+from rclpy.clock import ClockChange, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -25,6 +26,7 @@ from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.state import NANOSECONDS
 
 _DELAY_S = 5.0
 """Delay of the compiler: the first seconds of a real-time run have the processor alone."""
@@ -32,6 +34,7 @@ _END_S = 0.5  # wait for the thread of the run, where a step does not end
 FOLLOWED_STEP_NS = 200_000_000
 """Steps of a followed clock up to this length are simulated; longer ones are dropped time."""
 _LONGEST_WAIT_S = 0.05
+_STANDSTILL_S = 1.0  # of a followed clock, which is reported
 
 
 class Simulator(Worker[SimulatorParameters]):
@@ -46,10 +49,12 @@ class Simulator(Worker[SimulatorParameters]):
         names = ["commands", "commands_stamped"]
         if simulated.moment is not None and simulated.moment.topic:
             names.append("external_moment")
+        self._subscribed = (*names, "set_state")
         readers = [topics.Reader(self.node, topics.SIMULATOR[name]) for name in names]
         self._input = TorqueInput(run, simulated.actuators, *readers)
         followed = follows_clock(self.node)
-        source = FollowedClock(self.node) if followed else SteadyTime()
+        self._followed = FollowedClock(self.node) if followed else None
+        source = self._followed or SteadyTime()
         longest_ns = FOLLOWED_STEP_NS if followed else 0
         self._pacer = Pacer(run.period_ns, given.real_time_factor, source, longest_ns)
         build = partial(
@@ -142,11 +147,17 @@ class Simulator(Worker[SimulatorParameters]):
         rivals = [name for name in clocks if name != own]
         if rivals and self.parameters.publish_clock:
             yield f"/clock is also published by {', '.join(rivals)}"
-        if follows_clock(self.node) and self._topics.now_ns() == 0:
-            yield "use_sim_time is set and there is no /clock: the run waits for it"
+        if self._followed is not None:
+            yield from self._followed.warnings()
+        for name in self._subscribed:
+            yield from topics.other_types(self.node, topics.SIMULATOR[name])
         for topic in commands:
             for name in topics.publishers(self.node, topic, best_effort=True):
                 yield f"{topic} of {name} is best effort and not received: publish it reliably"
+        named = self.node.resolve_topic_name
+        for name in topics.publishers(self.node, named(topics.SIMULATOR["joint_states"].name)):
+            if name != own and self.node.count_publishers(f"{name}/phase"):
+                yield f"{name} publishes the same joint_states: give each simulator a namespace"
         # Not by the names of the graph: a node that has ended may stay there.
         if self.node.count_publishers(f"{own}/phase") > 1:
             yield f"another node is named {own}, too"
@@ -199,12 +210,13 @@ class FollowedClock(SteadyTime):
     """The ROS clock of a node with use_sim_time, as a time source of the pacer."""
 
     def __init__(self, node: Node) -> None:
-        self._clock, self._moved = node.get_clock(), threading.Event()
-        on, back = Duration(nanoseconds=1), Duration(nanoseconds=-1)
-        self._jumps = self._clock.create_jump_callback(
-            JumpThreshold(min_forward=on, min_backward=back),
-            post_callback=lambda _: self._moved.set(),
-        )
+        self._clock = node.get_clock()
+        self._moved = threading.Event()
+        self._moved_s = time.monotonic()  # the steady time of the last move
+        self._jumps: list[float] = []  # back [s], which nobody has been warned of
+        least = Duration(nanoseconds=1)
+        threshold = JumpThreshold(min_forward=least, min_backward=Duration(nanoseconds=-1))
+        self._handle = self._clock.create_jump_callback(threshold, post_callback=self._take_move)
 
     def now_ns(self) -> int:
         """Return the time [ns]; 0 before the first /clock."""
@@ -214,3 +226,19 @@ class FollowedClock(SteadyTime):
         """Wait for the next /clock."""
         self._moved.wait(_LONGEST_WAIT_S)
         self._moved.clear()
+
+    def warnings(self) -> Iterator[str]:
+        """Yield what keeps the run from going on, and each jump back once."""
+        if self.now_ns() == 0:
+            yield "use_sim_time is set and there is no /clock: the run waits for it"
+        elif time.monotonic() - self._moved_s > _STANDSTILL_S:
+            yield "/clock stands still: the run waits for it"
+        while self._jumps:
+            yield f"/clock jumped back by {self._jumps.pop(0):.9g} s; stamps of the run go on"
+
+    def _take_move(self, jump: TimeJump) -> None:
+        moved_s = jump.delta.nanoseconds / NANOSECONDS
+        if jump.clock_change == ClockChange.ROS_TIME_NO_CHANGE and moved_s < 0.0:
+            self._jumps.append(-moved_s)
+        self._moved_s = time.monotonic()
+        self._moved.set()

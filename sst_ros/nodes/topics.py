@@ -8,6 +8,7 @@ and goals of actions that end later than they are accepted.
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import math
 import re
 import time
@@ -23,6 +24,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.type_support import check_for_type_support
 
 from sst_ros.runtime.torque_input import MOST_WAITING
 
@@ -91,8 +94,8 @@ calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
 [torque_player]
 subscribes joint_states sensor_msgs/msg/JointState 1000
     samples that are answered, from the first on
-subscribes {simulator}/phase std_msgs/msg/String 1 latched
-    ends the player at a fault
+subscribes {simulator}/phase std_msgs/msg/String 10 latched
+    ends the player at a fault and at the end of the run
 
 [inverse_dynamics]
 publishes ~/reference sensor_msgs/msg/JointState 1000
@@ -203,6 +206,28 @@ def message_type(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{form}"), name)
 
 
+def optional_types(node: Node, type_names: Sequence[str]) -> dict[str, Any] | None:
+    """Import the types of an optional package, by the last part of their names.
+
+    None is returned where the package is not installed, and with a warning where its installation
+    is incomplete: a type is missing, or cannot be used by this middleware.
+    """
+    package = type_names[0].partition("/")[0]
+    if importlib.util.find_spec(package) is None:
+        return None
+    kinds = {}
+    try:
+        for type_name in type_names:
+            kind = message_type(type_name)
+            check_for_type_support(kind)
+            kinds[type_name.rpartition("/")[2]] = kind
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        node.get_logger().warning(f"{package} is installed but incomplete, not used ({reason})")
+        return None
+    return kinds
+
+
 def subscribe(
     node: Node, own: dict[str, Endpoint], simulator: str = "", **callbacks: Callable[[Any], None]
 ) -> None:
@@ -215,11 +240,27 @@ def subscribe(
 def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str]:
     """Full names of the nodes that publish a topic, one for each (best-effort) publisher."""
     return [
-        UNNAMED
-        if "_UNKNOWN_" in info.node_name  # to DDS, until its discovery is finished
-        else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+        _name_of(info)
         for info in node.get_publishers_info_by_topic(topic)
         if not best_effort or info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    ]
+
+
+def _name_of(info: TopicEndpointInfo) -> str:
+    """Return the full name of the node of a publisher or subscription."""
+    if "_UNKNOWN_" in info.node_name:  # to DDS, until its discovery is finished
+        return UNNAMED
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
+def other_types(node: Node, topic: Endpoint, *, simulator: str = "") -> list[str]:
+    """Say who publishes a topic of ours with another type, whose messages never arrive."""
+    name = node.resolve_topic_name(topic.name.format(simulator=simulator))
+    return [
+        f"{name} of {_name_of(info)} is {info.topic_type} and not received: must be "
+        f"{topic.type_name}"
+        for info in node.get_publishers_info_by_topic(name)
+        if info.topic_type != topic.type_name
     ]
 
 
@@ -228,7 +269,8 @@ def diagnostics(
 ) -> DiagnosticArray:
     """Build a DiagnosticArray of one status of a node; the level is 0, 1 or 2 for an error."""
     status = DiagnosticStatus(level=bytes([level]), message=text)
-    status.name = f"{node.get_fully_qualified_name()}: {what}"
+    name = node.get_fully_qualified_name()
+    status.name, status.hardware_id = f"{name}: {what}", name
     status.values = [KeyValue(key=key, value=str(x)) for key, x in values.items()]
     message = DiagnosticArray(status=[status])
     message.header.stamp = node.get_clock().now().to_msg()

@@ -20,13 +20,18 @@ from typing import Any, NamedTuple
 from sst_ros.dynamics.model import limits_of
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.host import processes
-from sst_ros.runtime.tick_loop import HeldTorques, NoAnswer, RunParts, TickLoop
+from sst_ros.runtime.tick_loop import (
+    IDLE_PERIOD_S,
+    HeldTorques,
+    NoAnswer,
+    RunParts,
+    TickLoop,
+)
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene, with_initial
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS, Vector3
 
-IDLE_PERIOD_S = 0.1
 _POLL_S = 0.001
 _REPLY_S = 30.0
 

@@ -166,6 +166,7 @@ class SimulatorParameters(Section):
             own_clock=self.publish_clock,
             waits=self.wait_for_command or self.sync == "lockstep",
             partial_commands=self.partial_commands,
+            base_frame=self.base_frame,
             command_timeout_ns=self.command_timeout * NANOSECONDS,
             lockstep_timeout=self.lockstep_timeout,
             subscriber_timeout=self.subscriber_timeout,
@@ -414,7 +415,19 @@ def _as_yaml(spec: Spec, word: str) -> str:
     """Return a value as rcl reads it, or raise ValueError."""
     value: Any = word.strip()
     if spec.shape or spec.kind == "texts":
-        value = [part.strip() for part in word.strip("[]").split(",")]
+        value = _read_list(value)
     text = json.dumps(accept(spec, value), ensure_ascii=False)
     # YAML 1.1 reads 1e-9 as text.
     return re.sub(r"(?<![\d.])(\d+)e", r"\1.0e", text) if spec.kind == "number" else text
+
+
+def _read_list(word: str) -> list[str]:
+    """Read a list with or without brackets, whose entries may be quoted as in JSON or YAML."""
+    inner = word.strip()
+    if inner.startswith("[") and inner.endswith("]"):
+        inner = inner[1:-1]
+    entries = [entry.strip() for entry in inner.split(",")]
+    return [
+        entry[1:-1] if len(entry) > 1 and entry[0] == entry[-1] and entry[0] in "\"'" else entry
+        for entry in entries
+    ]

@@ -23,6 +23,9 @@ from sst_ros.state import ZERO, State, Vector3
 _LONGEST_SLEEP_S = 0.05
 _TOGETHER_NS = 2_000_000  # bounds the ticks that one sleep ends in, so that few commands wait
 _POLL_S = 0.001
+IDLE_PERIOD_S = 0.1
+"""Period in which the state of a run that does not advance is shown."""
+_LOAD_S = 0.02  # loading what has been loaded takes less; then nothing is shown
 _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
@@ -262,9 +265,28 @@ class TickLoop:
     def warm_up(self) -> None:
         """Load the code of every method, take the first step and go back.
 
-        Later steps take no longer, also where they change the method.
+        Later steps take no longer, also where they change the method. To load the code takes a
+        second, and twenty on a machine with many busy processes. Meanwhile the state is shown: who
+        waits for joint_states would take the silence for the end of the simulator.
         """
-        self.simulation.load_code()  # may take a second, and is no step
+        failures: list[BaseException] = []
+
+        def load() -> None:
+            try:
+                self.simulation.load_code()
+            except BaseException as error:
+                failures.append(error)
+
+        loader = threading.Thread(target=load, name="load code", daemon=True)
+        loader.start()
+        loader.join(_LOAD_S)
+        while loader.is_alive():
+            if self.stopped.is_set():
+                return
+            self.show(fault=False, waits=True)
+            loader.join(IDLE_PERIOD_S)
+        if failures:
+            raise failures[0]
         with contextlib.suppress(RunStopped):
             self.simulation.step(ZERO, self._period_ns)
         self.simulation.reset()
@@ -370,17 +392,23 @@ class TickLoop:
         """Publish the state of a run that does not advance, marked as idle.
 
         Its stamp is the ROS time at which the state holds: that of the last sample where samples
-        will follow it, else the present time. Stamps never go back; where time stands still they
-        differ by 1 ns, because tf2 warns of transforms that have the stamp of the one before.
+        will follow it, else the present time; 0 before the first time of a followed clock. Stamps
+        never go back or repeat; where time stands still they differ by 1 ns, because tf2 warns of
+        transforms that have the stamp of the one before.
 
         In lockstep our /clock moves by a control period where the run waits: controllers that are
         updated by it can become active, and the run begins one update after what a command answers.
         """
         moves = waits and self._idle_step_ns > 0
-        stamp_ns = min(max(self._stamp_ns, self._idle_ns) + 1, self._stamp_ns + self._period_ns - 1)
+        later_ns = max(self._stamp_ns, self._idle_ns) + 1
         if fault or not self.begun:
-            now = self._output.now_ns() + moves * self._idle_step_ns
-            stamp_ns = max(now, self._stamp_ns + 1, self._idle_ns) if now else self._idle_ns
+            now_ns = self._output.now_ns()
+            if moves:
+                now_ns += self._idle_step_ns
+            has_time = max(now_ns, self._stamp_ns, self._idle_ns) > 0
+            stamp_ns = max(now_ns, later_ns) if has_time else 0
+        else:
+            stamp_ns = min(later_ns, self._stamp_ns + self._period_ns - 1)
         self._output.idle(self.simulation.state, stamp_ns, at_rest=fault, moves=moves)
         self._idle_ns = stamp_ns
         self._input.accept_idle(stamp_ns, alone=moves)

@@ -12,9 +12,18 @@ from typing import Any, TypeAlias
 
 from sst_ros.scene.loads import JOINTS, Actuators
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import NANOSECONDS, ZERO, Vector3, clamp, finite_vector, nanoseconds
+from sst_ros.state import (
+    BASE_FRAME,
+    NANOSECONDS,
+    ZERO,
+    Vector3,
+    clamp,
+    finite_vector,
+    nanoseconds,
+)
 
 ACTUATORS = JOINTS[:3]
+_SHOWN = 6  # entries of a list in the reason of a refusal
 
 MOST_WAITING = 50
 """Commands that wait for the next tick, which takes them all and uses the last: a process that is
@@ -44,6 +53,7 @@ class RunSettings:
     waits: bool = False  # a command starts the run
     own_clock: bool = False  # /clock is ours, and in lockstep goes on before the run, too
     partial_commands: bool = False  # an effort that is nan means zero torque
+    base_frame: str = BASE_FRAME  # {B}, in which external moments are given
     command_timeout_ns: float = 0.0  # age at which a command is no longer held; 0 for never
     lockstep_timeout: float = 0.0  # longest wait for the answer to a sample [s]; 0 for no end
     subscriber_timeout: float = 0.0  # longest wait for subscribers [s]
@@ -172,14 +182,22 @@ class TorqueInput:
         if self._moments is None:
             return
         for message in self._moments.read(math.inf if self._run.lockstep else now_ns):
-            vector = message.wrench.torque
             try:
-                self.moment = three_numbers((vector.x, vector.y, vector.z), "moments [N m]")
+                self.moment = self._read_moment(message)
                 self._moment_since = now_ns
             except MessageRefused as refused:
                 self._drop(refused)
         if not self._run.lockstep and self._is_old(self._moment_since, now_ns):
             self.moment = ZERO
+
+    def _read_moment(self, message: Any) -> Vector3:
+        """Return the moment in {B} [N m]; without a frame_id it is taken to be in {B}."""
+        frame_id, base_frame = message.header.frame_id, self._run.base_frame
+        if frame_id not in ("", base_frame):
+            reason = f"external_moment has frame_id {frame_id!r}, must be {base_frame!r} or empty"
+            raise MessageRefused("frame", reason)
+        vector = message.wrench.torque
+        return three_numbers((vector.x, vector.y, vector.z), "moments [N m]")
 
     def _accept(self, check: Callable[[Any], Vector3], content: Any, now_ns: int) -> Vector3 | None:
         """Hold the torques of a command; drop one that the check refuses."""
@@ -207,7 +225,7 @@ def three_numbers(data: Sequence[float], what: str = "torques [N m]") -> Vector3
     """Return three finite numbers, or raise MessageRefused."""
     if (vector := finite_vector(data)) is None:
         kind = "not finite" if len(data) == 3 else "wrong size"
-        raise MessageRefused(kind, f"{list(data)[:6]} must be 3 finite {what}")
+        raise MessageRefused(kind, f"{_shorten(data)} must be 3 finite {what}")
     return vector
 
 
@@ -220,8 +238,17 @@ def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3
     """Return one value for each actuator, gamma_1 to gamma_3, which may come in any order."""
     if sorted(names) != list(ACTUATORS):
         allowed = ", ".join(ACTUATORS)
-        raise MessageRefused("wrong names", f"names {list(names)[:6]} must be {allowed}, each once")
+        reason = f"names {_shorten(names)} must be {allowed}, each once"
+        raise MessageRefused("wrong names", reason)
     if len(values) == 3:
         at = dict(zip(names, values, strict=True))
         values = [at[name] for name in ACTUATORS]
     return three_numbers(values, what)
+
+
+def _shorten(values: Sequence[Any]) -> str:
+    """Write a list as it is, or its beginning and its length."""
+    if len(values) <= _SHOWN:
+        return str(list(values))
+    beginning = ", ".join(repr(value) for value in values[:_SHOWN])
+    return f"[{beginning}, ...] ({len(values)} in all)"

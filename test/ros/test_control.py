@@ -3,6 +3,8 @@
 
 import math
 
+import re
+
 import pytest
 from rcl_interfaces.msg import Log
 from ros.conftest import NAMES, NODE
@@ -106,7 +108,7 @@ def test_a_clock_is_given_and_a_second_one_told(nodes, observer):
 
 
 def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
-    nodes.run("simulator", use_sim_time=True)
+    process = nodes.run("simulator", use_sim_time=True)
     publisher = observer.publisher(Clock, "/clock")
     assert observer.stamp(observer.preview()) == 0  # no time, no run
     at = [100 * 10**9]
@@ -140,6 +142,8 @@ def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
         return len(told) > 1 and told[-1] == told[-2]
 
     observer.until(stands, "a standstill")
+    said = observer.told("said", lambda said: "/clock stands still: the run waits for it" in said)
+    assert said["level"] == b"\x01"
     settled = int(observer.said("ticks")[-1])
 
     at[0] += 3600 * 10**9  # a leap: dropped, no burst
@@ -154,4 +158,11 @@ def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
     at[0] -= 1800 * 10**9  # back: stamps never are
     run(20, "samples after the return")
     assert observer.told("clock_jumps", 1)["fault"] == ""
+    # A time of `run` comes first, 10 ms further.
+    text = re.compile(r"/clock jumped back by 1799\.\d+ s; stamps of the run go on")
+    back = [said for said in observer.diagnostics() if text.search(said["said"])]
+    assert [said["level"] for said in back] == [b"\x01"]
+    _, _, err = nodes.stop(process)
+    assert len(text.findall(err)) == 1
+    assert "/clock stands still: the run waits for it" in err
     assert observer.stamps() == sorted(set(observer.stamps()))

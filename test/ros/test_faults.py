@@ -9,11 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import QoSProfile
 from ros.conftest import COMMANDS, NAMES, NODE, STAMPED, children, is_running, named, torques
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -93,6 +94,21 @@ def test_two_publishers_are_told_and_moments_not_taken(nodes, observer):
     assert observer.node.count_subscribers(f"{NODE}/external_moment") == 0
     _, _, err = nodes.stop(process)
     assert "2 publishers of commands" in err
+
+
+def test_a_message_of_another_type_is_reported(nodes, observer):
+    """DDS does not deliver it: nothing else would say why the torques stay zero."""
+    process = nodes.run("simulator")
+    observer.node.create_publisher(Float64, COMMANDS, 10)
+    text = (
+        f"{COMMANDS} of /observer is std_msgs/msg/Float64 and not received: "
+        "must be std_msgs/msg/Float64MultiArray"
+    )
+    said = observer.told("said", lambda said: text in said)
+    assert said["level"] == b"\x01"
+    assert observer.listen(DiagnosticArray, "/diagnostics")[-1].status[0].hardware_id == NODE
+    _, _, err = nodes.stop(process)
+    assert err.count(text) == 1
 
 
 def test_commands_that_wait_while_the_process_is_held_up_are_all_used(nodes, observer):

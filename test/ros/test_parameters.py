@@ -176,3 +176,27 @@ def test_a_dump_of_the_parameters_loads_again(domain, tmp_path, command):
         finally:
             rclpy.try_shutdown()
     assert loaded[0] == loaded[1]
+
+
+BROKEN = {
+    "an empty folder": {},
+    "types without support": {"srv.py": "class GetEntities: _TYPE_SUPPORT = None"},
+    "an extension that fails": {"srv.py": "raise OSError('undefined symbol')"},
+}
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+@pytest.mark.parametrize(
+    ("package", "node"),
+    [("simulation_interfaces", "simulator"), ("control_msgs", "inverse_dynamics")],
+)
+def test_an_incomplete_package_of_messages_is_left_out(nodes, tmp_path, package, node, broken):
+    (folder := tmp_path / package).mkdir()
+    for name, text in BROKEN[broken].items():
+        (folder / name).write_text(text)
+    process = nodes.start(node, env={"PYTHONPATH": str(tmp_path)}, scene="reach")
+    words = f"{package} is installed but incomplete, not used ("
+    while words not in (line := process.stderr.readline()):
+        assert line, "no warning"
+    assert "Error" in line or "Exception" in line
+    assert nodes.stop(process)[0] == 0

@@ -3,6 +3,7 @@
 
 import re
 import resource
+import select
 import signal
 from functools import partial
 from importlib.metadata import version
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mcap.writer import MCAP0_MAGIC
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros.conftest import COMMANDS, NODE
@@ -19,10 +21,22 @@ from std_msgs.msg import Float64MultiArray, String
 
 from sst_ros.errors import InputError
 from sst_ros.nodes import topics
+from sst_ros.nodes.recorder import own_topics
 from sst_ros.recording import bag_writer, recording
+from sst_ros.scene.loads import JOINTS
 
 pytestmark = pytest.mark.ros
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def own_message(kind):
+    """A message that can be of a simulator."""
+    message = kind()
+    if kind is JointState:
+        message.name = list(JOINTS)
+    if kind is DiagnosticArray:
+        message.status = [DiagnosticStatus(name=f"{NODE}: run")]
+    return message
 
 
 def recorded(nodes, observer, bag, **given):
@@ -57,7 +71,8 @@ def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observ
     """Who commands waits for their readers: what the recorder has not found would be lost."""
 
     def make(topic):
-        return observer.node.create_publisher(topic.kind, topic.at(NODE), topic.qos()), topic.kind()
+        publisher = observer.node.create_publisher(topic.kind, topic.at(NODE), topic.qos())
+        return publisher, own_message(topic.kind)
 
     own = [one for one in topics.SIMULATOR.values() if one.name in topics.SAMPLED]
     speak = [make(topic) for topic in own if topic.name != "~/orientation"]
@@ -110,7 +125,7 @@ def test_a_partial_bag_is_an_error_that_names_what_is_missing(nodes, observer, t
     wanted = f"[/joint_states, {NODE}/orientation]"
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics=wanted)
     states = observer.publisher(JointState, "/joint_states")
-    states.publish(JointState())
+    states.publish(own_message(JointState))
     assert states.wait_for_all_acked()
     status, _, err = nodes.stop(recorder)
     assert status == 1 and "given up" not in err
@@ -123,17 +138,59 @@ def test_lost_messages_are_counted(nodes, observer, tmp_path):
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics="[/joint_states]")
     states = observer.node.create_publisher(JointState, "/joint_states", 1)
     observer.until(states.get_subscription_count, "the recorder")
-    states.publish(JointState())
+    states.publish(own_message(JointState))
     assert nodes.line(recorder) == "ready: 1 topics\n"
     recorder.send_signal(signal.SIGSTOP)
     for _ in range(100):  # more than the transport holds for a reader that is away
         states.publish(JointState(effort=[0.0] * 10_000))
     recorder.send_signal(signal.SIGCONT)
-    states.publish(JointState())
+    states.publish(own_message(JointState))
     assert states.wait_for_all_acked()
     status, _, err = nodes.stop(recorder)
     assert status == 1
     assert re.search(r"lost messages: \d+ of /joint_states", err), err
+
+
+def test_joint_states_of_another_robot_do_not_stand_for_those_of_the_simulator(
+    nodes, observer, tmp_path
+):
+    """They are recorded, as the topic is, but the recorder is not ready with them alone."""
+    wanted = f"[/joint_states, {NODE}/scene]"
+    recorder = nodes.run("recorder", output=tmp_path / "bag", topics=wanted)
+    states = observer.publisher(JointState, "/joint_states")
+    scene = observer.node.create_publisher(String, f"{NODE}/scene", LATCHED)
+    scene.publish(String(data="a scene"))
+    observer.until(scene.get_subscription_count, "the recorder")
+    gripper = JointState(name=["finger"], position=[0.0])
+    for _ in range(20):  # at 20 Hz, for five looks
+        states.publish(gripper)
+        observer.executor.spin_once(timeout_sec=0.05)
+    assert not select.select([recorder.stdout], [], [], 0.0)[0]
+    states.publish(own_message(JointState))
+    assert nodes.line(recorder) == "ready: 2 topics\n"
+    assert nodes.stop(recorder)[0] == 0
+
+
+def test_joint_states_of_another_robot_alone_are_an_incomplete_bag(nodes, observer, tmp_path):
+    recorder = nodes.run("recorder", output=tmp_path / "bag", topics="[/joint_states]")
+    states = observer.publisher(JointState, "/joint_states")
+    states.publish(JointState(name=["finger"], position=[0.0]))
+    assert states.wait_for_all_acked()
+    status, _, err = nodes.stop(recorder)
+    assert status == 1 and "no message of /joint_states (1 messages of 1 topics recorded)" in err
+
+
+def test_topics_belong_to_the_nodes_whose_private_topics_are_requested():
+    requested = [
+        "/left/joint_states",
+        "/left/sim/phase",
+        "/effort_controller/commands",
+        "/joint_state_broadcaster/joint_states",
+    ]
+    own = own_topics(requested, ["/sst_simulator"])
+    assert own["/left/joint_states"].use == own["/joint_states"].use == topics.PUBLISHES
+    assert {"/left/sim/commands", "/sst_simulator/scene"} < own.keys()
+    assert not {"/effort_controller/commands", "/joint_state_broadcaster/joint_states"} & own.keys()
 
 
 def test_rosbag2_is_given_the_declared_qos():

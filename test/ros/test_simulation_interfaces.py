@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
-from ros.conftest import NODE, foreign_types
+from ros.conftest import NODE, foreign_types, torques
+from std_msgs.msg import Float64MultiArray
 
 from sst_ros import load_scene
 from sst_ros.mechanism import kinematics, rates
@@ -194,6 +195,23 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     client.to(PLAYING)
     code, words = client.set(state, set_pose=True)
     assert code == FAILED and "running" in words
+
+
+def test_a_fault_is_no_pause(client):
+    """There is no state for a fault; it is left by a stop or a reset, not by a start."""
+    pull = client.observer.publisher(Float64MultiArray, f"{NODE}/commands")
+    assert client.to(STOPPED) in (OK, ALREADY_THERE)
+    assert client.to(PLAYING) == OK
+    client.observer.publish_until(
+        pull, torques(500.0, 0.0, 0.0), lambda: client.observer.phases[-1:] != ["running"], "fault"
+    )
+    client.observer.phase("fault")
+    code, words = client.code("GetSimulationState")
+    assert code == FAILED and words.startswith("fault: stopped at")
+    for state in (PLAYING, PAUSED):
+        assert client.to(state) == INCORRECT_TRANSITION
+    assert (client.to(STOPPED), client.state()) == (OK, STOPPED)
+    assert client.code("GetSimulationState") == (OK, "")
 
 
 def test_spawning_is_refused_by_name_and_the_node_quits(client, nodes_of_module):

@@ -5,7 +5,7 @@ import math
 import signal
 
 import pytest
-from ros.conftest import COMMANDS, STAMPED
+from ros.conftest import COMMANDS, NAMES, STAMPED
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.ros
 
 
 def sample(nanosec):
-    message = JointState()
+    message = JointState(name=NAMES)
     message.header.stamp.nanosec = nanosec
     return message
 

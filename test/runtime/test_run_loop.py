@@ -345,7 +345,7 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
         return [stamp for _, _, stamp in output.idles]
 
     bench.until(lambda: len(idle_stamps()) > 1)
-    output.now += 5
+    output.now += 10**6
     bench.until(lambda: idle_stamps()[-1] == output.now)
     bench.queue.append(plain(ZERO))
     bench.until(lambda: len(output.samples) > 3)
@@ -360,6 +360,71 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
     output.now += 10**9
     bench.until(lambda: idle_stamps()[-1] == output.now)
     assert idle_stamps() == sorted(idle_stamps())
+
+
+def test_the_state_is_shown_while_the_code_is_loaded(start):
+    """On a busy machine that took 20 s, and a controller gave up after 10 s without a state."""
+    loaded = threading.Event()
+
+    class Slow(Simulation):
+        def load_code(self):
+            assert loaded.wait(40.0)
+            super().load_code()
+
+    bench = start(build=Slow, duration=0.01)
+    output = bench.output
+    bench.until(lambda: len(output.idles) > 3)
+    assert not output.samples and output.phases == ["waiting"]
+    loaded.set()
+    bench.to(Phase.FINISHED)
+    assert output.stamps[0] > output.idles[-1][2]
+
+
+def test_a_run_is_stopped_while_its_code_is_loaded(start):
+    class Hanging(Simulation):
+        def load_code(self):
+            threading.Event().wait(40.0)
+
+    bench = start(build=Hanging)
+    bench.until(lambda: bench.output.idles)
+    bench.end()
+
+
+def test_code_that_cannot_be_loaded_is_a_fault(start):
+    class Broken(Simulation):
+        def load_code(self):
+            raise OSError("no such code")
+
+    bench = start(build=Broken)
+    bench.to(Phase.FAULT)
+    assert "internal error: OSError: no such code" in bench.loop.fault
+
+
+@pytest.mark.parametrize("sync", ["free", "lockstep"])
+@pytest.mark.parametrize("publish_clock", [True, False])
+def test_no_two_states_have_one_stamp_though_the_clock_stands_still(start, publish_clock, sync):
+    """Before the run, in a pause, in a fault and after a reset."""
+    bench = start("swing", wait_for_command=True, sync=sync, publish_clock=publish_clock)
+    output = bench.output
+
+    def show_more():
+        shown = len(output.idles)
+        bench.until(lambda: len(output.idles) > shown + 2)
+
+    show_more()
+    if sync == "free":
+        bench.queue.append(plain(ZERO))
+        bench.until(lambda: len(output.samples) > 2)
+    assert bench.ask("pause", True).success
+    show_more()
+    bench.loop.post(lambda: bench.loop._fail("as a test wants it"))
+    bench.to(Phase.FAULT)
+    show_more()
+    assert bench.ask("reset").success
+    show_more()
+    stamps = [stamp for _, _, stamp in output.idles]
+    assert min(np.diff(stamps)) > 0
+    assert not set(stamps) & set(output.stamps)
 
 
 @pytest.mark.parametrize(("of_the_run_before", "starts"), [(True, False), (False, True)])

@@ -122,12 +122,13 @@ def test_clear_forgets_what_has_arrived():
     assert bench.torque() == ZERO and not bench.board.begun
 
 
+def wrench(x, frame_id=""):
+    header = Message(frame_id=frame_id)
+    return Message(header=header, wrench=Message(torque=Message(x=x, y=0.0, z=0.0)))
+
+
 def test_moments_are_checked_and_let_go_of():
     bench = Bench(command_timeout=0.5)
-
-    def wrench(x):
-        return Message(wrench=Message(torque=Message(x=x, y=0.0, z=0.0)))
-
     bench.moments += [wrench(1.5), wrench(NAN)]
     bench.torque()
     assert bench.board.moment == (1.5, 0.0, 0.0)
@@ -150,3 +151,30 @@ def test_an_effort_that_is_no_number_means_not_commanded_where_that_is_asked_for
     plain = Bench()
     plain.stamped += [stamped(7, [NAN, 0.0, 1.0])]
     assert plain.torque() == ZERO and plain.board.reasons == {"not finite": 1}
+
+
+@pytest.mark.parametrize(
+    ("frame_id", "used"),
+    [("", True), ("base_link", False), ("left/base_link", True), ("star", False), ("world", False)],
+)
+def test_a_moment_in_another_frame_than_the_base_is_refused(frame_id, used):
+    bench = Bench(base_frame="left/base_link")
+    bench.moments += [wrench(1.5, frame_id)]
+    bench.torque()
+    if used:
+        assert bench.board.moment == (1.5, 0.0, 0.0) and not bench.board.reasons
+    else:
+        assert bench.board.moment == ZERO and bench.board.reasons == {"frame": 1}
+        reason = f"frame_id {frame_id!r}, must be 'left/base_link' or empty"
+        assert reason in bench.board.last_refusal
+
+
+def test_a_refusal_says_how_long_a_list_was():
+    bench = Bench()
+    bench.torque([1.0] * 20_000)
+    said = "[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, ...] (20000 in all) must be 3 finite torques [N m]"
+    assert bench.board.last_refusal == said
+    bench.torque([1.0] * 6)
+    assert bench.board.last_refusal.startswith("[1.0, 1.0, 1.0, 1.0, 1.0, 1.0] must be 3")
+    with pytest.raises(MessageRefused, match=r"names \['a', .*\] \(7 in all\) must be gamma_1"):
+        by_name(["a"] * 7, [0.0] * 7, "torques [N m] in effort")
