@@ -71,6 +71,8 @@ _MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd"
 _OF_SCENE = "name of a scene, or path of a .yaml file"
 SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")
+_RUN_OF = "namespace of the simulator, where the bag has several runs"
+_NAMESPACE = Arg("--namespace", _RUN_OF, metavar="NS")
 COMMANDS: dict[str, Subcommand | str] = {
     "simulate": Subcommand(
         "simulate a scene under its own torques",
@@ -160,7 +162,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("bag", "folder of a bag to play", nargs="?"),
         _scene("--scene", "start a simulator of this scene to look at", metavar="S"),
         Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
-        Arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
+        Arg("--namespace", f"namespace of its nodes; with BAG {_RUN_OF}", metavar="NS"),
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
         _count("--port", 65535, "port, or the next free one", 1024, default=8080),
         _flag("--open", "open it, where there is a desktop"),
@@ -173,6 +175,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "cli.reports:report_run",
         BAG,
         *_out("folder of the results", "BAG_report, beside the bag"),
+        _NAMESPACE,
         _flag("--verbose", "print all figures"),
         _flag("--damaged", "evaluate the intact part of a damaged recording"),
     ),
@@ -196,13 +199,17 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("bag", "folder of the bag", nargs="?", metavar="BAG"),
         *_out("folder of the pictures", "BAG_plots, beside the bag"),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
+        _NAMESPACE,
         _flag("--list", "list the pictures, and draw none"),
         _path("--compare", "deprecated: `sst-ros compare`", nargs="+", default=[], metavar="BAG"),
     ),
     "compare": Subcommand(
         "show by joint how recorded runs differ: table, pictures",
         "cli.reports:compare_runs",
-        _path("bags", "folders of two to six bags", nargs="+", metavar="BAG"),
+        _path("bags", "folders of two to six bags, or of one with several runs", nargs="+",
+              metavar="BAG"),
+        Arg("--namespace", f"{_RUN_OF}: one for all bags, one for each, or all of one bag",
+            nargs="+", default=[], metavar="NS"),
         *_out("folder of the pictures", "BAG_compared, beside the first bag"),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
         _path("--csv", "write the table, with all digits", metavar="FILE"),
@@ -211,6 +218,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write a recorded run as CSV or Parquet",
         "cli.runs:write_tables",
         BAG,
+        _NAMESPACE,
         Arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
         *_out("folder of the tables", "BAG_tables, beside the bag"),
     ),
@@ -245,6 +253,7 @@ COMMANDS: dict[str, Subcommand | str] = {
             nargs="+",
             metavar="P",
         ),
+        _NAMESPACE,
         Arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
         _number("--cutoff", "of a zero-phase filter of measured angles [Hz]; default: no filter"),
         _number("--duration", "of a designed motion [s]; default: 6"),

@@ -91,7 +91,8 @@ def run_identification(options: argparse.Namespace) -> None:
     if designing:
         found = design(load(options.designed), options.parameters, **chosen)
     else:
-        found = identify(options.bag, parameters=options.parameters, **chosen)
+        run = function("recording.recording:read")(options.bag, namespace=options.namespace)
+        found = identify(run, parameters=options.parameters, **chosen)
     print(found.table(), end="")
     if options.out is not None:
         with write_into(options.out.parent, "identify"):

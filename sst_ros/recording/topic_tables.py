@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import refusal
-from sst_ros.recording.bag_reader import Topic
+from sst_ros.recording.bag_reader import CONTROLLER, EVERYBODY, NAMESPACE, SIMULATOR, Topic
 from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.state import Array, is_idle, nanoseconds
 
 ACTUATED = JOINTS[:3]
+KINDS = ("gamma", "mu", "beta")
 
 Integers: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = list[tuple[int, Sequence[float]]]
@@ -53,11 +54,11 @@ class Column(NamedTuple):
 class TopicTable(Topic):
     """A topic, the columns of its rows, and the function that reads the rows of a message.
 
-    The function raises InvalidMessage.
+    The function returns None for a message of another robot, and raises InvalidMessage.
     """
 
     columns: tuple[Column, ...]
-    rows: Callable[[Any], Rows]
+    rows: Callable[[Any], Rows | None]
 
 
 class InvalidMessage(ValueError):
@@ -128,19 +129,45 @@ def sort_rows(table: TopicTable, times: array[int], numbers: array[float], path:
     return Series(columns, stamps, received, values)
 
 
-def _read_joints(joints: Sequence[str], message: Any) -> Rows:
-    """Read positions, velocities and the efforts of actuators of a JointState message."""
+def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
+    """Read positions, velocities and the efforts of actuators of a JointState message.
+
+    What it does not have is nan: drivers leave out velocities, efforts and passive joints. A
+    message without any of the joints is none of this robot.
+    """
     stamp = nanoseconds(message.header.stamp)
     if is_idle(stamp, message.header.frame_id):
         return []
-    at = _places(joints, tuple(message.name))
+    names = tuple(message.name)
+    at, absent = _find_joints(joints, names)
+    if len(absent) == len(joints):
+        return None
     parts = message.position, message.velocity, message.effort
-    sizes = {len(message.name), *map(len, parts)}
-    if len(sizes) > 1:
-        allowed = "name, position, velocity and effort must be equally long"
-        raise InvalidMessage(sorted(sizes), allowed)
-    position, velocity, effort = (part[at].tolist() for part in parts)
+    sizes = {len(part) for part in parts}
+    if not sizes <= {0, len(names)}:
+        allowed = "name, position, velocity and effort must be equally long, or empty"
+        missing = f"; joints are missing: {', '.join(absent)}" if absent else ""
+        raise InvalidMessage(sorted({len(names), *sizes}), allowed + missing)
+    if not absent and 0 not in sizes:
+        position, velocity, effort = (part[at].tolist() for part in parts)
+    else:
+        position, velocity, effort = (_take_known(part, at) for part in parts)
     return [(stamp, position + velocity + effort[: len(ACTUATED)])]
+
+
+def _take_known(part: Sequence[float], at: Sequence[int]) -> list[float]:
+    """Take numbers by their places, which are negative for what is not there; then nan."""
+    return [float(part[k]) if k >= 0 and len(part) else np.nan for k in at]
+
+
+@lru_cache(maxsize=64)  # all messages of a topic have the same names
+def _find_joints(
+    requested: Sequence[str], names: Sequence[str]
+) -> tuple[list[int], tuple[str, ...]]:
+    """Find the place of each joint among the names, -1 where it is not there, and which are not."""
+    at = [names.index(name) if name in names else -1 for name in requested]
+    absent = tuple(name for name in requested if name not in names)
+    return at, absent
 
 
 def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
@@ -195,11 +222,15 @@ def _legs(name: str) -> list[str]:
 
 
 def _table(
-    key: str, message_type: str, rows: Callable[[Any], Rows], *parts: tuple[Sequence[str], str, str]
+    key: str,
+    message_type: str,
+    rows: Callable[[Any], Rows | None],
+    *parts: tuple[Sequence[str], str, str],
+    owner: str = SIMULATOR,
 ) -> TopicTable:
-    """Make the table of the topic that ends in its key; a part is columns, their unit and what."""
+    """Make the table of a topic by its key and owner; a part is columns, their unit and what."""
     columns = [Column(name, unit, what, key) for names, unit, what in parts for name in names]
-    return TopicTable(key, message_type, columns=tuple(columns), rows=rows)
+    return TopicTable(key, message_type, owner, columns=tuple(columns), rows=rows)
 
 
 _JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -210,9 +241,18 @@ JOINT_STATES = _table(
     "joint_states",
     _JOINT_STATE,
     partial(_read_joints, JOINTS),
-    *((_legs(kind), "rad", f"joint angle {kind}") for kind in ("gamma", "mu", "beta")),
-    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in ("gamma", "mu", "beta")),
+    *((_legs(kind), "rad", f"joint angle {kind}") for kind in KINDS),
+    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in KINDS),
     (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
+    owner=NAMESPACE,
+)
+TRUE_JOINT_STATES = _table(
+    "true_joint_states",
+    _JOINT_STATE,
+    partial(_read_joints, JOINTS),
+    *((_legs(f"true_{kind}"), "rad", f"true joint angle {kind}") for kind in KINDS),
+    *((_legs(f"true_{kind}_dot"), "rad/s", f"true rate of {kind}") for kind in KINDS),
+    (_legs("true_tau"), "N m", "torque of the actuator over the step that ends here"),
 )
 ORIENTATION = _table(
     "orientation",
@@ -233,6 +273,7 @@ REFERENCE = _table(
     (_legs("gamma_desired"), "rad", "desired angle of the actuator"),
     (_legs("gamma_dot_desired"), "rad/s", "desired rate of the actuator"),
     (_legs("tau_feedforward"), "N m", "torque of the model for the desired motion"),
+    owner=CONTROLLER,
 )
 TRACKING_ERROR = _table(
     "tracking_error",
@@ -241,6 +282,7 @@ TRACKING_ERROR = _table(
     (_legs("gamma_error"), "rad", "desired less measured angle"),
     (_legs("gamma_dot_error"), "rad/s", "desired less measured rate"),
     (_legs("tau_feedback"), "N m", "torque of the feedback"),
+    owner=CONTROLLER,
 )
 TICKS = _table(
     "applied_torques",
@@ -266,10 +308,10 @@ MOMENT = _table(
 )
 
 SCENE = Topic("scene", "std_msgs/msg/String")
-DIAGNOSTICS = Topic("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", anywhere=False)
+DIAGNOSTICS = Topic("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", EVERYBODY)
 
 TABLES: dict[str, tuple[TopicTable, ...]] = {
-    "samples": (JOINT_STATES, ORIENTATION, EULER, REFERENCE, TRACKING_ERROR),
+    "samples": (JOINT_STATES, TRUE_JOINT_STATES, ORIENTATION, EULER, REFERENCE, TRACKING_ERROR),
     "ticks": (TICKS,),
     "commands": (COMMANDS,),
     "commands_stamped": (STAMPED_COMMANDS,),

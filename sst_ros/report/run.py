@@ -101,14 +101,16 @@ def evaluate_run(run: Recording) -> RunEvaluation:
     return RunEvaluation(measured, integration, ideal, summary)
 
 
-def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
+def write_run_report(
+    bag: Path, out: Path, *, damaged: bool = False, namespace: str | None = None
+) -> dict[str, Any]:
     """Evaluate a recorded run; write summary.json, the page and the pictures into `out`.
 
-    Of a `damaged` recording what is intact is evaluated. The summary is returned; `summary_text`
-    makes a short text of it, `summary_table` the whole. Raises InputError where the bag is no whole
-    recording of a run, or `out` cannot be written.
+    Of a `damaged` recording what is intact is evaluated; the `namespace` is that of `read_bag`. The
+    summary is returned; `summary_text` makes a short text of it, `summary_table` the whole. Raises
+    InputError where the bag is no whole recording of a run, or `out` cannot be written.
     """
-    run = recording.read(bag, damaged=damaged)
+    run = recording.read(bag, damaged=damaged, namespace=namespace)
     with write_into(out, "report"):
         found = evaluate_run(run)
         drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])

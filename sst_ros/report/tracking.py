@@ -68,7 +68,7 @@ def read_tracking(path: Path) -> TrackedRun:
     Raises InputError where it is no recording of a run that followed a reference, or a damaged one.
     """
     run = recording.read(path)
-    missing = run.signals.bag.absent
+    missing = run.signals.absent
     if absent := [missing[key] for key in KEYS if key in missing]:
         raise InputError(str(path), absent)
     found = of(run)
