@@ -375,7 +375,7 @@ class McapFile:
     def _parse(self, content: bytes, place: int) -> Sequence[McapRecord]:
         """Return the record that bytes are; none, and note it, if they are damaged."""
         try:
-            return [*_records(content)]
+            return [next(_records(content))]
         except Exception as error:  # mcap raises anything on bad bytes
             self.damage.append(Damage(place, _one_line(error)))
             return ()
