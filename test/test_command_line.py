@@ -97,6 +97,10 @@ def test_the_version_is_that_of_the_package(capsys):
         *((["view", "bag", "--port", port], "must be a whole number from 1024 to 65535")
           for port in ("-1", "0", "65536", "http")),
         (["simulate", "example2", "--samples", "0"], "must be a whole number from 1 to 10000000"),
+        (["simulate", "example2", "--samples", "\u0661"], "must be a whole number from 1 to"),
+        (["simulate", "example2", "--duration", "1_0"], "must be a number, not '1_0'"),
+        (["simulate", "example2", "--duration", "ten"], "invalid float value: 'ten'"),
+        (["identify", "design", "reach", "--seed", "\u0661"], "must be a number, not"),
         (["compile", "--integrator", "rk5"], "did you mean 'rk4'?"),
         (["demo", "feedforward", "--mode", "pdd"], "did you mean 'pd'?"),
         (["demo", "--scene", "swing"], "are options of `demo feedforward`"),

@@ -99,9 +99,7 @@ class Bag:
     exhausted, `topics` when they have been selected.
     """
 
-    def __init__(
-        self, path: Path, requested: Sequence[Topic], *, damaged: bool = False
-    ) -> None:
+    def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
         if not os.path.exists(path):  # noqa: PTH110  # Path's raises where a name is too long
             raise refusal(path, "bag", str(path), "does not exist")
         if not (path.is_dir() or path.is_file()):

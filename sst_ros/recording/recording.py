@@ -26,8 +26,14 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import topic_tables as topics
 from sst_ros.recording.bag_reader import Bag, Received
-from sst_ros.recording.run_topics import find_absent, select_topics
-from sst_ros.recording.topic_tables import Integers, Series, TopicTable, places
+from sst_ros.recording.topic_tables import (
+    Integers,
+    Series,
+    TopicTable,
+    find_absent,
+    places,
+    select_topics,
+)
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
@@ -215,6 +221,8 @@ def read_signals(
     for key, one in of_run.items():
         if one.fault is not None:
             raise refusal(path, key, *one.fault.args) from None
+        if one.foreign and key != topics.JOINT_STATES.key:  # which others publish on, too
+            raise refusal(path, key, one.foreign, "messages have none of the robot's joints")
     nothing = _Heard(None)
     found = {}
     for key, table in tables.items():
@@ -227,9 +235,10 @@ def read_signals(
     scenes = of_run.get(topics.SCENE.key, nothing).scenes
     if len(scenes) > 1:
         raise refusal(path, topics.SCENE.key, len(scenes), "the recording must hold one scene")
-    stamped = [one for table in topics.STAMPED if len(one := found[table.key])]
-    starts = [int(one.stamp_ns[0]) for one in stamped]
-    start_ns = min(starts or [int(one.received_ns[0]) for one in found.values() if len(one)])
+    stamped = [found[table.key] for table in topics.STAMPED if len(found[table.key])]
+    starts = [int(series.stamp_ns[0]) for series in stamped]
+    firsts = [int(series.received_ns[0]) for series in found.values() if len(series)]
+    start_ns = min(starts or firsts)
     origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
     scene = yaml_document.read(Scene, next(iter(scenes)), origin) if scenes else None
     told = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
@@ -481,8 +490,9 @@ class Recording(Explained):
     def trajectory(self) -> Trajectory:
         """The run as a `Trajectory`; samples whose orientation was lost are left out.
 
-        Between samples `Trajectory.at` integrates under the recorded torques. Its error estimate,
-        method and message are those that the simulator reported.
+        Between samples `Trajectory.at` integrates under the recorded torques; where samples and
+        torques are lost there is a gap. Its error estimate, method and message are those that the
+        simulator reported.
         """
         known, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
         joints = np.hstack([getattr(self, name) for name in JOINTS])
@@ -490,6 +500,10 @@ class Recording(Explained):
         with contextlib.suppress(ValueError):
             error_estimate = float(reported.get("error_estimate", "nan"))
         fault = reported.get("fault", "")
+        gaps = self._find_gaps(self.time_ns[known])
+        lost = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
+        inside = [any(begin <= one < end for begin, end in gaps) for one in lost.tolist()]
+        law = TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque) if all(inside) else None
         return Trajectory(
             self.scene,
             self.seconds[known],
@@ -501,8 +515,23 @@ class Recording(Explained):
             message=fault or reported.get("phase", "recorded"),
             method=reported.get("integrator", ""),
             error_estimate=error_estimate,
-            law=None if ticks.gaps else TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque),
+            law=law,
+            gaps=np.array(gaps) / NANOSECONDS,
         )
+
+    def _find_gaps(self, time_ns: Integers) -> list[tuple[int, int]]:
+        """Find the spans [ns] between these samples of which some torques are lost, too.
+
+        A span of one period is none: the torque of its last tick is the effort of its sample.
+        """
+        begin, end = time_ns[:-1], time_ns[1:]
+        edges = np.stack([self.ticks.start_ns, self.ticks.end_ns], axis=1).ravel()
+        length = self.ticks.end_ns - self.ticks.start_ns
+        known_ns = np.append(0, np.cumsum(np.stack([length, 0 * length], axis=1).ravel()))[:-1]
+        held = np.diff(np.interp(time_ns, edges, known_ns))
+        longer = end - begin > 1.5 * self.period_ns
+        lost = longer & (held < (end - begin) - 0.5)
+        return list(zip(begin[lost].tolist(), end[lost].tolist(), strict=True))
 
 
 def _finite_rows(found: Signals, table: TopicTable) -> Series:
@@ -542,9 +571,7 @@ def _usual(lengths_ns: Integers) -> int:
     return int(values[np.argmax(counts)])
 
 
-def read(
-    path: str | Path, *, damaged: bool = False, namespace: str | None = None
-) -> Recording:
+def read(path: str | Path, *, damaged: bool = False, namespace: str | None = None) -> Recording:
     """Read a rosbag2 recording of a run, MCAP or sqlite3, a folder or its file.
 
     Args:
@@ -571,6 +598,9 @@ def read_run_motion(bag: str | Path) -> Trajectory:
     motion = read(bag).trajectory
     if len(motion) < 2:
         raise refusal(Path(bag), "orientation", len(motion), "two samples or more must have one")
+    for begin, end in motion.gaps.tolist():
+        allowed = f"must be of one motion: nothing is recorded from {begin:g} to {end:g} s"
+        raise refusal(Path(bag), "orientation", len(motion), allowed)
     return motion
 
 

@@ -52,9 +52,7 @@ def test_topics_are_those_of_the_node_that_publishes_the_scene(
 ):
     """`ros2 bag record -a` beside ros2_control: the last words of the names are the same."""
     late = later(of_topic(example2, bags.JOINTS), 13)
-    beside = at_topic(
-        bags, monkeypatch, "/joint_state_broadcaster/joint_states", bags.JOINTS, late
-    )
+    beside = at_topic(bags, monkeypatch, "/joint_state_broadcaster/joint_states", bags.JOINTS, late)
     commands = later(of_topic(example2, bags.COMMANDS), 17)
     beside += at_topic(bags, monkeypatch, "/effort_controller/commands", bags.COMMANDS, commands)
     text = bags.make("std_msgs/String", data="a drawing, and no scene")
@@ -104,9 +102,7 @@ def two_robots(bags, example2, tmp_path, monkeypatch):
     return bags.write(tmp_path / "two", both)
 
 
-def test_two_robots_in_a_bag_are_told_apart_by_their_namespaces(
-    two_robots, read, bags, example2
-):
+def test_two_robots_in_a_bag_are_told_apart_by_their_namespaces(two_robots, read, bags, example2):
     with pytest.raises(InputError, match=r"namespace = None: must be one of /left, /right"):
         read_bag(two_robots)
     with pytest.raises(InputError, match=r"namespace = 'middle': must be one .*: /left, /right"):
@@ -147,7 +143,7 @@ def test_two_simulators_in_one_namespace_are_refused(read, bags, example2, monke
         name = entry.topic.replace("sst_simulator", "second")
         if name != entry.topic:
             again += at_topic(bags, monkeypatch, name, entry.topic, [entry])
-    with pytest.raises(InputError, match="scene = '/second, /sst_simulator': .* one namespace"):
+    with pytest.raises(InputError, match=r"scene = '/second, /sst_simulator': .* one namespace"):
         read([*example2, *again])
 
 
@@ -157,7 +153,9 @@ def test_a_bag_of_foreign_topics_says_what_it_has(written, bags, monkeypatch):
     one = bags.Entry("/arm/joint_positions", bags.START_NS, foreign_joints(bags, bags.START_NS))
     for sqlite in (False, True):
         path = written([one], sqlite=sqlite)
-        with pytest.raises(InputError, match="topics = '/arm/joint_positions': must have at least"):
+        with pytest.raises(
+            InputError, match=r"topics = '/arm/joint_positions': must have"
+        ):
             read_signals(path)
 
 
@@ -171,13 +169,13 @@ def strip(message, joints, *empty):
 def test_joint_states_as_drivers_send_them_are_a_table(written, bags, example2, tmp_path):
     """Angles of the actuators alone: no passive joints, no velocities, no efforts."""
     pd = pytest.importorskip("pandas")
-    bare = bags.edited(
-        example2, bags.JOINTS, None, lambda one: strip(one, 3, "velocity", "effort")
-    )
+    bare = bags.edited(example2, bags.JOINTS, None, lambda one: strip(one, 3, "velocity", "effort"))
     path = written([one for one in bare if one.topic == bags.JOINTS])
     recording.export(path, tmp_path / "out")
     table = pd.read_csv(tmp_path / "out" / "samples.csv")
-    assert len(table) == 151 and np.isfinite(table[[f"gamma_{k}_rad" for k in (1, 2, 3)]]).all(axis=None)
+    assert len(table) == 151 and np.isfinite(table[[f"gamma_{k}_rad" for k in (1, 2, 3)]]).all(
+        axis=None
+    )
     unknown = [n for n in table if n.endswith(("rad_per_s", "N_m")) or n.startswith(("mu", "beta"))]
     assert len(unknown) == 18 and table[unknown].isna().all(axis=None)
 

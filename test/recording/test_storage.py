@@ -95,7 +95,7 @@ def test_other_counts_than_those_of_the_metadata_are_damage(
 def test_rows_that_a_database_has_lost_are_damage(whole):
     with contextlib.closing(sqlite3.connect(database_of(whole))) as database, database:
         database.execute("DELETE FROM messages WHERE id % 3 = 0")
-    with pytest.raises(InputError, match="that metadata.yaml counts"):
+    with pytest.raises(InputError, match=r"that metadata.yaml counts"):
         recording.read(whole)
 
 
@@ -167,7 +167,7 @@ def test_a_folder_without_metadata_is_what_its_files_are(written, example2, bags
     bags.same(recording.read(bag), expected)
     (file,) = [*bag.glob("*.db3"), *bag.glob("*.mcap")]
     shutil.copyfile(file, bag / f"another{file.suffix}")
-    with pytest.raises(InputError, match="files of several recordings.*name one file"):
+    with pytest.raises(InputError, match=r"files of several recordings.*name one file"):
         recording.read(bag)
 
 
@@ -197,7 +197,7 @@ def test_compressed_files_are_known_by_their_first_bytes(
     bags.same(recording.read(path), recording.read(bag))
     cut = target.read_bytes()
     target.write_bytes(cut[: len(cut) // 2])
-    with pytest.raises(InputError, match="must be a whole rosbag2 recording"):
+    with pytest.raises(InputError, match=r"must be a whole rosbag2 recording"):
         recording.read(path)
 
 
@@ -206,5 +206,5 @@ def test_a_database_without_messages_is_empty(written, example2):
     (bag / "metadata.yaml").unlink()
     with contextlib.closing(sqlite3.connect(database_of(bag))) as database, database:
         database.execute("DELETE FROM messages")
-    with pytest.raises(InputError, match="messages = 0: the recording is empty"):
+    with pytest.raises(InputError, match=r"messages = 0: the recording is empty"):
         recording.read(bag)
