@@ -133,6 +133,11 @@ class Signals:
         """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
         return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
 
+    def true_legs(self, name: str) -> Array:
+        """Return true angles or rates, as `legs`, or what was measured where none are recorded."""
+        recorded = len(self.topic_series[topics.TRUE_JOINT_STATES.key])
+        return self.legs(f"true_{name}" if recorded else name)
+
     def table(self, name: str = "samples") -> pd.DataFrame:
         """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
 
@@ -416,18 +421,29 @@ class Recording(Explained):
         """
         if self._truth is not None:
             return self._truth
-        off = self.measured_error.max(axis=1)
+        shown = self._shown_joints
+        angles = np.abs(np.angle(np.exp(1j * (self.measured.gamma - shown[:, :3]))))
+        rates = np.hstack([self.measured.gamma_dot, self.measured.mu_dot, self.measured.beta_dot])
+        # Those of a body that turns: nine rates of three numbers.
+        size = 1.0 + np.abs(rates).max(axis=1, initial=0.0)
+        off = np.maximum(angles.max(axis=1), np.abs(rates - shown[:, 3:]).max(axis=1) / size)
         known = np.isfinite(off)
         apart = known.any() and np.mean(off[known] > MEASURED_APART) > MEASURED_SHARE
         return None if apart else self.measured
 
     @cached_property
-    def exact_gamma(self) -> Array:
-        """Angles of the actuators in the recorded orientations [rad], (n, 3); nan where lost."""
+    def _shown_joints(self) -> Array:
+        """Angles gamma and all rates that go with orientation and body rate, shape (n, 12)."""
         model = model_of(self.scene)
         with np.errstate(all="ignore"):
             found = kernel.joints(model, tuple(self.states[:, :7].T))
-        return np.stack(found.gamma, axis=1)
+        rows = *found.gamma, *found.gamma_dot, *found.mu_dot, *found.beta_dot
+        return np.stack([np.broadcast_to(row, self.time_ns.shape) for row in rows], axis=1)
+
+    @cached_property
+    def exact_gamma(self) -> Array:
+        """Angles of the actuators in the recorded orientations [rad], (n, 3); nan where lost."""
+        return self._shown_joints[:, :3]
 
     @cached_property
     def measured_error(self) -> Array:

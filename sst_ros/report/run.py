@@ -138,6 +138,8 @@ def summarise(run: Recording, integration: Comparison, ideal: Comparison | None)
     """Collect the figures of what was computed anew: errors, energy, tracking, efforts."""
     tracked = tracking.of(run)
     found, off = tracked and tracked.metrics, largest(run.effort_difference)
+    measured = run.motion is not run.measured
+    apart = run.measured_error if measured else np.full((1, 3), np.nan)
     compared = {
         "integration_error": integration.error,
         "integration_reference_error": integration.own,
@@ -149,6 +151,11 @@ def summarise(run: Recording, integration: Comparison, ideal: Comparison | None)
         "tracking_error_rms_rad": found and found.rms.tolist(),
         "tracking_error_max_rad": found and found.largest.tolist(),
         "settling_time_s": found and found.settling,
+        "motion_of": "joint_states" if not measured else run.motion and "true_joint_states",
+        "measurement_error_max_rad": largest(apart),
+        "measurement_error_rms_rad": largest(np.sqrt(np.nanmean(apart**2, axis=0)))
+        if np.isfinite(apart).any()
+        else None,
         **{
             f"{name}_{key}_{unit}": largest(table[key])
             for name, table in compared.items()
@@ -193,6 +200,8 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "stamp_gaps": int(np.count_nonzero(spacing > period)),
         "samples_missing_between_stamps": between,
         "idle_states": run.idle_states,
+        "foreign_states": run.foreign_states,
+        "samples_measured": len(run.measured.time_ns),
         "tick_period_s": run.ticks.period_ns / NANOSECONDS,
         "ticks_recorded": len(run.ticks.start_ns),
         "tick_gaps": run.ticks.gaps,
@@ -296,10 +305,11 @@ def _measure_answers(recording: Recording, paired: DataFrame) -> dict[str, float
     commands, start_ns = recording.commands, recording.ticks.start_ns
     share = age = None
     if len(paired) > 1:  # a torque that is commanded once and for all answers no samples
+        seen = recording.measured  # what a controller receives
         if commands.stamp_ns.any():
-            answered = np.isin(recording.time_ns + recording.start_ns, commands.stamp_ns)
+            answered = np.isin(seen.time_ns + recording.start_ns, commands.stamp_ns)
         else:
-            counts = np.searchsorted(commands.received_ns, recording.received_ns, side="left")
+            counts = np.searchsorted(commands.received_ns, seen.received_ns, side="left")
             answered = np.append(np.diff(counts), 0) > 0
         # The last sample is the end of the run, which nothing answers.
         share = 100.0 * float(np.mean(answered[:-1]))

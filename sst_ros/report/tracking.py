@@ -56,7 +56,8 @@ class TrackedRun:
         if np.isfinite(measured[0]).all():
             with suppress(SingularConfiguration):
                 first = rotation_matrix(measured[0])
-                start = continuation.advance(geometry, first, run.gamma[self.rows[0]], gamma[0])
+                begin = run.exact_gamma[self.rows[0]]
+                start = continuation.advance(geometry, first, begin, gamma[0])
                 expected, _ = continuation.follow(geometry, gamma, start)
                 return angle_between(quaternion_of(expected), measured)
         return np.full(len(gamma), np.nan)

@@ -153,9 +153,7 @@ def test_a_bag_of_foreign_topics_says_what_it_has(written, bags, monkeypatch):
     one = bags.Entry("/arm/joint_positions", bags.START_NS, foreign_joints(bags, bags.START_NS))
     for sqlite in (False, True):
         path = written([one], sqlite=sqlite)
-        with pytest.raises(
-            InputError, match=r"topics = '/arm/joint_positions': must have"
-        ):
+        with pytest.raises(InputError, match=r"topics = '/arm/joint_positions': must have"):
             read_signals(path)
 
 
