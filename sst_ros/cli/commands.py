@@ -280,7 +280,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _number("--cutoff", "of a zero-phase filter of measured angles [Hz]; default: no filter"),
         _number(
             "--delay",
-            "of measured angles against the torques [s]; default: estimated where angles are filtered",
+            "of measured angles [s]; default: estimated where angles are filtered",
         ),
         _number("--duration", "of a designed motion [s]; default: 6"),
         _whole("--harmonics", "of a designed motion; default: 5"),

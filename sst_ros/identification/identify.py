@@ -88,7 +88,7 @@ FIRST_DELAY = 10.0  # periods, up to which a delay is looked for first
 SETTLED = 1e-7  # change of the delay, in periods, that ends its iteration
 APART = 0.05  # median difference [rad] of measured mu and beta from those of gamma, that is refused
 NEAR = 0.1  # largest difference [rad] of the first angles from those of a given orientation
-_DELAY_STEPS = 20
+_DELAY_STEPS, _SLOPES = 20, 4  # of the delay, and of its column, which depends on the estimates
 _EDGE = 8  # samples at both ends at which an interpolating quintic spline has not its full order
 
 
@@ -342,14 +342,17 @@ class Equations:
         if step is None:
             return found
         later, moved, *_ = self._form(delay + step, longest)
-        before = torque - chosen @ estimate
-        slope = (later - moved[..., base.chosen] @ estimate - before) / step
-        # The delay comes first: what is below its row of the root is what it leaves to the others.
-        both = np.concatenate([-slope[..., None], chosen], axis=2)
-        together, whole, spread = fit_weighted(both, torque, noise, terms=terms)
+        for _ in range(_SLOPES):
+            before = torque - chosen @ estimate
+            slope = (later - moved[..., base.chosen] @ estimate - before) / step
+            # The delay comes first: what is below its row of the root is what it leaves to
+            # the others.
+            both = np.concatenate([-slope[..., None], chosen], axis=2)
+            together, whole, spread = fit_weighted(both, torque, noise, terms=terms)
+            estimate = together[1:]
         inverse = solve_triangular(whole, np.eye(len(whole)))
         return found._replace(
-            estimate=together[1:],
+            estimate=estimate,
             root=whole[1:, 1:],
             noise=spread,
             delay=delay + float(together[0]),
