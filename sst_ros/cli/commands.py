@@ -13,6 +13,7 @@ import os
 import re
 import sys
 import traceback
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -43,8 +44,20 @@ class Subcommand:
         self.needs, self.more = needs.split(), more
 
 
+def _number_of(kind: Callable[[str], Any], text: str) -> Any:
+    """Read a number as scenes have it: Python would also take 1_0 and other digits."""
+    if "_" in text or not text.isascii():
+        raise argparse.ArgumentTypeError(f"must be a number, not {text!r}")
+    try:
+        return kind(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"invalid {kind.__name__} value: {text!r}") from None
+
+
 _flag = partial(Arg, action="store_true")
-_path, _number = partial(Arg, type=Path), partial(Arg, type=float)
+_path = partial(Arg, type=Path)
+_number = partial(Arg, type=partial(_number_of, float))
+_whole = partial(Arg, type=partial(_number_of, int))
 _scene = partial(Arg, completer="scene.scene:names")  # which shells complete by argcomplete
 
 
@@ -58,7 +71,7 @@ def _count(name: str, most: int, what: str, least: int = 1, **options: Any) -> A
     """Describe an option that is a whole number in a range."""
 
     def whole(text: str) -> int:
-        if text.isdecimal() and least <= int(text) <= most:
+        if text.isascii() and text.isdecimal() and least <= int(text) <= most:
             return int(text)
         allowed = f"must be a whole number from {least} to {most}, not {text!r}"
         raise argparse.ArgumentTypeError(allowed)
@@ -71,6 +84,8 @@ _MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd"
 _OF_SCENE = "name of a scene, or path of a .yaml file"
 SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")
+_RUN_OF = "namespace of the simulator, where the bag has several runs"
+_NAMESPACE = Arg("--namespace", _RUN_OF, metavar="NS")
 COMMANDS: dict[str, Subcommand | str] = {
     "simulate": Subcommand(
         "simulate a scene under its own torques",
@@ -154,7 +169,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("bag", "folder of a bag to play", nargs="?"),
         _scene("--scene", "start a simulator of this scene to look at", metavar="S"),
         Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
-        Arg("--namespace", "namespace of its nodes", default="/", metavar="NS"),
+        Arg("--namespace", f"namespace of its nodes; with BAG {_RUN_OF}", metavar="NS"),
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
         _count("--port", 65535, "port, or the next free one", 1024, default=8080),
         _flag("--open", "open it, where there is a desktop"),
@@ -167,6 +182,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "cli.reports:report_run",
         BAG,
         *_out("folder of the results", "BAG_report, beside the bag"),
+        _NAMESPACE,
         _flag("--verbose", "print all figures"),
         _flag("--damaged", "evaluate the intact part of a damaged recording"),
     ),
@@ -190,13 +206,26 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("bag", "folder of the bag", nargs="?", metavar="BAG"),
         *_out("folder of the pictures", "BAG_plots, beside the bag"),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
+        _NAMESPACE,
         _flag("--list", "list the pictures, and draw none"),
         _path("--compare", "deprecated: `sst-ros compare`", nargs="+", default=[], metavar="BAG"),
     ),
     "compare": Subcommand(
         "show by joint how recorded runs differ: table, pictures",
         "cli.reports:compare_runs",
-        _path("bags", "folders of two to six bags", nargs="+", metavar="BAG"),
+        _path(
+            "bags",
+            "folders of two to six bags, or of one with several runs",
+            nargs="+",
+            metavar="BAG",
+        ),
+        Arg(
+            "--namespace",
+            f"{_RUN_OF}: one for all bags, one for each, or all of one bag",
+            nargs="+",
+            default=[],
+            metavar="NS",
+        ),
         *_out("folder of the pictures", "BAG_compared, beside the first bag"),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
         _path("--csv", "write the table, with all digits", metavar="FILE"),
@@ -205,6 +234,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write a recorded run as CSV or Parquet",
         "cli.runs:write_tables",
         BAG,
+        _NAMESPACE,
         Arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
         *_out("folder of the tables", "BAG_tables, beside the bag"),
     ),
@@ -239,11 +269,16 @@ COMMANDS: dict[str, Subcommand | str] = {
             nargs="+",
             metavar="P",
         ),
+        _NAMESPACE,
         Arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
         _number("--cutoff", "of a zero-phase filter of measured angles [Hz]; default: no filter"),
+        _number(
+            "--delay",
+            "of measured angles [s]; default: estimated where angles are filtered",
+        ),
         _number("--duration", "of a designed motion [s]; default: 6"),
-        Arg("--harmonics", "of a designed motion; default: 5", type=int),
-        Arg("--seed", "of a designed motion; default: 0", type=int),
+        _whole("--harmonics", "of a designed motion; default: 5"),
+        _whole("--seed", "of a designed motion; default: 0"),
         _path("--out", "write the scene", metavar="SCENE.yaml"),
         _flag("--force", "overwrite the file of --out"),
         more="`identify BAG` fits the torques of a recorded run by weighted least squares: "

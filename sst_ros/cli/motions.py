@@ -74,7 +74,10 @@ def run_sweep(options: argparse.Namespace) -> None:
 def run_identification(options: argparse.Namespace) -> None:
     """Identify a scene from a recorded run, or design a motion that determines its parameters."""
     designing, later = options.bag == DESIGN, "must be given after design, and only there"
-    ours, others = ("duration", "harmonics", "seed"), ("cutoff", "scene", "method")
+    ours, others = (
+        ("duration", "harmonics", "seed"),
+        ("cutoff", "delay", "scene", "method", "namespace"),
+    )
     chosen, foreign = (
         {name: value for name in names if (value := getattr(options, name)) is not None}
         for names in ((ours, others) if designing else (others, ours))
@@ -91,7 +94,9 @@ def run_identification(options: argparse.Namespace) -> None:
     if designing:
         found = design(load(options.designed), options.parameters, **chosen)
     else:
-        found = identify(options.bag, parameters=options.parameters, **chosen)
+        namespace = chosen.pop("namespace", None)
+        run = function("recording.recording:read")(options.bag, namespace=namespace)
+        found = identify(run, parameters=options.parameters, **chosen)
     print(found.table(), end="")
     if options.out is not None:
         with write_into(options.out.parent, "identify"):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sst_ros import demo
 from sst_ros.cli.commands import free_out, function
+from sst_ros.errors import refuse_unless
 from sst_ros.host.output import replace_file, require_free, results_folder
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
@@ -18,7 +19,8 @@ from sst_ros.scene.scene import load, names
 def report_run(options: argparse.Namespace) -> None:
     """Evaluate a recorded run."""
     out = free_out(options, results_folder(options.bag, "report"))
-    summary = function("report.run:write_run_report")(options.bag, out, damaged=options.damaged)
+    given = {"damaged": options.damaged, "namespace": options.namespace}
+    summary = function("report.run:write_run_report")(options.bag, out, **given)
     if options.verbose:
         print(function("report.run:summary_table")(summary))
     print(function("report.run:summary_text")(summary, str(out)), end="")
@@ -47,11 +49,13 @@ def draw_pictures(options: argparse.Namespace) -> int:
     if options.compare:
         print("plot --compare is deprecated: use sst-ros compare", file=sys.stderr)
         options.bags, options.csv = [*filter(None, [options.bag]), *options.compare], None
+        options.namespace = [options.namespace] if options.namespace else []
         return compare_runs(options)
     if options.bag is None:
         options.parser.error("name a BAG")
     out = free_out(options, results_folder(options.bag, "plots"))
-    return _tell(*pictures.draw_run(read_signals(options.bag), out, options.only))
+    run = read_signals(options.bag, namespace=options.namespace)
+    return _tell(*pictures.draw_run(run, out, options.only))
 
 
 def compare_runs(options: argparse.Namespace) -> int:
@@ -59,7 +63,10 @@ def compare_runs(options: argparse.Namespace) -> int:
     out = free_out(options, results_folder(options.bags[0], "compared"))
     if options.csv is not None:
         require_free(options.csv, "compare", force=options.force)
-    runs = [read_signals(bag) for bag in options.bags]
+    runs = [
+        read_signals(bag, namespace=namespace)
+        for bag, namespace in _pair(options.bags, options.namespace)
+    ]
     drawn = compare.draw_comparison(runs, out, options.only)
     print(compare.difference_text(runs))
     if options.csv is not None:
@@ -67,6 +74,20 @@ def compare_runs(options: argparse.Namespace) -> int:
             compare.differences(runs).to_csv(path, lineterminator="\n")
         print(options.csv)
     return _tell(*drawn)
+
+
+def _pair(bags: list[Path], namespaces: list[str]) -> list[tuple[Path, str | None]]:
+    """Return each run that is compared, by its bag and its namespace, None for the only one."""
+    if not namespaces:
+        return [(bag, None) for bag in bags]
+    if len(bags) == 1:
+        bags = bags * len(namespaces)
+    if len(namespaces) == 1:
+        namespaces = namespaces * len(bags)
+    allowed = f"must be one, or one for each of {len(bags)} bags"
+    fits = len(namespaces) == len(bags)
+    refuse_unless("compare", ("--namespace", namespaces, fits, allowed))
+    return list(zip(bags, namespaces, strict=True))
 
 
 def _tell(paths: list[Path], missing: dict[str, str]) -> int:

@@ -147,7 +147,8 @@ def view(options: argparse.Namespace) -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as end:
-            page = function("view.page:Page")(Replay(options.bag), options.host, options.port)
+            replay = Replay(options.bag, options.namespace)
+            page = function("view.page:Page")(replay, options.host, options.port)
             end.callback(page.close)
             page.announce(opened=options.open)
             threading.Event().wait()
@@ -156,7 +157,7 @@ def view(options: argparse.Namespace) -> int:
     if options.scene is not None:
         load(options.scene)  # refused before a process of its own would be
     given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
-    words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace}"]
+    words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace or '/'}"]
     with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
         status: int = function("nodes.process:run")([*words, *processes.words(given)])
     return status
@@ -166,7 +167,8 @@ def write_tables(options: argparse.Namespace) -> None:
     """Write the tables of a recorded run."""
     out = free_out(options, results_folder(options.bag, "tables"))
     export = function("recording.recording:export")
-    for path in export(options.bag, out, options.format, force=options.force):
+    given = {"force": options.force, "namespace": options.namespace}
+    for path in export(options.bag, out, options.format, **given):
         print(path)
 
 

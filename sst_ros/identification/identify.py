@@ -21,17 +21,22 @@ What holds for samples holds for the components (Gautier, Proc. IEEE ICRA 1997, 
 sines are orthonormal, so that white noise stays white, and vanish at both ends, where cosines or
 sums would leave noise of the rates (Shinbrot, Trans. ASME 79 (1957) 547-552).
 docs/howto/identify.md has the bias with and without them, measured.
+
+What was measured of the angles at a time is what they were a delay before, of sensors and of what
+transports their readings. The delay is one more unknown, in which the torques are not linear: by
+Gauss-Newton, beside the base parameters. Its column is the derivative of the residuals, so that the
+standard deviations of the others hold its uncertainty, too.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import compress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,17 +49,25 @@ from scipy.signal import butter, sosfiltfilt
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics.kernel import joints, model_of
 from sst_ros.dynamics.variational import VariationalEquations
-from sst_ros.errors import AssemblyError, InputError, check_kinds, refuse_errors, refuse_unless
+from sst_ros.errors import (
+    AssemblyError,
+    InputError,
+    check_kinds,
+    refusal,
+    refuse_errors,
+    refuse_unless,
+)
 from sst_ros.identification import parameters
 from sst_ros.identification.consistency import find_consistent_values, fit_weighted, scales
 from sst_ros.identification.measured_motion import (
     Measured,
     MeasuredMotion,
-    read_motion,
+    read_segments,
+    resample,
     take_angles,
 )
 from sst_ros.identification.parameters import BaseParameters, Identification, Regressor
-from sst_ros.mechanism import continuation
+from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene, SceneInput, scene_of
 from sst_ros.scene.yaml_document import find_number
@@ -70,6 +83,12 @@ MARGIN = 10.0  # default cut-off over the bandwidth of the motion
 STEP = 0.03  # between poses that continuation follows [rad]; Newton's method takes the rest
 POSITIVE = re.compile(r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$")
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
+LONGEST_DELAY = 0.2  # [s] that is looked for: at 5 Hz this is a whole period of the motion
+FIRST_DELAY = 10.0  # periods, up to which a delay is looked for first
+SETTLED = 1e-7  # change of the delay, in periods, that ends its iteration
+APART = 0.05  # median difference [rad] of measured mu and beta from those of gamma, that is refused
+NEAR = 0.1  # largest difference [rad] of the first angles from those of a given orientation
+_DELAY_STEPS, _SLOPES = 20, 4  # of the delay, and of its column, which depends on the estimates
 _EDGE = 8  # samples at both ends at which an interpolating quintic spline has not its full order
 
 
@@ -86,6 +105,8 @@ class TorqueFit(Identification):
         vague: combinations whose standard deviation exceeds their size.
         samples: of the torques that were fitted.
         band: frequency below which they were [Hz]; None where angles were not filtered.
+        delay: of the measured angles [s].
+        delay_deviation: its standard deviation [s]; None where the delay was given, or is none.
 
     """
 
@@ -96,6 +117,8 @@ class TorqueFit(Identification):
     vague: tuple[str, ...]
     samples: int
     band: float | None
+    delay: float = 0.0
+    delay_deviation: float | None = None
 
     @property
     def consistent(self) -> bool:
@@ -122,6 +145,7 @@ def identify(
     *,
     cutoff: float | None = None,
     noise: ArrayLike | None = None,
+    delay: float | None = None,
 ) -> Identification:
     """Identify constants of a scene from a motion.
 
@@ -136,7 +160,9 @@ def identify(
     Args:
         data: a recording or its path, a `Trajectory`, or a mapping of arrays: t [s], gamma [rad]
             (n, 3), torque [N m] (n, 3), and where they are known gamma_dot [rad/s] (n, 3),
-            quaternion (4,) at the first sample, held (torques act to the next sample).
+            quaternion (4,) at the first sample, held (torques act to the next sample), mu and beta
+            [rad] (n, 3), by which the angles are checked. Angles may wrap, times may be those of an
+            epoch, uneven, and have gaps: what was done about it is in `warnings`.
         scene: what is known of the manipulator, and the values to start from; by default the
             scene of the data.
         parameters: names of unknowns, by inverse dynamics also how their names begin ("star",
@@ -146,6 +172,8 @@ def identify(
         cutoff: of the zero-phase filter of the angles [Hz]; by default none where rates were
             measured, else ten times the bandwidth of the motion.
         noise: standard deviations of the torques [N m], three; by default estimated.
+        delay: how long before its stamp a measured angle was what it says, against the torques [s];
+            by default estimated where angles are filtered, else none.
 
     Returns:
         A `TorqueFit` by inverse dynamics, a `SimulationFit` by simulation.
@@ -165,9 +193,9 @@ def identify(
     refuse_unless("identify", ("scene", None, given is not None, "must be given with arrays"))
     given = scene_of(given)
     if method == "inverse_dynamics":
-        return fit_torques(data, given, parameters, cutoff, noise)
-    plain = cutoff is None and noise is None
-    refuse_unless("identify", ("method", method, plain, "takes no cutoff or noise"))
+        return fit_torques(data, given, parameters, cutoff, noise, delay)
+    plain = cutoff is None and noise is None and delay is None
+    refuse_unless("identify", ("method", method, plain, "takes no cutoff, noise or delay"))
     return fit_simulation(data, given, parameters)
 
 
@@ -177,51 +205,34 @@ def fit_torques(
     requested: Iterable[str] | None,
     cutoff: float | None,
     noise: ArrayLike | None,
+    delay: float | None,
 ) -> TorqueFit:
     """Identify by torques; arguments as for `identify`."""
     names = parameters.select_names(scene, requested)
-    measured = read_motion(data)
-    reached = float(np.ptp(measured.gamma, axis=0).max())
+    segments = read_segments(data)
+    reached = max(float(np.ptp(part.gamma, axis=0).max()) for part in segments.parts)
     allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
     weights = finite_vector(noise)
     three = noise is None or (weights is not None and min(weights) > 0.0)
+    late = delay is None or abs(delay) <= LONGEST_DELAY
     refuse_unless(
         "identify",
         ("gamma", reached, reached >= STILL or scene.gravity is not None, allowed),
         ("parameters", requested, bool(names), "must name one or more"),
         ("noise", noise, three, "must be three finite standard deviations > 0 [N m]"),
+        ("delay", delay, late, f"must be from -{LONGEST_DELAY:g} to {LONGEST_DELAY:g} s"),
     )
-    regressor = Regressor(scene, names)
-    known, columns, torque, band = form_equations(measured, regressor, cutoff)
-    limit = np.inf if scene.torque_limit is None else scene.torque_limit * (1.0 - 1e-9)
-    sound = np.abs(torque).max(axis=1) < limit
-    warning = (
-        f"{int((~sound).sum())} of {len(sound)} samples left out: a torque was at the limit of "
-        "the actuators, and what was recorded may not be what acted"
-    )
-    torque, columns = (torque - known)[sound], columns[sound]
-    samples = len(torque)
-    allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
-    refuse_unless("identify", ("t", samples, samples > len(names), allowed))
-    if band is not None:
-        period = float(np.median(np.diff(measured.t)))
-        sines = max(int(np.ceil(2.0 * band * period * samples)), len(names))
-        torque, columns = (
-            np.asarray(dst(one, type=1, norm="ortho", axis=0)[:sines]) for one in (torque, columns)
-        )
-    base = parameters.find_independent(columns, names)
-    allowed = "must determine something: no torque depends on these parameters here"
-    refuse_unless("identify", ("parameters", list(names), bool(base.chosen), allowed))
+    equations = Equations(segments.parts, Regressor(scene, names), cutoff)
+    fitted = equations.fit(weights, delay)
+    base, estimate, root, spread = fitted.base, fitted.estimate, fitted.root, fitted.noise
     given = parameters.values(scene, names)
-    terms = float(np.sqrt(np.mean((np.abs(columns) @ np.abs(given)) ** 2)))
-    estimate, root, spread = fit_weighted(columns[..., base.chosen], torque, weights, terms=terms)
     inverse = solve_triangular(root, np.eye(len(root)))
     reach = max(scene.base.radius, scene.star.radius)
     values, excess = find_consistent_values(names, given, base.transform, estimate, root, reach)
-    whole = parameters.find_base_parameters(regressor)
+    whole = parameters.find_base_parameters(equations.regressor)
     lost = [chosen not in base.chosen for chosen in whole.chosen]
     vague = np.linalg.norm(inverse, axis=1) > scales(names, given)[base.chosen]
-    note = f"identified from {samples} samples"
+    note = f"identified from {fitted.samples} samples"
     return TorqueFit(
         scene=parameters.with_parameters(scene, names, values, note),
         names=names,
@@ -231,68 +242,269 @@ def fit_torques(
         estimate=estimate,
         covariance=inverse @ inverse.T,
         undetermined=tuple(compress(whole.labels, lost)),
-        warnings=() if sound.all() else (warning,),
+        warnings=(*segments.notes, *equations.notes, *fitted.notes),
         base=base,
         noise=spread,
         condition=float(np.linalg.cond(root / np.linalg.norm(root, axis=0))),
         excess=excess,
         vague=tuple(compress(base.labels, vague)),
-        samples=samples,
-        band=band,
+        samples=fitted.samples,
+        band=equations.band,
+        delay=fitted.delay,
+        delay_deviation=fitted.delay_deviation,
     )
 
 
-def form_equations(
-    measured: MeasuredMotion, regressor: Regressor, cutoff: float | None
-) -> tuple[Array, Array, Array, float | None]:
-    """Evaluate the equation of motion at the samples, or its means where torques are held.
+class WeightedFit(NamedTuple):
+    """What `Equations.fit` finds; root, R^T R, is the inverse of the covariance."""
+
+    base: BaseParameters
+    estimate: Array  # of the base parameters, shape (b,)
+    root: Array  # shape (b, b), with the uncertainty of the delay in it
+    noise: Array  # standard deviations of the torques [N m], shape (3,)
+    samples: int
+    delay: float  # [s]
+    delay_deviation: float | None  # None where it was not estimated
+    notes: tuple[str, ...]
+
+
+class Equations:
+    """The equation of motion along measured segments, as a function of the delay of the angles.
+
+    Attributes:
+        regressor: known torques, and columns of the parameters.
+        band: frequency [Hz] up to which the equations are sound, where angles are filtered;
+            else None.
+        notes: what was done to the data.
+
+    """
+
+    def __init__(
+        self, parts: Sequence[MeasuredMotion], regressor: Regressor, cutoff: float | None
+    ) -> None:
+        self.regressor = regressor
+        paths, notes = list[_Path](), list[str]()
+        for part in parts:
+            path, note = _Path.of(part, regressor.scene, cutoff)
+            paths.append(path)
+            notes += [note] if note and note not in notes else []
+        self._paths, self.notes = paths, tuple(notes)
+        bands = [path.band for path in paths if path.band is not None]
+        self.band = max(bands, default=None)
+        self._period = max(path.period for path in paths)
+
+    def fit(self, noise: Sequence[float] | None, delay: float | None) -> WeightedFit:
+        """Fit the base parameters, and the delay [s] where none is given and angles are filtered.
+
+        The noise is that of the torques [N m], three, by default estimated. InputError is raised
+        where the motion determines nothing.
+        """
+        if delay is not None or self.band is None:
+            given = delay or 0.0
+            return self._fit_at(given, None, noise, abs(given))
+        longest = FIRST_DELAY * self._period
+        while True:
+            found = self._find_delay(noise, longest)
+            inside = abs(found.delay) <= 0.8 * longest
+            if inside or longest >= LONGEST_DELAY:
+                return found
+            longest = min(2.0 * longest, LONGEST_DELAY)
+
+    def _find_delay(self, noise: Sequence[float] | None, longest: float) -> WeightedFit:
+        """Fit the delay up to a longest one [s] by Gauss-Newton."""
+        delay, step = 0.0, 0.25 * self._period
+        for _ in range(_DELAY_STEPS):
+            found = self._fit_at(delay, step, noise, longest)
+            change = found.delay - delay
+            limited = min(max(found.delay, -longest), longest)
+            if abs(change) <= SETTLED * self._period or limited == delay:
+                break
+            delay = limited
+        return found._replace(delay=delay)
+
+    def _fit_at(
+        self, delay: float, step: float | None, noise: Sequence[float] | None, longest: float
+    ) -> WeightedFit:
+        """Fit the base parameters at a delay [s]; with a `step` [s] its change, too.
+
+        Segments are cut so that no delay up to the longest leaves them.
+        """
+        names = self.regressor.names
+        torque, columns, samples, notes = self._form(delay, longest)
+        base = parameters.find_independent(columns, names)
+        allowed = "must determine something: no torque depends on these parameters here"
+        refuse_unless("identify", ("parameters", list(names), bool(base.chosen), allowed))
+        given = parameters.values(self.regressor.scene, names)
+        terms = float(np.sqrt(np.mean((np.abs(columns) @ np.abs(given)) ** 2)))
+        chosen = columns[..., base.chosen]
+        estimate, root, spread = fit_weighted(chosen, torque, noise, terms=terms)
+        found = WeightedFit(base, estimate, root, spread, samples, delay, None, notes)
+        if step is None:
+            return found
+        later, moved, *_ = self._form(delay + step, longest)
+        for _ in range(_SLOPES):
+            before = torque - chosen @ estimate
+            slope = (later - moved[..., base.chosen] @ estimate - before) / step
+            # The delay comes first: what is below its row of the root is what it leaves to
+            # the others.
+            both = np.concatenate([-slope[..., None], chosen], axis=2)
+            together, whole, spread = fit_weighted(both, torque, noise, terms=terms)
+            estimate = together[1:]
+        inverse = solve_triangular(whole, np.eye(len(whole)))
+        return found._replace(
+            estimate=estimate,
+            root=whole[1:, 1:],
+            noise=spread,
+            delay=delay + float(together[0]),
+            delay_deviation=float(np.linalg.norm(inverse[0])),
+        )
+
+    def _form(self, delay: float, longest: float) -> tuple[Array, Array, int, tuple[str, ...]]:
+        """Return torques less known ones, (m, 3), columns, (m, 3, p), number of samples, notes."""
+        scene, names = self.regressor.scene, self.regressor.names
+        limit = np.inf if scene.torque_limit is None else scene.torque_limit * (1.0 - 1e-9)
+        torques, columns = list[Array](), list[Array]()
+        samples = cut = total = 0
+        for path in self._paths:
+            known, part, torque = path.evaluate(self.regressor, delay, longest)
+            sound = np.abs(torque).max(axis=1) < limit
+            total, cut = total + len(sound), cut + int((~sound).sum())
+            left, part = (torque - known)[sound], part[sound]
+            samples += len(left)
+            if path.band is not None:
+                count = int(np.ceil(2.0 * path.band * path.period * len(left)))
+                count = max(count, len(names) if len(self._paths) == 1 else 0)
+                left, part = (
+                    np.asarray(dst(one, type=1, norm="ortho", axis=0)[:count])
+                    for one in (left, part)
+                )
+            torques.append(left)
+            columns.append(part)
+        allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
+        refuse_unless("identify", ("t", samples, samples > len(names), allowed))
+        warning = (
+            f"{cut} of {total} samples left out: a torque was at the limit of "
+            "the actuators, and what was recorded may not be what acted"
+        )
+        notes = (warning,) if cut else ()
+        return np.concatenate(torques), np.concatenate(columns), samples, notes
+
+
+class _Path(NamedTuple):
+    """Angles, rates and accelerations along one segment, and where the equation is taken.
 
     Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at MARGIN times
     the bandwidth of the motion.
-
-    Returns known and measured torques [N m], each shape (m, 3), between them the regressor of p
-    parameters, shape (m, 3, p); and the frequency [Hz] up to which they are sound where angles were
-    filtered, else None. Angles that no assembly has, and uneven samples where they are filtered,
-    are refused.
     """
-    t, gamma, rate, band, unsettled = measured.t, measured.gamma, measured.gamma_dot, None, 0
-    spline: Any
-    if cutoff is not None or rate is None:
-        bandwidth = find_bandwidth(float(np.median(np.diff(t))), gamma)
-        band = min(BAND * bandwidth, cutoff or np.inf)
-        smooth, unsettled = filter_angles(t, gamma, cutoff)
-        spline = make_interp_spline(t, smooth, k=5)
-        path = spline, spline.derivative(), spline.derivative(2)
-    elif measured.held:
-        spline = CubicHermiteSpline(t, gamma, rate)
-        path = spline, spline.derivative(), spline.derivative(2)
-    else:
-        spline, unsettled = make_interp_spline(t, rate, k=5), min(_EDGE, len(t) // 4)
-        path = make_interp_spline(t, gamma, k=5), spline, spline.derivative()
-    times = t[:, None]
-    if measured.held:  # two Gauss points in each interval
-        middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t) / np.sqrt(3.0)
-        times = np.stack([middle - half, middle + half], axis=1)
-    rows = slice(unsettled, len(times) - unsettled)
-    angles, rates, accelerations = (one(times[rows].ravel()) for one in path)
-    space = ActuatorSpaceMap(Geometry.of(regressor.scene))
-    quaternion = _follow_orientations(space, angles, measured)
-    moving = *quaternion.T, *rates.T, *accelerations.T
-    star = np.stack(space.star_accelerations(*moving), axis=1)
-    found = regressor(quaternion, star[:, :3], star[:, 3:])
-    known, columns = (x.reshape(-1, times.shape[1], *x.shape[1:]).mean(axis=1) for x in found)
-    return known, columns, measured.torque[rows], band
+
+    measured: MeasuredMotion
+    space: ActuatorSpaceMap
+    times: Array  # of the equation [s], shape (m, 1 or 2): the second is of held torques
+    curves: Any  # angles, rates and accelerations over time
+    unsettled: int  # samples at both ends that the filter or the spline has not settled for
+    band: float | None  # frequency up to which they are sound; None where they are not filtered
+    period: float  # usual time between samples [s]
+
+    @classmethod
+    def of(cls, measured: MeasuredMotion, scene: Scene, cutoff: float | None) -> tuple[_Path, str]:
+        """Return the path of a segment, and a note of what was done to its samples.
+
+        Raises InputError where the cut-off is not allowed, the segment is too short to be filtered,
+        or measured mu and beta are not those of gamma.
+        """
+        note, band, unsettled, rate = "", None, 0, measured.gamma_dot
+        space = ActuatorSpaceMap(Geometry.of(scene))
+        _check_passive(space, measured, scene)
+        curves: Any
+        if cutoff is not None or rate is None:
+            measured, note = resample(measured)
+            t, gamma = measured.t, measured.gamma
+            bandwidth = find_bandwidth(float(np.median(np.diff(t))), gamma)
+            band = min(BAND * bandwidth, cutoff or np.inf)
+            smooth, unsettled = filter_angles(t, gamma, cutoff)
+            spline = make_interp_spline(t, smooth, k=5)
+            curves = spline, spline.derivative(), spline.derivative(2)
+        else:
+            t = measured.t - measured.t[0]
+            if measured.held:
+                spline = CubicHermiteSpline(t, measured.gamma, rate)
+                curves = spline, spline.derivative(), spline.derivative(2)
+            else:
+                spline, unsettled = make_interp_spline(t, rate, k=5), min(_EDGE, len(t) // 4)
+                curves = make_interp_spline(t, measured.gamma, k=5), spline, spline.derivative()
+        times = t[:, None]
+        if measured.held:  # two Gauss points in each interval
+            middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t) / np.sqrt(3.0)
+            times = np.stack([middle - half, middle + half], axis=1)
+        period = float(np.median(np.diff(t)))
+        return cls(measured, space, times, curves, unsettled, band, period), note
+
+    def evaluate(
+        self, regressor: Regressor, delay: float, longest: float
+    ) -> tuple[Array, Array, Array]:
+        """Evaluate the equation of motion at the samples, or its means where torques are held.
+
+        Returns known and measured torques [N m], each shape (m, 3), between them the regressor of p
+        parameters, shape (m, 3, p). Angles were measured a delay [s] late. Angles that no assembly
+        has are refused.
+        """
+        cut = self.unsettled + int(np.ceil(longest / self.period * (1.0 - 1e-9)))
+        rows = slice(cut, max(len(self.times) - cut, cut))
+        times = self.times[rows]
+        allowed = f"must last longer than {2.0 * cut * self.period:g} s"
+        last = float(np.ptp(self.measured.t))
+        refuse_unless("identify", ("t", last, len(times) > 1, allowed))
+        angles, rates, accelerations = (one(times.ravel() + delay) for one in self.curves)
+        quaternion = _follow_orientations(self.space, angles, self.measured)
+        moving = *quaternion.T, *rates.T, *accelerations.T
+        star = np.stack(self.space.star_accelerations(*moving), axis=1)
+        found = regressor(quaternion, star[:, :3], star[:, 3:])
+        known, columns = (
+            one.reshape(-1, times.shape[1], *one.shape[1:]).mean(axis=1) for one in found
+        )
+        return known, columns, self.measured.torque[rows]
+
+
+def _check_passive(space: ActuatorSpaceMap, measured: MeasuredMotion, scene: Scene) -> None:
+    """Refuse measured mu and beta that are not those of the measured gamma.
+
+    What is measured need not close the loops: by APART they tell another manipulator or assembly.
+    """
+    given = {name: getattr(measured, name) for name in ("mu", "beta")}
+    if all(values is None for values in given.values()):
+        return
+    quaternion = _follow_orientations(space, measured.gamma, measured)
+    at_rest = *quaternion.T, *np.zeros((3, len(quaternion)))
+    found = joints(model_of(scene), at_rest)
+    for name, values in given.items():
+        if values is None:
+            continue
+        turns = np.exp(1j * (values - np.stack(getattr(found, name), axis=1)))
+        apart = float(np.median(np.abs(np.angle(turns)).max(axis=1)))
+        allowed = f"must be within {APART:g} rad of those that gamma has in this scene"
+        refuse_unless("identify", (name, f"{apart:.3g} rad off", apart <= APART, allowed))
 
 
 def _follow_orientations(space: ActuatorSpaceMap, gamma: Array, measured: MeasuredMotion) -> Array:
-    """Quaternions (n, 4) at gamma (n, 3) in the assembly mode of the first sample."""
+    """Quaternions (n, 4) at gamma (n, 3) in the assembly mode of the first sample.
+
+    A given orientation says which one that is: measured angles are only near those of it.
+    """
     begin, first = measured.quaternion, measured.gamma[:1]
-    start = None if begin is None else rotation_matrix(begin)
     length = np.cumsum(np.linalg.norm(np.diff(gamma, axis=0, prepend=first), axis=1))
     known = np.unique(np.searchsorted(length, np.arange(0.0, length[-1] + STEP, STEP)))
     points = np.vstack([first, gamma[known[known < len(gamma)]]])
     refused = "gamma", first[0].tolist(), "must be angles of this manipulator"
-    with refuse_errors("identify", *refused, AssemblyError, continuation.BranchEnds):
+    failures = AssemblyError, continuation.BranchEnds
+    with refuse_errors("identify", *refused, *failures):
+        start = None
+        if begin is not None:
+            rotation = rotation_matrix(np.array(begin))
+            shown = kinematics.inverse(space.geometry, rotation)[0]
+            off = np.angle(np.exp(1j * (first[0] - shown)))
+            if not np.abs(off).max() <= NEAR:
+                raise refusal("identify", *refused)
+            start = continuation.advance(space.geometry, rotation, shown, shown + off)
         coarse, _ = continuation.follow(space.geometry, points, start)
     nearest = np.searchsorted(known, np.arange(len(gamma)), side="right")
     return space.orientations(quaternion_of(coarse)[nearest], gamma)

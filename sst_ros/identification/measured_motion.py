@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured: angles and torques of the actuators.
+"""What was measured: angles and torques of the actuators, cut where it was lost.
 
 Torques are samples at the times of the angles, or each is held over an interval, as a controller's
-are.
+are. Angles of encoders may count whole turns or wrap; stamps may be uneven; samples may be missing:
+over some of them the motion is smooth, at more of them it is cut into segments.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any]"
 
 FEWEST = 20  # samples to identify anything: filters and splines have transients at both ends
+GAP = 10.0  # periods without a sample from which a motion is cut
+EVEN = 1e-3  # share of a period by which even samples may be off
 _HELD = (torques.TorqueTable, torques.ConstantTorque)
 
 
@@ -50,6 +54,8 @@ class MeasuredMotion(Section):
         "by default the admissible one",
         "1",
     )
+    mu: Array | None = entry("measured angles of the carriages, checked alone", "rad", shape=(3,))
+    beta: Array | None = entry("measured angles of the star, checked alone", "rad", shape=(3,))
     held: bool = entry("whether torques are held over the intervals", default=False)
 
     def settle(self) -> Iterator[Problem]:
@@ -63,44 +69,170 @@ class MeasuredMotion(Section):
         n = len(self.t)
         yield not torques.ascend(self.t), "t", self.t, "must be rising times [s], shape (n,)"
         yield n < FEWEST, "t", n, f"must be {FEWEST} samples or more"
-        rows = {"gamma": n, "torque": n - self.held, "gamma_dot": n}
+        rows = {"gamma": n, "torque": n - self.held, "gamma_dot": n, "mu": n, "beta": n}
         for name, count in rows.items():
             array = getattr(self, name)
             wrong = array is not None and len(array) != count
             yield wrong, name, np.shape(array), f"must have the shape {count, 3}"
 
 
+class Segments(NamedTuple):
+    """A measured motion in parts, over each of which angles and torques are known."""
+
+    parts: tuple[MeasuredMotion, ...]
+    notes: tuple[str, ...]  # what was done to the data
+
+
 def read_motion(data: Measured) -> MeasuredMotion:
     """Read a motion from a recording, a trajectory, or arrays, see `identify`, or refuse it."""
-    given = data if isinstance(data, Mapping) else _take_samples(data)
-    known = {name: value for name, value in given.items() if value is not None}
-    return build(MeasuredMotion, known, "identify")
+    return _read(data)[0]
 
 
-def _take_samples(data: Recording | Trajectory) -> dict[str, Any]:
-    """Take a simulated motion, or a recorded run while it has torques."""
-    motion = data if isinstance(data, Trajectory) else getattr(data, "trajectory", None)
-    if motion is None:
+def read_segments(data: Measured) -> Segments:
+    """Read a motion as `read_motion`, cut where samples or torques are lost."""
+    motion, known, turns = _read(data)
+    notes = [turns] if turns else []
+    spacing = np.diff(motion.t)
+    cuts = np.flatnonzero((spacing > GAP * np.median(spacing)) | ~known)
+    bounds = [0, *(cuts + 1).tolist(), len(motion.t)]
+    spans = [(a, b) for a, b in pairwise(bounds) if b - a >= FEWEST]
+    if len(cuts):
+        lost = ", ".join(f"{t:g} s" for t in (motion.t[cuts] - motion.t[0]).tolist()[:5])
+        more = ", ..." if len(cuts) > 5 else ""
+        text = f"samples or torques are lost after {lost}{more}: {len(spans)} segments are fitted"
+        notes.append(text)
+    if not spans:
+        allowed = f"must have {FEWEST} samples or more without a gap"
+        raise refusal("identify", "t", len(motion.t), allowed)
+    return Segments(tuple(_cut(motion, first, end) for first, end in spans), tuple(notes))
+
+
+def resample(motion: MeasuredMotion) -> tuple[MeasuredMotion, str]:
+    """Return the motion at even times, without rates, and a note of it; as it is where it is even.
+
+    Angles, and torques that are not held, are interpolated by a cubic spline; held torques are
+    averaged.
+    """
+    t = motion.t - motion.t[0]  # seconds since an epoch have few digits left
+    spacing = np.diff(t)
+    period = float(np.median(spacing))
+    if np.abs(spacing - period).max() <= EVEN * period + 2.0 * np.spacing(motion.t[-1]):
+        even = np.linspace(0.0, t[-1], len(t))
+        return replace(motion, t=even, gamma_dot=None), ""
+    count = int(t[-1] / period * (1.0 + 1e-12)) + 1
+    even = period * np.arange(count)
+    gamma = CubicSpline(t, motion.gamma)(even)
+    if motion.held:
+        torque = _average(torques.TorqueTable(t[:-1], motion.torque), even)
+    else:
+        torque = CubicSpline(t, motion.torque)(even)
+    passive = dict.fromkeys(("mu", "beta", "gamma_dot"))
+    note = (
+        f"stamps are uneven, {spacing.min():.3g} to {spacing.max():.3g} s apart: the motion is "
+        f"sampled again each {period:.3g} s"
+    )
+    return replace(motion, t=even, gamma=gamma, torque=torque, **passive), note
+
+
+def _read(data: Measured) -> tuple[MeasuredMotion, Array, str]:
+    """Read a motion; say of each interval whether its torque is known, and what was unwrapped."""
+    if isinstance(data, Mapping):
+        given, known = dict(data), None
+    else:
+        given, known = _take_samples(data)
+    given = {name: value for name, value in given.items() if value is not None}
+    motion = build(MeasuredMotion, given, "identify")
+    if known is None:
+        known = np.full(len(motion.t) - 1, True)
+    jumps = np.argwhere(np.abs(np.diff(motion.gamma, axis=0)) > np.pi)
+    if not len(jumps):
+        return motion, known, ""
+    row, leg = jumps[0].tolist()
+    step = float(motion.gamma[row + 1, leg] - motion.gamma[row, leg])
+    text = (
+        f"angles wrap {len(jumps)} times, gamma_{leg + 1} first by {step:+.3f} rad at row "
+        f"{row + 1}: whole turns are taken out"
+    )
+    return replace(motion, gamma=np.unwrap(motion.gamma, axis=0)), known, text
+
+
+def _cut(motion: MeasuredMotion, first: int, end: int) -> MeasuredMotion:
+    """Return the samples from the first up to the end, and the torques between them."""
+    rows = slice(first, end)
+    chosen = {
+        name: None if (array := getattr(motion, name)) is None else array[rows]
+        for name in ("t", "gamma", "gamma_dot", "mu", "beta")
+    }
+    torque = motion.torque[first : end - motion.held]
+    quaternion = motion.quaternion if first == 0 else None
+    return replace(motion, **chosen, torque=torque, quaternion=quaternion)
+
+
+def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Array | None]:
+    """Take a simulated motion, or what was measured in a recorded run while it has torques.
+
+    Also whether the torque of each interval is known. Rates of a run count only where they are
+    those of its motion: what was measured has noise, and its rates more than its angles.
+    """
+    if not isinstance(data, Trajectory) and hasattr(data, "measured"):
+        return _take_measured(data)
+    if not isinstance(data, Trajectory):
         allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
         raise refusal("identify", "data", data, allowed)
-    law, rows = motion.law, np.full(len(motion.t), True)
-    if not isinstance(data, Trajectory):
-        begins, ends = data.ticks.start_ns / 1e9, data.ticks.end_ns / 1e9
-        rows = (motion.t >= begins[0] - 1e-12) & (motion.t <= ends[-1] + 1e-12)
-        law = torques.TorqueTable(begins, data.ticks.torque)
-    t, torque = motion.t[rows], motion.torque[rows]
+    motion, law = data, data.law
+    t, torque = motion.t, motion.torque
     # With a lag the torques at the joints are behind those of the law: they are samples.
     held = not motion.scene.lags and (law is None or isinstance(law, _HELD))
     if held:  # without a law to their sample, see `Trajectory`
         torque = torque[1:] if law is None else _average(law, t)
+    begin, end = t[:-1, None], t[1:, None]
+    lost = ((begin < motion.gaps[:, 1]) & (end > motion.gaps[:, 0])).any(axis=1)
     return {
         "t": t,
-        "gamma": np.unwrap(motion.gamma[rows], axis=0),
-        "gamma_dot": motion.gamma_dot[rows],
+        "gamma": np.unwrap(motion.gamma, axis=0),
+        "gamma_dot": motion.gamma_dot,
         "torque": torque,
-        "quaternion": next(iter(motion.quaternion[rows]), None),
+        "quaternion": next(iter(motion.quaternion), None),
         "held": held,
-    }
+    }, ~lost
+
+
+def _take_measured(run: Recording) -> tuple[dict[str, Any], Array]:
+    """Take what was measured in a recorded run, while its torques are known."""
+    exact = run.motion is run.measured
+    if exact:  # samples without an orientation are none of the motion
+        motion = run.trajectory
+        t, gamma, rates, effort = motion.t, motion.gamma, motion.gamma_dot, motion.torque
+        passive, quaternions = (None, None), motion.quaternion
+    else:
+        shown = run.measured
+        t, gamma, rates, effort = shown.time_ns / 1e9, shown.gamma, None, shown.effort
+        at = np.searchsorted(run.time_ns[:-1], shown.time_ns)
+        passive, quaternions = (shown.mu, shown.beta), run.quaternion[at]
+    ticks = run.ticks
+    begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
+    rows = (t >= begins[0] - 1e-12) & (t <= ends[-1] + 1e-12)
+    t, held = t[rows], not run.scene.lags
+    torque = _average(torques.TorqueTable(begins, ticks.torque), t) if held else effort[rows]
+    # How long torques are known from the start on, up to each sample.
+    edges = np.stack([begins, ends], axis=1).ravel()
+    lengths = np.stack([ends - begins, np.zeros(len(begins))], axis=1).ravel()
+    so_far = np.append(0.0, np.cumsum(lengths))[:-1]
+    known = np.diff(np.interp(t, edges, so_far)) > np.diff(t) - 1e-9
+    quaternion = next(iter(quaternions[rows]), None)
+    if quaternion is not None and not np.isfinite(quaternion).all():
+        quaternion = None
+    mu, beta = (None if one is None else one[rows] for one in passive)
+    return {
+        "t": t,
+        "gamma": np.unwrap(gamma[rows], axis=0),
+        "gamma_dot": None if rates is None else rates[rows],
+        "torque": torque,
+        "quaternion": quaternion,
+        "mu": mu,
+        "beta": beta,
+        "held": held,
+    }, known
 
 
 def _average(law: torques.TorqueProfile, t: Array) -> Array:

@@ -147,8 +147,14 @@ def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def labels(runs: Sequence[Signals]) -> list[str]:
-    """Name each run by its folder, or by number and path where two folders have one name."""
-    names = [run.bag.path.resolve().name for run in runs]
+    """Name each run by its folder, or by number and path where two folders have one name.
+
+    Runs of one bag have the names of their namespaces.
+    """
+    if len({run.bag.path.resolve() for run in runs}) == 1:
+        names = [run.namespace for run in runs]
+    else:
+        names = [run.bag.path.resolve().name for run in runs]
     if len(set(names)) == len(names):
         return names
     return [f"{index}: {run.bag.path}" for index, run in enumerate(runs, 1)]

@@ -25,7 +25,7 @@ from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_ang
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot import workspace
 from sst_ros.recording.recording import Signals
-from sst_ros.recording.topic_tables import SCENE
+from sst_ros.recording.topic_tables import SCENE, TRUE_JOINT_STATES
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 
@@ -68,6 +68,27 @@ def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], F
 def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
     """Return a panel of one quantity of the three legs."""
     return label, leg_names(letter), lambda run: scale * run.legs(quantity)
+
+
+def joints(letters: Mapping[str, str], unit: str, scale: float = 1.0) -> Callable[..., Figure]:
+    """Return what draws quantities of the joints of the legs, by their letters.
+
+    Where the true ones are recorded, they are the lines, and dots behind them what was measured.
+    """
+
+    def draw(run: Signals, _: Scene) -> Figure:
+        seconds, recorded = run.seconds(), TRUE_JOINT_STATES.key not in run.missing
+        figure, panels = stack([f"{letter} [{unit}]" for letter in letters.values()], 2.6)
+        for axes, (name, letter) in zip(panels, letters.items(), strict=True):
+            if recorded:
+                label: str | None = "measured"
+                for column in scale * run.legs(name).T:
+                    axes.plot(seconds, column, ".", color=GREY, markersize=2, label=label)
+                    label = None
+            figures.lines(axes, seconds, scale * run.true_legs(name), leg_names(letter))
+        return figure
+
+    return draw
 
 
 def draw_legs(
@@ -168,7 +189,10 @@ def _tracking(run: Signals, _: Scene) -> Figure:
     seconds, below = run.seconds(), {"color": GREY, "linewidth": 3.2}
     above = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
     desired, measured = (DEGREES * run.legs(name) for name in ("gamma_desired", "gamma"))
-    series = ("desired", seconds, desired, below), ("measured", seconds, measured, above)
+    series = [("desired", seconds, desired, below), ("measured", seconds, measured, above)]
+    if TRUE_JOINT_STATES.key not in run.missing:
+        looks = {"color": VERMILION, "linewidth": 0.9, "linestyle": ":"}
+        series.append(("true", seconds, DEGREES * run.true_legs("gamma"), looks))
     return draw_legs("γ [deg]", series)
 
 
@@ -211,7 +235,7 @@ def tick_torques(run: Signals) -> tuple[Array, Array]:
 def energies(run: Signals, scene: Scene) -> tuple[Array, Array]:
     """Kinetic and potential energy at each sample [J], shape (n,); nan where it was lost."""
     quaternion = run.take(*QUATERNION)
-    rates = [run.legs(name) for name in ("gamma_dot", "mu_dot", "beta_dot")]
+    rates = [run.true_legs(name) for name in ("gamma_dot", "mu_dot", "beta_dot")]
     turned = body_rates(Geometry.of(scene), quaternion, *rates)
     model, state = model_of(scene), (*quaternion.T, *turned.T)
     kinetic = np.asarray(kinetic_energy(model, state))
@@ -225,7 +249,7 @@ def work(run: Signals) -> Array:
     ticks between samples are those of the cubic through angles and rates of both; where ticks are
     lost the work is nan from there on.
     """
-    time, gamma, rate = run.time_ns("samples"), run.legs("gamma"), run.legs("gamma_dot")
+    time, gamma, rate = run.time_ns("samples"), *map(run.true_legs, ("gamma", "gamma_dot"))
     start, end, torque = _ticks(run)
     known = np.isfinite(gamma).all(axis=1) & np.isfinite(rate).all(axis=1)
     if np.count_nonzero(known) < 2:
@@ -268,7 +292,8 @@ def _margins(run: Signals, scene: Scene) -> Figure:
     figure, panels = stack(["to an end of the stroke [deg]", "to a limit of β [deg]"], 2.6)
     most = {"gamma": geometry.arc, "beta": geometry.beta_max}
     for axes, (name, limit) in zip(panels, most.items(), strict=True):
-        left = np.minimum(run.legs(name), limit - run.legs(name))
+        angles = run.true_legs(name)
+        left = np.minimum(angles, limit - angles)
         figures.lines(axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)])
         axes.axhline(0.0, color="black", linewidth=0.8)
     return figure
@@ -287,7 +312,7 @@ def _sphere(run: Signals, scene: Scene) -> Figure:
 
 def _power(run: Signals) -> Array:
     """Power of each actuator at the end of each step [W]."""
-    return run.legs("tau") * run.legs("gamma_dot")
+    return run.true_legs("tau") * run.true_legs("gamma_dot")
 
 
 JOINTS, ORIENTATION, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
@@ -304,8 +329,8 @@ _POWERS = curves(
     ("power τₖ γ̇ₖ [W]", ACTUATORS, _power),
     ("all three [W]", ["sum"], lambda run: _power(run).sum(axis=1)[:, None]),
 )
-_ANGLES = curves(*(legs(f"{k} [deg]", name, k, DEGREES) for name, k in KINDS.items()))
-_RATES = curves(*(legs(f"{k}̇ [rad/s]", f"{name}_dot", f"{k}̇") for name, k in KINDS.items()))
+_ANGLES = joints(KINDS, "deg", DEGREES)
+_RATES = joints({f"{name}_dot": f"{letter}̇" for name, letter in KINDS.items()}, "rad/s")
 _WORK = curves(("work [J]", ACTUATORS, work), height=3.2)
 PICTURES = {
     "path_of_E": Picture("Path of point E", (ORIENTATION, S), _path),

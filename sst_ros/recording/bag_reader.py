@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The messages of a rosbag2 recording in one pass; every fault of it becomes an InputError.
 
-mcap reads MCAP and checks each chunk by its CRC-32; rosbags knows the types of the messages. A
-database is read as such: rosbags refuses one with an action, whose definitions rosbag2 leaves
-empty, and none is needed here. What mcap leaves to its caller is here: the checksums of the index
-(summary) and of the data section, the number of messages, and to go on behind a damaged chunk,
-which needs the place of the next one from the index, or a damaged chunk whose length is whole.
+mcap reads MCAP and checks each chunk by its CRC-32; rosbags knows the types of the
+messages. A database is read as such: rosbags refuses one with an action, whose
+definitions rosbag2 leaves empty, and none is needed here. What mcap leaves to its caller
+is here: the checksums of the index (summary) and of the data section, messages outside
+of chunks, the number of messages, and to go on behind a damaged chunk, which needs the
+place of the next one from the index, or a damaged chunk whose length is whole.
 """
 
 from __future__ import annotations
@@ -14,28 +15,45 @@ import contextlib
 import io
 import itertools
 import os
+import re
+import shutil
 import sqlite3
+import struct
 import tempfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePath
-from typing import IO, Any, TypeAlias
+from typing import IO, Any, NamedTuple, TypeAlias
 
 import yaml
 import zstandard
 from mcap import records
+from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
 from mcap.records import Chunk, ChunkIndex, McapRecord
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from rosbags.typesys import Stores, get_typestore
 
-from sst_ros.errors import InputError, Problem, refusal
+from sst_ros.errors import InputError, refusal
 
 _DATA_END_SIZE = 9 + 4  # bytes of opcode and length, and of its content
+_HEAD = struct.Struct("<BQ")  # opcode and length, with which each record of MCAP begins
 _PIECE = 1 << 20
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SQLITE_MAGIC = b"SQLite format 3\0"
+_UNFINISHED = ("-wal", "-journal")
+"""Files beside a database in which SQLite keeps what a killed process had not yet moved
+into it, or out of it."""
+_STORED = re.compile(r"(.*?)(?:_(\d+))?\.(mcap|db3)(?:\.zstd)?")
+"""Name of a file of a recording: what all of them share, its number, what it is."""
+
+SIMULATOR, NAMESPACE, CONTROLLER, EVERYBODY = (
+    "simulator", "namespace", "controller", "everybody"
+)  # fmt: skip
 
 RawMessage: TypeAlias = tuple[str, str, int, bytes]
 """Topic, type, reception by the recorder [ns], serialized content."""
@@ -43,142 +61,202 @@ RawMessage: TypeAlias = tuple[str, str, int, bytes]
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic to look for: the last word of its name, which may be `anywhere`, its message type."""
+    """A topic of a run: the last part of its name, its message type, and whose it is.
+
+    The owner is SIMULATOR for a topic of the simulator's node, NAMESPACE for one that lies
+    beside the node, CONTROLLER for one of another node there, EVERYBODY for one whose name
+    is the same for all.
+    """
 
     key: str
     type: str
-    anywhere: bool = True
+    owner: str = SIMULATOR
 
     @property
     def ending(self) -> str:
-        """End of its full name, or the whole name where it is not `anywhere`."""
+        """End of its full name, the whole name where it is everybody's."""
         return f"/{self.key}"
 
-    def matches(self, name: str) -> bool:
-        """Return whether a full name is that of this topic."""
-        return name.endswith(self.ending) if self.anywhere else name == self.ending
+    def may_be(self, name: str) -> bool:
+        """Return whether some run may have it by this full name."""
+        return name == self.ending if self.owner == EVERYBODY else name.endswith(self.ending)
+
+
+class Received(NamedTuple):
+    """A message of a topic that some run may have."""
+
+    name: str  # full name of the topic
+    topic: Topic
+    received_ns: int  # by the recorder's clock
+    content: Any
 
 
 class Bag:
     """A recording, MCAP or sqlite3, a folder or a single file; refused where there is none.
 
-    Topics that are not requested are skipped. With `damaged`, what is intact of a damaged recording
-    is read instead of refusing it. Attributes are complete when `messages` is exhausted.
+    Topics that are not requested are skipped. With `damaged`, what is intact of a damaged
+    recording is read instead of refusing it. Attributes are complete when `messages` is
+    exhausted, `topics` when they have been selected.
     """
 
     def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
         if not os.path.exists(path):  # noqa: PTH110  # Path's raises where a name is too long
             raise refusal(path, "bag", str(path), "does not exist")
+        if not (path.is_dir() or path.is_file()):
+            raise refusal(path, "bag", str(path), "must be a folder or a file")
         self.path = path
-        self.topics: dict[str, str] = {}  # full names of the topics found, by key
+        self.channels: dict[str, str] = {}  # type of each topic of the recording
+        self.candidates: dict[str, Topic] = {}  # what they may be of a run, by full name
+        self.topics: dict[str, str] = {}  # full names of the topics of the run, by key
         self.damage: tuple[str, ...] = ()  # what is damaged or lost, a line for each part
         self.unverified = 0  # chunks without a checksum
         self._requested, self._damaged = requested, damaged
-        self._channels: dict[tuple[str, str], Topic | None] = {}
+        self._unreadable: dict[str, InputError] = {}
 
-    def messages(self) -> Iterator[tuple[str, int, Any]]:
-        """Yield key of the topic, reception [ns] and content of the messages, as the file has them.
+    def messages(self) -> Iterator[Received]:
+        """Yield the messages of topics that some run may have, as the file has them.
 
-        Raises InputError where the recording is damaged, which is known at the end at the latest,
-        where it is empty, and where two topics match one that is requested.
+        Raises InputError where the recording is damaged, which is known at the end at the
+        latest, and where it is empty.
         """
-        store, empty = message_types(), True
+        store = message_types()
         for name, message_type, received_ns, data in self._stored():
-            empty = False
-            if (topic := self._topic(name, message_type)) is None:
+            topic = self._candidate(name, message_type)
+            if topic is None or name in self._unreadable:
                 continue
             try:
                 content = store.deserialize_cdr(data, message_type)
             except Exception as error:  # rosbags raises anything on bad bytes
-                raise self._not_whole(error, f" in {topic.key}") from None
-            yield topic.key, received_ns, content
-        if empty:
-            raise refusal(self.path, "messages", 0, "the recording is empty")
+                self._unreadable[name] = self._not_whole(error, f" in {name}")
+                continue
+            yield Received(name, topic, received_ns, content)
 
-    @property
-    def absent(self) -> dict[str, Problem]:
-        """Why a requested topic is missing, by its key."""
-        found = {}
-        for topic in (one for one in self._requested if one.key not in self.topics):
-            others = [f"{name} ({kind})" for name, kind in self._channels if topic.matches(name)]
-            allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
-            found[topic.key] = Problem(topic.key, ", ".join(sorted(others)) or None, allowed)
-        return found
+    def select(self, names: Mapping[str, str]) -> None:
+        """Take topics for the run, full names by their keys.
+
+        Raises InputError where a message of one of them could not be read.
+        """
+        self.topics = dict(names)
+        for name in names.values():
+            if name in self._unreadable:
+                raise self._unreadable[name]
 
     def _stored(self) -> Iterator[RawMessage]:
         """Yield the messages of all files; of a database those of requested topics alone."""
-        files, compressed = self._files()
+        files, declared = self._files()
+        counts = Counter[str]()
+        self._empty = True
         with tempfile.TemporaryDirectory() as folder:
             for path in files:
                 try:
-                    file = _decompress(path, Path(folder)) if compressed == "file" else path
-                    stored = self._read_mcap if file.suffix == ".mcap" else self._read_database
-                    for name, message_type, received_ns, data in stored(file):
-                        if compressed == "message":
-                            data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+                    file, kind = _prepare(path, Path(folder))
+                    read = self._read_mcap if kind == "mcap" else self._read_database
+                    for name, message_type, received_ns, data in read(file, Path(folder)):
+                        if data[:4] == _ZSTD_MAGIC:  # compressed message by message
+                            data = _decompress_message(data)
+                        counts[name] += 1
                         yield name, message_type, received_ns, data
                 except (OSError, zstandard.ZstdError) as error:
                     raise self._not_whole(error) from None
+        self._compare_counts(declared, counts)
+        if self._empty and not counts:
+            raise refusal(self.path, "messages", 0, "the recording is empty")
 
-    def _files(self) -> tuple[list[Path], str]:
-        """Return the files in their order, and what of them is compressed: file, message or ""."""
+    def _compare_counts(self, declared: Mapping[str, int], counts: Counter[str]) -> None:
+        """Note where the recording has other numbers of messages than it says of itself."""
+        lines = [
+            f"{name}: {counts[name]} messages of {number} that metadata.yaml counts"
+            for name, number in declared.items()
+            if name in self.candidates and counts[name] != number
+        ]
+        if lines and not self._damaged:
+            raise self._not_whole("; ".join(lines), advice=_READ_DAMAGED)
+        self.damage += tuple(lines)
+
+    def _files(self) -> tuple[list[Path], dict[str, int]]:
+        """Return the files in their order, and how many messages of each topic they hold.
+
+        Without metadata.yaml, which a killed recorder has not written, they are those that
+        are there, and nothing says how much they hold.
+        """
         if not self.path.is_dir():
-            return [self.path], ""
-        files, compressed = [], ""
+            return [self.path], {}
+        files, counts = list[Path](), dict[str, int]()
+        text = self.path / "metadata.yaml"
         try:
-            text = (self.path / "metadata.yaml").read_text(encoding="utf-8")
-            found = yaml.safe_load(text)["rosbag2_bagfile_information"]
+            found = yaml.safe_load(text.read_text(encoding="utf-8"))
+            found = found["rosbag2_bagfile_information"]
             files = [self.path / PurePath(name).name for name in found["relative_file_paths"]]
-            compressed = str(found.get("compression_mode") or "").lower()
+            for one in found.get("topics_with_message_count") or ():
+                name = str(one["topic_metadata"]["name"])
+                counts[name] = counts.get(name, 0) + int(one["message_count"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
-            if not self._damaged:
+            if not self._damaged and (text.exists() or not self._listed()):
                 raise self._not_whole(f"metadata.yaml: {error}") from None
-        if self._damaged and not (files and all(map(Path.exists, files))):
-            files = sorted(self.path.glob("*.mcap"))
-        return files, compressed
+        if not (files and all(map(Path.exists, files))) and (self._damaged or not files):
+            files = self._listed()
+        return files, counts
 
-    def _read_mcap(self, path: Path) -> Iterator[RawMessage]:
+    def _listed(self) -> list[Path]:
+        """List the files of one recording in the folder, in the order of their numbers."""
+        parts = [(match, path) for path in self.path.iterdir() if (match := _name(path))]
+        kinds = {(match[1], match[3]) for match, _ in parts}
+        if len(kinds) > 1:
+            names = ", ".join(sorted(path.name for _, path in parts))
+            allowed = "are files of several recordings, without metadata.yaml: name one file"
+            raise refusal(self.path, "bag", names, allowed)
+        return [path for _, path in sorted(parts, key=lambda one: int(one[0][2] or 0))]
+
+    def _read_mcap(self, path: Path, _: Path) -> Iterator[RawMessage]:
         file = McapFile(path)
         yield from file.messages()
         for channel in file.channels.values():
-            self._topic(*channel)
+            self._candidate(*channel)
         lines = file.describe()
         if lines and not self._damaged:
-            raise self._not_whole("; ".join(lines), advice=", --damaged reads it here")
+            raise self._not_whole("; ".join(lines), advice=_READ_DAMAGED)
         self.damage += tuple(lines)
         self.unverified += file.unverified
 
-    def _read_database(self, path: Path) -> Iterator[RawMessage]:
+    def _read_database(self, path: Path, folder: Path) -> Iterator[RawMessage]:
+        """Yield the messages of requested topics in a database, with all that SQLite sees."""
         count = 0
+        beside = [path.with_name(path.name + ending) for ending in _UNFINISHED]
+        unfinished = [one for one in beside if one.exists() and one.stat().st_size]
         try:
             # Not written to, nor is a journal made beside it.
             address = f"{path.absolute().as_uri()}?immutable=1"
+            if unfinished:  # SQLite brings a copy to its last whole state
+                own = folder / "unfinished"
+                own.mkdir(exist_ok=True)
+                for one in (path, *unfinished):
+                    shutil.copyfile(one, own / one.name)
+                address = (own / path.name).absolute().as_uri()
             with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
                 topics = database.execute("SELECT id, name, type FROM topics")
-                chosen = {key: channel for key, *channel in topics if self._topic(*channel)}
+                chosen = {key: channel for key, *channel in topics if self._candidate(*channel)}
                 rows = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
                 rows += f"({','.join('?' * len(chosen))}) ORDER BY timestamp"
                 for key, received_ns, data in database.execute(rows, [*chosen]):
                     yield *chosen[key], int(received_ns), data
                     count += 1
+                some = database.execute("SELECT EXISTS (SELECT 1 FROM messages)").fetchone()
+                self._empty = self._empty and not some[0]
         except (sqlite3.Error, ValueError, TypeError) as error:
             raise self._not_whole(error, f" after {count} messages") from None
 
-    def _topic(self, name: str, message_type: str) -> Topic | None:
-        """Return the requested topic of a channel, and note that it was found."""
-        channel = name, message_type
-        if channel not in self._channels:
-            named = (one for one in self._requested if one.matches(name))
-            topic = next((one for one in named if one.type == message_type), None)
-            self._channels[channel] = topic
-            if topic is not None and self.topics.setdefault(topic.key, name) != name:
-                names = ", ".join(sorted([self.topics[topic.key], name]))
-                allowed = f"only one topic may end in {topic.ending}; record one simulator a bag"
-                raise refusal(self.path, topic.key, names, allowed)
-        return self._channels[channel]
+    def _candidate(self, name: str, message_type: str) -> Topic | None:
+        """Return what a topic may be of a run, and note the topic."""
+        if self.channels.setdefault(name, message_type) != message_type:
+            return None  # of two types: that which comes first
+        if name not in self.candidates:
+            for topic in self._requested:
+                if topic.type == message_type and topic.may_be(name):
+                    self.candidates[name] = topic
+        return self.candidates.get(name)
 
     def _not_whole(self, reason: object, where: str = "", advice: str = "") -> InputError:
-        sqlite = self.path.suffix == ".db3" or any(self.path.glob("*.db3"))
+        sqlite = ".db3" in self.path.suffixes or any(self.path.glob("*.db3*"))
         by = "sqlite3 FILE .recover | sqlite3 NEW" if sqlite else "python -m sst_ros recover BAG"
         allowed = (
             "must be a whole rosbag2 recording, MCAP or sqlite3; "
@@ -186,6 +264,9 @@ class Bag:
             f"{by} makes a whole one of what is intact{advice}"
         )
         return refusal(self.path, "bag", self.path.name, allowed)
+
+
+_READ_DAMAGED = ", --damaged reads it here"
 
 
 @dataclass
@@ -209,6 +290,7 @@ class McapFile:
         self.unverified = 0  # chunks without a checksum
         self.count = self.lost = 0  # messages that were read, and that are known to be lost
         self._origin_ns = 0
+        self._schemas: dict[int, str] = {}
 
     def describe(self) -> list[str]:
         """Name what is damaged or lost, a line for each part; none of a whole file."""
@@ -226,31 +308,75 @@ class McapFile:
         return lines
 
     def messages(self) -> Iterator[RawMessage]:
-        """Yield all messages that are intact, in the order of the file; may raise OSError."""
-        schemas: dict[int, str] = {}
+        """Yield all messages that are intact, those outside of chunks last; may raise OSError."""
         with self.path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
             index, data_end = self._read_index(file)
             chunks = [one for one in index if isinstance(one, ChunkIndex)]
-            stored = self._read_at(file, chunks) if chunks else self._read_on(file)
-            for record in itertools.chain(index, stored):
-                if isinstance(record, records.Schema):
-                    schemas[record.id] = record.name
-                elif isinstance(record, records.Channel):
-                    self.channels[record.id] = record.topic, schemas.get(record.schema_id, "")
-                elif isinstance(record, records.Message):
-                    if channel := self.channels.get(record.channel_id):
-                        self.count += 1
-                        yield *channel, record.log_time, record.data
-                    else:
-                        reason = f"channel {record.channel_id} is not described"
-                        self.damage.append(Damage(0, reason))
+            chunks.sort(key=lambda one: one.chunk_start_offset)
+            # Only an index whose checksum is right says how many there were.
+            written = [one for one in index if isinstance(one, records.Statistics)]
+            if not chunks:
+                yield from self._take(itertools.chain(index, self._read_on(file)))
+            else:
+                outside = list(_gaps(chunks, data_end))
+                described = self._read_gaps(file, outside, _DESCRIPTIONS)
+                yield from self._take(itertools.chain(index, described))
+                yield from self._take(self._read_at(file, chunks))
             if index and not self.damage:
                 self._check_data(file, data_end)
-        # Only an index whose checksum is right says how many there were.
-        written = (one.message_count for one in index if isinstance(one, records.Statistics))
-        self.lost = max(0, next(written, 0) - self.count)
+                sound = not self.damage
+            else:
+                sound = bool(index)
+            whole = written and self.count >= written[0].message_count
+            if chunks and sound and not whole:
+                yield from self._take(self._read_gaps(file, outside, _MESSAGES))
+        if written:
+            self.lost = max(0, written[0].message_count - self.count)
+
+    def _take(self, stored: Iterator[McapRecord]) -> Iterator[RawMessage]:
+        """Yield the messages of records, and keep the descriptions that come first."""
+        for record in stored:
+            if isinstance(record, records.Schema):
+                self._schemas.setdefault(record.id, record.name)
+            elif isinstance(record, records.Channel):
+                described = record.topic, self._schemas.get(record.schema_id, "")
+                self.channels.setdefault(record.id, described)
+            elif isinstance(record, records.Message):
+                if channel := self.channels.get(record.channel_id):
+                    self.count += 1
+                    yield *channel, record.log_time, record.data
+                else:
+                    reason = f"channel {record.channel_id} is not described"
+                    self.damage.append(Damage(0, reason))
+
+    def _read_gaps(
+        self, file: IO[bytes], gaps: Sequence[tuple[int, int]], kinds: Collection[int]
+    ) -> Iterator[McapRecord]:
+        """Yield the records of some kinds that lie between chunks: most have none there."""
+        for begin, end in gaps:
+            place = begin
+            while place < end:
+                file.seek(place)
+                kind, length = _HEAD.unpack(file.read(_HEAD.size))
+                behind = place + _HEAD.size + length
+                if behind > end:
+                    found = Damage(place, "unreadable bytes between chunks")
+                    self.damage += [] if found in self.damage else [found]
+                    break
+                if kind in kinds:
+                    file.seek(place)
+                    yield from self._parse(file.read(behind - place), place)
+                place = behind
+
+    def _parse(self, content: bytes, place: int) -> Sequence[McapRecord]:
+        """Return the record that bytes are; none, and note it, if they are damaged."""
+        try:
+            return [next(_records(content))]
+        except Exception as error:  # mcap raises anything on bad bytes
+            self.damage.append(Damage(place, _one_line(error)))
+            return ()
 
     def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
         """Return the records of the index and where it begins; none where it is not intact."""
@@ -280,7 +406,7 @@ class McapFile:
 
     def _read_at(self, file: IO[bytes], chunks: Sequence[ChunkIndex]) -> Iterator[McapRecord]:
         """Yield the records in each chunk, where the index says that it begins."""
-        for one in sorted(chunks, key=lambda one: one.chunk_start_offset):
+        for one in chunks:
             begin = file.seek(one.chunk_start_offset)
             stored = _records(file.read(one.chunk_length), chunks=True)
             place = Damage(begin, "", one.message_start_time, one.message_end_time)
@@ -347,11 +473,50 @@ def message_types() -> Any:
     return get_typestore(Stores.ROS2_KILTED)
 
 
-def _decompress(path: Path, folder: Path) -> Path:
-    """Write a file that is compressed as a whole into a folder, under the name that it had."""
-    with path.open("rb") as source, (folder / path.stem).open("wb") as target:
-        zstandard.ZstdDecompressor().copy_stream(source, target)
-    return folder / path.stem
+_DESCRIPTIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
+_MESSAGES = (Opcode.MESSAGE,)
+
+
+def _gaps(chunks: Sequence[ChunkIndex], end: int) -> Iterator[tuple[int, int]]:
+    """Yield where the parts of the data section begin and end that are no chunk or its index."""
+    begin = len(MCAP0_MAGIC)
+    for one in chunks:
+        yield begin, one.chunk_start_offset
+        begin = one.chunk_start_offset + one.chunk_length + one.message_index_length
+    yield begin, end - _DATA_END_SIZE
+
+
+def _name(path: Path) -> re.Match[str] | None:
+    """Return the parts of the name of a file of a recording; None for another file."""
+    return _STORED.fullmatch(path.name)
+
+
+def _prepare(path: Path, folder: Path) -> tuple[Path, str]:
+    """Return a file, decompressed into the folder where it must be, and what it is.
+
+    Its first bytes say what it is, its name only where they say nothing.
+    """
+    if _magic(path) == _ZSTD_MAGIC:
+        target = folder / path.name.removesuffix(".zstd")
+        with path.open("rb") as source, target.open("wb") as whole:
+            zstandard.ZstdDecompressor().copy_stream(source, whole)
+        path = target
+    with path.open("rb") as file:
+        begin = file.read(len(_SQLITE_MAGIC))
+    named = _name(path)
+    is_database = begin == _SQLITE_MAGIC or (named and named[3] == "db3")
+    return path, "db3" if is_database and begin[:8] != MCAP0_MAGIC else "mcap"
+
+
+def _magic(path: Path) -> bytes:
+    """Return the first four bytes of a file."""
+    with path.open("rb") as file:
+        return file.read(len(_ZSTD_MAGIC))
+
+
+def _decompress_message(data: bytes) -> bytes:
+    """Return the content of a message that was compressed by itself."""
+    return bytes(zstandard.ZstdDecompressor().decompressobj().decompress(data))
 
 
 def _one_line(error: object) -> str:

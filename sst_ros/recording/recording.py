@@ -10,21 +10,30 @@ from __future__ import annotations
 
 import contextlib
 from array import array
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sst_ros.dynamics import kernel
+from sst_ros.dynamics.model import model_of
 from sst_ros.dynamics.motion_table import JOINTS
-from sst_ros.errors import InputError, refusal, require
+from sst_ros.errors import InputError, Problem, refusal, require
 from sst_ros.host.output import require_free, write_into, write_table
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import topic_tables as topics
-from sst_ros.recording.bag_reader import Bag
-from sst_ros.recording.topic_tables import Integers, Series, TopicTable, places
+from sst_ros.recording.bag_reader import Bag, Received
+from sst_ros.recording.topic_tables import (
+    Integers,
+    Series,
+    TopicTable,
+    find_absent,
+    places,
+    select_topics,
+)
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
@@ -37,6 +46,10 @@ if TYPE_CHECKING:
 ESSENTIAL = (topics.JOINT_STATES, topics.ORIENTATION, topics.TICKS, topics.SCENE)
 """Topics without which a recording is not that of a run."""
 OPTIONAL = (topics.EULER, topics.DIAGNOSTICS, topics.COMMANDS)
+MEASURED_APART = 1e-9
+"""Angle [rad] by which joint_states are off the orientation where they are not the motion
+itself: those of a simulator agree to rounding."""
+MEASURED_SHARE = 0.1  # of the samples that must be, as single ones are faults
 
 
 class Status(NamedTuple):
@@ -56,7 +69,10 @@ class Signals:
     start_ns: int  #: stamp of the start of the run [ns]
     topic_series: dict[str, Series]  #: rows of each topic, none if not recorded, by its key
     idle_states: int  #: number of joint states that are no samples of the run
+    foreign_states: int  #: number of joint states of other robots on the same topic
     statuses: tuple[Status, ...]  #: diagnostics, in order of reception
+    absent: dict[str, Problem]  #: why a topic of the run is missing, by its key
+    namespace: str = "/"  #: of the simulator
 
     @cached_property
     def tables(self) -> dict[str, Series]:
@@ -89,7 +105,8 @@ class Signals:
     def statuses_of(self, part: str, key: str) -> list[Status]:
         """Diagnostics of a part of the node that publishes a topic: other nodes send theirs, too.
 
-        All of that part where none has the name of the node.
+        All of that part where none has the name of the node, as in a bag that was played under
+        another name and recorded again.
         """
         name = f"{self.bag.topics.get(key, '').rpartition('/')[0]}: {part}"
         named = [one for one in self.statuses if one.name.endswith(f": {part}")]
@@ -116,6 +133,11 @@ class Signals:
         """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
         return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
 
+    def true_legs(self, name: str) -> Array:
+        """Return true angles or rates, as `legs`, or what was measured where none are recorded."""
+        recorded = len(self.topic_series[topics.TRUE_JOINT_STATES.key])
+        return self.legs(f"true_{name}" if recorded else name)
+
     def table(self, name: str = "samples") -> pd.DataFrame:
         """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
 
@@ -136,47 +158,129 @@ class Signals:
         return result
 
 
-def read_signals(path: str | Path, *, damaged: bool = False) -> Signals:
-    """Read a rosbag2 recording, MCAP or sqlite3, in one pass.
+@dataclass
+class _Heard:
+    """What came on one topic."""
 
-    With `damaged`, what is intact of a damaged recording; `Signals.bag.damage` names the rest.
-    Raises InputError where there is no recording, it is damaged, or it has nothing of a run.
-    """
-    path, tables = Path(path), {table.key: table for table in topics.TOPIC_TABLES}
-    bag = Bag(path, [*tables.values(), topics.SCENE, topics.DIAGNOSTICS], damaged=damaged)
+    table: TopicTable | None  # None for scenes and diagnostics
     # Compact: an hour at 500 Hz has 1.8 million rows.
-    stored = {key: (array("q"), array("d")) for key in tables}
-    scenes, statuses, idle = set[str](), list[Status](), 0
-    for key, received_ns, content in bag.messages():
-        if key == topics.SCENE.key:
-            scenes.add(content.data)
-        elif key == topics.DIAGNOSTICS.key:
+    times: array[int] = field(default_factory=lambda: array("q"))
+    numbers: array[float] = field(default_factory=lambda: array("d"))
+    scenes: set[str] = field(default_factory=set)
+    statuses: list[Status] = field(default_factory=list)
+    messages: int = 0
+    idle: int = 0  # messages that are no samples of a run
+    foreign: int = 0  # messages of other robots
+    fault: topics.InvalidMessage | None = None  # the first one
+
+    def take(self, message: Received) -> None:
+        """Take the numbers or the text of a message."""
+        self.messages += 1
+        content = message.content
+        if message.topic == topics.SCENE:
+            self.scenes.add(content.data)
+        elif self.table is None:
             for status in content.status:
                 texts = {pair.key: pair.value for pair in status.values}
-                statuses.append(Status(received_ns, status.name, texts))
-        else:
-            try:
-                rows = tables[key].rows(content)
-            except topics.InvalidMessage as error:
-                raise refusal(path, key, *error.args) from None
-            idle += key == topics.JOINT_STATES.key and not rows
-            times, numbers = stored[key]
-            for stamp, values in rows:
-                times.extend((stamp, received_ns))
-                numbers.extend(values)
-    found = {key: topics.sort_rows(one, *stored.pop(key), path) for key, one in tables.items()}
+                self.statuses.append(Status(message.received_ns, status.name, texts))
+        elif self.fault is None:
+            self._take_rows(self.table, message)
+
+    def _take_rows(self, table: TopicTable, message: Received) -> None:
+        try:
+            rows = table.rows(message.content)
+        except topics.InvalidMessage as error:
+            self.fault = error
+            return
+        if rows is None:
+            self.foreign += 1
+            return
+        self.idle += not rows
+        for stamp, values in rows:
+            self.times.extend((stamp, message.received_ns))
+            self.numbers.extend(values)
+
+
+def read_signals(
+    path: str | Path, *, damaged: bool = False, namespace: str | None = None
+) -> Signals:
+    """Read a run from a rosbag2 recording, MCAP or sqlite3, in one pass.
+
+    With `damaged`, what is intact of a damaged recording; `Signals.bag.damage` names the
+    rest. The `namespace` is that of the simulator, where several runs are recorded. Raises
+    InputError where there is no recording, it is damaged, it has nothing of a run, or of
+    several runs none is named.
+    """
+    path, tables = Path(path), {table.key: table for table in topics.TOPIC_TABLES}
+    requested = [*tables.values(), topics.SCENE, topics.DIAGNOSTICS]
+    bag = Bag(path, requested, damaged=damaged)
+    heard: dict[str, _Heard] = {}
+    for message in bag.messages():
+        if message.name not in heard:
+            heard[message.name] = _Heard(tables.get(message.topic.key))
+        heard[message.name].take(message)
+    own = [name for name, one in heard.items() if one.messages > one.foreign]
+    run = select_topics(bag, own, namespace)
+    bag.select(run.names)
+    of_run = {key: heard[name] for key, name in run.names.items() if name in heard}
+    for key, one in of_run.items():
+        if one.fault is not None:
+            raise refusal(path, key, *one.fault.args) from None
+        if one.foreign and key != topics.JOINT_STATES.key:  # which others publish on, too
+            raise refusal(path, key, one.foreign, "messages have none of the robot's joints")
+    nothing = _Heard(None)
+    found = {}
+    for key, table in tables.items():
+        one = of_run.get(key, nothing)
+        found[key] = topics.sort_rows(table, one.times, one.numbers, path)
     if not any(map(len, found.values())):
-        allowed = "must have at least one of " + ", ".join(one.ending for one in tables.values())
-        raise refusal(path, "topics", None, allowed)
+        endings = ", ".join(one.ending for one in tables.values())
+        listed = ", ".join(sorted(bag.channels)) or None
+        raise refusal(path, "topics", listed, f"must have at least one of {endings}")
+    scenes = of_run.get(topics.SCENE.key, nothing).scenes
     if len(scenes) > 1:
         raise refusal(path, topics.SCENE.key, len(scenes), "the recording must hold one scene")
-    stamped = [one for table in topics.STAMPED if len(one := found[table.key])]
-    starts = [int(one.stamp_ns[0]) for one in stamped]
-    start_ns = min(starts or [int(one.received_ns[0]) for one in found.values() if len(one)])
+    stamped = [found[table.key] for table in topics.STAMPED if len(found[table.key])]
+    starts = [int(series.stamp_ns[0]) for series in stamped]
+    firsts = [int(series.received_ns[0]) for series in found.values() if len(series)]
+    start_ns = min(starts or firsts)
     origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
-    scene = yaml_document.read(Scene, scenes.pop(), origin) if scenes else None
+    scene = yaml_document.read(Scene, next(iter(scenes)), origin) if scenes else None
+    told = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
+    statuses = [one for one in told if not run.is_of_another(one.name)]
     statuses.sort(key=lambda status: status.received_ns)
-    return Signals(bag, scene, start_ns, found, idle, tuple(statuses))
+    joints = of_run.get(topics.JOINT_STATES.key, nothing)
+    return Signals(
+        bag=bag,
+        scene=scene,
+        start_ns=start_ns,
+        topic_series=found,
+        idle_states=joints.idle,
+        foreign_states=joints.foreign,
+        statuses=tuple(statuses),
+        absent=find_absent(bag, requested, run),
+        namespace=run.namespace,
+    )
+
+
+class JointSamples(NamedTuple):
+    """Angles, rates and torques of the joints at n instants of a run."""
+
+    time_ns: Integers  # since the start of the run [ns], shape (n,)
+    received_ns: Integers  # by the recorder's clock [ns], shape (n,)
+    gamma: Array  # angles [rad], shape (n, 3), of the actuators
+    mu: Array  # of the carriages
+    beta: Array  # of the star
+    gamma_dot: Array  # rates [rad/s], shape (n, 3)
+    mu_dot: Array
+    beta_dot: Array
+    effort: Array  # actuator torques of the tick that ends at the sample [N m], shape (n, 3)
+
+    @classmethod
+    def of(cls, series: Series, start_ns: int) -> JointSamples:
+        """Return those of a topic, whose first one may be after the start of the run."""
+        parts = np.split(series.values, 7, axis=1)
+        return cls(series.stamp_ns - start_ns, series.received_ns, *parts)
 
 
 @dataclass(frozen=True)
@@ -211,7 +315,9 @@ class Recording(Explained):
             relative to it.
         time_ns, received_ns: instant of each sample, and when the recorder got it by its own
             clock [ns], shape (n,).
-        gamma: joint angles of the actuators [rad], shape (n, 3).
+        measured: the samples of joint_states, as the robot's sensors gave them.
+        gamma: joint angles of the actuators [rad], shape (n, 3): the true ones where they are
+            recorded (true_joint_states), else those measured; so all that follow.
         mu: joint angles of the carriages.
         beta: joint angles of the star.
         gamma_dot: joint rates of the actuators [rad/s], shape (n, 3).
@@ -222,6 +328,7 @@ class Recording(Explained):
         euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where they were lost.
         ticks: applied torques.
         idle_states: number of joint states that are no samples, which are not in the arrays.
+        foreign_states: number of joint states of other robots, which are not either.
         commands: recorded commands of both topics in order of their reception: `received_ns` and
             `stamp_ns`, that of the sample which is answered, 0 where commands have none [ns],
             shape (c,); `torque` [N m], shape (c, 3).
@@ -238,19 +345,26 @@ class Recording(Explained):
         if not isinstance(found, Signals):
             raise refusal(Path(), "found", found, "must be `Signals`, of `read_signals`")
         self.signals, self.path, self.table = found, found.bag.path, found.table
-        absent = found.bag.absent
+        absent = found.absent
         if problems := [absent[topic.key] for topic in ESSENTIAL if topic.key in absent]:
             raise InputError(str(self.path), problems)
         if found.scene is None:
             raise refusal(self.path, topics.SCENE.key, 0, "the recording must hold one scene")
         self.scene, self.idle_states = found.scene, found.idle_states
+        self.foreign_states = found.foreign_states
         self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
         runs = found.statuses_of("run", topics.SCENE.key)
         self.reports = tuple((one.received_ns, one.values) for one in runs if "phase" in one.values)
         self.diagnostics: dict[str, str] = self.reports[-1][1] if self.reports else {}
-        joints, orientation, euler, ticks = (
+        joints, truth, orientation, euler, ticks = (
             _finite_rows(found, table)
-            for table in (topics.JOINT_STATES, topics.ORIENTATION, topics.EULER, topics.TICKS)
+            for table in (
+                topics.JOINT_STATES,
+                topics.TRUE_JOINT_STATES,
+                topics.ORIENTATION,
+                topics.EULER,
+                topics.TICKS,
+            )
         )
         if len(joints) < 2:
             allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
@@ -259,11 +373,13 @@ class Recording(Explained):
             raise refusal(self.path, "joint_states", len(joints), allowed)
         if not len(ticks):
             raise refusal(self.path, "applied_torques", 0, "the run has no recorded torque")
-        self.start_ns = min(int(joints.stamp_ns[0]), int(ticks.stamp_ns[0]))
-        self.time_ns, self.received_ns = joints.stamp_ns - self.start_ns, joints.received_ns
-        self.gamma, self.mu, self.beta, *rates, self.effort = np.split(joints.values, 7, axis=1)
-        self.gamma_dot, self.mu_dot, self.beta_dot = rates
-        self.quaternion, self.euler = orientation.at(joints.stamp_ns), euler.at(joints.stamp_ns)
+        shown = truth if len(truth) >= 2 else joints
+        self.start_ns = min(int(shown.stamp_ns[0]), int(ticks.stamp_ns[0]))
+        self.measured = JointSamples.of(joints, self.start_ns)
+        self._truth = JointSamples.of(truth, self.start_ns) if shown is truth else None
+        vars(self).update((self._truth or self.measured)._asdict())
+        self.quaternion = orientation.at(shown.stamp_ns)
+        self.euler = euler.at(shown.stamp_ns)
         with np.errstate(over="ignore"):  # too long is refused just below
             length = np.sqrt(np.einsum("ij,ij->i", self.quaternion, self.quaternion))
         wrong = length[np.abs(length - 1.0) > 1e-6]  # nan compares False: lost is not wrong
@@ -284,6 +400,61 @@ class Recording(Explained):
         names = ("stamp_ns", "received_ns", "values")
         columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
         self.commands = Series(topics.COMMANDS.columns, *columns)
+
+    time_ns: Integers
+    received_ns: Integers
+    gamma: Array
+    mu: Array
+    beta: Array
+    gamma_dot: Array
+    mu_dot: Array
+    beta_dot: Array
+    effort: Array
+
+    @cached_property
+    def motion(self) -> JointSamples | None:
+        """The samples of the true motion; None where only what was measured of it is recorded.
+
+        That is where joint_states are not those of the recorded orientation: they have noise,
+        a delay or the steps of encoders. A few samples that are not are faults of the
+        simulator, and are seen as such.
+        """
+        if self._truth is not None:
+            return self._truth
+        shown = self._shown_joints
+        angles = np.abs(np.angle(np.exp(1j * (self.measured.gamma - shown[:, :3]))))
+        rates = np.hstack([self.measured.gamma_dot, self.measured.mu_dot, self.measured.beta_dot])
+        # Those of a body that turns: nine rates of three numbers.
+        size = 1.0 + np.abs(rates).max(axis=1, initial=0.0)
+        off = np.maximum(angles.max(axis=1), np.abs(rates - shown[:, 3:]).max(axis=1) / size)
+        known = np.isfinite(off)
+        apart = known.any() and np.mean(off[known] > MEASURED_APART) > MEASURED_SHARE
+        return None if apart else self.measured
+
+    @cached_property
+    def _shown_joints(self) -> Array:
+        """Angles gamma and all rates that go with orientation and body rate, shape (n, 12)."""
+        model = model_of(self.scene)
+        with np.errstate(all="ignore"):
+            found = kernel.joints(model, tuple(self.states[:, :7].T))
+        rows = *found.gamma, *found.gamma_dot, *found.mu_dot, *found.beta_dot
+        return np.stack([np.broadcast_to(row, self.time_ns.shape) for row in rows], axis=1)
+
+    @cached_property
+    def exact_gamma(self) -> Array:
+        """Angles of the actuators in the recorded orientations [rad], (n, 3); nan where lost."""
+        return self._shown_joints[:, :3]
+
+    @cached_property
+    def measured_error(self) -> Array:
+        """How far measured angles are from the true ones [rad], shape (m, 3), by leg.
+
+        The true ones are those recorded, else those of the orientation; nan where neither is.
+        """
+        truth = self.exact_gamma if self._truth is None else self._truth.gamma
+        at = places(self.time_ns, self.measured.time_ns)
+        turns = np.exp(1j * (self.measured.gamma - truth[at]))
+        return np.where((at >= 0)[:, None], np.abs(np.angle(turns)), np.nan)
 
     @property
     def period_ns(self) -> int:
@@ -335,8 +506,9 @@ class Recording(Explained):
     def trajectory(self) -> Trajectory:
         """The run as a `Trajectory`; samples whose orientation was lost are left out.
 
-        Between samples `Trajectory.at` integrates under the recorded torques. Its error estimate,
-        method and message are those that the simulator reported.
+        Between samples `Trajectory.at` integrates under the recorded torques; where samples and
+        torques are lost there is a gap. Its error estimate, method and message are those that the
+        simulator reported.
         """
         known, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
         joints = np.hstack([getattr(self, name) for name in JOINTS])
@@ -344,6 +516,10 @@ class Recording(Explained):
         with contextlib.suppress(ValueError):
             error_estimate = float(reported.get("error_estimate", "nan"))
         fault = reported.get("fault", "")
+        gaps = self._find_gaps(self.time_ns[known])
+        lost = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
+        inside = [any(begin <= one < end for begin, end in gaps) for one in lost.tolist()]
+        law = TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque) if all(inside) else None
         return Trajectory(
             self.scene,
             self.seconds[known],
@@ -355,18 +531,54 @@ class Recording(Explained):
             message=fault or reported.get("phase", "recorded"),
             method=reported.get("integrator", ""),
             error_estimate=error_estimate,
-            law=None if ticks.gaps else TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque),
+            law=law,
+            gaps=np.array(gaps) / NANOSECONDS,
         )
+
+    def _find_gaps(self, time_ns: Integers) -> list[tuple[int, int]]:
+        """Find the spans [ns] between these samples of which some torques are lost, too.
+
+        A span of one period is none: the torque of its last tick is the effort of its sample.
+        """
+        begin, end = time_ns[:-1], time_ns[1:]
+        edges = np.stack([self.ticks.start_ns, self.ticks.end_ns], axis=1).ravel()
+        length = self.ticks.end_ns - self.ticks.start_ns
+        known_ns = np.append(0, np.cumsum(np.stack([length, 0 * length], axis=1).ravel()))[:-1]
+        held = np.diff(np.interp(time_ns, edges, known_ns))
+        longer = end - begin > 1.5 * self.period_ns
+        lost = longer & (held < (end - begin) - 0.5)
+        return list(zip(begin[lost].tolist(), end[lost].tolist(), strict=True))
 
 
 def _finite_rows(found: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
     series = found.topic_series[table.key]
-    bad = ~np.isfinite(series.values[:, : 4 if table is topics.TICKS else None]).all(axis=1)
-    if bad.any():
-        stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-        raise refusal(found.bag.path, table.key, row, f"is not finite at stamp {stamp} ns")
-    return series
+    needed = series.values[:, : 4 if table is topics.TICKS else None]
+    finite = np.isfinite(needed)
+    if finite.all():
+        return series
+    absent = [
+        column.quantity
+        for column, known in zip(series.columns, finite.T, strict=False)
+        if not known.any()
+    ]
+    if absent and table in (topics.JOINT_STATES, topics.TRUE_JOINT_STATES):
+        allowed = (
+            "must have these: a whole run has angles and rates of all nine joints, and efforts "
+            "of the actuators; `export` writes what there is"
+        )
+        raise refusal(found.bag.path, table.key, f"no {_shorten(absent)}", allowed)
+    bad = ~finite.all(axis=1)
+    stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
+    raise refusal(found.bag.path, table.key, row, f"is not finite at stamp {stamp} ns")
+
+
+def _shorten(quantities: list[str]) -> str:
+    """Write quantities, as in "mu_1, mu_2, mu_3, tau_1", with all three of a kind as one."""
+    text = ", ".join(quantities)
+    for kind in dict.fromkeys(name.rpartition("_")[0] for name in quantities):
+        text = text.replace(", ".join(f"{kind}_{leg}" for leg in (1, 2, 3)), f"{kind}_1..3")
+    return text
 
 
 def _usual(lengths_ns: Integers) -> int:
@@ -375,17 +587,26 @@ def _usual(lengths_ns: Integers) -> int:
     return int(values[np.argmax(counts)])
 
 
-def read(path: str | Path, *, damaged: bool = False) -> Recording:
+def read(path: str | Path, *, damaged: bool = False, namespace: str | None = None) -> Recording:
     """Read a rosbag2 recording of a run, MCAP or sqlite3, a folder or its file.
 
-    With `damaged`, what is intact of a damaged recording; `signals.bag.damage` names the rest.
-    Raises InputError, which names the fault, where it is no recording of a run, or a damaged one.
+    Args:
+        path: of the recording.
+        damaged: read what is intact of a damaged one; `signals.bag.damage` names the rest.
+        namespace: of the simulator, as "/left", where the recording has several runs.
+
+    Raises:
+        InputError: it is no recording of a run, or a damaged one, or it has several runs and
+            none is named.
+
     """
     if not isinstance(path, (str, Path)):
         raise refusal(Path(), "path", path, "must be a path")
     if not isinstance(damaged, (bool, np.bool_)):
         raise refusal(path, "damaged", damaged, "must be True or False")
-    return Recording(read_signals(path, damaged=damaged))
+    if not (namespace is None or isinstance(namespace, str)):
+        raise refusal(path, "namespace", namespace, "must be text")
+    return Recording(read_signals(path, damaged=damaged, namespace=namespace))
 
 
 def read_run_motion(bag: str | Path) -> Trajectory:
@@ -393,17 +614,28 @@ def read_run_motion(bag: str | Path) -> Trajectory:
     motion = read(bag).trajectory
     if len(motion) < 2:
         raise refusal(Path(bag), "orientation", len(motion), "two samples or more must have one")
+    for begin, end in motion.gaps.tolist():
+        allowed = f"must be of one motion: nothing is recorded from {begin:g} to {end:g} s"
+        raise refusal(Path(bag), "orientation", len(motion), allowed)
     return motion
 
 
-def export(bag: Path, out: Path, form: str = "csv", *, force: bool = False) -> list[Path]:
+def export(
+    bag: Path,
+    out: Path,
+    form: str = "csv",
+    *,
+    force: bool = False,
+    namespace: str | None = None,
+) -> list[Path]:
     """Write each table of a recording, as csv or parquet, into a folder; return the paths.
 
-    The folder is made if it is not there; `force` replaces earlier files. Raises InputError where
+    The folder is made if it is not there; `force` replaces earlier files; the `namespace` is
+    that of `read_signals`. Raises InputError where
     the recording cannot be read, `out` cannot be written or is not empty, and MissingDependency.
     """
     require_free(out, "export", force=force)
-    run = read_signals(bag)
+    run = read_signals(bag, namespace=namespace)
     paths = [out / f"{name}.{form}" for name in run.tables]
     with write_into(out, "export"):
         for (name, series), path in zip(run.tables.items(), paths, strict=True):

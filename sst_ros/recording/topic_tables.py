@@ -2,12 +2,18 @@
 """Topics of a run, the numbers in their messages, and the tables that these become.
 
 Columns bear their units. A recording that lacks a topic lacks its columns, and nothing else.
+
+A recording may hold more than one robot, and topics of others whose names end alike:
+`/joint_state_broadcaster/joint_states`, the commands of another controller. The simulator
+publishes its scene, so that the name of this topic names its node; its other topics are
+named after the node, `joint_states` lies in the namespace of the node, and so do the
+controllers that follow a reference.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from operator import attrgetter
@@ -17,12 +23,20 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import refusal
-from sst_ros.recording.bag_reader import Topic
+from sst_ros.errors import InputError, Problem, refusal
+from sst_ros.recording.bag_reader import (
+    CONTROLLER,
+    EVERYBODY,
+    NAMESPACE,
+    SIMULATOR,
+    Bag,
+    Topic,
+)
 from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.state import Array, is_idle, nanoseconds
 
 ACTUATED = JOINTS[:3]
+KINDS = ("gamma", "mu", "beta")
 
 Integers: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = list[tuple[int, Sequence[float]]]
@@ -53,11 +67,11 @@ class Column(NamedTuple):
 class TopicTable(Topic):
     """A topic, the columns of its rows, and the function that reads the rows of a message.
 
-    The function raises InvalidMessage.
+    The function returns None for a message of another robot, and raises InvalidMessage.
     """
 
     columns: tuple[Column, ...]
-    rows: Callable[[Any], Rows]
+    rows: Callable[[Any], Rows | None]
 
 
 class InvalidMessage(ValueError):
@@ -128,19 +142,45 @@ def sort_rows(table: TopicTable, times: array[int], numbers: array[float], path:
     return Series(columns, stamps, received, values)
 
 
-def _read_joints(joints: Sequence[str], message: Any) -> Rows:
-    """Read positions, velocities and the efforts of actuators of a JointState message."""
+def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
+    """Read positions, velocities and the efforts of actuators of a JointState message.
+
+    What it does not have is nan: drivers leave out velocities, efforts and passive joints. A
+    message without any of the joints is none of this robot.
+    """
     stamp = nanoseconds(message.header.stamp)
     if is_idle(stamp, message.header.frame_id):
         return []
-    at = _places(joints, tuple(message.name))
+    names = tuple(message.name)
+    at, absent = _find_joints(joints, names)
+    if len(absent) == len(joints):
+        return None
     parts = message.position, message.velocity, message.effort
-    sizes = {len(message.name), *map(len, parts)}
-    if len(sizes) > 1:
-        allowed = "name, position, velocity and effort must be equally long"
-        raise InvalidMessage(sorted(sizes), allowed)
-    position, velocity, effort = (part[at].tolist() for part in parts)
+    sizes = {len(part) for part in parts}
+    if not sizes <= {0, len(names)}:
+        allowed = "name, position, velocity and effort must be equally long, or empty"
+        missing = f"; joints are missing: {', '.join(absent)}" if absent else ""
+        raise InvalidMessage(sorted({len(names), *sizes}), allowed + missing)
+    if not absent and 0 not in sizes:
+        position, velocity, effort = (part[at].tolist() for part in parts)
+    else:
+        position, velocity, effort = (_take_known(part, at) for part in parts)
     return [(stamp, position + velocity + effort[: len(ACTUATED)])]
+
+
+def _take_known(part: Sequence[float], at: Sequence[int]) -> list[float]:
+    """Take numbers by their places, which are negative for what is not there; then nan."""
+    return [float(part[k]) if k >= 0 and len(part) else np.nan for k in at]
+
+
+@lru_cache(maxsize=64)  # all messages of a topic have the same names
+def _find_joints(
+    requested: Sequence[str], names: Sequence[str]
+) -> tuple[list[int], tuple[str, ...]]:
+    """Find the place of each joint among the names, -1 where it is not there, and which are not."""
+    at = [names.index(name) if name in names else -1 for name in requested]
+    absent = tuple(name for name in requested if name not in names)
+    return at, absent
 
 
 def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
@@ -195,11 +235,15 @@ def _legs(name: str) -> list[str]:
 
 
 def _table(
-    key: str, message_type: str, rows: Callable[[Any], Rows], *parts: tuple[Sequence[str], str, str]
+    key: str,
+    message_type: str,
+    rows: Callable[[Any], Rows | None],
+    *parts: tuple[Sequence[str], str, str],
+    owner: str = SIMULATOR,
 ) -> TopicTable:
-    """Make the table of the topic that ends in its key; a part is columns, their unit and what."""
+    """Make the table of a topic by its key and owner; a part is columns, their unit and what."""
     columns = [Column(name, unit, what, key) for names, unit, what in parts for name in names]
-    return TopicTable(key, message_type, columns=tuple(columns), rows=rows)
+    return TopicTable(key, message_type, owner, columns=tuple(columns), rows=rows)
 
 
 _JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -210,9 +254,18 @@ JOINT_STATES = _table(
     "joint_states",
     _JOINT_STATE,
     partial(_read_joints, JOINTS),
-    *((_legs(kind), "rad", f"joint angle {kind}") for kind in ("gamma", "mu", "beta")),
-    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in ("gamma", "mu", "beta")),
+    *((_legs(kind), "rad", f"joint angle {kind}") for kind in KINDS),
+    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in KINDS),
     (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
+    owner=NAMESPACE,
+)
+TRUE_JOINT_STATES = _table(
+    "true_joint_states",
+    _JOINT_STATE,
+    partial(_read_joints, JOINTS),
+    *((_legs(f"true_{kind}"), "rad", f"true joint angle {kind}") for kind in KINDS),
+    *((_legs(f"true_{kind}_dot"), "rad/s", f"true rate of {kind}") for kind in KINDS),
+    (_legs("true_tau"), "N m", "torque of the actuator over the step that ends here"),
 )
 ORIENTATION = _table(
     "orientation",
@@ -233,6 +286,7 @@ REFERENCE = _table(
     (_legs("gamma_desired"), "rad", "desired angle of the actuator"),
     (_legs("gamma_dot_desired"), "rad/s", "desired rate of the actuator"),
     (_legs("tau_feedforward"), "N m", "torque of the model for the desired motion"),
+    owner=CONTROLLER,
 )
 TRACKING_ERROR = _table(
     "tracking_error",
@@ -241,6 +295,7 @@ TRACKING_ERROR = _table(
     (_legs("gamma_error"), "rad", "desired less measured angle"),
     (_legs("gamma_dot_error"), "rad/s", "desired less measured rate"),
     (_legs("tau_feedback"), "N m", "torque of the feedback"),
+    owner=CONTROLLER,
 )
 TICKS = _table(
     "applied_torques",
@@ -266,10 +321,10 @@ MOMENT = _table(
 )
 
 SCENE = Topic("scene", "std_msgs/msg/String")
-DIAGNOSTICS = Topic("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", anywhere=False)
+DIAGNOSTICS = Topic("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", EVERYBODY)
 
 TABLES: dict[str, tuple[TopicTable, ...]] = {
-    "samples": (JOINT_STATES, ORIENTATION, EULER, REFERENCE, TRACKING_ERROR),
+    "samples": (JOINT_STATES, TRUE_JOINT_STATES, ORIENTATION, EULER, REFERENCE, TRACKING_ERROR),
     "ticks": (TICKS,),
     "commands": (COMMANDS,),
     "commands_stamped": (STAMPED_COMMANDS,),
@@ -286,3 +341,125 @@ TIMES = (
     Column("received", "ns", "when the recorder got it, by its clock; 0 where it did not"),
 )
 """The first columns of every table, whole numbers; all others are doubles."""
+
+PUBLISHED = {one.key for one in (SCENE, ORIENTATION, EULER, TICKS, TRUE_JOINT_STATES)}
+"""Topics that a simulator publishes under its own name; others publish its commands."""
+
+
+class RunTopics(NamedTuple):
+    """The topics of one run."""
+
+    namespace: str  # of the simulator, "/" for the root
+    node: str | None  # full name of the simulator's node; None where no topic shows it
+    names: dict[str, str]  # full name of each topic by its key
+    others: frozenset[str] = frozenset()  # namespaces of other runs in the recording
+
+    def is_of_another(self, name: str) -> bool:
+        """Return whether a topic, or a status by the name of its node, is of another run."""
+        return _parent(name.partition(":")[0]) in self.others
+
+
+def select_topics(bag: Bag, heard: Collection[str], namespace: str | None = None) -> RunTopics:
+    """Return the topics of the run in a namespace, by default of the only one.
+
+    `heard` are the topics that have messages of this robot. Raises InputError where there is
+    no run in the namespace, or none is given and there are several, or where two nodes
+    publish what only one can.
+    """
+    nodes = _find_simulators(bag.candidates)
+    spaces = {_parent(node) for node in nodes} or _find_namespaces(bag.candidates)
+    chosen = _choose_namespace(bag, spaces, namespace)
+    here = sorted(node for node in nodes if _parent(node) == chosen)
+    if len(here) > 1:
+        allowed = "are of several simulators in one namespace; record one simulator a bag"
+        raise refusal(bag.path, SCENE.key, ", ".join(here), allowed)
+    node = here[0] if here else None
+    names = dict[str, str]()
+    for name, topic in bag.candidates.items():
+        own = {
+            EVERYBODY: True,
+            SIMULATOR: _parent(name) == node,
+            NAMESPACE: name == chosen.rstrip("/") + topic.ending,
+            CONTROLLER: False,
+        }
+        if own[topic.owner]:
+            names[topic.key] = name
+    alone = len(spaces) == 1
+    names |= _find_controllers(bag, heard, chosen, alone)
+    return RunTopics(chosen, node, names, frozenset({*spaces} - {chosen}))
+
+
+def find_absent(bag: Bag, requested: Collection[Topic], run: RunTopics) -> dict[str, Problem]:
+    """Return why a requested topic of a run is missing, by its key."""
+    found = {}
+    for topic in (one for one in requested if one.key not in run.names):
+        others = sorted(name for name in bag.channels if topic.may_be(name))
+        typed = [f"{name} ({bag.channels[name]})" for name in others]
+        allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
+        if any(name in bag.candidates for name in others):
+            typed, where = others, run.node if topic.owner == SIMULATOR else run.namespace
+            allowed = f"no such topic is of {where}, whose scene is recorded; record it"
+        found[topic.key] = Problem(topic.key, ", ".join(typed) or None, allowed)
+    return found
+
+
+def _choose_namespace(bag: Bag, spaces: Collection[str], namespace: str | None) -> str:
+    """Return the namespace that is asked for, or the only one; InputError names all."""
+    listed = ", ".join(sorted(spaces))
+    if namespace is not None:
+        asked = "/" + namespace.strip("/")
+        if asked not in spaces:
+            allowed = f"must be one in which a run is recorded: {listed or 'there is none'}"
+            raise refusal(bag.path, "namespace", namespace, allowed)
+        return asked
+    if len(spaces) > 1:
+        allowed = f"must be one of {listed}: the recording has a run in each (--namespace)"
+        raise refusal(bag.path, "namespace", None, allowed)
+    return next(iter(spaces), "/")
+
+
+def _find_simulators(candidates: Mapping[str, Topic]) -> list[str]:
+    """Full names of the nodes that publish a scene; without one, those with other topics."""
+    topics: dict[str, set[str]] = {}
+    for name, topic in candidates.items():
+        if topic.owner == SIMULATOR:
+            topics.setdefault(_parent(name), set()).add(topic.key)
+    publishing = {node: keys & PUBLISHED for node, keys in topics.items() if keys & PUBLISHED}
+    with_scene = {node: keys for node, keys in publishing.items() if SCENE.key in keys}
+    # Another node may publish a text of the name `scene`, but nothing else of a simulator.
+    sure = [node for node, keys in with_scene.items() if len(keys) > 1]
+    return sure or [*with_scene] or [*publishing] or [*topics]
+
+
+def _find_namespaces(candidates: Mapping[str, Topic]) -> set[str]:
+    """Namespaces of runs of which no topic of the simulator's node is recorded."""
+    beside = {_parent(n) for n, topic in candidates.items() if topic.owner == NAMESPACE}
+    below = {_parent(_parent(n)) for n, topic in candidates.items() if topic.owner == CONTROLLER}
+    return beside or below
+
+
+def _find_controllers(
+    bag: Bag, heard: Collection[str], namespace: str, alone: bool
+) -> dict[str, str]:
+    """Topics of the controller of a run by their keys: of the node that publishes most of them.
+
+    It is a node in the namespace; where the recording has one run `alone`, of any.
+    """
+    nodes: dict[str, dict[str, str]] = {}
+    for name, topic in bag.candidates.items():
+        if topic.owner == CONTROLLER and name in heard:
+            nodes.setdefault(_parent(name), {})[topic.key] = name
+    near = {node: found for node, found in nodes.items() if _parent(node) == namespace}
+    chosen = near or (nodes if alone else {})
+    most = max(map(len, chosen.values()), default=0)
+    best = {node: found for node, found in chosen.items() if len(found) == most}
+    if len(best) > 1:
+        allowed = "are of several controllers of this robot; record one controller a bag"
+        problem = Problem("reference", ", ".join(sorted(best)), allowed)
+        raise InputError(str(bag.path), [problem])
+    return next(iter(best.values()), {})
+
+
+def _parent(name: str) -> str:
+    """Return the name of the node of a topic, or the namespace of a node."""
+    return name.rpartition("/")[0] or "/"

@@ -7,6 +7,10 @@ which the scene names, and again at a sample where torques are lost. Long runs a
 
 Actuators that lag are part of the state, and torques are held to the scene's limit. A moment from a
 topic must be recorded; without it there is nothing to compare with.
+
+What is compared is the true motion. Where only measured joint states are recorded, which have noise
+or a delay, the angles are those of the recorded orientation; rates and energies are not known, and
+the reference begins at the start of the run alone.
 """
 
 from __future__ import annotations
@@ -19,11 +23,12 @@ import numpy as np
 import pandas as pd
 
 from sst_ros.dynamics import kernel
+from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.host.output import Bar
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.point import Point
 from sst_ros.integration.stepper import CannotStep, EvaluationBudget, Stepper
-from sst_ros.mechanism.geometry import Array, angle_between
+from sst_ros.mechanism.geometry import Array, Geometry, angle_between
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.scene.scene import Scene
@@ -94,8 +99,24 @@ def begins(recording: Recording) -> bool:
     if recording.diagnostics.get("samples_published") == str(len(recording.time_ns)):
         return True
     start = recording.scene.initial
-    off = np.abs(recording.gamma[0] - start.gamma), np.abs(recording.gamma_dot[0] - start.gamma_dot)
-    return bool(np.max(off) < SAME_START)
+    _, gamma, gamma_dot = _true_samples(recording)
+    off = np.abs(gamma[0] - start.gamma), np.abs(gamma_dot[0] - start.gamma_dot)
+    return bool(np.nanmax(off, initial=0.0) < SAME_START)
+
+
+def _true_samples(run: Recording) -> tuple[Array, Array, Array]:
+    """Quaternions, gamma [rad] and gamma_dot [rad/s] of the true motion; nan if unknown."""
+    if run.motion is not None:
+        return run.quaternion, run.gamma, run.gamma_dot
+    return run.quaternion, run.exact_gamma, np.full_like(run.gamma_dot, np.nan)
+
+
+def _first_state(run: Recording) -> Array:
+    """State of the first sample; of the scene where the rates of the sample are not known."""
+    if run.motion is not None:
+        return np.asarray(run.states[0])
+    start = np.array(initial_state(run.scene, Geometry.of(run.scene)))[:7]
+    return np.append(start, run.effort[0] if run.scene.lags else [])
 
 
 QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
@@ -157,12 +178,12 @@ def _compare(run: Recording, torque: SineTorque | None, held: Held, *, known: bo
     again at a sample after each, and after a tick that no step resolves.
     """
     time = run.time_ns
-    samples = run.quaternion, run.gamma, run.gamma_dot
+    samples, exact = _true_samples(run), run.motion is not None
     distances, energy = np.full((2, len(time), 3), np.nan), np.full(len(time), np.nan)
     start_ns, end_ns, drives = held
     motion, count = TickStepper(run.scene, torque), len(start_ns)
     model = motion.dynamics.model
-    state = run.states[0]
+    state = _first_state(run)
     known = known and bool(count and np.isfinite(state[0]))
     if known:  # by what the first sample is off, the simulator was
         start = run.scene.initial
@@ -171,14 +192,15 @@ def _compare(run: Recording, torque: SineTorque | None, held: Held, *, known: bo
         distances[0, :1] = _measure([values[:1] for values in samples], asked)
     # Ticks at which it can begin again: no sample is on the motion under continuous torques.
     sample = places(time, start_ns)
-    usable = np.flatnonzero((sample >= 0) & np.isfinite(samples[0][sample, 0]) & (torque is None))
+    restarts = torque is None and exact
+    usable = np.flatnonzero((sample >= 0) & np.isfinite(samples[0][sample, 0]) & restarts)
     known = known and start_ns[0] == 0
     lost = np.append(not known, start_ns[1:] != end_ns[:-1])[:count]  # before each tick
     stops = np.append(np.flatnonzero(lost), count)
     begun, bar = list[int](), Bar("reference", count > CHUNK)
     k, failed, residual, done = 0, 0, 0.0, 0.0
     if known:
-        energy[0], done = 0.0, _energy(model, state[None])[0]
+        energy[0], done = 0.0 if exact else np.nan, _energy(model, state[None])[0]
     while k < count and failed < UNRESOLVED:
         if not known:
             after = usable[np.searchsorted(usable, k) :]
@@ -196,7 +218,8 @@ def _compare(run: Recording, torque: SineTorque | None, held: Held, *, known: bo
         first, second = (_joints(model, states) for states in (found[:, 0], found[:, 1]))
         distances[0, rows] = _measure([values[rows] for values in samples], first)
         distances[1, rows] = _measure(second, first)
-        energy[rows] = _energy(model, run.states[rows]) - done - found[:, 0, -1]
+        if exact:
+            energy[rows] = _energy(model, run.states[rows]) - done - found[:, 0, -1]
         residual = next((x for x in energy[rows][::-1].tolist() if np.isfinite(x)), residual)
         k += len(reached)
         known = k == end and k not in stops

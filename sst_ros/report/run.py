@@ -101,14 +101,16 @@ def evaluate_run(run: Recording) -> RunEvaluation:
     return RunEvaluation(measured, integration, ideal, summary)
 
 
-def write_run_report(bag: Path, out: Path, *, damaged: bool = False) -> dict[str, Any]:
+def write_run_report(
+    bag: Path, out: Path, *, damaged: bool = False, namespace: str | None = None
+) -> dict[str, Any]:
     """Evaluate a recorded run; write summary.json, the page and the pictures into `out`.
 
-    Of a `damaged` recording what is intact is evaluated. The summary is returned; `summary_text`
-    makes a short text of it, `summary_table` the whole. Raises InputError where the bag is no whole
-    recording of a run, or `out` cannot be written.
+    Of a `damaged` recording what is intact is evaluated; the `namespace` is that of `read_bag`. The
+    summary is returned; `summary_text` makes a short text of it, `summary_table` the whole. Raises
+    InputError where the bag is no whole recording of a run, or `out` cannot be written.
     """
-    run = recording.read(bag, damaged=damaged)
+    run = recording.read(bag, damaged=damaged, namespace=namespace)
     with write_into(out, "report"):
         found = evaluate_run(run)
         drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
@@ -136,6 +138,8 @@ def summarise(run: Recording, integration: Comparison, ideal: Comparison | None)
     """Collect the figures of what was computed anew: errors, energy, tracking, efforts."""
     tracked = tracking.of(run)
     found, off = tracked and tracked.metrics, largest(run.effort_difference)
+    measured = run.motion is not run.measured
+    apart = run.measured_error if measured else np.full((1, 3), np.nan)
     compared = {
         "integration_error": integration.error,
         "integration_reference_error": integration.own,
@@ -147,6 +151,11 @@ def summarise(run: Recording, integration: Comparison, ideal: Comparison | None)
         "tracking_error_rms_rad": found and found.rms.tolist(),
         "tracking_error_max_rad": found and found.largest.tolist(),
         "settling_time_s": found and found.settling,
+        "motion_of": "joint_states" if not measured else run.motion and "true_joint_states",
+        "measurement_error_max_rad": largest(apart),
+        "measurement_error_rms_rad": largest(np.sqrt(np.nanmean(apart**2, axis=0)))
+        if np.isfinite(apart).any()
+        else None,
         **{
             f"{name}_{key}_{unit}": largest(table[key])
             for name, table in compared.items()
@@ -191,6 +200,8 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "stamp_gaps": int(np.count_nonzero(spacing > period)),
         "samples_missing_between_stamps": between,
         "idle_states": run.idle_states,
+        "foreign_states": run.foreign_states,
+        "samples_measured": len(run.measured.time_ns),
         "tick_period_s": run.ticks.period_ns / NANOSECONDS,
         "ticks_recorded": len(run.ticks.start_ns),
         "tick_gaps": run.ticks.gaps,
@@ -294,10 +305,11 @@ def _measure_answers(recording: Recording, paired: DataFrame) -> dict[str, float
     commands, start_ns = recording.commands, recording.ticks.start_ns
     share = age = None
     if len(paired) > 1:  # a torque that is commanded once and for all answers no samples
+        seen = recording.measured  # what a controller receives
         if commands.stamp_ns.any():
-            answered = np.isin(recording.time_ns + recording.start_ns, commands.stamp_ns)
+            answered = np.isin(seen.time_ns + recording.start_ns, commands.stamp_ns)
         else:
-            counts = np.searchsorted(commands.received_ns, recording.received_ns, side="left")
+            counts = np.searchsorted(commands.received_ns, seen.received_ns, side="left")
             answered = np.append(np.diff(counts), 0) > 0
         # The last sample is the end of the run, which nothing answers.
         share = 100.0 * float(np.mean(answered[:-1]))

@@ -56,7 +56,8 @@ class TrackedRun:
         if np.isfinite(measured[0]).all():
             with suppress(SingularConfiguration):
                 first = rotation_matrix(measured[0])
-                start = continuation.advance(geometry, first, run.gamma[self.rows[0]], gamma[0])
+                begin = run.exact_gamma[self.rows[0]]
+                start = continuation.advance(geometry, first, begin, gamma[0])
                 expected, _ = continuation.follow(geometry, gamma, start)
                 return angle_between(quaternion_of(expected), measured)
         return np.full(len(gamma), np.nan)
@@ -68,7 +69,7 @@ def read_tracking(path: Path) -> TrackedRun:
     Raises InputError where it is no recording of a run that followed a reference, or a damaged one.
     """
     run = recording.read(path)
-    missing = run.signals.bag.absent
+    missing = run.signals.absent
     if absent := [missing[key] for key in KEYS if key in missing]:
         raise InputError(str(path), absent)
     found = of(run)

@@ -30,7 +30,7 @@ else:
         return lambda cls: cls
 
 
-_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 """A decimal number of YAML 1.2 and JSON: no 3_5, 0x10 or 1:30, of which YAML 1.1 makes others."""
 
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -339,7 +339,7 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
         if spec.nonzero and not any(x * x for x in found):
             raise ValueError
         return found
-    text = isinstance(value, str) and not _NUMBER.fullmatch(value)
+    text = isinstance(value, str) and not NUMBER.fullmatch(value)
     if text or isinstance(value, (bool, np.complexfloating)):
         raise ValueError
     result = float(value)

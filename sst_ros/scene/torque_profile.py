@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.errors import InputError, Problem, check_kinds, refusal, refuse_errors, refuse_unless
-from sst_ros.scene.schema import Section, entry
+from sst_ros.scene.schema import NUMBER, Section, entry
 from sst_ros.state import ZERO, Array, State, Vector3, finite_vector
 
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
@@ -208,6 +208,21 @@ def count_arguments(function: Callable[..., Any]) -> int:
     raise refusal("simulate", "torque", function, allowed)
 
 
+_COLUMNS = ("time", "tau_1", "tau_2", "tau_3")
+
+
+def _read_numbers(row: Sequence[str], places: Sequence[int]) -> list[float] | None:
+    """Return the numbers in some places of a row of text; None where one is no finite number.
+
+    Numbers are written as in scenes: Python would also take 1_0, nan and other digits.
+    """
+    texts = [row[place].strip() for place in places]
+    if not all(map(NUMBER.fullmatch, texts)):
+        return None
+    numbers = [float(text) for text in texts]
+    return numbers if all(map(math.isfinite, numbers)) else None
+
+
 class TorqueTable(TorqueProfile):
     """Held torques [N m], shape (n, 3): each row acts from its time until the next.
 
@@ -232,35 +247,39 @@ class TorqueTable(TorqueProfile):
     @classmethod
     @check_kinds
     def read(cls, path: str | Path) -> TorqueTable:
-        """Read a CSV file with the header time, tau_1, tau_2, tau_3 [s, N m].
+        """Read a CSV file with columns time, tau_1, tau_2 and tau_3 [s, N m], in any order.
 
-        InputError says why the file cannot be read, or lists every bad row with its line.
+        Columns of other names are skipped. InputError says why the file cannot be read, or
+        lists every bad row with its line.
         """
-        origin, header = str(path), ["time", "tau_1", "tau_2", "tau_3"]
+        origin = str(path)
         unread = OSError, UnicodeDecodeError, csv.Error
         with (
             refuse_errors(origin, "csv", origin, "must be readable", *unread),
-            Path(path).open(newline="", encoding="utf-8") as file,
+            # Spreadsheets begin a file with a byte order mark.
+            Path(path).open(newline="", encoding="utf-8-sig") as file,
         ):
             reader = csv.reader(file)
             names = [name.strip() for name in next(reader, [])]
             lines = [(reader.line_num, row) for row in reader]
+        while lines and not any(map(str.strip, lines[-1][1])):
+            lines.pop()
+        if any(names.count(column) != 1 for column in _COLUMNS):
+            allowed = "must be " + ", ".join(_COLUMNS)
+            raise InputError(origin, [Problem("header", names or None, allowed, 1)])
         problems = [] if lines else [Problem("rows", 0, "must be one or more")]
-        if names != header:
-            problems = [Problem("header", names or None, "must be " + ", ".join(header), 1)]
+        places = [names.index(column) for column in _COLUMNS]
         last, rows = -math.inf, []
         for line, row in lines:
-            numbers: list[float] = []
-            with contextlib.suppress(ValueError):
-                numbers = [float(text) for text in row]
-            begin, torque = finite_vector(numbers[:3]), finite_vector(numbers[1:])
-            if begin is None or torque is None:
+            numbers = _read_numbers(row, places) if len(row) == len(names) else None
+            if numbers is None:
                 problems.append(Problem("row", row, "must be four finite numbers", line))
-            elif begin[0] <= last:
-                problems.append(Problem("time", begin[0], f"must be > {last:g} s, the last", line))
+            elif numbers[0] <= last:
+                allowed = f"must be > {last:g} s, the last"
+                problems.append(Problem("time", numbers[0], allowed, line))
             else:
-                last = begin[0]
-                rows.append((last, *torque))
+                last = numbers[0]
+                rows.append(numbers)
         if problems:
             raise InputError(origin, problems)
         table = np.array(rows)

@@ -98,6 +98,8 @@ class Trajectory(MotionTable):
             each is held over the interval that ends at its sample.
         dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses instead.
         parameters: numbers of the scene, its start or its torques that `sensitivities` are by.
+        gaps: spans of time [s] of which nothing is known, begin and end, shape (g, 2); `at` refuses
+            times inside of them.
 
     Raises:
         InputError: shapes do not fit, or times do not ascend.
@@ -123,8 +125,11 @@ class Trajectory(MotionTable):
         law: Any = None,
         dense: Callable[[Array], Array] | None = None,
         parameters: Sequence[str] = (),
+        gaps: ArrayLike = (),
     ) -> None:
         self.scene, self.t = scene, _own(t)
+        self.gaps = _own(np.empty((0, 2)) if np.size(gaps) == 0 else gaps)
+        spans = self.gaps.ndim == 2 and self.gaps.shape[1] == 2 and ascend(self.gaps.ravel())
         given: dict[str, Any] = {"quaternion": quaternion, "body_rate": body_rate, "torque": torque}
         given |= {} if joints is None else {"_joints": joints}
         if dense is None or any(array is not None for array in given.values()):
@@ -136,6 +141,7 @@ class Trajectory(MotionTable):
             "trajectory",
             ("scene", scene, isinstance(scene, Scene), "must be a Scene"),
             ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
+            ("gaps", gaps, spans, "must be rising pairs of times [s], shape (g, 2)"),
             *((name.strip("_"), x, x == y, f"must have the shape {y}") for name, x, y in shaped),
         )
         self.status, self.message, self.method = status, message, method
@@ -249,8 +255,8 @@ class Trajectory(MotionTable):
             t: one time or times [s], shape (m,), within the trajectory.
 
         Raises:
-            InputError: a time lies outside; or between samples that were loaded from a file, of a
-                run under a function.
+            InputError: a time lies outside, or in a gap; or between samples that were loaded from a
+                file, of a run under a function.
 
         """
         times = np.atleast_1d(np.asarray(t, dtype=float))
@@ -261,6 +267,10 @@ class Trajectory(MotionTable):
         known = not isinstance(self.law, LostTorque) or bool(np.all(np.isin(times, self.t)))
         allowed = "must be times of samples: the function of the torques is not in the file"
         refuse_unless("at", ("t", t, known, allowed))
+        for begin, end in self.gaps.tolist():
+            outside = not np.any((times > begin) & (times < end))
+            allowed = f"nothing is known of the motion from {begin:g} to {end:g} s"
+            refuse_unless("at", ("t", t, outside, allowed))
         y = _propagate(self, times)
         return self._sampled(times, y[:, :4], y[:, 4:7], y[:, 7:])
 
@@ -277,7 +287,7 @@ class Trajectory(MotionTable):
             status=self.status, message=self.message, method=self.method,
             error_estimate=self.error_estimate, energy_residual=lambda: self.energy_residual,
             evaluations=self.evaluations, step=self.step, law=self.law, dense=self.dense,
-            parameters=self._parameters,
+            parameters=self._parameters, gaps=self.gaps,
         )  # fmt: skip
 
     @check_kinds
@@ -305,6 +315,7 @@ class Trajectory(MotionTable):
             "format": _FORMAT,
             "scene": dump(self.scene),
             "torque": self.law and record_of(self.law),
+            "gaps": self.gaps.tolist(),
         }
         units = {name: {"unit": unit} for name, unit in UNITS.items()}
         with refuse_errors("save", "path", str(path), "must be writable", OSError):
@@ -339,6 +350,7 @@ class Trajectory(MotionTable):
             *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
             joints=np.hstack([arrays[name] for name in JOINTS]),
             law=about["torque"] and profile_from(about["torque"]),
+            gaps=about.get("gaps", ()),
             **{name: about[name] for name in _FIGURES if name in about},
         )
 

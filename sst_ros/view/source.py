@@ -74,13 +74,14 @@ class RunControl(Protocol):
 class Replay:
     """Plays a bag of `length` [s]; has `scene`, `states` and `status` as a run.
 
-    It is used from two threads of the page. Raises InputError where the bag is no whole recording.
+    The namespace is that of `read_bag`. It is used from two threads of the page. Raises InputError
+    where the bag is no whole recording.
     """
 
-    def __init__(self, bag: Path) -> None:
+    def __init__(self, bag: Path, namespace: str | None = None) -> None:
         from sst_ros.recording.recording import read  # needs rosbags, which a live view does not
 
-        self._run = read(bag)
+        self._run = read(bag, namespace=namespace)
         self.scene, self._seconds = self._run.scene, self._run.seconds
         self.length = float(self._seconds[-1])
         self._lock = threading.Lock()

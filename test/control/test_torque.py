@@ -47,6 +47,33 @@ def test_spaces_and_windows_line_ends_are_taken(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeff" + HEADER + "0,1,2,3\n",  # as spreadsheets write it
+        HEADER + "0,1,2,3\n\n",
+        HEADER + "0,1,2,3\r\n,,,\r\n \r\n",
+        "tau_3,note,time,tau_1,tau_2\n3,first,0,1,2\n",
+        "tau_2,time,tau_1,tau_3\n2.,+0,1e0,.3e1",
+    ],
+)
+def test_a_table_as_other_programs_write_it(tmp_path, text):
+    profile = TorqueTable.read(written(tmp_path, text))
+    assert profile(0.0) == (1.0, 2.0, 3.0) and profile.times.tolist() == [0.0]
+
+
+@pytest.mark.parametrize("number", ["1_0", "\u0661", "\uff11", "0x1", "1e", "infinity", "1e400"])
+def test_numbers_are_those_of_scenes(tmp_path, number):
+    with pytest.raises(InputError, match=r"line 2: row = .*must be four finite numbers"):
+        TorqueTable.read(written(tmp_path, HEADER + f"0,1,{number},3\n"))
+
+
+@pytest.mark.parametrize("header", ["time,tau_1,tau_2", "time,tau_1,tau_1,tau_2,tau_3"])
+def test_each_column_is_there_once(tmp_path, header):
+    with pytest.raises(InputError, match=r"line 1: header = .*: must be time, tau_1"):
+        TorqueTable.read(written(tmp_path, header + "\n0,1,2,3,4\n"))
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", r"line 1: header = None: must be time, tau_1, tau_2, tau_3"),

@@ -114,9 +114,9 @@ def test_the_filter_has_no_phase_and_leaves_the_motion():
 
 def test_angles_to_be_filtered_must_be_evenly_spaced_and_long_enough():
     case = measured()
-    uneven = case.recording(0) | {"t": case.t + 4e-4 * np.sin(np.arange(len(case.t)))}
+    t = case.t + 4e-4 * np.sin(np.arange(len(case.t)))
     with pytest.raises(InputError, match="must be evenly spaced"):
-        identify(uneven, case.model)
+        filter_angles(t, case.gamma, 20.0)
     short = {name: rows[:60] for name, rows in case.recording(0).items()}
     with pytest.raises(InputError, match="must last"):
         identify(short, case.model, cutoff=20.0)

@@ -67,14 +67,6 @@ def test_a_missing_essential_topic_is_named(read, bags, example2, topic):
         read(bags.without(example2, *gone))
 
 
-def test_two_matching_topics_are_refused(read, bags, example2, monkeypatch):
-    monkeypatch.setitem(bags.KINDS, "/other/joint_states", bags.KINDS[bags.JOINTS])
-    extra = [e for e in example2 if e.topic == bags.JOINTS][:5]
-    extra = [dataclasses.replace(entry, topic="/other/joint_states") for entry in extra]
-    with pytest.raises(InputError, match=r"/joint_states, /other/joint_states.*only one topic"):
-        read([*example2, *extra])
-
-
 def test_what_is_no_bag_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"nowhere.*does not exist"):
         recording.read(tmp_path / "nowhere")
