@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from programs import python
+from programs import HIDDEN, python
 
 from sst_ros.__main__ import main
 from sst_ros.cli import commands
@@ -17,15 +17,7 @@ from sst_ros.errors import EXTRAS
 from sst_ros.simulation.simulation import INTEGRATORS
 from sst_ros.simulation.trajectory import Trajectory
 
-BLOCKED = """
-import sys
-
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {names!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
-
-sys.meta_path.insert(0, Blocker())
+BLOCKED = f"""{HIDDEN}
 from sst_ros.__main__ import main
 
 def status(words):
@@ -34,7 +26,7 @@ def status(words):
     except SystemExit as end:
         return end.code
 
-sys.exit(max(map(status, {commands!r})))
+sys.exit(max(map(status, {{commands!r}})))
 """
 OPTIONAL = (
     "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "numba",

@@ -46,6 +46,19 @@ ROS_KEYS = {
 """Packages that are released in both jazzy/ and kilted/distribution.yaml of the same commit."""
 
 
+BRINGS = {
+    "distributed": "dask[distributed]",
+    "flint": "python-flint>=",
+    "llvmlite": "numba",
+    "lz4": "rosbags",
+    "pinocchio": "pin>=",
+    "trimesh": "viser",
+    "websockets": "viser",
+    "zstandard": "rosbags",
+}
+"""Package that brings a module of another name."""
+
+
 def test_the_version_is_the_same_everywhere():
     package = re.search("<version>(.*)</version>", (ROOT / "package.xml").read_text())
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
@@ -56,14 +69,8 @@ def test_every_extra_that_a_message_names_brings_the_module():
     setup = (ROOT / "setup.py").read_text()
     for module, extra in EXTRAS.items():
         assert f'"{extra}"' in setup
-        if module not in ("lz4", "zstandard"):  # brought by rosbags
-            names = {
-                "flint": "python-flint>=",
-                "pinocchio": "pin>=",
-                "distributed": "dask[distributed]",
-            }
-            package = names.get(module, module)
-            assert f'"{package}' in setup
+        package = BRINGS.get(module, module)
+        assert f'"{package}' in setup
 
 
 def test_every_node_has_an_executable_for_ros2_run():
