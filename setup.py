@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Packaging for colcon (ament_python) and for pip."""
 
-import re
+import xml.etree.ElementTree as ET
 from itertools import chain
 from pathlib import Path
 
@@ -9,8 +9,7 @@ from setuptools import find_packages, setup
 
 NAME = "sst_ros"
 HERE = Path(__file__).resolve().parent  # `colcon build --symlink-install` builds beside a link
-TEXT = (HERE / NAME / "version.py").read_text(encoding="utf-8")
-(VERSION,) = re.findall(r'^VERSION = "(.+)"$', TEXT, re.M)
+PACKAGE = ET.parse(HERE / "package.xml").getroot()  # the one place of version and metadata
 ROS_MESSAGES = (
     "std",
     "sensor",
@@ -85,25 +84,35 @@ def files(pattern: str) -> list[str]:
     return sorted(str(path) for path in Path().glob(pattern))
 
 
+def text(element: str) -> str:
+    """Return the text of an element of package.xml."""
+    return str(PACKAGE.findtext(element))
+
+
+URLS = {str(url.get("type")).capitalize(): str(url.text) for url in PACKAGE.iter("url")}
+PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
+
 setup(
     name=NAME,
-    version=VERSION,
-    description="Simulator of the 3-RRP spherical star-triangle manipulator, for Python and ROS 2",
+    version=text("version"),
+    description=text("description"),
     long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
-    url="https://doi.org/10.1007/s10846-010-9469-9",
+    url=URLS.pop("Website"),
+    project_urls=URLS,
     keywords="parallel manipulator, spherical mechanism, direct dynamics, robotics, ROS 2",
     classifiers=[
         "Development Status :: 4 - Beta",
         "Intended Audience :: Science/Research",
         "Operating System :: POSIX :: Linux",
         "Programming Language :: Python :: 3",
+        *(f"Programming Language :: Python :: {version}" for version in PYTHONS),
         "Topic :: Scientific/Engineering :: Physics",
         "Typing :: Typed",
     ],
-    license="Apache-2.0",
-    maintainer="sst_ros founders",
-    maintainer_email="sst-ros@example.org",
+    license=text("license"),
+    maintainer=text("maintainer"),
+    maintainer_email=PACKAGE.find("maintainer").get("email"),
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["py.typed", "nodes/*.xml", "host/*.mplstyle", "*/templates/*"]},

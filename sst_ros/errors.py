@@ -264,19 +264,20 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
 
 EXTRAS = dict.fromkeys(("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard"), "record")
-EXTRAS |= {
-    "distributed": "cluster",
-    "llvmlite": "fast",
-    "matplotlib": "plot",
-    "pinocchio": "engines",
-}
-EXTRAS |= {"control": "control", "flint": "proof", "viser": "view", "xarray": "all"}
+EXTRAS |= {"distributed": "cluster", "matplotlib": "plot", "pinocchio": "engines"}
+EXTRAS |= {"argcomplete": "all", "control": "control", "flint": "proof", "llvmlite": "fast"}
+EXTRAS |= {**dict.fromkeys(("trimesh", "viser", "websockets"), "view"), "xarray": "all"}
 """Extra of this package that installs a module."""
 
-_APT = ("llvmlite", "lz4", "matplotlib", "pandas", "xarray", "zstandard")
+_APT = ("argcomplete", "llvmlite", "lz4", "matplotlib", "pandas", "xarray", "zstandard")
 _PIP = {**dict.fromkeys(("mcap", "rosbags"), "mcap rosbags"), "distributed": "dask[distributed]"}
-_PIP |= {"flint": "python-flint", "pinocchio": "pin"}
-_ROS = ("ament_index_python", "rclpy", "rcl_interfaces", "builtin_interfaces", "launch")
+_PIP |= {"flint": "python-flint", "pinocchio": "pin", "trimesh": "viser", "websockets": "viser"}
+_ROS = ("ament_index_python", "rclpy", "rcl_interfaces", "builtin_interfaces")
+_NO_WHEEL = ("launch", "launch_ros")  # only a ROS installation has them
+_BUILT = {
+    "sst_ros_hardware": "colcon build --base-paths src/sst_ros/hardware",
+}
+"""Packages of ROS that no distribution has, with the command that builds them in a workspace."""
 
 
 class MissingDependency(SstError, ImportError):
@@ -296,6 +297,8 @@ def require(module: str) -> Any:
 def explanation(error: ModuleNotFoundError) -> str | None:
     """Return how to install what is missing; None for a module that is no optional dependency."""
     module = (error.name or "").partition(".")[0]
+    if module in _NO_WHEEL:
+        return f"{module} is not installed: source a ROS 2 installation"
     ros = module in _ROS or module.endswith(("_msgs", "_srvs"))
     extra = "ros" if ros else EXTRAS.get(module)
     how = f"pip install 'sst_ros[{extra}]' (in the source folder: pip install '.[{extra}]')"
@@ -304,3 +307,13 @@ def explanation(error: ModuleNotFoundError) -> str | None:
         apt, pip = f"apt install python3-{module}", f"pip install {_PIP.get(module, module)}"
         more = f"{apt if module in _APT else pip}, or "
     return f"{module} is not installed: {more}{how}" if extra else None
+
+
+def explain_missing_ros(packages: Sequence[str]) -> str:
+    """Return how to install packages of ROS, or to build those that cannot be installed."""
+    distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
+    names = [name.replace("_", "-") for name in packages if name not in _BUILT]
+    apt = " ".join(f"ros-{distribution}-{name}" for name in names)
+    commands = [f"apt install {apt}"] if apt else []
+    commands += [_BUILT[name] for name in packages if name in _BUILT]
+    return f"this needs the ROS package(s) {', '.join(packages)}: {'; '.join(commands)}"

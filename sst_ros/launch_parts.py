@@ -28,7 +28,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from sst_ros.description.robot import TOPICS, urdf
-from sst_ros.errors import suggestion
+from sst_ros.errors import explain_missing_ros, suggestion
 from sst_ros.host import processes
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import SimulatorParameters, default_topics, ros_arguments
@@ -258,9 +258,7 @@ def require(*packages: str) -> None:
     """Refuse a launch for which ROS packages are missing, all of them, before any start."""
     installed = get_packages_with_prefixes()
     if missing := [package for package in packages if package not in installed]:
-        distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
-        apt = " ".join(f"ros-{distribution}-{name.replace('_', '-')}" for name in missing)
-        raise RuntimeError(f"this needs the ROS package(s) {', '.join(missing)}: apt install {apt}")
+        raise RuntimeError(explain_missing_ros(missing))
 
 
 def _exit_handler(

@@ -3,24 +3,19 @@
 
 import copy
 import dataclasses
-import itertools
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.geometry import rotation_matrix, zyz_angles
-from sst_ros.recording import recording
 from sst_ros.recording.bag_reader import message_types
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.recording.recording import Recording
-from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import JOINTS as ALL_JOINTS
 from sst_ros.simulation.simulation import Simulation
@@ -276,35 +271,3 @@ def altered(run: Recording, **values: Any) -> Recording:
     again = copy.copy(run)
     vars(again).update(values)
     return again
-
-
-@pytest.fixture(scope="session")
-def bags():
-    return sys.modules[__name__]
-
-
-@pytest.fixture(scope="session")
-def example2(bags):
-    """Messages of 0.3 s of Example 2."""
-    return simulated(scenes.load("example2"), 0.3)
-
-
-@pytest.fixture(scope="session")
-def example2_bag(tmp_path_factory, example2):
-    """A recording of `example2`, which no test changes."""
-    return write(tmp_path_factory.mktemp("example2") / "bag", example2)
-
-
-@pytest.fixture
-def read(written):
-    """Write messages in the order of their reception, and read them as a recording."""
-    return lambda entries, **options: recording.read(
-        written(sorted(entries, key=lambda entry: entry.received_ns), **options)
-    )
-
-
-@pytest.fixture
-def written(tmp_path):
-    """Write messages into a new folder and return its path."""
-    names = (f"bag{number or ''}" for number in itertools.count())
-    return lambda entries, **options: write(tmp_path / next(names), entries, **options)

@@ -6,18 +6,25 @@ import os
 # Before NumPy is imported: OpenBLAS's threads wait for each other where workers share the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import itertools
+
 import hypothesis
 import pytest
-from bags import bags, example2, example2_bag, read, written
 
 from sst_ros.dynamics import kernel, traced_dynamics
+from sst_ros.scene import scene
 
 # By its default an example of 0.2 s is a failure: on a loaded machine any may take that long.
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
-pytest_plugins = ["pytester", "unexpected_skips", "repeat_failures"]
-__all__ = ["bags", "browser", "example2", "example2_bag", "read", "written", "wrong_kernel"]
+pytest_plugins = ["pytester", "missing_packages", "unexpected_skips", "repeat_failures"]
+
+
+def pytest_configure(config):
+    """Leave out slow tests, unless tests are chosen by `-m` or by name: colcon chooses none."""
+    if not config.option.markexpr and not any("::" in word for word in config.args):
+        config.option.markexpr = "not slow"
 
 
 def pytest_pycollect_makemodule(module_path, parent):
@@ -25,7 +32,9 @@ def pytest_pycollect_makemodule(module_path, parent):
 
     A module that skips itself then skips its whole folder.
     """
-    return pytest.Module.from_parent(parent, path=module_path)
+    from missing_packages import TestModule
+
+    return TestModule.from_parent(parent, path=module_path)
 
 
 @pytest.fixture(scope="session")
@@ -35,6 +44,43 @@ def browser():
 
     with browse() as started:
         yield started
+
+
+@pytest.fixture(scope="session")
+def bags():
+    """Helpers that make and write messages of a run; they need rosbags."""
+    import bags
+
+    return bags
+
+
+@pytest.fixture(scope="session")
+def example2(bags):
+    """Messages of 0.3 s of Example 2."""
+    return bags.simulated(scene.load("example2"), 0.3)
+
+
+@pytest.fixture(scope="session")
+def example2_bag(tmp_path_factory, bags, example2):
+    """A recording of `example2`, which no test changes."""
+    return bags.write(tmp_path_factory.mktemp("example2") / "bag", example2)
+
+
+@pytest.fixture
+def read(written):
+    """Write messages in the order of their reception, and read them as a recording."""
+    from sst_ros.recording import recording
+
+    return lambda entries, **options: recording.read(
+        written(sorted(entries, key=lambda entry: entry.received_ns), **options)
+    )
+
+
+@pytest.fixture
+def written(bags, tmp_path):
+    """Write messages into a new folder and return its path."""
+    names = (f"bag{number or ''}" for number in itertools.count())
+    return lambda entries, **options: bags.write(tmp_path / next(names), entries, **options)
 
 
 @pytest.fixture

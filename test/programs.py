@@ -9,6 +9,18 @@ from unittest.mock import patch
 
 from sst_ros.host import processes
 
+HIDDEN = """
+import sys
+
+class Hider:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {names!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Hider())
+"""
+"""Start of a program in which packages of these `names` cannot be found."""
+
 
 def python(*words, env=None, status=0, **options):
     """Run Python with these words, a program by default; return what it has printed and said."""

@@ -17,7 +17,7 @@ import yaml
 import sst_ros
 from sst_ros.cli.commands import NODES
 from sst_ros.errors import EXTRAS
-from tools import changelog_rst
+from tools import changelog_rst, metadata, rosdep_keys
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,42 +29,61 @@ PYTHON_KEYS = {name: f"python3-{name}" for name in (*_SAME.split(), "pytest-time
     "mpmath": "python3-sympy",  # which needs mpmath
     "PyYAML": "python3-yaml",
 }
-"""Keys of rosdep/python.yaml of github.com/ros/rosdistro, commit 8468e88c of 2026-08-22.
-
-Each is a package of apt on Ubuntu and on Debian, as bloom needs it: it refuses keys of pip.
-"""
+"""Keys of rosdep, which are packages of apt as bloom needs them: it refuses keys of pip."""
 
 WITHOUT_KEY = {"control", "dask", "mcap", "pyarrow", "python-flint", "rosbags", "viser", "xarray"}
 """Python packages of setup.py that have none, or one of pip: `pip install sst_ros[all]`."""
 
-ROS_KEYS = {
-    *("ament_copyright", "ament_flake8", "ament_index_python", "ament_pep257", "ament_xmllint"),
-    *("builtin_interfaces", "control_msgs", "diagnostic_msgs", "geometry_msgs", "launch"),
-    *("launch_ros", "rcl_interfaces", "rclpy", "robot_state_publisher"),
-    *("ros2bag", "ros2launch", "rosbag2_storage_mcap", "rosgraph_msgs", "rviz2", "sensor_msgs"),
-    *("simulation_interfaces", "std_msgs", "std_srvs", "trajectory_msgs"),
+KEYS = yaml.safe_load((ROOT / "test/rosdep_keys.yaml").read_text(encoding="utf-8"))
+"""What each key is in each distribution, on a date: python -m tools.rosdep_keys."""
+
+RELEASED_FOR = ("debian", "ubuntu")
+"""Systems for which bloom makes packages; docs/release.md says why RHEL and Fedora are left out."""
+
+BRINGS = {
+    "distributed": "dask[distributed]",
+    "flint": "python-flint>=",
+    "llvmlite": "numba",
+    "lz4": "rosbags",
+    "pinocchio": "pin>=",
+    "trimesh": "viser",
+    "websockets": "viser",
+    "zstandard": "rosbags",
 }
-"""Packages that are released in both jazzy/ and kilted/distribution.yaml of the same commit."""
+"""Package that brings a module of another name."""
 
 
-def test_the_version_is_the_same_everywhere():
-    package = re.search("<version>(.*)</version>", (ROOT / "package.xml").read_text())
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    assert sst_ros.__version__ == package[1] == citation["version"]
+def test_version_and_metadata_are_those_of_package_xml():
+    texts = {name: (ROOT / name).read_text(encoding="utf-8") for name in metadata.written()}
+    assert texts == metadata.written(), "run python -m tools.metadata"
+    assert sst_ros.__version__ == metadata.version()
+    assert f'VERSION = "{metadata.version()}"' in texts["sst_ros/version.py"]
+
+
+def test_what_a_person_fills_in_is_in_one_file():
+    """Addresses that exist nowhere stand in package.xml and its copy, and nothing else."""
+    assert len(metadata.placeholders()) == 3
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("needs a clone by git")
+    files = {ROOT / name for name in listed.stdout.splitlines()} - {Path(__file__)}
+    texts = {
+        path: path.read_text(encoding="utf-8", errors="ignore")
+        for path in files
+        if path.is_file() and path.stat().st_size < 200_000
+    }
+    marked = [path for path, text in texts.items() if "sst-ros.invalid" in text]
+    found = {path.relative_to(ROOT).as_posix() for path in marked}
+    assert found == {"package.xml", "hardware/package.xml"}
+    assert not [path for path, text in texts.items() if "@example.org" in text]
 
 
 def test_every_extra_that_a_message_names_brings_the_module():
     setup = (ROOT / "setup.py").read_text()
     for module, extra in EXTRAS.items():
         assert f'"{extra}"' in setup
-        if module not in ("lz4", "zstandard"):  # brought by rosbags
-            names = {
-                "flint": "python-flint>=",
-                "pinocchio": "pin>=",
-                "distributed": "dask[distributed]",
-            }
-            package = names.get(module, module)
-            assert f'"{package}' in setup
+        package = BRINGS.get(module, module)
+        assert f'"{package}' in setup
 
 
 def test_every_node_has_an_executable_for_ros2_run():
@@ -91,8 +110,53 @@ def required():
     return {name for name in names if not name.startswith("ros-")}
 
 
-def test_every_key_is_known(depends):
-    assert depends <= ROS_KEYS | set(PYTHON_KEYS.values())
+def test_the_stored_table_has_the_keys_of_today():
+    assert rosdep_keys.keys() == list(KEYS["keys"]), "run python -m tools.rosdep_keys"
+    assert list(KEYS["platforms"]) == ["jazzy", "kilted", "lyrical"]
+
+
+@pytest.mark.parametrize("distribution", KEYS["platforms"])
+def test_every_key_resolves_on_every_platform(distribution):
+    """A package of ROS that is released there, or a package of the system: none of pip."""
+    platforms = {
+        f"{system} {release}"
+        for system, releases in KEYS["platforms"][distribution].items()
+        for release in releases
+        if system in RELEASED_FOR
+    }
+    assert len(platforms) == 2
+    for key, known in KEYS["keys"].items():
+        told = known[distribution]
+        assert isinstance(told, str) or platforms <= set(told), key
+
+
+def test_platforms_without_all_keys_are_named():
+    """docs/release.md names each key that RHEL or Fedora has no package for."""
+    missing = set()
+    for distribution, platforms in KEYS["platforms"].items():
+        others = {
+            f"{system} {release}"
+            for system, releases in platforms.items()
+            for release in releases
+            if system not in RELEASED_FOR
+        }
+        for key, known in KEYS["keys"].items():
+            told = known[distribution]
+            if not isinstance(told, str) and others - set(told):
+                missing.add(key)
+    page = (ROOT / "docs/release.md").read_text(encoding="utf-8")
+    assert missing and not [key for key in missing if key not in page]
+
+
+@pytest.mark.parametrize("desktop", ["", "1"])
+def test_what_needs_a_screen_is_asked_for_only_with_a_desktop(desktop):
+    parse = pytest.importorskip("catkin_pkg.package").parse_package
+    package = parse(ROOT)
+    package.evaluate_conditions({"ROS_DISTRO": "kilted", "SST_ROS_DESKTOP": desktop})
+    asked = {one.name for one in package.exec_depends if one.evaluated_condition}
+    heavy = {"rviz2", "ros2bag", "rosbag2_storage_mcap", "robot_state_publisher"}
+    assert asked & heavy == (heavy if desktop else set())
+    assert "rclpy" in asked
 
 
 def test_every_requirement_has_its_key(depends, required):

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import FAST
+from test_scene_refusals import SOURCE, refusal
 
 from sst_ros.__main__ import main
 from sst_ros.errors import InputError
@@ -20,7 +21,6 @@ from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import Scene, load
 from sst_ros.scene.schema import Section, entry
 from sst_ros.scene.yaml_document import dump, read
-from test.test_scene_refusals import SOURCE, refusal
 
 EXAMPLE2 = load("example2_heavy")
 

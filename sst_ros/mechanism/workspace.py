@@ -287,7 +287,9 @@ def distance_to_singularity(where: SceneInput | Geometry, gamma: ArrayLike) -> N
     turn = angles[leg] * turn / np.linalg.norm(turn)
 
     def det_j2(turns: Array) -> Array:
-        rotation = start @ Rotation.from_rotvec(turns).as_matrix()
+        # A list of vectors: SciPy before 1.16 takes no arrays of more dimensions.
+        matrices = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
+        rotation = start @ matrices.reshape(*turns.shape[:-1], 3, 3)
         found, _, _ = kinematics.inverse(geometry, rotation)
         return measures(geometry, found, rotation).det_j2
 

@@ -14,7 +14,6 @@ import threading
 import time
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
@@ -43,7 +42,11 @@ from sst_ros.scene.schema import Section, Spec
 from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-_FIRST_RCLPY_ON_FAST_DDS_3 = 9  # of ROS 2 Kilted
+_PROFILES = {
+    "FASTRTPS_DEFAULT_PROFILES_FILE": "fast_dds_2.xml",
+    "FASTDDS_DEFAULT_PROFILES_FILE": "fast_dds_3.xml",
+}
+"""Our profile, by the variable that names it: for Fast DDS 2, libfastrtps, and 3, libfastdds."""
 _POLL_S = 0.1  # longest delay of a signal. The executor would take half a millisecond for each look
 _CALLBACK_S = 1.0
 """Wait for a callback in progress: a service that waits for the run ends once that is closed."""
@@ -408,14 +411,18 @@ def configure_middleware() -> None:
 
     Other middleware ignores the profile.
     """
-    names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-    if any(os.environ.get(name) for name in names):
+    if any(os.environ.get(name) for name in _PROFILES):
         return
-    generation = 3
-    with contextlib.suppress(PackageNotFoundError, ValueError):
-        if int(version("rclpy").partition(".")[0]) < _FIRST_RCLPY_ON_FAST_DDS_3:
-            generation = 2  # which has other names for both the variable and the setting
-    os.environ[names[generation - 2]] = str(Path(__file__).with_name(f"fast_dds_{generation}.xml"))
+    is_old = _has_library("fastrtps") and not _has_library("fastdds")
+    old, new = _PROFILES
+    name = old if is_old else new
+    os.environ[name] = str(Path(__file__).with_name(_PROFILES[name]))
+
+
+def _has_library(name: str) -> bool:
+    """Look for a shared library where that of the middleware is found when it is loaded."""
+    folders = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+    return any(next(Path(one).glob(f"lib{name}.so*"), None) for one in folders if one)
 
 
 def every(node: Node, seconds: float, callback: Callable[[], None]) -> Timer:

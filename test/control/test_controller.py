@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from models import seeded_samples
 from scipy.spatial.transform import Rotation
 
 from sst_ros.control.actuator_space import ActuatorSpaceMap, ReferenceMotion
@@ -17,7 +18,6 @@ from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene import scene
 from sst_ros.scene.loads import Actuators, Initial, Moment
 from sst_ros.simulation.simulation import Simulation
-from test.models import seeded_samples
 
 PERIOD = 0.002
 ZERO = (0.0, 0.0, 0.0)

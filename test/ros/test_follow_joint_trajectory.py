@@ -10,13 +10,12 @@ from action_msgs.msg import GoalStatus
 from programs import own_domain
 from rclpy.action import ActionClient
 from ros.conftest import NAMES, Nodes, Observer, foreign_types
+from ros.test_inverse_dynamics import AWAY, HOME, trajectory, written
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros.runtime.trajectory_messages import ErrorCode
 from sst_ros.state import nanoseconds
-
-from .test_inverse_dynamics import AWAY, HOME, trajectory, written
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 NODE = "/sst_inverse_dynamics"

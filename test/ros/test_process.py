@@ -138,13 +138,24 @@ def test_a_profile_of_the_user_is_left_alone(name, no_profile, monkeypatch):
     assert dict(os.environ) == before
 
 
-@pytest.mark.parametrize(("rclpy", "name"), [("7.1.5", NAMES[0]), ("9.1.2", NAMES[1])])
-def test_each_generation_finds_its_own_file(rclpy, name, no_profile, monkeypatch):
-    monkeypatch.setattr(process, "version", lambda package: {"rclpy": rclpy}[package])
+@pytest.mark.parametrize(
+    ("libraries", "name", "element"),
+    [
+        (["libfastrtps.so.2.14"], NAMES[0], "<heartbeatPeriod>"),
+        (["libfastdds.so.3.2"], NAMES[1], "<heartbeat_period>"),
+        ([], NAMES[1], "<heartbeat_period>"),
+    ],
+)
+def test_each_generation_finds_its_own_file(
+    libraries, name, element, no_profile, monkeypatch, tmp_path
+):
+    for library in libraries:
+        (tmp_path / library).touch()
+    monkeypatch.setenv("LD_LIBRARY_PATH", f"/nowhere:{tmp_path}")
     process.configure_middleware()
     (given,) = {each: os.environ.pop(each) for each in NAMES if each in os.environ}.items()
     assert given[0] == name
-    assert Path(given[1]).is_file()
+    assert element in Path(given[1]).read_text(encoding="utf-8")
 
 
 def test_garbage_of_the_start_is_not_looked_through_again(domain):

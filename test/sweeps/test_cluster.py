@@ -13,13 +13,13 @@ import time
 from contextlib import contextmanager
 
 import pytest
+from sweeps.test_sweep import same
 
 from sst_ros import load_scene
 from sst_ros.host import many_runs
 from sst_ros.host.many_runs import SweepFailed, connect
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
-from test.sweeps.test_sweep import same
 
 for module in ("distributed", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a cluster needs it")
