@@ -1,0 +1,1 @@
+def fmu_file(equations): return {}
