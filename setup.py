@@ -45,6 +45,10 @@ EXTRAS = {
 EXTRAS["all"] = ["argcomplete", "xarray", *chain.from_iterable(EXTRAS.values())]
 EXTRAS |= {
     "jazzy": wheels("jazzy"),
+    # Each for one target of `equations`, and large: not in `all`.
+    "casadi": ["casadi>=3.6.5"],
+    "jax": ["jax>=0.4.35"],
+    "mpmath": ["mpmath"],
     # For developers.
     "docs": [
         "furo",
@@ -59,11 +63,14 @@ EXTRAS |= {
     "test": [
         "argcomplete",
         "build",
+        "casadi>=3.6.5",
         "catkin_pkg",  # for rosidl_adapter
         "codespell",
         "colcon-common-extensions",
         "control",
+        "fmpy>=0.3.20",
         "hypothesis",
+        "jax>=0.4.35",
         "jsonschema",
         "mpmath",
         "mypy",

@@ -266,6 +266,7 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 EXTRAS = dict.fromkeys(("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard"), "record")
 EXTRAS |= {"distributed": "cluster", "matplotlib": "plot", "numba": "fast", "pinocchio": "engines"}
 EXTRAS |= {"control": "control", "flint": "proof", "viser": "view", "xarray": "all"}
+EXTRAS |= {"casadi": "casadi", "jax": "jax", "mpmath": "mpmath"}
 """Extra of this package that installs a module."""
 
 _APT = ("lz4", "matplotlib", "numba", "pandas", "xarray", "zstandard")

@@ -72,27 +72,31 @@ def mjcf(scene: Scene) -> str:
         bodies.update(dict.fromkeys(STARS, third))
     angles = Dynamics.of(scene).joints(*start_of(scene)[:7])
     places = [JOINTS.index(joint.name) for _, _, joint in _nest(joints) if joint]
-    document: str = load_description_templates().get_template("model.mjcf.xml").render(
-        name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
-        left_out=[*_left_out(scene)],
-        least=LEAST,
-        gravity=ZERO if scene.gravity is None else scene.gravity.acceleration,
-        base=BASE,
-        visuals={link: [*chain(*map(solids, some))] for link, some in shapes(scene).items()},
-        solid=_geom,
-        chains=[*_nest(joints)],
-        bodies=bodies,
-        carried=carried,
-        quaternion=_quaternion,
-        full_inertia=_full_inertia,
-        attributes=_joint_attributes(scene, geometry),
-        sites=_sites(scene, geometry),
-        end=[0.0, 0.0, scene.star.radius],
-        ties=[(f"{STAR}_{end}{k}", f"{STARS[k - 1]}_{end}") for k in (2, 3) for end in "et"],
-        actuated=JOINTS[:3],
-        motor=_motor(scene),
-        start=[angles[i] for i in places],
-        start_rates=[angles[9 + i] for i in places],
+    document: str = (
+        load_description_templates()
+        .get_template("model.mjcf.xml")
+        .render(
+            name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
+            left_out=[*_left_out(scene)],
+            least=LEAST,
+            gravity=ZERO if scene.gravity is None else scene.gravity.acceleration,
+            base=BASE,
+            visuals={link: [*chain(*map(solids, some))] for link, some in shapes(scene).items()},
+            solid=_geom,
+            chains=[*_nest(joints)],
+            bodies=bodies,
+            carried=carried,
+            quaternion=_quaternion,
+            full_inertia=_full_inertia,
+            attributes=_joint_attributes(scene, geometry),
+            sites=_sites(scene, geometry),
+            end=[0.0, 0.0, scene.star.radius],
+            ties=[(f"{STAR}_{end}{k}", f"{STARS[k - 1]}_{end}") for k in (2, 3) for end in "et"],
+            actuated=JOINTS[:3],
+            motor=_motor(scene),
+            start=[angles[i] for i in places],
+            start_rates=[angles[9 + i] for i in places],
+        )
     )
     return document
 
@@ -176,12 +180,13 @@ def _full_inertia(body: Body) -> Array:
 
 
 def _geom(kind: str, sizes: Any, at: Any, turn: Any, rgba: Any) -> str:
-    """Write a shape of `robot.solids` as a geom; a rod is drawn with round ends."""
-    size = {
-        "sphere": lambda: sizes["radius"],
-        "box": lambda: [0.5 * side for side in sizes["size"]],
-        "cylinder": lambda: [sizes["radius"][0], 0.5 * sizes["length"][0]],
-    }[kind]()
+    """Write a shape of `robot.solids` as a geom; lengths of MuJoCo are halves."""
+    if kind == "box":
+        size = [0.5 * side for side in sizes["size"]]
+    elif kind == "cylinder":
+        size = [sizes["radius"][0], 0.5 * sizes["length"][0]]
+    else:
+        size = sizes["radius"]
     parts = {"size": size, "pos": at, "euler": turn, "rgba": rgba}
     words = (
         f'{key}="{" ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)}"'

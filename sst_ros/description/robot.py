@@ -220,20 +220,24 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
         limits["effort"] = (torque or SERVO_TORQUE) if kind == "gamma" else 0.0
         limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
         limited.append((joint, limits, getattr(scene.friction, kind, None)))
-    document: str = load_description_templates().get_template("urdf.xml").render(
-        # An XML name has no spaces.
-        name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
-        assumed=[body.name for body in bodies.values() if body.assumed],
-        links=list(dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))),
-        bodies=bodies,
-        visuals={link: [*chain(*map(solids, some))] for link, some in drawn.items()},
-        joints=limited,
-        starts=list(zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)),
-        topics=topics,
-        least=LEAST,
-        passive=JOINTS[3:],
-        plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
-        roll_pitch_yaw=roll_pitch_yaw,
+    document: str = (
+        load_description_templates()
+        .get_template("urdf.xml")
+        .render(
+            # An XML name has no spaces.
+            name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
+            assumed=[body.name for body in bodies.values() if body.assumed],
+            links=list(dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))),
+            bodies=bodies,
+            visuals={link: [*chain(*map(solids, some))] for link, some in drawn.items()},
+            joints=limited,
+            starts=list(zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)),
+            topics=topics,
+            least=LEAST,
+            passive=JOINTS[3:],
+            plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
+            roll_pitch_yaw=roll_pitch_yaw,
+        )
     )
     return document
 
@@ -243,9 +247,7 @@ def load_description_templates() -> Any:
     templates = load_templates("description")
     templates.filters |= {
         "exact": lambda values: " ".join(repr(float(x) + 0.0) for x in values),
-        "short": lambda values: " ".join(
-            f"{round(float(x), 6) + 0.0:g}" for x in values
-        ),
+        "short": lambda values: " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values),
     }
     return templates
 

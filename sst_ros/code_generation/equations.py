@@ -9,15 +9,15 @@ unit of the Functional Mock-up Interface, or as a model of MuJoCo.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from sst_ros.code_generation.c_source import c_files, identifier
+from sst_ros.code_generation.fmu import fmu_file
+from sst_ros.code_generation.named_programs import CALLER, SceneEquations
+from sst_ros.code_generation.python_module import LIBRARIES, python_module
 from sst_ros.description.mjcf import mjcf
-from sst_ros.equations.c_source import c_files, identifier
-from sst_ros.equations.fmu import fmu_file
-from sst_ros.equations.named_programs import CALLER, OUTPUTS, SceneEquations
-from sst_ros.equations.python_module import LIBRARIES, python_module
 from sst_ros.errors import check_kinds, refuse_unless, require
 from sst_ros.host.output import replace_file, require_free, write_into
 from sst_ros.scene.scene import SceneInput, scene_of

@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from sst_ros.code_generation.named_programs import NamedProgram, SceneEquations
 from sst_ros.dynamics.expression import Program
-from sst_ros.equations.named_programs import NamedProgram, SceneEquations
 
 FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos")
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
-STACK = '''
+STACK = """
 def _collect(values, *shape):
     whole = {library}.stack({library}.broadcast_arrays(*values))
     return whole.reshape(*shape, *whole.shape[1:])
-'''
+"""
 ARRAYS = """\
 An argument is an array whose first axis has the numbers below, in their order; further
 axes, of many runs, follow, also in the results. {more}"""

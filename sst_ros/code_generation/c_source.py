@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from sst_ros.equations.named_programs import Argument, NamedProgram, SceneEquations
+from sst_ros.code_generation.named_programs import Argument, NamedProgram, SceneEquations
 
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 PATTERNS = {
@@ -55,12 +55,14 @@ def c_header(equations: SceneEquations) -> str:
     ]
     for argument in (equations.state, *equations.acting, *equations.open):
         lines.append(f"#define {word}_{argument.name.upper()}_SIZE {argument.size}")
+    lines += ["", "#ifdef __cplusplus", 'extern "C" {', "#endif"]
     lines += ["", f"extern const double {name}_initial_state[{equations.state.size}];"]
     for argument in equations.open:
         lines.append(f"extern const double {name}_scene_parameters[{argument.size}];")
     for named in equations.programs:
         lines += ["", *_comment([f"The {named.description}.", *_shape_note(named)])]
         lines.append(f"{_signature(name, named)};")
+    lines += ["", "#ifdef __cplusplus", "}", "#endif"]
     lines += ["", f"#endif /* {word}_H */", ""]
     return "\n".join(lines)
 
@@ -144,4 +146,3 @@ def _expression(operation: str, operands: list[str]) -> str:
     if operation in INFIX:
         return f"{operands[0]} {INFIX[operation]} {operands[1]}"
     return PATTERNS.get(operation, f"{operation}({{}})").format(*operands)
-

@@ -100,9 +100,7 @@ class SceneEquations:
         self.parameters = _list_parameters(scene, parameters)
         self.values = tuple(_value_of(scene, key) for key in self.parameters)
         self.dynamics = Dynamics.of(scene)
-        known = [
-            name for name in OUTPUTS if self.parameters or name != BY_PARAMETERS
-        ]
+        known = [name for name in OUTPUTS if self.parameters or name != BY_PARAMETERS]
         self.outputs = tuple(known if outputs is None else outputs)
         for name in self.outputs:
             if name not in known:
@@ -159,8 +157,7 @@ class SceneEquations:
         symbols = tuple(f"p{i}" for i in range(len(self.parameters)))
         keys = zip(self.parameters, self.values, strict=True)
         quantities = tuple(
-            f"{key} [{_unit_of(self.scene, key)}], in the scene {value!r}"
-            for key, value in keys
+            f"{key} [{_unit_of(self.scene, key)}], in the scene {value!r}" for key, value in keys
         )
         return (Argument(PARAMETERS, symbols, quantities),)
 

@@ -1,1 +1,0 @@
-def fmu_file(equations): return {}
