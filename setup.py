@@ -51,6 +51,7 @@ EXTRAS |= {
     "mpmath": ["mpmath"],
     # For developers.
     "docs": [
+        "casadi>=3.6.5",
         "furo",
         "latex2mathml",
         "matplotlib>=3.5",
