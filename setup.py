@@ -44,8 +44,13 @@ EXTRAS = {
 EXTRAS["all"] = ["argcomplete", "xarray", *chain.from_iterable(EXTRAS.values())]
 EXTRAS |= {
     "jazzy": wheels("jazzy"),
+    # Each for one target of `equations`, and large: not in `all`.
+    "casadi": ["casadi>=3.6.5"],
+    "jax": ["jax>=0.4.35"],
+    "mpmath": ["mpmath"],
     # For developers.
     "docs": [
+        "casadi>=3.6.5",
         "furo",
         "latex2mathml",
         "matplotlib>=3.5",
@@ -58,11 +63,14 @@ EXTRAS |= {
     "test": [
         "argcomplete",
         "build",
+        "casadi>=3.6.5",
         "catkin_pkg",  # for rosidl_adapter
         "codespell",
         "colcon-common-extensions",
         "control",
+        "fmpy>=0.3.20",
         "hypothesis",
+        "jax>=0.4.35",
         "jsonschema",
         "mpmath",
         "mypy",

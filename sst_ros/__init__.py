@@ -14,6 +14,8 @@ from sst_ros.version import VERSION
 
 TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
 if TYPE_CHECKING:
+    from sst_ros.code_generation.equations import Equations as Equations
+    from sst_ros.code_generation.equations import equations as equations
     from sst_ros.control.actuator_space import ReferenceMotion as ReferenceMotion
     from sst_ros.control.controller import Controller as Controller
     from sst_ros.control.controller import InverseDynamics as InverseDynamics
@@ -58,6 +60,7 @@ __version__ = VERSION
 
 # Names of each module; one that has another name there is followed by it.
 _MODULES = {
+    "code_generation.equations": "Equations equations",
     "control.actuator_space": "ReferenceMotion",
     "control.controller": "Controller InverseDynamics",
     "control.law": "ControllerSettings",

@@ -267,6 +267,7 @@ EXTRAS = dict.fromkeys(("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandar
 EXTRAS |= {"distributed": "cluster", "matplotlib": "plot", "pinocchio": "engines"}
 EXTRAS |= {"argcomplete": "all", "control": "control", "flint": "proof", "llvmlite": "fast"}
 EXTRAS |= {**dict.fromkeys(("trimesh", "viser", "websockets"), "view"), "xarray": "all"}
+EXTRAS |= {"casadi": "casadi", "jax": "jax", "mpmath": "mpmath"}
 """Extra of this package that installs a module."""
 
 _APT = ("argcomplete", "llvmlite", "lz4", "matplotlib", "pandas", "xarray", "zstandard")

@@ -24,7 +24,7 @@ FLOORS = (
     {"integration"},
     {"simulation"},
     {"control", "description", "proof"},
-    {"recording"},
+    {"code_generation", "recording"},
     {"plot", "view"},
     {"report"},
     {"runtime"},

@@ -9,6 +9,7 @@ ALLOWED = (
     "/dev/cpu_dma_latency may not be written here",
     "needs root to act as a second user",
     "of a ROS installation",
+    "no C compiler",
     "no C++ compiler",
     "no chromium with chromedriver on the PATH",
     "with the rclpy of Jazzy",

@@ -81,6 +81,7 @@ def _count(name: str, most: int, what: str, least: int = 1, **options: Any) -> A
 
 _INTEGRATORS = ("auto", "rk4", "dopri5", "dop853", "rodas5p")
 _MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
+_TARGETS = ("c", "numpy", "jax", "casadi", "mpmath", "fmu", "mjcf")
 _OF_SCENE = "name of a scene, or path of a .yaml file"
 SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")
@@ -152,6 +153,21 @@ COMMANDS: dict[str, Subcommand | str] = {
             const="free",
             choices=("free", "lockstep"),
         ),
+    ),
+    "equations": Subcommand(
+        "write the equations of a scene for another program: C, CasADi, JAX, FMI, MuJoCo",
+        "cli.runs:write_equations",
+        SCENE,
+        Arg("--target", "what to write", choices=_TARGETS, required=True),
+        Arg(
+            "--parameters",
+            "keys of numbers that stay open, as in: star.inertia.zz payload.mass",
+            nargs="+",
+            default=[],
+            metavar="KEY",
+        ),
+        Arg("--outputs", "equations; default: all", nargs="+", metavar="NAME"),
+        *_out("folder of the files", "SCENE_TARGET"),
     ),
     "demo": Subcommand(
         "run the paper's examples or a reference motion by the nodes",

@@ -163,6 +163,17 @@ def view(options: argparse.Namespace) -> int:
     return status
 
 
+def write_equations(options: argparse.Namespace) -> None:
+    """Write the equations of a scene for another program."""
+    target = options.target
+    out = free_out(options, Path(f"{Path(options.scene).stem}_{target}"))
+    equations = function("code_generation.equations:equations")
+    given = {"parameters": options.parameters, "outputs": options.outputs}
+    written = equations(options.scene, target, **given)
+    for path in written.write(out, force=options.force):
+        print(path)
+
+
 def write_tables(options: argparse.Namespace) -> None:
     """Write the tables of a recorded run."""
     out = free_out(options, results_folder(options.bag, "tables"))

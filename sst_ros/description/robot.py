@@ -53,6 +53,9 @@ STEEL: Colour = (0.60, 0.63, 0.67)
 LEG_COLOURS: tuple[Colour, ...] = ((0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45))
 """Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
 
+LEAST = 1e-10
+"""Mass [kg] and moments of inertia [kg m^2] that MuJoCo gives a link without them."""
+
 STEP = np.radians(6.0)  # arcs are drawn as chords of this length or less: 0.14 % of the radius off
 
 SERVO_TORQUE, SERVO_RATE = 10.6, np.pi
@@ -204,7 +207,7 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
     and no command starts the run.
     """
     geometry, drawn = Geometry.of(scene), shapes(scene)
-    joints, bodies = joints_of(geometry), {body.name: body for body in _bodies(scene)}
+    joints, bodies = joints_of(geometry), {body.name: body for body in bodies_of(scene)}
     ranges = {joint: ends for joint, *ends in ranges_of([*limits_of(scene, geometry)])}
     limited = []
     for joint in joints:
@@ -217,29 +220,39 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
         limits["effort"] = (torque or SERVO_TORQUE) if kind == "gamma" else 0.0
         limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
         limited.append((joint, limits, getattr(scene.friction, kind, None)))
+    document: str = (
+        load_description_templates()
+        .get_template("urdf.xml")
+        .render(
+            # An XML name has no spaces.
+            name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
+            assumed=[body.name for body in bodies.values() if body.assumed],
+            links=list(dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))),
+            bodies=bodies,
+            visuals={link: [*chain(*map(solids, some))] for link, some in drawn.items()},
+            joints=limited,
+            starts=list(zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)),
+            topics=topics,
+            least=LEAST,
+            passive=JOINTS[3:],
+            plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
+            roll_pitch_yaw=roll_pitch_yaw,
+        )
+    )
+    return document
+
+
+def load_description_templates() -> Any:
+    """Return the templates of this room, with the filters that write numbers."""
     templates = load_templates("description")
     templates.filters |= {
         "exact": lambda values: " ".join(repr(float(x) + 0.0) for x in values),
         "short": lambda values: " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values),
     }
-    document: str = templates.get_template("urdf.xml").render(
-        # An XML name has no spaces.
-        name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
-        assumed=[body.name for body in bodies.values() if body.assumed],
-        links=list(dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))),
-        bodies=bodies,
-        visuals={link: [*chain(*map(_solids, some))] for link, some in drawn.items()},
-        joints=limited,
-        starts=list(zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)),
-        topics=topics,
-        passive=JOINTS[3:],
-        plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
-        roll_pitch_yaw=roll_pitch_yaw,
-    )
-    return document
+    return templates
 
 
-class _Body(NamedTuple):
+class Body(NamedTuple):
     """A rigid body that is fixed to a link of the tree, and has its name where it is the link."""
 
     name: str
@@ -255,21 +268,21 @@ class _Body(NamedTuple):
         return dict(zip(_INERTIA, self.tensor[np.triu_indices(3)].tolist(), strict=True))
 
 
-def _bodies(scene: Scene) -> Iterator[_Body]:
+def bodies_of(scene: Scene) -> Iterator[Body]:
     """All bodies that have mass or inertia."""
     star, base, payload, motor = scene.star, scene.base, scene.payload, scene.actuators
 
     def body(
         name: str, radius: float, about_o: Array, mass: float = 0.0, at: Vector3 = (0.0, 0.0, 0.0)
-    ) -> _Body:
+    ) -> Body:
         c, assumed = np.array(at), float(np.trace(about_o)) / (2.0 * radius**2)
         own = about_o - mass * (c @ c * np.eye(3) - np.outer(c, c))
-        return _Body(name, name, mass or assumed, c, own, mass == 0.0)
+        return Body(name, name, mass or assumed, c, own, mass == 0.0)
 
     yield body(STAR, star.radius, star.tensor, star.mass, star.centre)
     if payload is not None:
         tensor = np.zeros((3, 3)) if payload.inertia is None else payload.inertia.matrix
-        yield _Body(PAYLOAD, STAR, payload.mass, np.array(payload.centre), tensor)
+        yield Body(PAYLOAD, STAR, payload.mass, np.array(payload.centre), tensor)
     for k, leg in enumerate(LEGS):
         for name, link, radius in (
             (ACTUATED[k], scene.actuated_links[k], base.radius),
@@ -296,7 +309,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     return np.array([roll, pitch, yaw])
 
 
-def _solids(shape: Shape) -> Iterator[tuple[Any, ...]]:
+def solids(shape: Shape) -> Iterator[tuple[Any, ...]]:
     """Yield kind, sizes, centre, roll, pitch, yaw, and colour of what a shape is in URDF."""
     colour = (*shape.colour, getattr(shape, "opacity", 1.0))
     if isinstance(shape, Ball):

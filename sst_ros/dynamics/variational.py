@@ -51,7 +51,12 @@ AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivat
 MOST = 4_000_000
 """Evaluations of a motion: minutes, where a stiff motion needs hours by an explicit method."""
 GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
-ACTUATORS = ("actuators.torque_limit", "actuators.idle_damping")
+ACTUATORS = (
+    "actuators.torque_limit",
+    "actuators.idle_damping",
+    "actuators.velocity_limit",
+    "actuators.acceleration_limit",
+)
 OUTSIDE = ("torque", "motion", "duration", "initial.orientation", *ACTUATORS)
 REBOUND = ("stroke.restitution", "stroke.impact_rate")  # known to the equations as one damping
 FIRST = np.zeros(1)
@@ -79,16 +84,7 @@ class VariationalEquations:
         self.scene, self.names = scene, tuple(names)
         self._torque, self._geometry, self._caller = torque, Geometry.of(scene), caller
         self._by_torque = by_torque
-        for name in self.names:
-            allowed = ""
-            if name.startswith(GEOMETRY):
-                allowed = "is geometry, which is taken as known"
-            elif name.startswith(OUTSIDE):
-                allowed = "is no number of the equations of motion"
-            elif find_number(scene, name) is None:
-                allowed = "must be the key of a number that the scene has"
-            if allowed:
-                raise refusal(caller, "parameters", name, allowed)
+        refuse_other_numbers(scene, self.names, caller)
 
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:
         """Integrate the motion and its sensitivities with values of the parameters, shape (p,).
@@ -215,6 +211,18 @@ class VariationalEquations:
         return lambda time: slopes(time) * free
 
 
+def refuse_other_numbers(scene: Scene, names: Sequence[str], caller: str) -> None:
+    """Raise InputError of a caller for a name that is no number of the equations of motion."""
+    for name in names:
+        if name.startswith(GEOMETRY):
+            raise refusal(caller, "parameters", name, "is geometry, which is taken as known")
+        if name.startswith(OUTSIDE):
+            raise refusal(caller, "parameters", name, "is no number of the equations of motion")
+        if find_number(scene, name) is None:
+            allowed = "must be the key of a number that the scene has"
+            raise refusal(caller, "parameters", name, allowed)
+
+
 @lru_cache(maxsize=32)
 def trace_derivatives(
     scene: Scene, names: tuple[str, ...], by_torque: bool
@@ -331,7 +339,7 @@ class Sensitivities:
     """
 
     def __init__(self, scene: Scene, names: Iterable[str], torque: TorqueProfile) -> None:
-        keys = {name: [] if name == OWN_TORQUE else _list_numbers(scene, name) for name in names}
+        keys = {name: [] if name == OWN_TORQUE else list_numbers(scene, name) for name in names}
         flat = list(dict.fromkeys(chain(*keys.values())))
         self._columns: dict[str, Any] = {
             name: slice(len(flat), None) if name == OWN_TORQUE else [flat.index(key) for key in own]
@@ -362,7 +370,7 @@ class Sensitivities:
         }
 
 
-def _list_numbers(scene: Scene, name: str) -> list[str]:
+def list_numbers(scene: Scene, name: str) -> list[str]:
     """Return the key of each number that a key names; itself where it names nothing."""
     try:
         fields = list(find_fields(scene, name, components=True))

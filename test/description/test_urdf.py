@@ -19,6 +19,7 @@ from sst_ros.__main__ import main
 from sst_ros.description.robot import (
     ACTUATED,
     INTERMEDIATE,
+    LEAST,
     LEGS,
     PLUGIN,
     STAR,
@@ -212,13 +213,18 @@ def test_motion_under_gravity_with_payload_and_rotors():
     assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("name", names())
+def test_mujoco_loads_every_scene(name):
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
+    model = mujoco.MjModel.from_xml_string(urdf(load(name)))
+    assert {model.joint(i).name for i in range(model.njnt)} == set(JOINTS)
+    assert model.body_inertia[1:].min() == LEAST  # of the frames, which MuJoCo wants to weigh
+
+
 def test_mujoco_reads_it():
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
     sample = seeded_samples(3, 1)[0]
-    # MuJoCo takes no bodies without mass: the two frames get some.
-    asked = '<mujoco><compiler boundmass="1e-9" boundinertia="1e-12" fusestatic="false"/></mujoco>'
-    text = urdf(sample.scene).replace("</robot>", f"{asked}</robot>")
-    model = mujoco.MjModel.from_xml_string(text)
+    model = mujoco.MjModel.from_xml_string(urdf(sample.scene))
     data = mujoco.MjData(model)
     for name, angle in angles_of(sample.geometry, sample.gamma, sample.rotation).items():
         data.qpos[model.joint(name).qposadr[0]] = angle

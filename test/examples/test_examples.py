@@ -74,6 +74,11 @@ CHECKS = {
         max(found["errors"].values()) < 1e-8
         and 4 * found["motions"]["exact derivatives"] < found["motions"]["differences"]
     ),
+    "mpc": lambda found: all(
+        2 * found["errors"]["MPC", word] < found["errors"]["computed torque", word]
+        for word in ("no noise", "noise")
+    ),
+    "observer": lambda found: found["inside"] >= 0.9,
     "zero_order_hold": lambda found: found["order"] == pytest.approx(2.0, abs=0.1),
 }
 """What an example shows, by its names."""

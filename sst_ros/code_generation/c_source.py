@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equations of a scene as C99: a file and its header, with nothing but libm.
+
+The functions do the operations of the package in its order, so they give its bits where
+the functions of libm do. A compiler must neither fuse a multiplication and an addition nor
+reorder them: the source switches the former off for GCC, Clang and all others that know
+the pragma of C99; the latter happens only with -ffast-math, which must not be given.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from sst_ros.code_generation.named_programs import Argument, NamedProgram, SceneEquations
+
+INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
+PATTERNS = {
+    "neg": "-{}",
+    "positive": "0.0 > {0} ? 0.0 : {0}",
+    "step": "{} > 0.0 ? 1.0 : 0.0",
+    "atan2": "atan2({}, {})",
+}
+NO_FUSION = """\
+/* A fused multiplication and addition rounds once where the package rounds twice. */
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("fp-contract=off")
+#else
+#pragma STDC FP_CONTRACT OFF
+#endif
+"""
+
+
+def identifier(equations: SceneEquations) -> str:
+    """Return the name of the scene as an identifier of C and a name of files."""
+    return re.sub(r"^(?=\d)", "scene_", re.sub(r"\W", "_", equations.scene.name, flags=re.A))
+
+
+def c_files(equations: SceneEquations) -> dict[str, str]:
+    """Write the source and its header, by name."""
+    name = identifier(equations)
+    return {f"{name}.h": c_header(equations), f"{name}.c": c_source(equations)}
+
+
+def c_header(equations: SceneEquations) -> str:
+    """Write the header."""
+    name = identifier(equations)
+    word = name.upper()
+    lines = [
+        *_comment([*equations.header, "", "Results may be where the arguments are."]),
+        f"#ifndef {word}_H",
+        f"#define {word}_H",
+        "",
+        f'#define {word}_SCENE_SHA256 "{equations.scene_hash}"',
+    ]
+    for argument in (equations.state, *equations.acting, *equations.open):
+        lines.append(f"#define {word}_{argument.name.upper()}_SIZE {argument.size}")
+    lines += ["", "#ifdef __cplusplus", 'extern "C" {', "#endif"]
+    lines += ["", f"extern const double {name}_initial_state[{equations.state.size}];"]
+    for argument in equations.open:
+        lines.append(f"extern const double {name}_scene_parameters[{argument.size}];")
+    for named in equations.programs:
+        lines += ["", *_comment([f"The {named.description}.", *_shape_note(named)])]
+        lines.append(f"{_signature(name, named)};")
+    lines += ["", "#ifdef __cplusplus", "}", "#endif"]
+    lines += ["", f"#endif /* {word}_H */", ""]
+    return "\n".join(lines)
+
+
+def c_source(equations: SceneEquations) -> str:
+    """Write the source."""
+    name = identifier(equations)
+    lines = [*_comment(equations.header), f'#include "{name}.h"', "#include <math.h>"]
+    lines += ["", NO_FUSION]
+    lines += _constant(f"{name}_initial_state", equations.initial)
+    if equations.parameters:
+        lines += _constant(f"{name}_scene_parameters", equations.values)
+    for named in equations.programs:
+        lines += ["", f"{_signature(name, named)}", "{", *_body(named), "}"]
+    return "\n".join([*lines, ""])
+
+
+def _comment(lines: list[str]) -> Iterator[str]:
+    yield "/*"
+    yield from (f" * {line}".rstrip().replace("*/", "* /") for line in lines)
+    yield " */"
+
+
+def _shape_note(named: NamedProgram) -> list[str]:
+    if len(named.shape) == 1:
+        return []
+    columns = named.shape[1]
+    return [f"Entry (i, j) is result[{columns} * i + j]."]
+
+
+def _constant(name: str, values: tuple[float, ...]) -> Iterator[str]:
+    yield f"const double {name}[{len(values)}] = {{"
+    yield from (f"    {value!r}," for value in values)
+    yield "};"
+
+
+def _signature(name: str, named: NamedProgram) -> str:
+    given = [f"const double {one.name}[{one.size}]" for one in named.arguments]
+    size = len(named.program.outputs)
+    arguments = ", ".join([*given, f"double result[{size}]"])
+    return f"void {name}_{named.name}({arguments})"
+
+
+def _body(named: NamedProgram) -> Iterator[str]:
+    """Write the statements: arguments are read, then computed with, then results stored."""
+    program = named.program
+    used = {
+        operand
+        for operands in (*(step[1] for step in program.steps), program.outputs)
+        for operand in operands
+        if isinstance(operand, int)
+    }
+    first = 0
+    for argument in named.arguments:
+        numbers = range(first, first + argument.size)
+        yield from _reads(argument, [number - first for number in numbers if number in used])
+        first += argument.size
+    words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
+    for i, (operation, operands) in enumerate(program.steps):
+        expression = _expression(operation, [_word(x, words) for x in operands])
+        yield f"    const double v{i} = {expression};"
+    for i, output in enumerate(program.outputs):
+        yield f"    result[{i}] = {_word(output, words)};"
+
+
+def _reads(argument: Argument, used: list[int]) -> Iterator[str]:
+    if not used:
+        yield f"    (void){argument.name};"
+    for i in used:
+        yield f"    const double {argument.symbols[i]} = {argument.name}[{i}];"
+
+
+def _word(operand: float | int, words: list[str]) -> str:
+    if isinstance(operand, int):
+        return words[operand]
+    number = repr(float(operand))
+    return f"({number})" if number.startswith("-") else number
+
+
+def _expression(operation: str, operands: list[str]) -> str:
+    if operation in INFIX:
+        return f"{operands[0]} {INFIX[operation]} {operands[1]}"
+    return PATTERNS.get(operation, f"{operation}({{}})").format(*operands)

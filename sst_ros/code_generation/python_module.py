@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equations of a scene as a Python module on numbers of another library.
+
+The module needs that library alone. Each function is straight-line code, an operation a
+line, in which the functions beyond + - * / are those of the library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from sst_ros.code_generation.named_programs import NamedProgram, SceneEquations
+from sst_ros.dynamics.expression import Program
+
+FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos")
+INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
+
+STACK = """
+def _collect(values, *shape):
+    whole = {library}.stack({library}.broadcast_arrays(*values))
+    return whole.reshape(*shape, *whole.shape[1:])
+"""
+ARRAYS = """\
+An argument is an array whose first axis has the numbers below, in their order; further
+axes, of many runs, follow, also in the results. {more}"""
+
+CASADI_TAIL = """
+def _collect(values, *shape):
+    whole = casadi.vertcat(*values)
+    return casadi.reshape(whole, *shape[::-1]).T if shape[1:] else whole
+
+
+def _function(equations, results, **sizes):
+    symbols = {name: casadi.SX.sym(name, size) for name, size in sizes.items()}
+    given = [*symbols.values()]
+    return casadi.Function(results, given, [equations(*given)], [*symbols], [results])
+
+"""
+MPMATH_TAIL = """
+def _collect(values, rows, columns=None):
+    if columns is None:
+        return [*map(mpmath.mpf, values)]
+    return mpmath.matrix([values[columns * i : columns * (i + 1)] for i in range(rows)])
+"""
+
+
+@dataclass(frozen=True)
+class Library:
+    """How a library spells what the equations need."""
+
+    name: str
+    imports: str
+    about: str  # of arguments and results, for the head of the module
+    collect: str  # defines _collect(values, *shape), which makes a vector or matrix
+    unpack: str = "{}"  # of the numbers of an argument
+    words: Mapping[str, str] = field(default_factory=dict)  # other names of functions
+    positive: str = "maximum({}, 0.0)"  # the larger of a number and zero
+    step: str = "where({} > 0.0, 1.0, 0.0)"
+    made: str = ""  # lines that make what is returned of a function; by default itself
+
+    def expression(self, operation: str, operands: Sequence[str]) -> str:
+        """Write an operation on operands."""
+        if operation in INFIX:
+            return f"{operands[0]} {INFIX[operation]} {operands[1]}"
+        if operation == "neg":
+            return f"-{operands[0]}"
+        if operation in ("positive", "step"):
+            pattern = self.positive if operation == "positive" else self.step
+            return pattern.format(*operands)
+        return f"{self.words.get(operation, operation)}({', '.join(operands)})"
+
+
+LIBRARIES = {
+    library.name: library
+    for library in (
+        Library(
+            name="numpy",
+            imports="import numpy\n"
+            "from numpy import arctan2, cos, exp, maximum, sin, sqrt, tanh, where",
+            about=ARRAYS.format(more="Numbers are doubles."),
+            collect=STACK.format(library="numpy"),
+            words={"atan2": "arctan2"},
+        ),
+        Library(
+            name="jax",
+            imports="import jax.numpy as jnp\n"
+            "from jax.numpy import arctan2, cos, exp, maximum, sin, sqrt, tanh, where",
+            about=ARRAYS.format(
+                more="Functions are pure: jit, grad, vmap and scan take them.\n"
+                "Numbers have the precision of the arguments: for doubles call\n"
+                '`jax.config.update("jax_enable_x64", True)` before arrays are made.'
+            ),
+            collect=STACK.format(library="jnp"),
+            words={"atan2": "arctan2"},
+        ),
+        Library(
+            name="casadi",
+            imports="import casadi\n"
+            "from casadi import atan2, cos, exp, fmax, if_else, sin, sqrt, tanh",
+            about="Each is a `casadi.Function` of column vectors.",
+            collect=CASADI_TAIL,
+            unpack="casadi.vertsplit({})",
+            positive="fmax({}, 0.0)",
+            step="if_else({} > 0.0, 1.0, 0.0)",
+            made='{name} = _function({name}, "{name}", {sizes})',
+        ),
+        Library(
+            name="mpmath",
+            imports="import mpmath\nfrom mpmath import atan2, cos, exp, sin, sqrt, tanh",
+            about="Arguments are sequences of numbers; the precision is that of mpmath.mp.\n"
+            "The constants are the doubles of the package: more digits than theirs are\n"
+            "those of the equations with exactly these constants.",
+            collect=MPMATH_TAIL,
+            unpack="map(mpmath.mpf, {})",
+            positive="max({}, 0)",
+            step="(1 if {} > 0 else 0)",
+        ),
+    )
+}
+
+
+def python_module(equations: SceneEquations, library: Library) -> str:
+    """Write the module."""
+    head = "\n".join([*equations.header, "", library.about])
+    values = dict(zip(equations.parameters, equations.values, strict=True))
+    parts = [
+        f'"""{head}\n"""',
+        library.imports,
+        f"INITIAL_STATE = {equations.initial!r}",
+        f"PARAMETERS = {values!r}",
+        library.collect.strip("\n"),
+    ]
+    for named in equations.programs:
+        parts.append("\n".join(["", *_function(named, library)]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _function(named: NamedProgram, library: Library) -> Iterator[str]:
+    arguments = [argument.name for argument in named.arguments]
+    yield f"def {named.name}({', '.join(arguments)}):"
+    yield f'    """Return the {named.description}."""'
+    for argument in named.arguments:
+        symbols = ", ".join(argument.symbols)
+        yield f"    {symbols}, = {library.unpack.format(argument.name)}"
+    lines, results = write_operations(named.program, library)
+    yield from (f"    {line}" for line in lines)
+    shape = ", ".join(map(str, named.shape))
+    yield f"    return _collect(({', '.join(results)},), {shape})"
+    if library.made:
+        given = ((argument.name, argument.size) for argument in named.arguments)
+        sizes = ", ".join(f"{name}={size}" for name, size in given)
+        yield f"\n\n{library.made.format(name=named.name, sizes=sizes)}"
+
+
+def write_operations(program: Program, library: Library) -> tuple[list[str], list[str]]:
+    """Return a line for each step, v0 = .., v1 = .., and what the outputs are called."""
+    words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
+
+    def word(operand: float | int) -> str:
+        if isinstance(operand, int):
+            return words[operand]
+        number = repr(float(operand))
+        return f"({number})" if number.startswith("-") else number
+
+    lines = []
+    for i, (operation, operands) in enumerate(program.steps):
+        lines.append(f"v{i} = {library.expression(operation, [*map(word, operands)])}")
+    return lines, [word(output) for output in program.outputs]

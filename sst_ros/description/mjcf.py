@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The manipulator as a model of MuJoCo, with its loops closed.
+
+The tree is that of `robot`: nine hinges through O, of which leg 1 ends in the star and
+legs 2 and 3 in frames of their own. Here these have a body each, with a third of the
+star's inertia as the star itself, and two `connect` constraints a loop make one body of
+them again. Two points are enough: all frames share O, which no joint moves. The points
+belong to bodies that weigh next to nothing: MuJoCo makes a tie as soft as the centre of
+mass of its body is mobile, and a centre at O would make it too stiff for any step.
+
+MuJoCo's constraints are springs and dampers, so a loop opens a little under load; its
+joints know viscous and dry friction, linear springs and no other loads. What a scene has
+beyond that is named at the head of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from sst_ros.description.robot import (
+    ACTUATED,
+    BASE,
+    INTERMEDIATE,
+    LEAST,
+    LEGS,
+    STAR,
+    STARS,
+    Body,
+    Joint,
+    bodies_of,
+    joints_of,
+    load_description_templates,
+    shapes,
+    solids,
+)
+from sst_ros.dynamics.initial_state import start_of
+from sst_ros.dynamics.model import limits_of, model_of, ranges_of
+from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
+from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.scene import Scene
+from sst_ros.state import ZERO
+
+KINDS = ("gamma", "mu", "beta")
+
+
+def mjcf(scene: Scene) -> str:
+    """Write a scene as an MJCF document, with its initial state as the key `initial`.
+
+    Raises:
+        AssemblyError: the initial gamma has no unique admissible assembly.
+
+    """
+    geometry = Geometry.of(scene)
+    joints = {joint.child: joint for joint in joints_of(geometry)}
+    bodies = dict.fromkeys(joints)
+    carried: dict[str, list[Body]] = {}
+    for body in bodies_of(scene):
+        if body.name.startswith("rotor"):
+            continue  # is the armature of its joint
+        if body.name == body.link:
+            bodies[body.name] = body
+        else:
+            carried.setdefault(body.link, []).append(body)
+    star = bodies[STAR]
+    if star is not None:
+        third = star._replace(mass=star.mass / 3.0, tensor=star.tensor / 3.0)
+        bodies.update(dict.fromkeys(STARS, third))
+    angles = Dynamics.of(scene).joints(*start_of(scene)[:7])
+    places = [JOINTS.index(joint.name) for _, _, joint in _nest(joints) if joint]
+    document: str = (
+        load_description_templates()
+        .get_template("model.mjcf.xml")
+        .render(
+            name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
+            left_out=[*_left_out(scene)],
+            least=LEAST,
+            gravity=ZERO if scene.gravity is None else scene.gravity.acceleration,
+            base=BASE,
+            visuals={link: [*chain(*map(solids, some))] for link, some in shapes(scene).items()},
+            solid=_geom,
+            chains=[*_nest(joints)],
+            bodies=bodies,
+            carried=carried,
+            quaternion=_quaternion,
+            full_inertia=_full_inertia,
+            attributes=_joint_attributes(scene, geometry),
+            sites=_sites(scene, geometry),
+            end=[0.0, 0.0, scene.star.radius],
+            ties=[(f"{STAR}_{end}{k}", f"{STARS[k - 1]}_{end}") for k in (2, 3) for end in "et"],
+            actuated=JOINTS[:3],
+            motor=_motor(scene),
+            start=[angles[i] for i in places],
+            start_rates=[angles[9 + i] for i in places],
+        )
+    )
+    return document
+
+
+def _nest(joints: dict[str, Joint]) -> Iterator[tuple[bool, str, Joint | None]]:
+    """Yield where each body begins, with its joint, and where it ends."""
+    for k in range(3):
+        chained = (ACTUATED[k], INTERMEDIATE[k], STARS[k])
+        for link in chained:
+            yield True, link, joints[link]
+        for link in reversed(chained):
+            yield False, link, None
+
+
+def _sites(scene: Scene, geometry: Geometry) -> dict[str, list[tuple[str, Array]]]:
+    """Return the points that the ties connect, by link: along e_k, and at the end E."""
+    radius = scene.star.radius
+    end = np.array([0.0, 0.0, radius])
+    found: dict[str, list[tuple[str, Array]]] = {STAR: []}
+    for leg in LEGS[1:]:
+        along = radius * geometry.e[leg - 1]
+        found[STAR] += [(f"{STAR}_e{leg}", along), (f"{STAR}_t{leg}", end)]
+        name = STARS[leg - 1]
+        found[name] = [(f"{name}_e", along), (f"{name}_t", end)]
+    return found
+
+
+def _joint_attributes(scene: Scene, geometry: Geometry) -> dict[str, dict[str, Any]]:
+    """Return springs, friction, range and rotor of each joint, as MuJoCo names them."""
+    model = model_of(scene)
+    ranges = {joint: ends for joint, *ends in ranges_of([*limits_of(scene, geometry)])}
+    found: dict[str, dict[str, Any]] = {}
+    for number, name in enumerate(JOINTS):
+        kind, leg = divmod(number, 3)
+        given: dict[str, Any] = {}
+        if (spring := model.legs[leg].springs[kind]) is not None:
+            given["stiffness"] = [spring.stiffness]
+            given["springref"] = [spring.rest]
+        if (friction := model.legs[leg].friction[kind]) is not None:
+            given["damping"] = [friction.viscous]
+            given["frictionloss"] = [friction.coulomb]
+        if KINDS[kind] != "mu" and np.isfinite(ranges.get(number, np.inf)).all():
+            given["range"] = ranges[number]
+        motor = scene.actuators
+        if KINDS[kind] == "gamma" and motor is not None and motor.rotor_inertia:
+            given["armature"] = [motor.gear_ratio**2 * motor.rotor_inertia]
+        found[name] = given
+    return found
+
+
+def _motor(scene: Scene) -> dict[str, object]:
+    """Return torque limit and lag of the actuators, as MuJoCo names them."""
+    found: dict[str, object] = {}
+    if scene.torque_limit is not None:
+        found["ctrlrange"] = f"{-scene.torque_limit!r} {scene.torque_limit!r}"
+    if scene.actuators is not None and scene.actuators.time_constant is not None:
+        found |= {"dyntype": "filter", "dynprm": repr(scene.actuators.time_constant)}
+    return found
+
+
+def _left_out(scene: Scene) -> Iterator[str]:
+    """Say what the scene has and MuJoCo has not, or has otherwise."""
+    kinds = [getattr(scene.friction, kind, None) for kind in KINDS]
+    if any(one is not None and (one.coulomb or one.static) for one in kinds):
+        yield "Dry friction is MuJoCo's own, without breakaway torque and smoothing."
+    if scene.stroke.at_end == "elastic":
+        yield "Elastic stops are left out: MuJoCo's are of another kind."
+    if scene.moment is not None:
+        yield "The moment on the star is left out: apply it by xfrc_applied."
+
+
+def _quaternion(rotation: Array) -> list[float]:
+    """Return a rotation as MuJoCo has it, (w, x, y, z)."""
+    x, y, z, w = quaternion_of(rotation).tolist()
+    return [w, x, y, z]
+
+
+def _full_inertia(body: Body) -> Array:
+    """Return the tensor about the centre of mass as (xx, yy, zz, xy, xz, yz)."""
+    return np.asarray(body.tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+
+
+def _geom(kind: str, sizes: Any, at: Any, turn: Any, rgba: Any) -> str:
+    """Write a shape of `robot.solids` as a geom; lengths of MuJoCo are halves."""
+    if kind == "box":
+        size = [0.5 * side for side in sizes["size"]]
+    elif kind == "cylinder":
+        size = [sizes["radius"][0], 0.5 * sizes["length"][0]]
+    else:
+        size = sizes["radius"]
+    parts = {"size": size, "pos": at, "euler": turn, "rgba": rgba}
+    words = (
+        f'{key}="{" ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)}"'
+        for key, values in parts.items()
+    )
+    return f'<geom type="{kind}" {" ".join(words)} />'
