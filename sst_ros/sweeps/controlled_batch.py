@@ -263,6 +263,7 @@ class ControlledBatch:
             for row, value in zip(blocks[name], values, strict=False):
                 row[:] = value
         gains = self._make_gains(batch, given, count)
+        drives = [np.zeros((3, count))]  # torques that were sent before each kept state
 
         def advance(first: int, count: int, step: float, *arrays: Any, rows: Any) -> None:
             if rows is not None:  # torques are held while a step is repeated
@@ -278,9 +279,13 @@ class ControlledBatch:
                     span = min(hold - now % hold, end - now)
                     batch.module.batch(step, now, span, *part, *arrays)
                     now += span
+            if kept and end % kept == 0:
+                drives.append(arrays[1][:3].copy())
 
         step = self.samples * control.period / steps
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
+        if result.kept is not None:
+            result.kept.sent = np.moveaxis(np.stack(drives), 1, -1)
         # Root of the mean square and largest error of gamma [rad] at the samples of a run and its
         # end, and of the torque [N m]; when the error of all joints is in the band for good [s].
         final = np.array(divide(REFERENCES, self._references[-1])["gamma"]) - result.gamma
