@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rates and accelerations of every joint and link, and the moments that their joints transmit.
+"""Rates and accelerations of every joint and link.
 
 One leg equation, Eqs. 9 and 24 to 27, serves both directions; with c_k = (r x t).w = (w x r).t::
 
@@ -10,31 +10,20 @@ One leg equation, Eqs. 9 and 24 to 27, serves both directions; with c_k = (r x t
 Scalar products with N = r x t, r and w x r give gamma, mu and beta of a leg from the star; this
 needs no J2 and works at a parallel singularity. From the actuators, omega = J gamma_dot, Eq. 15,
 and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40, come first.
-
-All seven links turn about O, so every joint is a revolute about an axis through O: w_k (base to
-actuated link), r_k (to the intermediate link), t_k (the curved prismatic joint, to the star).
-Without friction it transmits a moment about O across its axis: 9 x 2 components, which with 3
-torques are as many as the 7 x 3 moment balances. So they are determinate, and each leg gives them
-in closed form: with the rates of change of angular momentum D_1k and D_2k of its links, the moment
-m on the star obeys::
-
-    t.m = 0,   r.m = -r.D_2k,   w.m = tau_k - w.(D_1k + D_2k),
-
-three equations with the determinant c_k. Only the moment about O is determinate: the forces in
-the bearings depend on where and how many they are. Divide by a bearing distance to size one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.errors import SingularConfiguration, refuse_unless
+from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
-from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture, Three
+from sst_ros.mechanism.virtual_work import SINGULAR, Posture
 from sst_ros.state import ZERO
 
 
@@ -138,65 +127,78 @@ def _motion(
     return BodyRates(*frozen(omega, omega_dot, *joints, *links))
 
 
-@dataclass(frozen=True)
-class Reactions:
-    """Constraint moments about O [N m], shape (3, 3), rows by leg. Read-only.
+class OrientationSensitivity(NamedTuple):
+    """Derivatives of the orientation, as rotation vectors in {E} [rad]: components first."""
 
-    A moment is what the link nearer the base exerts on the next one; the next one answers with
-    the opposite. In the frame of its own joint the component along the axis is 0.
+    gamma: Array  #: by the actuator angles, shape (..., 3, 3)
+    v: Array  #: by the unit directions v_k, leg and axis, shape (..., 3, 3, 3)
+    alpha: Array  #: by the angles of the star [rad], the last of which is 2 pi less the others
+
+
+def orientation_sensitivity(
+    geometry: Geometry, rotation: ArrayLike, gamma: ArrayLike | None = None
+) -> OrientationSensitivity:
+    """Differentiate the orientation by actuator angles and geometry, exactly.
+
+    The closed loops F_k = r_k . R e_k = 0 give, for a turn d of the star in {B},
+
+        (t_k x r_k) . d = -(dr_k . t_k + r_k . R de_k),
+
+    three equations with the matrix J2. The change of r_k is that of gamma_k, of v_k, and of
+    w_k, which v_k and v_k+1 span. With these derivatives, tolerances of encoders and parts give
+    the error of the orientation.
+
+    Args:
+        geometry: of the manipulator.
+        rotation: orientations R, shape (..., 3, 3).
+        gamma: actuator angles [rad], shape (..., 3); by default mu_k in (0, pi).
+
+    Raises:
+        SingularConfiguration: some orientation is a parallel singularity, det J2 = 0.
+
     """
-
-    #: base on actuated link k, across w_k, in {B}; the torque tau_k w_k not included
-    actuated: Array
-    revolute: Array  #: actuated on intermediate link, across r_k, in {B}
-    prismatic: Array  #: intermediate link on the star, across t_k, in {B}
-    actuated_local: Array  #: in {1k} = [r, w x r, w]; z is 0
-    revolute_local: Array  #: in {2k} = [r, t x r, t]; x is 0
-    prismatic_local: Array  #: in {2k}; z is 0
-    torque: Array  #: actuator torques that belong to this motion [N m], shape (3,)
-
-
-def of_motion(
-    mechanism: Mechanism, at: Posture, gamma_dot: Three, gamma_ddot: Three, moment: Three = ZERO
-) -> Reactions:
-    """Constraint moments, and torques, that a motion asks for: gamma_dot [rad/s], gamma_ddot.
-
-    The moment is n_ext [N m] in {B}, beside the weights of all bodies. For the motion that torques
-    cause see `virtual_work.direct_dynamics`. InputError refuses scenes with friction, springs or
-    elastic stops.
-    """
-    allowed = f"a scene with {', '.join(mechanism.others)} has moments that are not known here"
-    refuse_unless("reactions", ("scene", mechanism.others, not mechanism.others, allowed))
-    frames = virtual_work.link_frames(at)
-    of_star, *of_links = mechanism.weights
-    weight = np.asarray(moment) + cross(at.rotation @ of_star, mechanism.gravity)
-    torque = virtual_work.inverse_dynamics(mechanism, at, gamma_dot, gamma_ddot, weight)
-    # Moments of the weights of links about O in their own frames, which work by their Jacobians.
-    local_weights = [
-        cross(centre, mechanism.gravity @ frame)
-        for centre, frame in zip(of_links, frames, strict=True)
-    ]
-    for jacobian, acting in zip(virtual_work.link_jacobians(at), local_weights, strict=True):
-        torque = torque - np.einsum("kij,ki->j", jacobian, acting)
-    motion = of_actuators(at, gamma_dot, gamma_ddot)
-    inertias = mechanism.actuated, mechanism.intermediate
-    rates = (motion.omega_a, motion.omega_a_dot), (motion.omega_ipl, motion.omega_ipl_dot)
-    # I omega_dot + omega x I omega of three links in their own frames, less weights; then in {B}.
-    changes = (
-        np.einsum("kij,kj->ki", i, omega_dot)
-        + cross(omega, np.einsum("kij,kj->ki", i, omega))
-        - acting
-        for i, (omega, omega_dot), acting in zip(inertias, rates, local_weights, strict=True)
+    matrix = np.asarray(rotation, dtype=float)
+    if gamma is None:
+        gamma = kinematics.inverse(geometry, matrix)[0]
+    angles = np.asarray(gamma, dtype=float)
+    v, w = geometry.v, geometry.w
+    r = kinematics.carriage_directions(geometry, angles)
+    t = geometry.e @ np.swapaxes(matrix, -1, -2)
+    shape = angles.shape[:-1]
+    by_gamma = np.zeros((*shape, 3, 3))  # change of F by leg, then by parameter
+    by_v = np.zeros((*shape, 3, 3, 3))
+    by_alpha = np.zeros((*shape, 3, 3))
+    axes = np.eye(3)
+    turns = np.cumsum([0.0, *geometry.alpha[:2]])
+    for k in range(3):
+        following = (k + 1) % 3
+        sine, cosine = np.sin(angles[..., k, None]), np.cos(angles[..., k, None])
+        by_gamma[..., k, k] = _dot(np.cross(w[k], r[..., k, :]), t[..., k, :])
+        for axis in range(3):
+            for leg in (k, following):
+                moved = axes[axis] - v[leg] * v[leg][axis]  # of a unit vector
+                if leg == k:
+                    normal, along = cross(moved, v[following]), moved
+                else:
+                    normal, along = cross(v[k], moved), np.zeros(3)
+                normal = (normal - w[k] * (w[k] @ normal)) / np.sin(geometry.arc[k])
+                across = cross(normal, v[k]) + cross(w[k], along)
+                change = cosine * along + sine * across
+                by_v[..., k, leg, axis] = _dot(change, t[..., k, :])
+        turned = np.array([-np.cos(turns[k]), -np.sin(turns[k]), 0.0])
+        by_turn = _dot(r[..., k, :], matrix @ turned)
+        by_alpha[..., k, :k] = by_turn[..., None]
+    j2 = cross(t, r)
+    determinant = np.linalg.det(j2)
+    if np.min(np.abs(determinant)) < SINGULAR:
+        least = float(np.min(np.abs(determinant)))
+        raise SingularConfiguration("parallel singularity, det J2 = 0", least)
+    solved = -np.swapaxes(matrix, -1, -2) @ np.linalg.inv(j2)
+    of_v = solved @ by_v.reshape(*shape, 3, 9)
+    return OrientationSensitivity(
+        solved @ by_gamma, of_v.reshape(*shape, 3, 3, 3), solved @ by_alpha
     )
-    d1, d2 = (np.einsum("kij,kj->ki", f, d) for f, d in zip(frames, changes, strict=True))
-    # With t.m = 0 and r, N = r x t across t: m = x r + y N, and w.r = 0, w.N = c.
-    x = -np.sum(at.r * d2, axis=1)
-    y = (torque - np.sum(at.w * (d1 + d2), axis=1)) / at.c
-    prismatic = x[:, None] * at.r + y[:, None] * cross(at.r, at.t)
-    revolute = prismatic + d2
-    actuated = revolute + d1 - torque[:, None] * at.w
-    moments, own_frames = [actuated, revolute, prismatic], (*frames, frames[1])
-    local = [np.einsum("kij,ki->kj", f, m) for f, m in zip(own_frames, moments, strict=True)]
-    for array, axis in zip(local, (2, 0, 2), strict=True):
-        array[:, axis] = 0.0  # by the equations above; what rounding left goes
-    return Reactions(*frozen(*moments, *local, torque))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.sum(a * b, axis=-1))
