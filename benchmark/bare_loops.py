@@ -161,7 +161,7 @@ def measure(watch: Client, name: str, seconds: float, latency_us: int = -1) -> d
                 return process.submit(run_loop, name, seconds, latency_us).result()
         full = "/sst_simulator"
         watch.values.clear()
-        simulator = start_simulator(scene="swing", compiled=True, cpu_dma_latency=latency_us)
+        simulator = start_simulator(scene="swing", cpu_dma_latency=latency_us)
         try:
             watch.wait_for_runs(full)
             watch.spin(2.5)

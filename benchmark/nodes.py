@@ -22,14 +22,12 @@ _TICK = os.sysconf("SC_CLK_TCK")
 
 
 @contextmanager
-def own_domain(*, compiled: bool = True) -> Iterator[int]:
+def own_domain() -> Iterator[int]:
     """Give the processes that are started inside a ROS domain of their own, on localhost."""
     number, lock = processes.lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:
         with patch.dict(os.environ, ours):
-            os.environ.pop("SST_ROS_NUMBA", None)
-            os.environ.update({} if compiled else {"SST_ROS_NUMBA": "0"})
             yield number
     finally:
         os.close(lock)

@@ -95,7 +95,6 @@ def track_node_over_bare_loop() -> float:
     from benchmark import bare_loops
     from benchmark.nodes import Client
 
-    subprocess.run([sys.executable, "-m", "sst_ros", "compile", "swing"], check=True)
     with Client.start() as watch:
         node, loop = (
             median(bare_loops.measure(watch, name, 5.0, -1)["processor"] for _ in range(3))

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -223,13 +221,9 @@ def _count_recorded(bag: Path) -> str:
 
 def main() -> None:
     of_runs: dict[str, Any] = {"minutes": 1.0, "usual": float, "rounds": 3, "seconds": 20.0}
-    of_nodes = {"scene": "example2_heavy", "plain": False, "priority": 20, "fleet": 0, "rate": 200}
+    of_nodes = {"scene": "example2_heavy", "priority": 20, "fleet": 0, "rate": 200}
     options = read_options("realtime", __doc__, None, **of_runs, **of_nodes, write=False)
-    given = {"scene": options.scene, "compiled": str(not options.plain).lower()}
-    given["realtime_priority"] = options.priority
-    if not options.plain:
-        made = [sys.executable, "-m", "sst_ros", "compile", options.scene]
-        subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
+    given = {"scene": options.scene, "realtime_priority": options.priority}
     with Client.start() as watch:
         parts = dict(_measure(watch, options, given))
     if options.write:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import re
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -139,7 +138,6 @@ def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]
 def main() -> int:
     """Soak, print the table and what is wrong."""
     options = read_options("soak", __doc__, minutes=10.0)
-    subprocess.run([sys.executable, "-m", "sst_ros", "compile", SCENE], check=True)
     with own_domain(), tempfile.TemporaryDirectory() as folder:
         columns, wrong = soak(Path(folder), 60.0 * options.minutes)
         stamps = recording.read(Path(folder) / "bag").time_ns

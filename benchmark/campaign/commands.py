@@ -111,7 +111,7 @@ WRONG += [
 def command_lines(ledger: Ledger) -> None:
     """Give wrong words to every verb: one line and a status other than 0, or usage."""
     rng = ledger.rng
-    with own_domain(compiled=False), tempfile.TemporaryDirectory() as name:
+    with own_domain(), tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "folder").mkdir()
         (folder / "empty.yaml").write_text("")
@@ -135,16 +135,16 @@ def surroundings(ledger: Ledger) -> None:
         folder.chmod(0o777)
         readonly = folder / "readonly"
         readonly.mkdir(mode=0o555)
-        show, compiled, full = "scene show example2", "compile example2", "XDG_CACHE_HOME"
+        show, run, full = "scene show example2", "simulate example2 --duration 0.1", "TMPDIR"
         cases: dict[str, tuple[str, dict[str, str], int | None]] = {
             "no HOME": ("scene list", {"HOME": ""}, None),
             "HOME that is not there": (show, {"HOME": "/nonexistent"}, None),
-            "read-only HOME": (compiled, {"HOME": str(readonly)}, nobody),
+            "read-only HOME": (run, {"HOME": str(readonly)}, nobody),
             "TMPDIR that is not there": ("scene list", {"TMPDIR": "/nonexistent"}, None),
             "plain ASCII": (show, {"LANG": "C", "LC_ALL": "C"}, None),
             "ASCII output": ("scene list", {"PYTHONIOENCODING": "ascii"}, None),
-            "cache in a full disk": (compiled, {full: "/dev/full"}, None),
-            "cache that is a file": (compiled, {full: "/etc/passwd"}, None),
+            "temporary files in a full disk": (run, {full: "/dev/full"}, None),
+            "temporary files in a file": (run, {full: "/etc/passwd"}, None),
             "another user": ("scene list", {"HOME": str(folder)}, nobody),
             "no columns": ("scene list", {"COLUMNS": "0", "TERM": "dumb"}, None),
         }

@@ -101,7 +101,7 @@ class Ledger:
 
 PARTS = {
     "invariants": ("scenes", "random scenes: invariants over 0.1 s"),
-    "bits": ("scenes", "random scenes: compiled against interpreted"),
+    "bits": ("scenes", "random scenes: machine code against plain Python"),
     "estimates": ("scenes", "error estimates: ten classes of scenes, all methods"),
     "workers": ("machine", "simulations in threads, forked and spawned processes"),
     "saves": ("machine", "saves to one path at a time"),

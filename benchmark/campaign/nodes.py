@@ -38,7 +38,7 @@ def start(command: str, **given: Any) -> Process:
 @contextmanager
 def running(**given: object) -> Iterator[tuple[Process, Client]]:
     """Give a running simulator and a client of it."""
-    with own_domain(compiled=False) as number:
+    with own_domain() as number:
         process = start("simulator", **{"scene": "swing", "duration": 0.0, **given})
         client = Client(number)
         try:
@@ -169,7 +169,7 @@ def node_kills(ledger: Ledger) -> None:
 def recorder_kills(ledger: Ledger) -> None:
     """Kill the recorder at random moments: all but the last chunk comes back."""
     for number in ledger.cases(34):
-        with TemporaryDirectory() as name, own_domain(compiled=False):
+        with TemporaryDirectory() as name, own_domain():
             bag = Path(name) / "bag"
             recorder = start("recorder", output=bag)
             simulator = start("simulator", scene="swing", duration=0.0)
@@ -239,7 +239,7 @@ def starts(ledger: Ledger) -> None:
     rng = ledger.rng
     before = _shared_memory()
     for number in ledger.cases(200, least=4):
-        with own_domain(compiled=False):
+        with own_domain():
             kind = ("simulator", "torque_player", "recorder", "inverse_dynamics")[number % 4]
             bag = {"output": f"/tmp/sst_campaign_{os.getpid()}_{number}"}
             process = start(kind, **(bag if kind == "recorder" else {}))

@@ -122,6 +122,7 @@ def _body(named: NamedProgram) -> Iterator[str]:
         first += argument.size
     words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
     for i, (operation, operands) in enumerate(program.steps):
+        assert isinstance(operation, str)  # no other program is called
         expression = _expression(operation, [_word(x, words) for x in operands])
         yield f"    const double v{i} = {expression};"
     for i, output in enumerate(program.outputs):

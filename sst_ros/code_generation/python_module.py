@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sst_ros.code_generation.named_programs import NamedProgram, SceneEquations
-from sst_ros.dynamics.expression import Program
+from sst_ros.programs.expression import Program
 
 FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos")
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
@@ -165,5 +165,6 @@ def write_operations(program: Program, library: Library) -> tuple[list[str], lis
 
     lines = []
     for i, (operation, operands) in enumerate(program.steps):
+        assert isinstance(operation, str)  # no other program is called
         lines.append(f"v{i} = {library.expression(operation, [*map(word, operands)])}")
     return lines, [word(output) for output in program.outputs]

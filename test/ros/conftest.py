@@ -101,7 +101,7 @@ class Nodes:
             stderr=subprocess.PIPE,
             text=True,
             # To make machine code for every scene of a test would take longer than all tests.
-            env={**os.environ, "SST_ROS_NUMBA": "0", **ends_with, **(env or {})},
+            env={**os.environ, **ends_with, **(env or {})},
         )
         self.running.append(process)
         return process
@@ -111,7 +111,7 @@ class Nodes:
         if command == "simulator":  # in lockstep by default it would end with the scene's
             given.setdefault("duration", 0.0)
         words = [command, *words, "--ros-args", *processes.words(given)]
-        self.running.append(ForkedNode(words, {**os.environ, "SST_ROS_NUMBA": "0"}))
+        self.running.append(ForkedNode(words, dict(os.environ)))
         return self.running[-1]
 
     def line(self, process, timeout=40):
@@ -326,7 +326,7 @@ def forked_demos(domain_of_module):
     """Have demos fork their nodes, too; test_demo.py starts them as a user does."""
 
     def start(words, env, **_):
-        return ForkedNode(words[words.index("sst_ros") + 1 :], {**env, "SST_ROS_NUMBA": "0"})
+        return ForkedNode(words[words.index("sst_ros") + 1 :], env)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(processes, "Popen", start)

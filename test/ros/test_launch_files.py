@@ -46,7 +46,7 @@ class Launch:
     def __init__(self, folder, *words):
         self._printed = folder / f"printed_{len(list(folder.glob('printed_*')))}"
         with self._printed.open("w") as out:
-            env = {**os.environ, "SST_ROS_NUMBA": "0", "ROS_LOG_DIR": str(folder / "log")}
+            env = {**os.environ, "ROS_LOG_DIR": str(folder / "log")}
             self._process = subprocess.Popen(
                 [ROS2, *words],
                 cwd=folder,

@@ -132,7 +132,7 @@ sys.exit(status)
 
 
 def test_a_signal_while_python_exits_changes_nothing(domain):
-    assert "Traceback" not in python(LATE, env={"SST_ROS_NUMBA": "0"}).stderr
+    assert "Traceback" not in python(LATE).stderr
 
 
 def test_signals_are_handled_before_what_takes_time_to_import():
