@@ -44,6 +44,8 @@ _ATTEMPTS = 4
 """Runs until the error estimate is at most the tolerance."""
 _FINEST = 1e-14
 """Least tolerance of a step: below it rounding decides."""
+_LEAST_GAIN = 0.5
+"""A run by a fifth of the tolerance or less that keeps more of the error is the last."""
 _FUNCTION_BUDGET = 1_000_000
 """Evaluations where each calls a function of the state: half a minute."""
 _ADVICE = (
@@ -169,7 +171,7 @@ def _integrate(task: Task, *, progress: bool) -> Trajectory:
     """
     budget = EvaluationBudget(_budget_of(task), whole_run=True)
     remembers = task.period is not None and not task.memoryless
-    local, kept = task.tolerance, None
+    local, kept, last = task.tolerance, None, math.inf
     for _ in range(_ATTEMPTS):
         attempt = replace(task, tolerance=local)
         motion = SteppedMotion(attempt, start_of(task.scene), budget, progress=progress).run()
@@ -177,8 +179,10 @@ def _integrate(task: Task, *, progress: bool) -> Trajectory:
             break
         kept = motion
         excess = motion.at.error / task.tolerance
-        if remembers or motion.status < 0 or not excess > 1.0:
+        hopeless = excess > _LEAST_GAIN * last  # as under torques that switch with the state
+        if remembers or motion.status < 0 or not excess > 1.0 or hopeless:
             break
+        last = excess
         local = max(local / (5.0 * excess), _FINEST)
     assert kept is not None
     unseen = remembers and task.torque.feedback
