@@ -468,7 +468,7 @@ class _Path(NamedTuple):
 def _check_passive(space: ActuatorSpaceMap, measured: MeasuredMotion, scene: Scene) -> None:
     """Refuse measured mu and beta that are not those of the measured gamma.
 
-    What is measured need not close the loops: by APART they tell another manipulator or assembly.
+    What is measured need not close the loops: APART is what no sensor is off, but another assembly.
     """
     given = {name: getattr(measured, name) for name in ("mu", "beta")}
     if all(values is None for values in given.values()):

@@ -14,6 +14,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from sst_ros.errors import Problem, refusal
@@ -26,6 +27,9 @@ from sst_ros.state import Array, Quaternion
 if TYPE_CHECKING:
     from sst_ros.recording.recording import Recording
 
+
+Known: TypeAlias = NDArray[np.bool_]
+"""Of each interval between samples whether its torque is known."""
 
 Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any]"
 
@@ -117,16 +121,15 @@ def resample(motion: MeasuredMotion) -> tuple[MeasuredMotion, str]:
     spacing = np.diff(t)
     period = float(np.median(spacing))
     if np.abs(spacing - period).max() <= EVEN * period + 2.0 * np.spacing(motion.t[-1]):
-        even = np.linspace(0.0, t[-1], len(t))
-        return replace(motion, t=even, gamma_dot=None), ""
+        return replace(motion, t=np.linspace(0.0, t[-1], len(t)), gamma_dot=None), ""
     count = int(t[-1] / period * (1.0 + 1e-12)) + 1
-    even = period * np.arange(count)
+    even: Array = period * np.arange(count, dtype=float)
     gamma = CubicSpline(t, motion.gamma)(even)
     if motion.held:
         torque = _average(torques.TorqueTable(t[:-1], motion.torque), even)
     else:
         torque = CubicSpline(t, motion.torque)(even)
-    passive = dict.fromkeys(("mu", "beta", "gamma_dot"))
+    passive: dict[str, Any] = dict.fromkeys(("mu", "beta", "gamma_dot"))
     note = (
         f"stamps are uneven, {spacing.min():.3g} to {spacing.max():.3g} s apart: the motion is "
         f"sampled again each {period:.3g} s"
@@ -134,8 +137,10 @@ def resample(motion: MeasuredMotion) -> tuple[MeasuredMotion, str]:
     return replace(motion, t=even, gamma=gamma, torque=torque, **passive), note
 
 
-def _read(data: Measured) -> tuple[MeasuredMotion, Array, str]:
+def _read(data: Measured) -> tuple[MeasuredMotion, Known, str]:
     """Read a motion; say of each interval whether its torque is known, and what was unwrapped."""
+    given: dict[str, Any]
+    known: Known | None
     if isinstance(data, Mapping):
         given, known = dict(data), None
     else:
@@ -159,7 +164,7 @@ def _read(data: Measured) -> tuple[MeasuredMotion, Array, str]:
 def _cut(motion: MeasuredMotion, first: int, end: int) -> MeasuredMotion:
     """Return the samples from the first up to the end, and the torques between them."""
     rows = slice(first, end)
-    chosen = {
+    chosen: dict[str, Any] = {
         name: None if (array := getattr(motion, name)) is None else array[rows]
         for name in ("t", "gamma", "gamma_dot", "mu", "beta")
     }
@@ -168,7 +173,7 @@ def _cut(motion: MeasuredMotion, first: int, end: int) -> MeasuredMotion:
     return replace(motion, **chosen, torque=torque, quaternion=quaternion)
 
 
-def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Array | None]:
+def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Known]:
     """Take a simulated motion, or what was measured in a recorded run while it has torques.
 
     Also whether the torque of each interval is known. Rates of a run count only where they are
@@ -186,7 +191,7 @@ def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Array |
     if held:  # without a law to their sample, see `Trajectory`
         torque = torque[1:] if law is None else _average(law, t)
     begin, end = t[:-1, None], t[1:, None]
-    lost = ((begin < motion.gaps[:, 1]) & (end > motion.gaps[:, 0])).any(axis=1)
+    lost: Known = np.any((begin < motion.gaps[:, 1]) & (end > motion.gaps[:, 0]), axis=1)
     return {
         "t": t,
         "gamma": np.unwrap(motion.gamma, axis=0),
@@ -197,13 +202,13 @@ def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Array |
     }, ~lost
 
 
-def _take_measured(run: Recording) -> tuple[dict[str, Any], Array]:
+def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
     """Take what was measured in a recorded run, while its torques are known."""
-    exact = run.motion is run.measured
-    if exact:  # samples without an orientation are none of the motion
+    passive: tuple[Array | None, Array | None] = (None, None)
+    if run.motion is run.measured:  # samples without an orientation are none of the motion
         motion = run.trajectory
         t, gamma, rates, effort = motion.t, motion.gamma, motion.gamma_dot, motion.torque
-        passive, quaternions = (None, None), motion.quaternion
+        quaternions = motion.quaternion
     else:
         shown = run.measured
         t, gamma, rates, effort = shown.time_ns / 1e9, shown.gamma, None, shown.effort

@@ -160,7 +160,7 @@ class Signals:
 
 @dataclass
 class _Heard:
-    """What came on one topic."""
+    """Messages of one topic."""
 
     table: TopicTable | None  # None for scenes and diagnostics
     # Compact: an hour at 500 Hz has 1.8 million rows.
@@ -246,8 +246,8 @@ def read_signals(
     start_ns = min(starts or firsts)
     origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
     scene = yaml_document.read(Scene, next(iter(scenes)), origin) if scenes else None
-    told = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
-    statuses = [one for one in told if not run.is_of_another(one.name)]
+    reported = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
+    statuses = [one for one in reported if not run.is_of_another(one.name)]
     statuses.sort(key=lambda status: status.received_ns)
     joints = of_run.get(topics.JOINT_STATES.key, nothing)
     return Signals(
