@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """equations(): the equations of motion of a scene for other programs and languages.
 
-The package traces its dynamics into straight-line programs (`dynamics.expression`). Here
+The package traces its dynamics into straight-line programs (`programs.expression`). Here
 they are written out: as C, as a module of Python on the numbers of another library, as a
 unit of the Functional Mock-up Interface, or as a model of MuJoCo.
 """

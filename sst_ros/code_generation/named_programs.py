@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import Program, mark_present, trace
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.dynamics.variational import REBOUND, list_numbers, refuse_other_numbers
 from sst_ros.errors import refusal, suggestion
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.programs.expression import Program, mark_present, trace
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import build_unchecked
@@ -76,6 +76,15 @@ class NamedProgram(NamedTuple):
     arguments: tuple[Argument, ...]
     shape: tuple[int, ...]
     program: Program  # its inputs are the symbols of the arguments, in order
+
+    @property
+    def steps(self) -> list[tuple[str, tuple[float | int, ...]]]:
+        """The operations of the program by name, with their operands."""
+        steps = []
+        for operation, operands in self.program.steps:
+            assert isinstance(operation, str)  # equations call no routine
+            steps.append((operation, operands))
+        return steps
 
 
 class SceneEquations:
