@@ -111,7 +111,7 @@ def _body(named: NamedProgram) -> Iterator[str]:
     program = named.program
     used = {
         operand
-        for operands in (*(step[1] for step in program.steps), program.outputs)
+        for operands in (*(step[1] for step in named.steps), program.outputs)
         for operand in operands
         if isinstance(operand, int)
     }
@@ -121,8 +121,7 @@ def _body(named: NamedProgram) -> Iterator[str]:
         yield from _reads(argument, [number - first for number in numbers if number in used])
         first += argument.size
     words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
-    for i, (operation, operands) in enumerate(program.steps):
-        assert isinstance(operation, str)  # no other program is called
+    for i, (operation, operands) in enumerate(named.steps):
         expression = _expression(operation, [_word(x, words) for x in operands])
         yield f"    const double v{i} = {expression};"
     for i, output in enumerate(program.outputs):

@@ -77,6 +77,15 @@ class NamedProgram(NamedTuple):
     shape: tuple[int, ...]
     program: Program  # its inputs are the symbols of the arguments, in order
 
+    @property
+    def steps(self) -> list[tuple[str, tuple[float | int, ...]]]:
+        """The operations of the program by name, with their operands."""
+        steps = []
+        for operation, operands in self.program.steps:
+            assert isinstance(operation, str)  # equations call no routine
+            steps.append((operation, operands))
+        return steps
+
 
 class SceneEquations:
     """The equations of a scene, with `parameters` open.

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sst_ros.code_generation.named_programs import NamedProgram, SceneEquations
-from sst_ros.programs.expression import Program
 
 FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos")
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
@@ -143,7 +142,7 @@ def _function(named: NamedProgram, library: Library) -> Iterator[str]:
     for argument in named.arguments:
         symbols = ", ".join(argument.symbols)
         yield f"    {symbols}, = {library.unpack.format(argument.name)}"
-    lines, results = write_operations(named.program, library)
+    lines, results = _write_operations(named, library)
     yield from (f"    {line}" for line in lines)
     shape = ", ".join(map(str, named.shape))
     yield f"    return _collect(({', '.join(results)},), {shape})"
@@ -153,8 +152,9 @@ def _function(named: NamedProgram, library: Library) -> Iterator[str]:
         yield f"\n\n{library.made.format(name=named.name, sizes=sizes)}"
 
 
-def write_operations(program: Program, library: Library) -> tuple[list[str], list[str]]:
+def _write_operations(named: NamedProgram, library: Library) -> tuple[list[str], list[str]]:
     """Return a line for each step, v0 = .., v1 = .., and what the outputs are called."""
+    program = named.program
     words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
 
     def word(operand: float | int) -> str:
@@ -164,7 +164,6 @@ def write_operations(program: Program, library: Library) -> tuple[list[str], lis
         return f"({number})" if number.startswith("-") else number
 
     lines = []
-    for i, (operation, operands) in enumerate(program.steps):
-        assert isinstance(operation, str)  # no other program is called
+    for i, (operation, operands) in enumerate(named.steps):
         lines.append(f"v{i} = {library.expression(operation, [*map(word, operands)])}")
     return lines, [word(output) for output in program.outputs]
