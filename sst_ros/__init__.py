@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sst_ros.control.linearize import equilibrium as equilibrium
     from sst_ros.control.linearize import linearize as linearize
     from sst_ros.control.reference_motions import reference_motion as reference_motion
+    from sst_ros.dynamics.own_loads import own_load as own_load
     from sst_ros.errors import AssemblyError as AssemblyError
     from sst_ros.errors import InputError as InputError
     from sst_ros.errors import RunStopped as RunStopped
@@ -63,6 +64,7 @@ _MODULES = {
     "control.law": "ControllerSettings",
     "control.linearize": "LinearModel equilibrium linearize",
     "control.reference_motions": "reference_motion",
+    "dynamics.own_loads": "own_load",
     "errors": "AssemblyError InputError RunStopped SingularConfiguration SstError",
     "identification.identify": "identify",
     "identification.parameters": "Identification",

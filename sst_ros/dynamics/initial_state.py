@@ -112,7 +112,7 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
     has them or in its inertias and n_ext; InputError names each other term.
     """
     lag = scene.actuators and scene.actuators.time_constant
-    end, terms = scene.stroke.at_end, ("gravity", "friction", "springs")
+    end, terms = scene.stroke.at_end, ("gravity", "friction", "springs", "own_loads")
     refused = "the equations of the paper have no such term: use equations = quaternion"
     refuse_unless(
         scene.name,

@@ -23,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from sst_ros.dynamics.model import ElasticStops, Leg, Model, model_of
+from sst_ros.dynamics.own_loads import LoadConstants, load_program, run_program
 from sst_ros.mechanism.generic_math import (
     Quadruple,
     Rows,
@@ -48,6 +49,7 @@ from sst_ros.mechanism.generic_math import (
 )
 from sst_ros.scene.bodies import PLACES
 from sst_ros.scene.loads import Friction
+from sst_ros.scene.own_loads import ANGLES, BODY_RATE, OMEGA, ROTATION
 from sst_ros.state import ZERO, Joints
 
 __all__ = ["Leg", "Model", "model_of"]
@@ -122,8 +124,11 @@ def balance(
     for external in (model.moment, moment):
         if external is not None:
             force = add(force, rotate_back(rows, external))
+    own = own_torques(model, rows, rate) if model.own_loads else None
+    if own is not None:
+        force = add(force, own.star)
     jacobian = []
-    for leg, drive in zip(model.legs, torque, strict=True):
+    for k, (leg, drive) in enumerate(zip(model.legs, torque, strict=True)):
         at = leg_motion(leg, rows, rate)
         a, p, u, g, a_dot, gamma_dot = at.a, at.p, at.u, at.g, at.a_dot, at.gamma_dot
         jacobian.append(g)
@@ -141,6 +146,8 @@ def balance(
         force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
         toward_a, toward_gamma = multiply(c_inertia, g), axpy(a_inertia, g, c_inertia, p)
         at_gamma, at_mu, at_beta = joint_torques(at, field)
+        if own is not None:
+            at_gamma, at_mu, at_beta = add((at_gamma, at_mu, at_beta), own.joints[k])
         force_gamma = force_gamma - at_gamma
         if not (type(at_mu) is float and at_mu == 0.0):
             force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
@@ -237,6 +244,10 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
             own = own - dot3(_combine(leg.drive, *first), field)
             own = own - dot3(_combine(leg.link, *second), field)
         total = total + own
+    legs = list(leg_motions(model, state)) if model.own_loads else []
+    for load in model.own_loads:
+        if load.formula.potential is not None:
+            total = total + _run_load(load, rows, triple(state[4:7]), legs)[0]
     return total
 
 
@@ -266,6 +277,10 @@ def power(
     for external in (model.moment, moment):
         if external is not None:
             total = total + dot3(external, triple(dot3(row, (wx, wy, wz)) for row in rows))
+    for load in model.own_loads:
+        if load.formula.moment:
+            legs = list(leg_motions(model, state))
+            total = total + dot3(_own_moment(load, rows, (wx, wy, wz), legs), (wx, wy, wz))
     return total
 
 
@@ -295,6 +310,62 @@ def joint_torques(at: LegMotion, field: Triple) -> Triple:
     rubbing = zip(friction, springs, strict=True)
     first, second, third = (rub + spring for rub, spring in rubbing)
     return first + at_gamma, second + at_mu, third
+
+
+class OwnTorques(NamedTuple):
+    """What the own loads of a scene do."""
+
+    star: Triple  # moment on the star in {E} [N m]
+    joints: list[Triple]  # torques at gamma, mu and beta by leg [N m]
+
+
+def own_torques(model: Model, rows: Rows, rate: Triple) -> OwnTorques:
+    """Sum the own loads; `rows` are the rows of R, `rate` is W."""
+    legs = [leg_motion(leg, rows, rate) for leg in model.legs]
+    star: Triple = ZERO
+    joints: list[Triple] = [ZERO, ZERO, ZERO]
+    for load in model.own_loads:
+        if load.formula.moment:
+            star = add(star, _own_moment(load, rows, rate, legs))
+            continue
+        _, *slopes = _run_load(load, rows, rate, legs)
+        names = load_program(load.formula).quantities
+        by_name = dict(zip(names, slopes, strict=True))
+        for i, row in enumerate(rows, start=1):
+            by_row = triple(by_name.get(f"R{i}{j}", 0.0) for j in (1, 2, 3))
+            star = add(star, cross3(row, by_row))  # -G_i x R_i
+        for k in range(3):
+            angles = (f"{kind}_{k + 1}" for kind in ("gamma", "mu", "beta"))
+            torques = triple(-by_name.get(name, 0.0) for name in angles)
+            joints[k] = add(joints[k], torques)
+    return OwnTorques(star, joints)
+
+
+def _own_moment(load: LoadConstants, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) -> Triple:
+    """Moment of an own load on the star in {E} [N m]."""
+    moment = triple(_run_load(load, rows, rate, legs))
+    return moment if load.formula.in_star else rotate_back(rows, moment)
+
+
+def _run_load(
+    load: LoadConstants, rows: Rows, rate: Triple, legs: Sequence[LegMotion]
+) -> list[Scalar]:
+    """Run the program of an own load at a state."""
+    names, program = load_program(load.formula)
+    values = [_quantity(name, rows, rate, legs) for name in names]
+    return run_program(program, [*values, *load.parameters])
+
+
+def _quantity(name: str, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) -> Scalar:
+    """Return what a name in a formula means: see `scene.own_loads.STATE`."""
+    if name in ROTATION:
+        return rows[int(name[1]) - 1][int(name[2]) - 1]
+    if name in OMEGA:
+        return dot3(rows[OMEGA.index(name)], rate)
+    if name in BODY_RATE:
+        return rate[BODY_RATE.index(name)]
+    kind, leg = ("gamma", "mu", "beta").index(name.partition("_")[0]), legs[int(name[-1]) - 1]
+    return joint_angle(leg, kind) if name in ANGLES else joint_rate(leg, kind)
 
 
 def friction_torque(friction: Friction, v: Scalar) -> Scalar:

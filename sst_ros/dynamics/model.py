@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sst_ros.dynamics.own_loads import LoadConstants, load_constants
 from sst_ros.errors import RunStopped, SingularityReached, StrokeExceeded, WorkspaceLeft
 from sst_ros.mechanism.generic_math import Symmetric, Triple, cross3, multiply, triple
 from sst_ros.mechanism.geometry import Geometry
@@ -69,6 +70,7 @@ class Model(NamedTuple):
     weight: Triple = ZERO  # mass times centre of star and payload in {E} [kg m]
     moment: Triple | None = None  # constant, on the star in {B} [N m]
     time_constant: float | None = None  # lag of the actuators [s]
+    own_loads: tuple[LoadConstants, ...] = ()
 
 
 def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
@@ -110,6 +112,7 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
         weight=triple(sum(body.mass * body.centre[i] for body in carried) for i in range(3)),
         moment=None if scene.moment is None else scene.moment.value,
         time_constant=None if scene.actuators is None else scene.actuators.time_constant,
+        own_loads=tuple(map(load_constants, scene.own_loads)),
     )
 
 

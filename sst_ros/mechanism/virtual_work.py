@@ -55,7 +55,9 @@ class Mechanism:
             np.array([np.multiply(link.mass, link.centre) for link in scene.intermediate_links]),
         )
         gravity = np.array(ZERO if scene.gravity is None else scene.gravity.acceleration)
-        others = tuple(name for name in ("friction", "springs") if getattr(scene, name))
+        others = tuple(
+            name for name in ("friction", "springs", "own_loads") if getattr(scene, name)
+        )
         others += ("stroke.stiffness",) if scene.stroke.stiffness is not None else ()
         geometry = Geometry.of(scene)
         return cls(geometry, star, actuated, intermediate, gravity, weights, others)

@@ -61,7 +61,7 @@ TURN, REST = ("turn_x", "turn_y", "turn_z"), (0.0, 0.0, 0.0)
 ATTEMPTS = 3
 _PHYSICAL = (
     "star", "actuated_links", "intermediate_links", "payload", "gravity", "moment", "friction",
-    "springs", "actuators",
+    "springs", "own_loads", "actuators",
 )  # fmt: skip
 """Parts of a scene that the equations have numbers from."""
 

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import InputError, Problem, check_kinds, refusal, suggestion
 from sst_ros.scene import loads, schema, yaml_document
 from sst_ros.scene.bodies import Base, Link, Payload, Star, Stroke, Workspace
+from sst_ros.scene.own_loads import FormulaLoad
 from sst_ros.scene.schema import Place, Section, Spec, amount, entry, key_of
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import find_fields, plain, read, replace_values, values_at
@@ -49,6 +50,7 @@ class Scene(Explained, Section):
     moment: loads.Moment | None = entry("external moment on the star")
     friction: loads.JointFriction | None = entry("friction in the joints")
     springs: tuple[loads.Spring, ...] = entry("springs at joints", default=())
+    own_loads: tuple[FormulaLoad, ...] = entry("loads of your own, by formulas", default=())
     actuators: loads.Actuators | None = entry("the actuators")
     stroke: Stroke = entry("range of the actuators", default=Stroke())
     workspace: Workspace = entry("where E may be", default=Workspace())
@@ -138,6 +140,7 @@ TERMS = {
     "friction in mu": "friction.mu",
     "friction in beta": "friction.beta",
     "springs": "springs",
+    "own loads": "own_loads",
     "rotors": "actuators.rotor_inertia",
     "torque limit": "actuators.torque_limit",
     "actuator lag": "actuators.time_constant",

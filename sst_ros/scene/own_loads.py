@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads of the user's own, written as formulas in the scene.
+
+A formula is arithmetic on names: no attribute, no index, no call but of a function in FUNCTIONS.
+So a scene from a stranger runs no code of its author, and the scene alone says what acts: in a
+file, in a bag, on each machine of a cluster. `dynamics.own_loads.own_load` writes a Python
+function as formulas.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Iterator
+from functools import lru_cache
+
+from sst_ros.scene.schema import Rules, Section, choice, entry
+
+ROTATION = tuple(f"R{i}{j}" for i in "123" for j in "123")
+"""Entries of R, the orientation of {E} in {B}: R13, R23, R33 is the direction of E."""
+
+ANGLES = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
+OMEGA = tuple(f"omega_{axis}" for axis in "xyz")  # angular velocity of the star in {B} [rad/s]
+BODY_RATE = tuple(f"body_rate_{axis}" for axis in "xyz")  # the same in {E}
+RATES = tuple(name.replace("_", "_dot_") for name in ANGLES)
+
+POSE = (*ROTATION, *ANGLES)
+"""Names that a potential may use."""
+STATE = (*POSE, *OMEGA, *BODY_RATE, *RATES)
+"""Names that a moment may use."""
+
+FUNCTIONS = {
+    "sqrt": 1, "exp": 1, "sin": 1, "cos": 1, "tan": 1, "tanh": 1, "abs": 1, "positive": 1,
+    "atan2": 2, "min": 2, "max": 2,
+}  # fmt: skip
+"""Number of arguments of each function; positive(x) is x where x > 0 and zero elsewhere."""
+
+RESERVED = {"pi", *STATE, *FUNCTIONS}
+LONGEST = 4000  # characters of a formula: the parser of Python recurses
+MOST_PARTS = 4000  # numbers, names and operations of a load: more is no formula, but a program
+DEEPEST = 200  # levels of a formula, whose evaluation recurses
+LARGEST_POWER = 8  # a power is written as products
+OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
+SIGNS = (ast.USub, ast.UAdd)
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+class LoadParameter(Section):
+    """A number of an own load, which sweeps, sensitivities and proofs may vary."""
+
+    name: str = entry("its name in the formulas")
+    value: float = entry("its value, in SI units", "SI")
+
+    def rules(self) -> Rules:
+        """Refuse names that formulas cannot have, or that mean something else."""
+        yield _is_strange(self.name), "name", self.name, _describe_name()
+
+
+class FormulaLoad(Section):
+    """A load by its potential energy, or by its moment on the star.
+
+    A potential acts where its formula says: by the rotation R on the star, by an angle at that
+    joint. Formulas have + - * / **, whole powers up to 8, sqrt, exp, sin, cos, tan, tanh, atan2,
+    abs, min, max, positive and pi. Their names are the parameters, the terms, and of the state
+    R11 to R33 (rows and columns of the rotation of {E} in {B}), gamma_1 to beta_3 [rad], and for a
+    moment omega_x (of the star in {B}), body_rate_x (in {E}) and gamma_dot_1 to beta_dot_3
+    [rad/s].
+    """
+
+    ONE_OF = "potential", "moment"
+
+    name: str = entry("short name")
+    parameters: tuple[LoadParameter, ...] = entry("numbers with names", default=())
+    terms: tuple[tuple[str, str], ...] = entry(
+        "intermediate results by name, each of those before it", default=()
+    )
+    potential: str | None = entry("formula of the potential energy [J]")
+    moment: tuple[str, ...] = entry("three formulas of the moment on the star [N m]", default=())
+    frame: str = choice("axes of the moment: those of {B} or of {E}", ("base", "star"))
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """Every formula of the load by its key."""
+        own = {f"terms.{name}": text for name, text in self.terms}
+        if self.potential is not None:
+            own["potential"] = self.potential
+        return own | {f"moment[{i}]": text for i, text in enumerate(self.moment)}
+
+    def rules(self) -> Rules:
+        """Refuse what is no formula, and names that are not there."""
+        count = len(self.moment)
+        yield count not in (0, 3), "moment", self.moment, "must be three formulas"
+        known = set(STATE if self.moment else POSE)
+        for parameter in self.parameters:
+            twice = parameter.name in known
+            yield twice, "parameters", parameter.name, "is given twice"
+            known.add(parameter.name)
+        parts = 0
+        for key, text in self.texts.items():
+            fault = find_fault(text, frozenset(known))
+            yield bool(fault), key, text, fault
+            if not fault:
+                parts += sum(1 for _ in ast.walk(parse(text)))
+            name = key.removeprefix("terms.")
+            if name != key:
+                strange = _is_strange(name) or name in known
+                yield strange, key, name, f"{_describe_name()}, and given once"
+                known.add(name)
+        yield parts > MOST_PARTS, "", parts, f"must have at most {MOST_PARTS} parts"
+
+
+@lru_cache(maxsize=256)
+def parse(text: str) -> ast.expr:
+    """Parse a formula; raises ValueError where it is none."""
+    if len(text) > LONGEST:
+        raise ValueError(f"must have at most {LONGEST} characters")
+    try:
+        return ast.parse(text, mode="eval").body
+    except (SyntaxError, RecursionError, MemoryError):
+        raise ValueError("must be a formula, as 0.5 * k * gamma_1**2 is one") from None
+
+
+@lru_cache(maxsize=256)
+def find_fault(text: str, known: frozenset[str]) -> str:
+    """Say what a formula must be that a text is not; "" where it is one of the known names."""
+    try:
+        tree = parse(text)
+    except ValueError as error:
+        return str(error)
+    if _measure_depth(tree) > DEEPEST:
+        return f"must have at most {DEEPEST} levels: write parts of it as terms"
+    called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    faults = (_fault_of(node, known) for node in ast.walk(tree) if id(node) not in called)
+    return next(filter(None, faults), "")
+
+
+def _measure_depth(tree: ast.AST) -> int:
+    """Count the levels of a formula."""
+    depth, level = 0, [tree]
+    while level:
+        depth += 1
+        level = [child for node in level for child in ast.iter_child_nodes(node)]
+    return depth
+
+
+def _fault_of(node: ast.AST, known: frozenset[str]) -> str:
+    """Say what is wrong with one part of a formula; "" for nothing."""
+    if isinstance(node, (*OPERATORS, *SIGNS, ast.Load)):
+        return ""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, OPERATORS):
+        return _fault_of_operation(node)
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, SIGNS):
+        return ""
+    if isinstance(node, ast.Constant):
+        return "" if is_finite(node.value) else "must have finite numbers only"
+    if isinstance(node, ast.Name):
+        if node.id in known or node.id == "pi":
+            return ""
+        if node.id in STATE:
+            return f"must be of the pose alone: {node.id} is a rate"
+        if node.id in FUNCTIONS:
+            return f"must give {node.id} its arguments in brackets"
+        return f"must have known names only: {node.id} is neither state, parameter nor term"
+    if isinstance(node, ast.Call):
+        return _fault_of_call(node)
+    return f"must be arithmetic: {type(node).__name__} is not allowed"
+
+
+def _fault_of_operation(node: ast.BinOp) -> str:
+    if isinstance(node.op, ast.Div):
+        divisor = node.right
+        if isinstance(divisor, ast.Constant) and divisor.value == 0:
+            return "must not divide by zero"
+    if isinstance(node.op, ast.Pow) and power_of(node) is None:
+        return f"must have powers that are whole numbers up to {LARGEST_POWER}"
+    return ""
+
+
+def _fault_of_call(node: ast.Call) -> str:
+    name = node.func.id if isinstance(node.func, ast.Name) else ""
+    if name not in FUNCTIONS:
+        return f"must call one of {', '.join(FUNCTIONS)}"
+    count = FUNCTIONS[name]
+    starred = any(isinstance(argument, ast.Starred) for argument in node.args)
+    if node.keywords or starred or len(node.args) != count:
+        return f"must give {name} {count} argument{'s' if count > 1 else ''}"
+    return ""
+
+
+def is_finite(value: object) -> bool:
+    """Whether a constant is a number that has a finite double; text and True are none."""
+    if type(value) is not int and type(value) is not float:
+        return False
+    try:
+        return math.isfinite(float(value))
+    except OverflowError:
+        return False
+
+
+def power_of(node: ast.BinOp) -> int | None:
+    """Return the power that a part of a formula raises to; None where it is not allowed."""
+    exponent, sign = node.right, 1
+    if isinstance(exponent, ast.UnaryOp) and isinstance(exponent.op, ast.USub):
+        exponent, sign = exponent.operand, -1
+    if not isinstance(exponent, ast.Constant) or type(exponent.value) is not int:
+        return None
+    return sign * exponent.value if 1 <= exponent.value <= LARGEST_POWER else None
+
+
+def names_in(texts: Iterator[str]) -> set[str]:
+    """Names that formulas use, those of functions left out."""
+    trees = [parse(text) for text in texts]
+    found = (node for tree in trees for node in ast.walk(tree))
+    return {node.id for node in found if isinstance(node, ast.Name)} - FUNCTIONS.keys()
+
+
+def _is_strange(name: str) -> bool:
+    return name in RESERVED or not _NAME.fullmatch(name)
+
+
+def _describe_name() -> str:
+    return "must be a name of letters, digits and _ that means nothing else"
