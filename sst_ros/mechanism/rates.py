@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rates and accelerations of every joint and link, and the moments that their joints transmit.
+"""Rates and accelerations of every joint and link.
 
 One leg equation, Eqs. 9 and 24 to 27, serves both directions; with c_k = (r x t).w = (w x r).t::
 
@@ -10,18 +10,6 @@ One leg equation, Eqs. 9 and 24 to 27, serves both directions; with c_k = (r x t
 Scalar products with N = r x t, r and w x r give gamma, mu and beta of a leg from the star; this
 needs no J2 and works at a parallel singularity. From the actuators, omega = J gamma_dot, Eq. 15,
 and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40, come first.
-
-All seven links turn about O, so every joint is a revolute about an axis through O: w_k (base to
-actuated link), r_k (to the intermediate link), t_k (the curved prismatic joint, to the star).
-Without friction it transmits a moment about O across its axis: 9 x 2 components, which with 3
-torques are as many as the 7 x 3 moment balances. So they are determinate, and each leg gives them
-in closed form: with the rates of change of angular momentum D_1k and D_2k of its links, the moment
-m on the star obeys::
-
-    t.m = 0,   r.m = -r.D_2k,   w.m = tau_k - w.(D_1k + D_2k),
-
-three equations with the determinant c_k. Only the moment about O is determinate: the forces in
-the bearings depend on where and how many they are. Divide by a bearing distance to size one.
 """
 
 from __future__ import annotations
@@ -31,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.errors import SingularConfiguration, refuse_unless
+from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
-from sst_ros.mechanism.virtual_work import SINGULAR, Mechanism, Posture, Three
+from sst_ros.mechanism.virtual_work import SINGULAR, Posture
 from sst_ros.state import ZERO
 
 
@@ -136,67 +124,3 @@ def _motion(
     )
     links = omega_a, omega_a_dot, omega_ipl, omega_ipl_dot
     return BodyRates(*frozen(omega, omega_dot, *joints, *links))
-
-
-@dataclass(frozen=True)
-class Reactions:
-    """Constraint moments about O [N m], shape (3, 3), rows by leg. Read-only.
-
-    A moment is what the link nearer the base exerts on the next one; the next one answers with
-    the opposite. In the frame of its own joint the component along the axis is 0.
-    """
-
-    #: base on actuated link k, across w_k, in {B}; the torque tau_k w_k not included
-    actuated: Array
-    revolute: Array  #: actuated on intermediate link, across r_k, in {B}
-    prismatic: Array  #: intermediate link on the star, across t_k, in {B}
-    actuated_local: Array  #: in {1k} = [r, w x r, w]; z is 0
-    revolute_local: Array  #: in {2k} = [r, t x r, t]; x is 0
-    prismatic_local: Array  #: in {2k}; z is 0
-    torque: Array  #: actuator torques that belong to this motion [N m], shape (3,)
-
-
-def of_motion(
-    mechanism: Mechanism, at: Posture, gamma_dot: Three, gamma_ddot: Three, moment: Three = ZERO
-) -> Reactions:
-    """Constraint moments, and torques, that a motion asks for: gamma_dot [rad/s], gamma_ddot.
-
-    The moment is n_ext [N m] in {B}, beside the weights of all bodies. For the motion that torques
-    cause see `virtual_work.direct_dynamics`. InputError refuses scenes with friction, springs or
-    elastic stops.
-    """
-    allowed = f"a scene with {', '.join(mechanism.others)} has moments that are not known here"
-    refuse_unless("reactions", ("scene", mechanism.others, not mechanism.others, allowed))
-    frames = virtual_work.link_frames(at)
-    of_star, *of_links = mechanism.weights
-    weight = np.asarray(moment) + cross(at.rotation @ of_star, mechanism.gravity)
-    torque = virtual_work.inverse_dynamics(mechanism, at, gamma_dot, gamma_ddot, weight)
-    # Moments of the weights of links about O in their own frames, which work by their Jacobians.
-    local_weights = [
-        cross(centre, mechanism.gravity @ frame)
-        for centre, frame in zip(of_links, frames, strict=True)
-    ]
-    for jacobian, acting in zip(virtual_work.link_jacobians(at), local_weights, strict=True):
-        torque = torque - np.einsum("kij,ki->j", jacobian, acting)
-    motion = of_actuators(at, gamma_dot, gamma_ddot)
-    inertias = mechanism.actuated, mechanism.intermediate
-    rates = (motion.omega_a, motion.omega_a_dot), (motion.omega_ipl, motion.omega_ipl_dot)
-    # I omega_dot + omega x I omega of three links in their own frames, less weights; then in {B}.
-    changes = (
-        np.einsum("kij,kj->ki", i, omega_dot)
-        + cross(omega, np.einsum("kij,kj->ki", i, omega))
-        - acting
-        for i, (omega, omega_dot), acting in zip(inertias, rates, local_weights, strict=True)
-    )
-    d1, d2 = (np.einsum("kij,kj->ki", f, d) for f, d in zip(frames, changes, strict=True))
-    # With t.m = 0 and r, N = r x t across t: m = x r + y N, and w.r = 0, w.N = c.
-    x = -np.sum(at.r * d2, axis=1)
-    y = (torque - np.sum(at.w * (d1 + d2), axis=1)) / at.c
-    prismatic = x[:, None] * at.r + y[:, None] * cross(at.r, at.t)
-    revolute = prismatic + d2
-    actuated = revolute + d1 - torque[:, None] * at.w
-    moments, own_frames = [actuated, revolute, prismatic], (*frames, frames[1])
-    local = [np.einsum("kij,ki->kj", f, m) for f, m in zip(own_frames, moments, strict=True)]
-    for array, axis in zip(local, (2, 0, 2), strict=True):
-        array[:, axis] = 0.0  # by the equations above; what rounding left goes
-    return Reactions(*frozen(*moments, *local, torque))

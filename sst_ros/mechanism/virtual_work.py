@@ -10,7 +10,7 @@ otherwise. The simulation runs `kernel`, which the tests hold against this file.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,11 +33,6 @@ class Mechanism:
     star: Array
     actuated: Array
     intermediate: Array
-    #: gravity [m/s^2] in {B}, shape (3,), and mass times centre [kg m] of the star, of actuated and
-    #: of intermediate links in their frames, shapes (3,), (3, 3), (3, 3): for `rates.of_motion`
-    gravity: Array
-    weights: tuple[Array, Array, Array]
-    others: tuple[str, ...]  #: terms of the scene that neither these equations nor `rates` have
 
     @classmethod
     def of(cls, scene: Scene) -> Mechanism:
@@ -48,19 +43,7 @@ class Mechanism:
             actuated[:, 2, 2] += motor.gear_ratio**2 * motor.rotor_inertia
         star = star if payload is None else star + payload.about_o
         intermediate = np.stack([link.tensor for link in scene.intermediate_links])
-        carried: list[Any] = [scene.star] if payload is None else [scene.star, payload]
-        weights = (
-            np.sum([body.mass * np.array(body.centre) for body in carried], axis=0),
-            np.array([np.multiply(link.mass, link.centre) for link in scene.actuated_links]),
-            np.array([np.multiply(link.mass, link.centre) for link in scene.intermediate_links]),
-        )
-        gravity = np.array(ZERO if scene.gravity is None else scene.gravity.acceleration)
-        others = tuple(
-            name for name in ("friction", "springs", "own_loads") if getattr(scene, name)
-        )
-        others += ("stroke.stiffness",) if scene.stroke.stiffness is not None else ()
-        geometry = Geometry.of(scene)
-        return cls(geometry, star, actuated, intermediate, gravity, weights, others)
+        return cls(Geometry.of(scene), star, actuated, intermediate)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.motion_table import JOINTS, MotionTable
+from sst_ros.dynamics.reactions import Reactions, reactions_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.variational import Sensitivities, Sensitivity
 from sst_ros.errors import (
@@ -196,6 +197,14 @@ class Trajectory(MotionTable):
             slope = kernel.derivative(model, y, triple(self.torque.T))
             found = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
         return np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1)
+
+    @cached_property
+    def reactions(self) -> Reactions:
+        """Forces and moments at every joint under `torque` and the scene's loads, see `Reactions`.
+
+        A moment from a topic is no part of them.
+        """
+        return reactions_of(self.scene, self.t, self.quaternion, self.body_rate, self.torque)
 
     @cached_property
     def euler_zyz(self) -> Array:
