@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from sst_ros import PolynomialTorque, SineTorque, TorqueTable, load_scene, simulate
 from sst_ros.errors import InputError
+from sst_ros.mechanism import rates
+from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.yaml_document import find_number
 
@@ -109,7 +111,8 @@ def test_a_key_of_several_numbers_means_each_of_them():
 @pytest.mark.parametrize(
     ("torque", "name", "message"),
     [
-        (CONSTANT, "base.radius", "is geometry"),
+        (CONSTANT, "base.radius", "is no number of the equations of motion"),
+        (CONSTANT, "workspace.beta_max_deg", "is no number of the equations of motion"),
         (CONSTANT, "duration", "is no number of the equations of motion"),
         (CONSTANT, "star.inertia", "must be the key of a number"),
         (lambda t: CONSTANT, "torque", "three numbers or a profile, not a function"),
@@ -119,3 +122,52 @@ def test_a_key_of_several_numbers_means_each_of_them():
 def test_what_has_no_sensitivity_is_refused(torque, name, message):
     with pytest.raises(InputError, match=message):
         simulate("example2", torque, 0.1, sensitivities=[name])
+
+
+def turned_by(scene, direction, size):
+    """Return the scene with other directions and angles of its star, that sum to 360 degrees."""
+    moved = np.array(scene.base.v) + size * direction[:9].reshape(3, 3)
+    alpha = np.array(scene.star.alpha_deg) + size * np.append(direction[9:], -direction[9:].sum())
+    return scene.with_values({"base.v": moved.tolist(), "star.alpha_deg": alpha.tolist()})
+
+
+@pytest.mark.parametrize("at_stops", [False, True])
+def test_sensitivities_by_the_geometry_are_the_limit_of_differences(at_stops):
+    """At fixed initial angles and rates, so that the start moves, and the stops with the arcs."""
+    scene, span = (bouncing() if at_stops else load_scene("general")), [0.0, 0.03, 0.05]
+    direction = np.random.default_rng(7).normal(size=11) * np.repeat([0.1, 5.0], [9, 2])
+    keys = ["base.v", "star.alpha_deg"]
+    motion = simulate(scene, CONSTANT, span[-1], t_eval=span, sensitivities=keys)
+    steps = np.array([-2.0, -1.0, 1.0, 2.0]) * 1e-3
+    given = [turned_by(scene, direction, step) for step in steps]
+    runs = [simulate(one, CONSTANT, span[-1], t_eval=span, tolerance=1e-13) for one in given]
+    weights = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
+    here = Rotation.from_quat(motion.quaternion).inv()
+    turns = [(here * Rotation.from_quat(one.quaternion)).as_rotvec() for one in runs]
+    of_v, of_alpha = (motion.sensitivities[key] for key in keys)
+    along = np.append(direction[9:], -direction[9:].sum())
+    for name in ("gamma", "gamma_dot", "body_rate", "rotation"):
+        rows = turns if name == "rotation" else [getattr(one, name) for one in runs]
+        change = getattr(of_v, name) @ direction[:9] + getattr(of_alpha, name) @ along
+        expected = np.tensordot(weights, rows, 1)
+        assert np.abs(change - expected).max() < 1e-8 * np.abs(expected).max()
+    assert np.abs(of_v.gamma[0]).max() < 1e-14  # the angles at the start are given
+
+
+def test_the_orientation_at_given_angles_by_the_geometry():
+    """Two derivations: closed loops in vectors, and the traced joint angles of the dynamics."""
+    scene = load_scene("general")
+    geometry = Geometry.of(scene)
+    motion = simulate(
+        scene, CONSTANT, 1e-3, sensitivities=["base.v", "star.alpha_deg", "initial.gamma"]
+    )
+    found = rates.orientation_sensitivity(geometry, rotation_matrix(motion.quaternion[0]))
+    traced = motion.sensitivities
+    assert found.gamma == pytest.approx(traced["initial.gamma"].rotation[0], abs=1e-12)
+    lengths = np.linalg.norm(scene.base.v, axis=1)
+    of_v = found.v / lengths[None, :, None]  # of directions of any length
+    assert of_v.reshape(3, 9) == pytest.approx(traced["base.v"].rotation[0], abs=1e-12)
+    of_alpha = np.radians(found.alpha)
+    assert of_alpha == pytest.approx(traced["star.alpha_deg"].rotation[0], abs=1e-13)
+    many = rates.orientation_sensitivity(geometry, rotation_matrix(motion.quaternion[:5]))
+    assert many.v.shape == (5, 3, 3, 3) and np.all(many.v[0] == found.v)

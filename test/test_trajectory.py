@@ -250,3 +250,21 @@ def test_a_picture_and_a_summary_for_notebooks(run):
     assert [len(axes.lines) for axes in run.plot().axes] == [3, 3, 3, 1]
     assert "<table>" in run._repr_html_()
     assert "<svg" in run._repr_html_()
+
+
+def test_reactions_are_columns_of_tables_and_files_that_ask_for_them(tmp_path):
+    motion = simulate("gravity_payload", duration=0.05, samples=4)
+    table = motion.to_pandas(reactions=True)
+    assert len(table.columns) == len(motion.to_pandas().columns) + 54
+    assert table.attrs["units"]["moment_revolute_2_z"] == "N m"
+    column = motion.reactions.revolute.moment[:, 1, 2]
+    assert table["moment_revolute_2_z"].to_numpy() == pytest.approx(column, abs=0.0)
+    motion.save(tmp_path / "motion.csv", reactions=True)
+    text = (tmp_path / "motion.csv").read_text(encoding="utf-8")
+    assert "force_prismatic_3_y" in text.splitlines()[0]
+    for name in ("motion.npz", "motion.parquet"):
+        with pytest.raises(InputError, match="csv alone"):
+            motion.save(tmp_path / name, reactions=True)
+        motion.save(tmp_path / name)
+        again = Trajectory.load(tmp_path / name)
+        assert np.all(again.reactions.revolute.moment[:, 1, 2] == column)

@@ -82,6 +82,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _count("--samples", 10_000_000, "even intervals in time; default: 200"),
         _path("--out", "trajectory, .parquet, .csv or .npz", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
+        _flag("--reactions", "forces and moments at every joint: in FILE (.csv), as a picture"),
         _flag("--force", "overwrite earlier results"),
         more="Simulate a scene under its own torques. Exit status 1 if the motion ended "
         "before the duration, at a limit of the scene for example.",

@@ -8,8 +8,16 @@ import contextlib
 import math
 
 from sst_ros.cli.commands import free_out, function
-from sst_ros.control.plan import UNITS, examine_motion, plan_json, time_scaling, write_torques
+from sst_ros.control.plan import (
+    UNITS,
+    examine_motion,
+    examine_reactions,
+    plan_json,
+    time_scaling,
+    write_torques,
+)
 from sst_ros.control.reference_motions import reference_motion
+from sst_ros.dynamics.reactions import SIZES
 from sst_ros.errors import refuse_unless
 from sst_ros.host.many_runs import connect
 from sst_ros.host.output import require_free, write_into
@@ -38,7 +46,9 @@ def check_plan(options: argparse.Namespace) -> int:
     if options.json:
         print(plan_json(plan, speeds))
     else:
-        print(render("plan.txt", plan=plan, speeds=speeds, units=UNITS), end="")
+        reactions = examine_reactions(plan)
+        shown = {"plan": plan, "speeds": speeds, "units": UNITS}
+        print(render("plan.txt", **shown, reactions=reactions, sizes=SIZES), end="")
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)
     return 1 if plan.problems else 0

@@ -100,26 +100,34 @@ def map_workspace(options: argparse.Namespace) -> None:
 
 def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
-    out, picture = options.out, None
+    out, pictures = options.out, list[tuple[Path, str]]()
     ends = f"must end in {' or '.join(SUFFIXES)}"
     refuse_unless("simulate", ("--out", str(out), out is None or out.suffix in SUFFIXES, ends))
+    written = out is None or out.suffix == ".csv"
+    shown = not options.reactions or (written and (out is not None or options.plot))
+    refuse_unless("simulate", ("--reactions", True, shown, "needs --plot, or --out FILE.csv"))
     if out is not None:
         free_out(options, out)
         if library := {".parquet": "pyarrow", ".csv": "pandas"}.get(out.suffix):
             require(library)
     if options.plot:
-        picture = (out or Path(Path(options.scene).name)).with_suffix(".png")
-        require_free(picture, "simulate", force=options.force)
+        stem = (out or Path(Path(options.scene).name)).with_suffix("")
+        pictures.append((stem.with_name(f"{stem.name}.png"), "motion"))
+        if options.reactions:
+            pictures.append((stem.with_name(f"{stem.name}_reactions.png"), "reactions"))
+        for picture, _ in pictures:
+            require_free(picture, "simulate", force=options.force)
         require("matplotlib")
     names = ("duration", "method", "tolerance", "samples")
     given = {name: getattr(options, name) for name in names}
     trajectory = simulate(options.scene, progress=True, **given)
     print(render("motion.txt", motion=trajectory), end="")
     if out is not None:
-        trajectory.save(out, overwrite=options.force)
+        trajectory.save(out, overwrite=options.force, reactions=options.reactions)
         print(out)
-    if picture is not None:
-        function("host.figures:save_figure")(trajectory.plot(), picture)
+    for picture, shown in pictures:
+        figure = trajectory.plot() if shown == "motion" else trajectory.reactions.plot()
+        function("host.figures:save_figure")(figure, picture)
         print(picture)
     return 0 if trajectory.success else 1
 

@@ -25,6 +25,7 @@ from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, Referenc
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import SINGULAR_MU
+from sst_ros.dynamics.reactions import SIZES, LoadFigures
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -38,6 +39,7 @@ SLOWEST, FASTEST = 1e-4, 1e8  # factors of speed between which ends are looked f
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
 """Of what a motion demands of an actuator; power is negative where the actuator brakes."""
 _GRID = 360  # factors to try
+_FINE = 33  # instants between two samples beside a peak of a reaction
 _ROUNDING = 1e-13
 
 
@@ -328,8 +330,31 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
     return excess
 
 
+def examine_reactions(plan: MotionPlan) -> dict[str, dict[str, LoadFigures]]:
+    """Return peak and RMS of the reactions of a plan, by kind of joint and `reactions.SIZES`.
+
+    The motion is sampled again, finely, beside each largest sample: a peak is off by some 1e-5 of
+    itself.
+    """
+    t = plan.trajectory.t
+    windows = [t]
+    for figures in plan.trajectory.reactions.figures.values():
+        for size in SIZES:
+            for top in np.searchsorted(t, figures[size].time):
+                begin, end = max(int(top) - 1, 0), min(int(top) + 1, len(t) - 1)
+                windows.append(np.linspace(t[begin], t[end], _FINE))
+    return plan.trajectory.at(np.unique(np.concatenate(windows))).reactions.figures
+
+
 def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for machines: SI units, null for what does not exist."""
+    reactions = {
+        name: {
+            size: {part: value.tolist() for part, value in one._asdict().items()}
+            for size, one in figures.items()
+        }
+        for name, figures in examine_reactions(plan).items()
+    }
     highest = fastest.highest
     any_speed = highest is not None and math.isinf(highest)
     found = {
@@ -343,6 +368,7 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
             | {"torque_rms": plan.torque_rms[leg]}
             for leg in range(3)
         ],
+        "reactions": reactions,
         "distances": [{**asdict(one), "least": one.least} for one in plan.distances],
         "highest_speed": None if any_speed else highest,
         "any_speed": any_speed,

@@ -30,9 +30,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
+from sst_ros.dynamics.expression import compile_for_arrays, mark_present, trace
 from sst_ros.dynamics.kernel import LegMotion
 from sst_ros.dynamics.model import Model
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
 from sst_ros.errors import require
 from sst_ros.mechanism.generic_math import (
     Rows,
@@ -51,6 +52,7 @@ from sst_ros.mechanism.generic_math import (
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import entries_of
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import leaves, rebuild
 from sst_ros.state import ZERO, Explained
 
 if TYPE_CHECKING:
@@ -64,6 +66,14 @@ SIZES = {
     "radial_force": "N", "axial_force": "N", "bending_moment": "N m", "axis_torque": "N m",
 }  # fmt: skip
 """What a bearing and a motor are chosen by, with units."""
+REACTION_UNITS = {
+    f"{kind}_{name}_{leg}_{axis}": unit
+    for name in LINK_JOINTS
+    for kind, unit in (("force", "N"), ("moment", "N m"))
+    for leg in (1, 2, 3)
+    for axis in "xyz"
+}
+"""Unit of each column of reactions, as "force_actuated_1_x"."""
 
 
 @dataclass(frozen=True)
@@ -138,15 +148,12 @@ class Reactions(Explained):
             yield name, getattr(self, name)
 
     def columns(self) -> dict[str, Array]:
-        """Return a column a number, as in "force_actuated_1_x" [N], "moment_revolute_2_z" [N m]."""
+        """Return a column a number by the names of REACTION_UNITS."""
         columns = {}
-        for name, loads in self.joints():
-            for kind in ("force", "moment"):
-                values = getattr(loads, kind)
-                for leg in range(3):
-                    for axis, letter in enumerate("xyz"):
-                        key = f"{kind}_{name}_{leg + 1}_{letter}"
-                        columns[key] = values[..., leg, axis]
+        for key in REACTION_UNITS:
+            kind, name, leg, axis = key.split("_")
+            values = getattr(getattr(self, name), kind)
+            columns[key] = values[..., int(leg) - 1, "xyz".index(axis)]
         return columns
 
     @cached_property
@@ -216,32 +223,71 @@ def reactions_of(
 
     """
     state = (*quaternion.T, *body_rate.T)
-    return reactions_of_columns(scene, Dynamics.of(scene).model, t, state, triple(torque.T))
-
-
-def reactions_of_columns(
-    scene: Any, model: Model, t: Array, state: Sequence[Scalar], torque: Triple
-) -> Reactions:
-    """Compute reactions of columns: quaternion, body rate and torques, each of the shape of t.
-
-    The numbers of scene and model may be columns, too: of many scenarios at once.
-    """
     with np.errstate(all="ignore"):
-        still = model._replace(time_constant=None)
-        slope = kernel.derivative(still, tuple(state), torque)
-        legs = _solve(scene, model, state, triple(slope[4:7]), torque)
-    frames = [_stack(t, [getattr(leg, name) for leg in legs]) for name in ("first", "second")]
-    joints: dict[str, JointLoads] = {}
-    for name in LINK_JOINTS:
-        vectors = [getattr(leg, name) for leg in legs]
-        force = _stack(t, [force for force, _ in vectors])
-        moment = _stack(t, [moment for _, moment in vectors])
+        legs = _legs(scene, Dynamics.of(scene).model, state, triple(torque.T))
+    return _collect(t, _flatten(legs), rotation_rows(_quadruple(state)))
+
+
+class ScenarioReactions:
+    """Reactions of many scenarios at once, whose numbers may differ.
+
+    Args:
+        scene: a scene, unchecked, with columns (N,) for the numbers that differ.
+        model: its constants, with columns too.
+
+    """
+
+    def __init__(self, scene: Any, model: Model) -> None:
+        tree = scene, model
+        numbers = leaves(tree)
+        columns = {place: x for place, x in numbers.items() if isinstance(x, np.ndarray)}
+        self._columns = list(columns.values())
+        names = (*MOTION, *TORQUE, *(f"p{i}" for i in range(len(columns))))
+
+        def run(*inputs: Any) -> list[Any]:
+            given = map(mark_present, inputs[10:])
+            own_scene, own_model = rebuild(tree, dict(zip(columns, given, strict=True)))
+            return _flatten(_legs(own_scene, own_model, inputs[:7], triple(inputs[7:10])))
+
+        self._run = compile_for_arrays(trace(run, names))
+
+    def of(self, t: Array, state: Array, torque: Array, rows: slice) -> Reactions:
+        """Return the reactions of some rows.
+
+        Shapes of t [s], of the states (7, ...) and of the torques (3, ...) [N m] end in the number
+        of these rows.
+        """
+        with np.errstate(all="ignore"):
+            numbers = self._run(*state, *torque, *(column[rows] for column in self._columns))
+        return _collect(t, list(numbers), rotation_rows(_quadruple(list(state))))
+
+
+def _legs(scene: Any, model: Model, state: Sequence[Scalar], torque: Triple) -> list[_LegReactions]:
+    """Solve for the reactions of the legs under torques that act."""
+    still = model._replace(time_constant=None)
+    slope = kernel.derivative(still, tuple(state), torque)
+    return _solve(scene, model, state, triple(slope[4:7]), torque)
+
+
+def _flatten(parts: Any) -> list[Scalar]:
+    """List the numbers of nested tuples in order."""
+    if isinstance(parts, (list, tuple)):
+        return [number for part in parts for number in _flatten(part)]
+    return [parts]
+
+
+def _collect(t: Array, numbers: Sequence[Scalar], rows: Rows) -> Reactions:
+    """Make reactions of the 36 numbers of each leg, which `_flatten` lists."""
+    flat = _stack(t, numbers).reshape(*t.shape, 3, 12, 3)
+    joints = {}
+    for index, name in enumerate(LINK_JOINTS):
+        force, moment = flat[..., 2 * index, :], flat[..., 2 * index + 1, :]
         joints[name] = JointLoads(force, moment, AXES[name])
-    rotation = _stack(t, rotation_rows(_quadruple(state)))
-    # Rows of the stacked frames are their axes in {E}.
-    first, second = (rotation[..., None, :, :] @ np.swapaxes(frame, -1, -2) for frame in frames)
-    first.setflags(write=False)
-    second.setflags(write=False)
+    # Rows of the frames are their axes in {E}.
+    axes = flat[..., 6:, :].reshape(*t.shape, 3, 2, 3, 3)
+    frames = _stack(t, rows)[..., None, None, :, :] @ np.swapaxes(axes, -1, -2)
+    frames.setflags(write=False)
+    first, second = frames[..., 0, :, :], frames[..., 1, :, :]
     return Reactions(t=t, **joints, actuated_frames=first, intermediate_frames=second)
 
 

@@ -29,7 +29,17 @@ from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
 from sst_ros.errors import SingularConfiguration, refusal
-from sst_ros.mechanism.generic_math import quaternion_rate
+from sst_ros.mechanism.generic_math import (
+    Triple,
+    atan2,
+    cos,
+    cross3,
+    dot3,
+    quaternion_rate,
+    sin,
+    sqrt,
+    triple,
+)
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.programs.expression import compile_for_arrays, compile_program, mark_present, trace
 from sst_ros.scene.scene import Scene
@@ -50,9 +60,13 @@ TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size 
 AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivatives loses its order
 MOST = 4_000_000
 """Evaluations of a motion: minutes, where a stiff motion needs hours by an explicit method."""
-GEOMETRY = ("base", "star.alpha_deg", "star.radius", "workspace", "stroke.at_end")
+GEOMETRY = ("base.v", "star.alpha_deg")
+"""Keys of the geometry that the equations of motion have; the third alpha is what is left."""
 ACTUATORS = ("actuators.torque_limit", "actuators.idle_damping")
-OUTSIDE = ("torque", "motion", "duration", "initial.orientation", *ACTUATORS)
+OUTSIDE = (
+    "torque", "motion", "duration", "initial.orientation", "base.radius", "star.radius",
+    "workspace", "stroke.at_end", *ACTUATORS,
+)  # fmt: skip
 REBOUND = ("stroke.restitution", "stroke.impact_rate")  # known to the equations as one damping
 FIRST = np.zeros(1)
 OWN_TORQUE = "torque"
@@ -63,8 +77,9 @@ class VariationalEquations:
     """Motions of a scene under torques over time, and their derivatives by parameters.
 
     Those are numbers of the scene by key, as "friction.gamma.smoothing", "initial.gamma_dot[0]" or
-    "actuators.time_constant", but not of its geometry; a list without index means all its entries.
-    With `by_torque` the numbers of the torques follow. InputError names what is no such key.
+    "actuators.time_constant"; a list without index means all its entries. Of the geometry they are
+    "base.v[0][1]" and "star.alpha_deg[0]", for `simulate` alone: `run` takes it as it is. With
+    `by_torque` the numbers of the torques follow. InputError names what is no such key.
     """
 
     def __init__(
@@ -81,7 +96,7 @@ class VariationalEquations:
         self._by_torque = by_torque
         for name in self.names:
             allowed = ""
-            if name.startswith(GEOMETRY):
+            if name.startswith(GEOMETRY) and caller != "simulate":
                 allowed = "is geometry, which is taken as known"
             elif name.startswith(OUTSIDE):
                 allowed = "is no number of the equations of motion"
@@ -176,9 +191,25 @@ class VariationalEquations:
 
     def differentiate_joints(self, motion: Array) -> Array:
         """Differentiate gamma and gamma_dot by quaternion and W, (7, n): shape (7, 6, n)."""
-        found = _trace_joints(self.scene)(*motion)
+        return self._joint_slopes(motion, ())
+
+    def differentiate_joints_by_geometry(self, motion: Array) -> Array:
+        """Differentiate gamma and gamma_dot at a fixed state, (7, n), by the parameters, (p, 6, n).
+
+        By what is no number of the geometry the derivative is zero.
+        """
+        names = tuple(name for name in self.names if name.startswith(GEOMETRY))
+        slopes = np.zeros((len(self.names), 6, motion.shape[1]))
+        chosen = [self.names.index(name) for name in names]
+        slopes[chosen] = self._joint_slopes(motion, names)[7:]
+        return slopes
+
+    def _joint_slopes(self, motion: Array, names: tuple[str, ...]) -> Array:
+        """Differentiate gamma and gamma_dot by quaternion, W and numbers of the geometry."""
+        numbers = [find_number(self.scene, name) for name in names]
+        found = _trace_joints(self.scene, names)(*motion, *numbers)
         rows = np.stack([np.broadcast_to(row, motion.shape[1]) for row in found])
-        return rows.reshape(8, 6, -1)[1:]
+        return rows.reshape(-1, 6, motion.shape[1])[1:]
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:
         """Return the initial state, and its derivatives by parameters and torques, (m, p + q)."""
@@ -187,7 +218,8 @@ class VariationalEquations:
         state[:7] = initial_state(scene, self._geometry)
         slopes = np.zeros((len(state), len(self.names) + more))
         own = [i for i, name in enumerate(self.names) if name.startswith("initial")]
-        if own:
+        shaped = [i for i, name in enumerate(self.names) if name.startswith(GEOMETRY)]
+        if own or shaped:
             # A rotation vector and W in {E} change gamma and gamma_dot: the inverse of that.
             tangent = np.zeros((7, 6))
             tangent[4:, 3:] = np.eye(3)
@@ -199,6 +231,9 @@ class VariationalEquations:
             except np.linalg.LinAlgError:
                 message = "no derivative by initial angles or rates: parallel singularity, det"
                 raise SingularConfiguration(message, 0.0) from None
+        if shaped:  # the star moves so that gamma and gamma_dot stay
+            by_geometry = self.differentiate_joints_by_geometry(state[:7, None])[shaped, :, 0]
+            slopes[:7, shaped] = -by_joints @ by_geometry.T
         for i in own:
             name, first = self.names[i], 3 * self.names[i].startswith("initial.gamma_dot")
             legs = [first + int(name[-2])] if name.endswith("]") else [first, first + 1, first + 2]
@@ -215,12 +250,53 @@ class VariationalEquations:
         return lambda time: slopes(time) * free
 
 
+class _TracedAxes(NamedTuple):
+    """The arrays of a `Geometry` that the dynamics take, as symbols."""
+
+    v: Sequence[Any]
+    w: Sequence[Any]
+    e: Sequence[Any]
+    arc: Sequence[Any]
+
+    @classmethod
+    def of(cls, scene: Any) -> _TracedAxes:
+        """Derive them from a scene whose base and star may have symbols, as `Geometry.build`."""
+        v = [_unit(triple(row)) for row in scene.base.v]
+        pairs = [(v[k], v[(k + 1) % 3]) for k in range(3)]
+        normals = [cross3(*pair) for pair in pairs]
+        sines = [sqrt(dot3(normal, normal)) for normal in normals]
+        w = [triple(part / sine for part in n) for n, sine in zip(normals, sines, strict=True)]
+        degree = float(np.radians(1.0))
+        first, second, _ = (degree * angle for angle in scene.star.alpha_deg)
+        turns = 0.0, first, first + second
+        e = [(-sin(turn), cos(turn), 0.0) for turn in turns]
+        arc = [atan2(sine, dot3(*pair)) for sine, pair in zip(sines, pairs, strict=True)]
+        return cls(v, w, e, arc)
+
+    def of_leg(self, name: str, k: int) -> Any:
+        """Return what an array has for leg k."""
+        return getattr(self, name)[k]
+
+
+def _unit(vector: Triple) -> Triple:
+    length = sqrt(dot3(vector, vector))
+    return triple(part / length for part in vector)
+
+
+def _open_model(scene: Scene, symbols: dict[str, Any]) -> Any:
+    """Return the model of a scene with symbols for some of its numbers."""
+    opened = build_unchecked(Scene, replace_values(plain(scene), symbols))
+    varied = any(name.startswith(GEOMETRY) for name in symbols)
+    geometry: Any = _TracedAxes.of(opened) if varied else Geometry.of(scene)
+    return kernel.model_of(opened, geometry)
+
+
 @lru_cache(maxsize=32)
 def trace_derivatives(
     scene: Scene, names: tuple[str, ...], by_torque: bool
 ) -> Callable[..., tuple[float, ...]]:
     """Return y', then its derivatives by each component of y, torque if needed, and parameter."""
-    state, geometry = Dynamics.of(scene).state, Geometry.of(scene)
+    state = Dynamics.of(scene).state
     size, varied = len(state), tuple(f"p{i}" for i in range(len(names)))
 
     def derivative(*inputs: Any) -> tuple[Any, ...]:
@@ -229,8 +305,7 @@ def trace_derivatives(
         if rebound:  # their numbers add up to the damping
             damping = mark_present(sum(rebound[1:], rebound[0]))
             symbols |= {"stroke.damping": damping, **dict.fromkeys(REBOUND)}
-        opened = build_unchecked(Scene, replace_values(plain(scene), symbols))
-        model = kernel.model_of(opened, geometry)
+        model = _open_model(scene, symbols)
         return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
 
     by = (*state, *(TORQUE if by_torque else ()), *varied)
@@ -238,15 +313,17 @@ def trace_derivatives(
 
 
 @lru_cache(maxsize=32)
-def _trace_joints(scene: Scene) -> Callable[..., tuple[Any, ...]]:
-    """Return gamma and gamma_dot of quaternion and W, then their derivatives by each of these."""
-    model = Dynamics.of(scene).model
+def _trace_joints(scene: Scene, names: tuple[str, ...]) -> Callable[..., tuple[Any, ...]]:
+    """Return gamma and gamma_dot, then their derivatives by quaternion, W and named numbers."""
+    inputs = (*MOTION, *(f"p{i}" for i in range(len(names))))
 
-    def joints(*motion: Any) -> tuple[Any, ...]:
-        found = kernel.joints(model, motion)
+    def joints(*given: Any) -> tuple[Any, ...]:
+        symbols = dict(zip(names, map(mark_present, given[7:]), strict=True))
+        model = _open_model(scene, symbols) if names else Dynamics.of(scene).model
+        found = kernel.joints(model, given[:7])
         return (*found.gamma, *found.gamma_dot)
 
-    return compile_for_arrays(trace(joints, MOTION, MOTION))
+    return compile_for_arrays(trace(joints, inputs, inputs))
 
 
 def _numbers(torque: TorqueProfile) -> Array:
@@ -353,6 +430,8 @@ class Sensitivities:
         motion, slopes = states[:, :7].T, slopes[:, :7]
         turn = np.array([quaternion_rate(tuple(motion[:4]), tuple(row)) for row in np.eye(3)])
         rates = np.einsum("qcn,nqp->ncp", self._equations.differentiate_joints(motion), slopes)
+        by_geometry = self._equations.differentiate_joints_by_geometry(motion)
+        rates[..., : len(by_geometry)] += np.moveaxis(by_geometry, (0, 2), (2, 0))
         # quaternion_rate(q, .) has orthogonal columns of length abs(q) / 2.
         rotation = 4.0 * np.einsum("cqn,nqp->ncp", turn, slopes[:, :4])
         whole = Sensitivity(rates[:, :3], rates[:, 3:], rotation, slopes[:, 4:])

@@ -350,6 +350,7 @@ class BatchResult(MotionTable):
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
         self.kept: BatchResult | None = None
+        self.sent: Array | None = None  # torques of a controller, where they are not `torque`
         self._computed: dict[str, Array] = {}
 
     @property
@@ -378,6 +379,8 @@ class BatchResult(MotionTable):
         """Torques that act at the actuators [N m], shape (..., N, 3)."""
         if self._state.shape[-1] > 7:
             return self._state[..., 7:10]
+        if self.sent is not None:
+            return self.sent
         profile = self._model.constants(list(self._columns.inputs)).torque
         if profile is None:
             return np.broadcast_to(self._torque, self.body_rate.shape)

@@ -15,6 +15,7 @@ and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40, come first.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -124,3 +125,80 @@ def _motion(
     )
     links = omega_a, omega_a_dot, omega_ipl, omega_ipl_dot
     return BodyRates(*frozen(omega, omega_dot, *joints, *links))
+
+
+class OrientationSensitivity(NamedTuple):
+    """Derivatives of the orientation, as rotation vectors in {E} [rad]: components first."""
+
+    gamma: Array  #: by the actuator angles, shape (..., 3, 3)
+    v: Array  #: by the unit directions v_k, leg and axis, shape (..., 3, 3, 3)
+    alpha: Array  #: by the angles of the star [rad], the last of which is 2 pi less the others
+
+
+def orientation_sensitivity(
+    geometry: Geometry, rotation: ArrayLike, gamma: ArrayLike | None = None
+) -> OrientationSensitivity:
+    """Differentiate the orientation by actuator angles and geometry, exactly.
+
+    The closed loops F_k = r_k . R e_k = 0 give, for a turn d of the star in {B},
+
+        (t_k x r_k) . d = -(dr_k . t_k + r_k . R de_k),
+
+    three equations with the matrix J2. The change of r_k is that of gamma_k, of v_k, and of
+    w_k, which v_k and v_k+1 span. With these derivatives, tolerances of encoders and parts give
+    the error of the orientation.
+
+    Args:
+        geometry: of the manipulator.
+        rotation: orientations R, shape (..., 3, 3).
+        gamma: actuator angles [rad], shape (..., 3); by default mu_k in (0, pi).
+
+    Raises:
+        SingularConfiguration: some orientation is a parallel singularity, det J2 = 0.
+
+    """
+    matrix = np.asarray(rotation, dtype=float)
+    if gamma is None:
+        gamma = kinematics.inverse(geometry, matrix)[0]
+    angles = np.asarray(gamma, dtype=float)
+    v, w = geometry.v, geometry.w
+    r = kinematics.carriage_directions(geometry, angles)
+    t = geometry.e @ np.swapaxes(matrix, -1, -2)
+    shape = angles.shape[:-1]
+    by_gamma = np.zeros((*shape, 3, 3))  # change of F by leg, then by parameter
+    by_v = np.zeros((*shape, 3, 3, 3))
+    by_alpha = np.zeros((*shape, 3, 3))
+    axes = np.eye(3)
+    turns = np.cumsum([0.0, *geometry.alpha[:2]])
+    for k in range(3):
+        following = (k + 1) % 3
+        sine, cosine = np.sin(angles[..., k, None]), np.cos(angles[..., k, None])
+        by_gamma[..., k, k] = _dot(np.cross(w[k], r[..., k, :]), t[..., k, :])
+        for axis in range(3):
+            for leg in (k, following):
+                moved = axes[axis] - v[leg] * v[leg][axis]  # of a unit vector
+                if leg == k:
+                    normal, along = cross(moved, v[following]), moved
+                else:
+                    normal, along = cross(v[k], moved), np.zeros(3)
+                normal = (normal - w[k] * (w[k] @ normal)) / np.sin(geometry.arc[k])
+                across = cross(normal, v[k]) + cross(w[k], along)
+                change = cosine * along + sine * across
+                by_v[..., k, leg, axis] = _dot(change, t[..., k, :])
+        turned = np.array([-np.cos(turns[k]), -np.sin(turns[k]), 0.0])
+        by_turn = _dot(r[..., k, :], matrix @ turned)
+        by_alpha[..., k, :k] = by_turn[..., None]
+    j2 = cross(t, r)
+    determinant = np.linalg.det(j2)
+    if np.min(np.abs(determinant)) < SINGULAR:
+        least = float(np.min(np.abs(determinant)))
+        raise SingularConfiguration("parallel singularity, det J2 = 0", least)
+    solved = -np.swapaxes(matrix, -1, -2) @ np.linalg.inv(j2)
+    of_v = solved @ by_v.reshape(*shape, 3, 9)
+    return OrientationSensitivity(
+        solved @ by_gamma, of_v.reshape(*shape, 3, 3, 3), solved @ by_alpha
+    )
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.sum(a * b, axis=-1))

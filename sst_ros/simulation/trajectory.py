@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.motion_table import JOINTS, MotionTable
-from sst_ros.dynamics.reactions import Reactions, reactions_of
+from sst_ros.dynamics.reactions import REACTION_UNITS, Reactions, reactions_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.variational import Sensitivities, Sensitivity
 from sst_ros.errors import (
@@ -50,6 +50,7 @@ from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 _KEY, _FORMAT = "sst_ros", 1
@@ -289,14 +290,28 @@ class Trajectory(MotionTable):
             parameters=self._parameters,
         )  # fmt: skip
 
+    def to_pandas(self, *, reactions: bool = False) -> pd.DataFrame:
+        """Table with a row an instant, a column a number, units in its `attrs`.
+
+        With `reactions` the columns of `Reactions.columns` follow.
+        """
+        table = super().to_pandas()
+        if reactions:
+            units = table.attrs["units"] | REACTION_UNITS
+            table = table.assign(**self.reactions.columns())
+            table.attrs["units"] = units
+        return table
+
     @check_kinds
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+    def save(self, path: str | Path, *, overwrite: bool = False, reactions: bool = False) -> None:
         """Write a file: whole, or not at all; others may read and write the same path meanwhile.
 
         Args:
             path: ends in .parquet or .npz, which `load` reads back to the bit, units (Parquet) and
                 scene included; or in .csv, the table of `to_pandas` for other programs.
             overwrite: replace a file that exists.
+            reactions: append the columns of `Reactions.columns` to a .csv; a trajectory that is
+                loaded from another file computes them.
 
         Raises:
             InputError: the suffix is another, the file exists, or it cannot be written.
@@ -309,6 +324,7 @@ class Trajectory(MotionTable):
             "save",
             ("path", str(path), path.suffix in SUFFIXES, ends),
             ("path", str(path), free, "exists; overwrite=True replaces it"),
+            ("reactions", True, not reactions or path.suffix == ".csv", "is for .csv alone"),
         )
         about = self._of_run() | {
             "format": _FORMAT,
@@ -316,8 +332,11 @@ class Trajectory(MotionTable):
             "torque": self.law and record_of(self.law),
         }
         units = {name: {"unit": unit} for name, unit in UNITS.items()}
+        columns = self.columns()
+        if reactions:
+            columns |= self.reactions.columns()
         with refuse_errors("save", "path", str(path), "must be writable", OSError):
-            write_table(self.columns(), path, units, {_KEY: json.dumps(about)})
+            write_table(columns, path, units, {_KEY: json.dumps(about)})
 
     @classmethod
     @check_kinds

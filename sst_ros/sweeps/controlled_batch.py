@@ -282,6 +282,7 @@ class ControlledBatch:
         gains = self._make_gains(batch, given, count)
         feedback = Feedback(self.answer, samples, hold, memory, gains, noise)
         width = block_width(count)
+        drives = [np.zeros((3, count))]  # torques that were sent before each kept state
 
         def advance(first: int, number: int, step: float, *arrays: Any, rows: Any) -> None:
             if rows is not None:  # torques are held while a step is repeated
@@ -289,9 +290,13 @@ class ControlledBatch:
                 return
             block = ControlledBlock(batch.programs, width, feedback)
             advance_blocks(block, range(0, count, width), first, number, step, *arrays)
+            if kept and (first + number) % kept == 0:
+                drives.append(arrays[1][:3].copy())
 
         step = self.samples * control.period / steps
         result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
+        if result.kept is not None:
+            result.kept.sent = np.moveaxis(np.stack(drives), 1, -1)
         # Root of the mean square and largest error of gamma [rad] at the samples of a run and its
         # end, and of the torque [N m]; when the error of all joints is in the band for good [s].
         final = np.array(divide(REFERENCES, self._references[-1])["gamma"]) - result.gamma

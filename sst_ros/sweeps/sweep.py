@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros.dynamics.reactions import LINK_JOINTS, SIZES, ScenarioReactions
 from sst_ros.errors import InputError, check_kinds, refusal, refuse_unless, require
 from sst_ros.host.many_runs import SweepFailed, run_many
 from sst_ros.host.output import TEMPORARY, Bar, replace_file, require_free, write_into
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 PARTS = 64  # extremes are those of the states at the ends of at most so many equal parts of a run
+REACTION_ROWS = 256  # runs whose reactions are computed at once: their arrays fit the cache
 
 PILOT = 256
 """Rows by which the number of steps is chosen; drawn apart, so that no number of rows matters."""
@@ -45,6 +47,7 @@ PILOT = 256
 MOST_STEPS = 1_000_000
 
 EXTREMES = tuple(itertools.product(Joints._fields, ("min", "max")))
+REACTIONS = tuple(itertools.product(SIZES, LINK_JOINTS, ("peak", "rms")))
 
 METADATA = b"sst_ros"
 _NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
@@ -195,7 +198,8 @@ class PreparedSweep:
         self.controlled = None if study.control is None else ControlledBatch(self.batch, study)
         # Compiled here, before several threads want it.
         _ = self.batch.programs, self.controlled and self.controlled.answer
-        self._quantities = [name for name in study.outputs if name != "extremes"]  # of a state
+        over_time = "extremes", "reactions"
+        self._quantities = [name for name in study.outputs if name not in over_time]
         self.pilot_error = math.nan
         self.steps = steps or study.steps or self._choose_steps()
 
@@ -242,6 +246,7 @@ class PreparedSweep:
         units = UNITS | {"fault_time": "s", "local_error": "1"}
         for k in DIMENSIONS["leg"]:
             joints = {f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES}
+            units |= {f"{size}_{name}_{part}_{k}": SIZES[size] for size, name, part in REACTIONS}
             units |= joints | {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
             units |= {f"torque_rms_{k}": "N m", f"torque_max_{k}": "N m", "settling_time": "s"}
         for one in self.study.variations:
@@ -308,7 +313,8 @@ class PreparedSweep:
     ) -> tuple[BatchResult, dict[str, NDArray[Any]]]:
         """Return results of rows by a number of steps, and their extremes or tracking figures."""
         batch = self.batch.with_parameters(scenarios)
-        every = -(-steps // PARTS) if "extremes" in self.study.outputs else 0
+        outputs = self.study.outputs
+        every = -(-steps // PARTS) if "extremes" in outputs or "reactions" in outputs else 0
         if self.controlled is not None:
             result, more = self.controlled.run(batch, starts, rows, steps, every)
         else:
@@ -319,13 +325,42 @@ class PreparedSweep:
                 gamma = np.broadcast_to(gamma, (len(rows), 3))
             step = self.study.length / steps
             result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
-        if result.kept is not None:
+        if result.kept is not None and "reactions" in outputs:
+            more |= self._reactions(batch, scenarios, result)
+        if result.kept is not None and "extremes" in outputs:
             with np.errstate(all="ignore"):
                 for (name, end), k in itertools.product(EXTREMES, range(3)):
                     angles = getattr(result.kept, name)[..., k]
                     more[f"{name}_{end}_{k + 1}"] = getattr(angles, end)(axis=0)
-            result.kept = None
+        result.kept = None
         return result, more
+
+    @staticmethod
+    def _reactions(batch: Batch, scenarios: Scenarios, result: BatchResult) -> dict[str, Array]:
+        """Peak and RMS of the reactions of runs at the states that they kept."""
+        kept = result.kept
+        assert kept is not None
+        model = batch.model.constants(list(batch.columns.inputs)).model
+        reactions = ScenarioReactions(scenarios.columns(), model)
+        state = np.moveaxis(np.concatenate([kept.quaternion, kept.body_rate], axis=-1), -1, 0)
+        torque = np.moveaxis(kept.torque, -1, 0)
+        count = result.t.shape[-1]
+        columns = {
+            f"{size}_{name}_{part}_{k + 1}": np.full(count, np.nan)
+            for size, name, part in REACTIONS
+            for k in range(3)
+        }
+        for first in range(0, count, REACTION_ROWS):
+            rows = slice(first, first + REACTION_ROWS)
+            at = kept.t[:, rows], state[..., rows], torque[..., rows]
+            figures = reactions.of(*at, rows).figures
+            for size, name, part in REACTIONS:
+                values = getattr(figures[name][size], part)
+                for k in range(3):
+                    columns[f"{size}_{name}_{part}_{k + 1}"][rows] = values[..., k]
+        for column in columns.values():
+            column[result.code < 0] = np.nan
+        return columns
 
     def _split(self, values: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
         """Numbers of the scene by key, and what a run is given: initial state and gains."""

@@ -44,8 +44,8 @@ DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
 CHUNK = 32_768
 """Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
 
-OUTPUTS = (*QUANTITIES, "energy", "extremes")
-"""What `outputs` may name: quantities of the final state, and extremes of joints."""
+OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
+"""What `outputs` may name: of the final state; extremes of joints and reactions over a run."""
 
 MOST = 10_000_000
 
@@ -90,7 +90,8 @@ class SweepStudy(Section):
         "settings of a controller and its channel, also as a mapping; see `ControlChannel`"
     )
     outputs: tuple[str, ...] = entry(
-        "quantities of the final state, and `extremes` of joints at the ends of the steps",
+        "quantities of the final state; `extremes` of joints, and peak and RMS of `reactions`, at "
+        "the ends of the steps",
         default=DEFAULT_OUTPUTS,
     )
     chunk: int = _count("rows of a task and of a file", default=CHUNK)

@@ -18,7 +18,13 @@ from scipy.spatial.transform import Rotation
 from symmetric_motion import inertia, inertia_slope
 
 from sst_ros import __main__ as cli
-from sst_ros.control.plan import check_motion, examine_motion, maximum, time_scaling
+from sst_ros.control.plan import (
+    check_motion,
+    examine_motion,
+    examine_reactions,
+    maximum,
+    time_scaling,
+)
 from sst_ros.control.reference_motions import geodesic_motion, reference_motion
 from sst_ros.errors import MotionRefused, SingularConfiguration
 from sst_ros.mechanism import kinematics
@@ -290,6 +296,8 @@ def test_json_says_what_the_table_says(capsys):
         assert found["torque"] == {"value": peak.value, "time": peak.time}
         assert found["torque_rms"] == plan.torque_rms[leg]
     assert len(told["distances"]) == len(plan.distances) == 16
+    torque = examine_reactions(plan)["actuated"]["axis_torque"]
+    assert told["reactions"]["actuated"]["axis_torque"]["rms"] == torque.rms.tolist()
 
 
 def test_written_torques_do_the_motion(tmp_path):
@@ -309,3 +317,23 @@ def test_written_torques_do_the_motion(tmp_path):
         errors.append(np.abs(np.subtract(simulation.state.joints.gamma, goal)).max())
     assert errors[1] < 1e-5
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.05)
+
+
+def test_peaks_of_reactions_are_those_of_a_fine_sampling():
+    scene = load("reach")
+    plan = examine_motion(reference_motion(scene), scene)
+    found, t = examine_reactions(plan), plan.trajectory.t
+    fine = plan.trajectory.at(np.linspace(t[0], t[-1], 20_001)).reactions
+    for name, loads in fine.joints():
+        for size, one in found[name].items():
+            dense = np.abs(getattr(loads, size))
+            assert one.peak == pytest.approx(dense.max(axis=0), rel=2e-5)
+            rms = np.sqrt(np.mean(dense[1:] ** 2, axis=0))
+            assert one.rms == pytest.approx(rms, rel=1e-4)
+    bare = scene.with_values({"friction": None})
+    plan = examine_motion(reference_motion(bare), bare)
+    motors = examine_reactions(plan)["actuated"]["axis_torque"]
+    peaks = plan.peaks["torque"]
+    assert motors.peak == pytest.approx([abs(peak.value) for peak in peaks], rel=2e-5)
+    assert motors.time == pytest.approx([peak.time for peak in peaks], abs=1e-3)
+    assert motors.rms == pytest.approx(plan.torque_rms, rel=1e-4)
