@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A design study: arcs, star angles and size against workspace, dexterity, torque and accuracy.
 
-Designs are drawn over a range of numbers; each is weighed, moved and measured by the package. What
-no other design betters in workspace, torque and accuracy at once is the Pareto front.
+What no other design betters in workspace, torque and accuracy at once is the Pareto front.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from studies import DOCS, PAGES, run
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-COUNT = 1024  # designs; a power of two, as Sobol points want
+COUNT = 1024  # a power of two
 LOW = (70.0, 70.0, 70.0, 100.0, 100.0, 0.7)
 HIGH = (110.0, 110.0, 110.0, 140.0, 140.0, 1.4)
 """Arcs [deg], the first two star angles [deg], and the size over that of the shipped scene."""
@@ -57,30 +56,28 @@ class Design:
     alpha_2: float
     size: float  # of the radii over 0.35 m and 0.4 m
 
-    @property
-    def alpha(self) -> list[float]:
-        """Angles between the arcs of the star [deg]."""
-        return [self.alpha_1, self.alpha_2, 360.0 - self.alpha_1 - self.alpha_2]
-
     def scene(self) -> Scene:
         """Make the manipulator of thin arcs whose mass grows with their length."""
         base, star = 0.35 * self.size, 0.4 * self.size
         turns = np.radians([0.0, self.alpha_1, self.alpha_1 + self.alpha_2])
         ends = np.stack([np.cos(turns), np.sin(turns), np.zeros(3)], axis=1)
         mass = STAR_DENSITY * star * np.pi / 2
-        tensor = sum(arc_inertia(mass, star, [0, 0, 1], end).matrix for end in ends)
-        middle = (ends + [0.0, 0.0, 1.0]).mean(axis=0) * 2.0 * star / np.pi
+        tensor = np.sum([arc_inertia(mass, star, [0, 0, 1], end).matrix for end in ends], axis=0)
+        middle = np.add(ends, [0.0, 0.0, 1.0]).mean(axis=0) * 2.0 * star / np.pi
         link = LINK_DENSITY * base * np.pi / 2
         centre = 2.0 * base / np.pi
         slider, own = SLIDER * star**2, 9e-6 * self.size**2
         arcs = [self.arc_12, self.arc_23, self.arc_31]
-        return load("gravity_payload").with_values(
+        alpha = [self.alpha_1, self.alpha_2, 360.0 - self.alpha_1 - self.alpha_2]
+        shape = load("gravity_payload").with_values({"base": {"arcs_deg": arcs, "radius": base}})
+        middle_of_base = Geometry.of(shape).v.sum(axis=0)
+        down = -9.80665 * middle_of_base / np.linalg.norm(middle_of_base)
+        return shape.with_values(
             {
                 "name": "design",
-                "base": {"arcs_deg": arcs, "radius": base},
-                "gravity.acceleration": (-9.80665 * _middle(arcs)).tolist(),
+                "gravity.acceleration": down.tolist(),
                 "star": {
-                    "alpha_deg": self.alpha, "radius": star, "inertia": _inertia(tensor),
+                    "alpha_deg": alpha, "radius": star, "inertia": _inertia(tensor),
                     "mass": 3.0 * mass, "centre": middle.tolist(),
                 },
                 "actuated_links": [{
@@ -111,14 +108,6 @@ class Indices:
     error: float  # root mean square of the orientation error [mrad]
 
 
-def _middle(arcs: list[float]) -> Array:
-    """Direction of the middle of a base triangle, along which gravity pulls."""
-    base = {"arcs_deg": arcs, "radius": 0.35}
-    v = Geometry.of(load("gravity_payload").with_values({"base": base})).v
-    total = v.sum(axis=0)
-    return np.asarray(total / np.linalg.norm(total))
-
-
 def _inertia(tensor: Array) -> dict[str, float]:
     places = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
     return {name: float(tensor[place]) for name, place in places.items() if name in Inertia.SPECS}
@@ -142,7 +131,8 @@ def evaluate(design: Design) -> Indices | None:
     chart = workspace.over_orientations(geometry, directions, TURNS)
     weights = np.zeros(len(directions))  # solid angle of each direction
     corners = directions[faces]
-    areas = 0.5 * np.linalg.norm(np.cross(*(corners[:, i] - corners[:, 0] for i in (1, 2))), axis=1)
+    sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    areas = 0.5 * np.linalg.norm(np.cross(*sides), axis=1)
     for corner in faces.T:
         np.add.at(weights, corner, areas / 3.0)
     inside = chart.measures.admissible
@@ -182,7 +172,7 @@ def follow(scene: Scene, geometry: Geometry) -> tuple[float, float]:
 
 
 def orientation_error(design: Design, geometry: Geometry, poses: Array) -> Array:
-    """Standard deviation of the orientation of poses (n, 3, 3) by tolerances [rad], shape (n,)."""
+    """Return the standard deviation of orientations (n, 3, 3) by tolerances [rad], shape (n,)."""
     by = rates.orientation_sensitivity(geometry, poses)
     on_base, on_star = PART_ERROR / (0.35 * design.size), PART_ERROR / (0.4 * design.size)
     variance = ENCODER_ERROR**2 * np.sum(by.gamma**2, axis=(1, 2))
@@ -215,12 +205,14 @@ def draw(table: DataFrame, front: Array) -> Figure:
     """Draw error and workspace of the designs over the peak torque, the first and front marked."""
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     labels = {"error": "orientation error (RMS) [mrad]", "workspace": "orientations reached [%]"}
+    looks = (("design", ".", GREY, 4), ("on the front", "o", BLUE, 4),
+             ("isotropic, shipped size", "*", VERMILION, 14))  # fmt: skip
+    rows = np.arange(len(table)) >= 0, front, np.arange(len(table)) == 0
     for axes, (name, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
-        torque = table["peak_torque"]
-        axes.plot(torque, table[name], ".", color=GREY, markersize=4, label="design")
-        axes.plot(torque[front], table[name][front], "o", color=BLUE, label="on the front")
-        axes.plot(torque[:1], table[name][:1], "*", color=VERMILION, markersize=14,
-                  label="isotropic, shipped size")  # fmt: skip
+        for (word, marker, colour, size), chosen in zip(looks, rows, strict=True):
+            part = table[chosen]
+            given = {"color": colour, "markersize": size, "label": word}
+            axes.plot(part["peak_torque"], part[name], marker, **given)
         axes.set(xlabel="peak torque of the motion [N m]", ylabel=label)
         axes.legend(fontsize=8)
     return figure
@@ -229,17 +221,12 @@ def draw(table: DataFrame, front: Array) -> Figure:
 def page(frame: DataFrame, designs: int, symmetric: list[tuple[float, float]]) -> str:
     """Write the page, with ten designs of the front from the least torque to the largest."""
     front = frame[frame["front"]].sort_values("peak_torque")
-    rows = np.unique(np.linspace(0, len(front) - 1, 10).astype(int))
-    shown = front.iloc[rows]
+    shown = front.iloc[np.unique(np.linspace(0, len(front) - 1, 10).astype(int))]
     values = shown.drop(columns="front").map(lambda x: f"{x:.3g}")
-    names = ["arc 12 [deg]", "arc 23", "arc 31", "alpha 1 [deg]", "alpha 2", "size",
-             "workspace [%]", "conditioning", "static torque [N m]", "peak torque [N m]",
-             "peak bending [N m]", "error [mrad]"]  # fmt: skip
     return render(
-        PAGES / "design.md", frame=frame, designs=designs, symmetric=symmetric,
-        shown=values.set_axis(names, axis=1), front=front, low=LOW, high=HIGH,
-        first=frame.iloc[0], motion=MOTION["spiral"], part=PART_ERROR, percentile=PERCENTILE,
-        payload=PAYLOAD,
+        PAGES / "design.md", frame=frame, designs=designs, symmetric=symmetric, front=front,
+        shown=values, first=frame.iloc[0], low=LOW, high=HIGH, motion=MOTION["spiral"],
+        part=PART_ERROR, percentile=PERCENTILE, payload=PAYLOAD,
     )  # fmt: skip
 
 
@@ -251,8 +238,7 @@ def report(options: argparse.Namespace) -> bool:
     frame = data_frame(asdict(one) | asdict(found) for one, found in kept)
     costs = np.stack([-frame["workspace"], frame["peak_torque"], frame["error"]], axis=1)
     frame["front"] = front = find_front(costs)
-    symmetric = isotropy()
-    text = page(frame, len(designs), symmetric)
+    text = page(frame, len(designs), symmetric := isotropy())
     publish(options.out, "design", {".csv": frame, ".md": text, ".png": draw(frame, front)})
     print(text)
     return bool(front.any()) and max(symmetric, key=lambda row: row[1])[0] == 90.0
