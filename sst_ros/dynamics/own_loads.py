@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.expression import Expression, Program, trace
 from sst_ros.errors import check_kinds, refusal, refuse_unless
 from sst_ros.mechanism import generic_math
 from sst_ros.mechanism.generic_math import Scalar
+from sst_ros.programs.expression import Expression, Program, trace
 from sst_ros.scene.own_loads import (
     ANGLES,
     BODY_RATE,
@@ -195,6 +195,7 @@ def run_program(program: Program, values: Sequence[Scalar]) -> list[Scalar]:
         return numbers[operand] if isinstance(operand, int) else operand
 
     for operation, operands in program.steps:
+        assert isinstance(operation, str)  # no routine: a load has none
         numbers.append(_STEPS[operation](*map(number, operands)))
     return [number(operand) for operand in program.outputs]
 
@@ -441,6 +442,7 @@ def write_formulas(program: Program) -> tuple[tuple[tuple[str, str], ...], tuple
         return repr(operand) if operand >= 0.0 else f"({operand!r})"
 
     for index, (operation, operands) in enumerate(program.steps, start=first):
+        assert isinstance(operation, str)  # no routine: a load has none
         text = _FORMS.get(operation, operation + "({})").format(*map(word, operands))
         if operation == "atan2":
             text = "atan2({}, {})".format(*map(word, operands))

@@ -30,7 +30,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.expression import compile_for_arrays, mark_present, trace
 from sst_ros.dynamics.kernel import LegMotion
 from sst_ros.dynamics.model import Model
 from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
@@ -50,6 +49,7 @@ from sst_ros.mechanism.generic_math import (
     triple,
 )
 from sst_ros.mechanism.geometry import Array
+from sst_ros.programs.expression import compile_for_arrays, mark_present, trace
 from sst_ros.scene.bodies import entries_of
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import leaves, rebuild
