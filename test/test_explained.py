@@ -36,6 +36,7 @@ def made(bag):
         batch,
         batch.run(start, 0.0 * start, step=1e-3, count=2),
         simulate(scene, duration=0.1),
+        simulate(scene, duration=0.1).reactions,
         certify("example2", duration=0.01, t_eval=[0.01]),
         linearize(scene, None, (0.0, 0.0, 0.0)),
     )

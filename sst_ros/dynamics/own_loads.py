@@ -195,6 +195,7 @@ def run_program(program: Program, values: Sequence[Scalar]) -> list[Scalar]:
         return numbers[operand] if isinstance(operand, int) else operand
 
     for operation, operands in program.steps:
+        assert isinstance(operation, str)  # no routine: a load has none
         numbers.append(_STEPS[operation](*map(number, operands)))
     return [number(operand) for operand in program.outputs]
 
@@ -441,7 +442,7 @@ def write_formulas(program: Program) -> tuple[tuple[tuple[str, str], ...], tuple
         return repr(operand) if operand >= 0.0 else f"({operand!r})"
 
     for index, (operation, operands) in enumerate(program.steps, start=first):
-        assert isinstance(operation, str)  # no other program is called
+        assert isinstance(operation, str)  # no routine: a load has none
         text = _FORMS.get(operation, operation + "({})").format(*map(word, operands))
         if operation == "atan2":
             text = "atan2({}, {})".format(*map(word, operands))

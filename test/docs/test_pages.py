@@ -16,7 +16,7 @@ from sst_ros.cli.commands import NODES, parser
 PAGES = pages()
 LONG = (
     "README batch collocation controller evaluate fast faults follow geometry identify index "
-    "lockstep look many plot record rodas5p simulate sweep torque twelve_tasks"
+    "lockstep look many own_loads plot reactions record rodas5p simulate sweep torque twelve_tasks"
 )
 """Pages that start nodes or whole runs, which other tests do as well, or that compile."""
 WITH_BLOCKS = [

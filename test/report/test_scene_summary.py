@@ -31,6 +31,7 @@ from sst_ros.report.scene_summary import (
     without,
 )
 from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Moment
+from sst_ros.scene.own_loads import FormulaLoad
 from sst_ros.scene.scene import TERMS, load, names, terms
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulate import simulate
@@ -59,8 +60,13 @@ def test_operations_are_counted_in_the_generated_source(name):
     )
 
 
+def with_everything():
+    own = FormulaLoad(name="own", potential="0.5 * R13**2 + sin(gamma_1)")
+    return replace(loaded(), own_loads=(own,))
+
+
 def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operation():
-    scene = loaded()
+    scene = with_everything()
     for term in TERMS:
         if term not in ("actuated links", "intermediate links"):
             assert term in terms(scene), term
@@ -70,7 +76,7 @@ def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operati
 
 def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
     """Inertias and limits fold into constants or act outside the right-hand side."""
-    added = {cost.name: cost.adds for cost in costs(loaded())}
+    added = {cost.name: cost.adds for cost in costs(with_everything())}
     folded = {"actuated links", "payload", "rotors", "torque limit"}
     assert {name for name, adds in added.items() if not adds} == folded
 
