@@ -8,13 +8,17 @@ import itertools
 
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from ros.conftest import NAMES
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sst_ros.errors import SstError
 from sst_ros.nodes.inverse_dynamics import InverseDynamicsController
+from sst_ros.nodes.process import Worker
 from sst_ros.nodes.torque_player import TorquePlayer
+from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene import scene
 from sst_ros.state import IDLE_FRAME_ID
 
@@ -66,7 +70,7 @@ class Commands:
     """Keeps the commands that a worker publishes, to one subscriber."""
 
     def __init__(self):
-        self.sent = []
+        self.sent, self.topic_name = [], "commands"
 
     def publish(self, message):
         torques = message.effort if isinstance(message, JointState) else message.data
@@ -147,6 +151,37 @@ def test_joint_states_of_another_robot_are_no_sign_of_life(make, kind):
     give(disturbed, GRIPPER)
     with pytest.raises(SstError, match=r"no joint_states for 11.*: 7 messages without gamma_1"):
         disturbed.watch()
+
+
+@pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
+def test_joint_states_of_another_type_are_named_in_the_end(make, kind):
+    worker = make(kind)
+    worker.node.create_publisher(String, "joint_states", 10)
+    worker.heard_s -= 11.0
+    with pytest.raises(SstError, match="is std_msgs/msg/String and not received: must be sensor"):
+        worker.watch()
+
+
+def test_the_result_of_a_goal_has_the_reason_of_the_end(make):
+    """Of a goal that is aborted because the node ends."""
+    worker, reasons = make(InverseDynamicsController), []
+    worker._active, worker.failure = object(), SstError("no joint_states for 10.0 s")
+    worker.node.executor = SingleThreadedExecutor()
+    worker._interrupt = reasons.append
+    worker.close()
+    assert reasons == ["the controller ends: no joint_states for 10.0 s"]
+
+
+def test_parameters_say_their_own_type_and_name(ros):
+    worker = Worker("sst_simulator", SimulatorParameters)
+    for name, spec in SimulatorParameters.SPECS.items():
+        descriptor, value = worker.node.describe_parameter(name), worker.node.get_parameter(name)
+        assert descriptor.type == value.type_.value != Parameter.Type.BYTE_ARRAY.value, name
+        if spec.kind == "texts":
+            assert value.type_ is Parameter.Type.STRING_ARRAY
+    (result,) = worker.node.set_parameters([Parameter("real_time_factor", value=1e-9)])
+    worker.node.destroy_node()
+    assert result.reason == "/sst_simulator: real_time_factor = 1e-09: must be 0 or >= 0.001"
 
 
 @pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
