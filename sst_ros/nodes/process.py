@@ -124,12 +124,6 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
         values[name], descriptor = value, _descriptor(name, spec)
         descriptor.read_only = name not in getattr(cls, "CHANGEABLE", ())
         try:
-            if value == [] and spec.kind == "texts":
-                # rclpy takes an empty list for one of bytes, except as an override of a known type.
-                kind = _TYPES[spec.kind]
-                node._parameter_overrides[name] = Parameter(name, kind, value)
-                node.declare_parameter(name, kind, descriptor)
-                continue
             node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
             checks.append((name, value, False, spec.describe()))

@@ -226,4 +226,3 @@ def _bag_qos(asked: QoSProfile) -> interfaces.Qos:
 
 def _join(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
-

@@ -197,7 +197,6 @@ class SimulationInterfaces:
 
         A thread asks for the steps, so that the node answers meanwhile.
         """
-
         kind = self._types["SimulateSteps"]
 
         def run() -> None:

@@ -386,7 +386,12 @@ def unknown_name(name: str, known: Iterable[str]) -> Check:
     names = [*known]
     near = suggestion(name, names) or f"; known are {', '.join(names)}"
     behind = ", unless behind --ros-args" if name.startswith("-") else ""
-    return "argument" if behind else "parameter", name, False, f"is no parameter of the node{behind}{near}"
+    return (
+        "argument" if behind else "parameter",
+        name,
+        False,
+        f"is no parameter of the node{behind}{near}",
+    )
 
 
 def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:

@@ -2,7 +2,6 @@
 """Pause, step, reset and set_state of a real simulator; its speed, /clock given and followed."""
 
 import math
-
 import re
 
 import pytest

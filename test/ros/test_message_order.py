@@ -153,32 +153,19 @@ def test_joint_states_of_another_robot_are_no_sign_of_life(make, kind):
         disturbed.watch()
 
 
-@pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
-def test_joint_states_of_another_type_are_named_in_the_end(make, kind):
-    worker = make(kind)
-    worker.node.create_publisher(String, "joint_states", 10)
-    worker.heard_s -= 11.0
-    with pytest.raises(SstError, match="is std_msgs/msg/String and not received: must be sensor"):
-        worker.watch()
-
-
 def test_the_result_of_a_goal_has_the_reason_of_the_end(make):
     """Of a goal that is aborted because the node ends."""
     worker, reasons = make(InverseDynamicsController), []
     worker._active, worker.failure = object(), SstError("no joint_states for 10.0 s")
-    worker.node.executor = SingleThreadedExecutor()
+    executor = SingleThreadedExecutor()
+    executor.add_node(worker.node)
     worker._interrupt = reasons.append
     worker.close()
     assert reasons == ["the controller ends: no joint_states for 10.0 s"]
 
 
-def test_parameters_say_their_own_type_and_name(ros):
+def test_a_refused_parameter_is_named_with_its_node(ros):
     worker = Worker("sst_simulator", SimulatorParameters)
-    for name, spec in SimulatorParameters.SPECS.items():
-        descriptor, value = worker.node.describe_parameter(name), worker.node.get_parameter(name)
-        assert descriptor.type == value.type_.value != Parameter.Type.BYTE_ARRAY.value, name
-        if spec.kind == "texts":
-            assert value.type_ is Parameter.Type.STRING_ARRAY
     (result,) = worker.node.set_parameters([Parameter("real_time_factor", value=1e-9)])
     worker.node.destroy_node()
     assert result.reason == "/sst_simulator: real_time_factor = 1e-09: must be 0 or >= 0.001"
