@@ -127,10 +127,13 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         super().receive(state)
         self.follower.proceed()
 
-    def may_begin(self) -> bool:
-        """Whether all have subscribed who are to hear the whole run."""
-        recorded = (self._reference, self._error) if self.parameters.wait_for_recorder else ()
-        return super().may_begin() and all(one.get_subscription_count() for one in recorded)
+    def missing_subscribers(self) -> list[str]:
+        """Return the topics that wait for subscribers, with wait_for_recorder its own, too."""
+        missing = super().missing_subscribers()
+        if self.parameters.wait_for_recorder:
+            recorded = (self._reference, self._error)
+            missing += [one.topic_name for one in recorded if not one.get_subscription_count()]
+        return missing
 
     def preview(self) -> Vector3 | None:
         """Return what answers the last state before the run [N m], if there is a motion."""

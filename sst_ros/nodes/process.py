@@ -54,6 +54,7 @@ _ACKNOWLEDGE_S = 1.2
 """A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
 _CLEAN_UP_S = 10.0  # longer than any clean-up of the middleware, also on a busy machine
 _WATCH_S = 0.25
+_LOG_PERIOD_S = 5.0  # of what a node waits for
 _STDERR = 2
 
 _TYPES = {
@@ -105,7 +106,8 @@ class Worker(Generic[P]):
         try:
             changed = dataclasses.replace(self.parameters, **mine)
         except InputError as error:
-            return Result(successful=False, reason=str(error))
+            named = InputError(self.node.get_fully_qualified_name(), error.problems)
+            return Result(successful=False, reason=str(named))
         if mine:
             self.change(changed)
         return Result(successful=True)
@@ -171,7 +173,7 @@ class AnsweringWorker(Worker[A]):
 
     def connect(self, own: dict[str, topics.Endpoint], **more: Callable[[Any], None]) -> None:
         """Publish commands, and listen to topics of its own table, as soon as it can answer."""
-        given = self.parameters
+        given, self._own = self.parameters, own
         self.begun = self.commanded = False
         self.phase = ""
         self.heard_s = time.monotonic()
@@ -207,8 +209,15 @@ class AnsweringWorker(Worker[A]):
         raise NotImplementedError
 
     def may_begin(self) -> bool:
-        """Whether the commands have as many subscribers as the parameters ask for."""
-        return self._commands.get_subscription_count() >= self.parameters.min_subscribers
+        """Whether all have subscribed who are to receive the whole run."""
+        return not self.missing_subscribers()
+
+    def missing_subscribers(self) -> list[str]:
+        """Return the topics without as many subscribers as the parameters ask for, with counts."""
+        count, least = self._commands.get_subscription_count(), self.parameters.min_subscribers
+        if count >= least:
+            return []
+        return [f"{self._commands.topic_name} has {count} of {least}"]
 
     def hear(self, phase: String) -> None:
         """Remember the phase; end with a simulator that stops by a fault.
@@ -276,9 +285,19 @@ class AnsweringWorker(Worker[A]):
                 raise SstError(f"stamped = false: {text}: give stamped:=true")
         silent = time.monotonic() - self.heard_s
         if silent > self.parameters.timeout:
-            foreign = f"{self.foreign_states} messages without {', '.join(ACTUATORS)} were ignored"
-            reason = foreign if self.foreign_states else "is the simulator running?"
-            raise SstError(f"no joint_states for {silent:.1f} s: {reason}")
+            reason = "is the simulator running?"
+            if self.foreign_states:
+                named = ", ".join(ACTUATORS)
+                reason = f"{self.foreign_states} messages without {named} were ignored"
+            others = topics.other_types(self.node, self._own["joint_states"])
+            reasons = "; ".join([reason, *others])
+            raise SstError(f"no joint_states for {silent:.1f} s: {reasons}")
+        if not self.commanded and silent < _WATCH_S and not self.may_begin():
+            self.node.get_logger().info(
+                f"waiting for subscribers: {', '.join(self.missing_subscribers())}",
+                throttle_duration_sec=_LOG_PERIOD_S,
+                skip_first=True,
+            )
 
     def _end_at_fault(self) -> None:
         if self.commanded and self.phase.startswith("fault"):
@@ -328,7 +347,8 @@ def run(words: Sequence[str]) -> int:
                 worker.node.get_logger().warning(line)
             spin(worker)
     except (SstError, ParameterException) as error:
-        print(f"{command}: {error}", file=sys.stderr)
+        text = str(error)
+        print(text if text.startswith(f"{command}: ") else f"{command}: {text}", file=sys.stderr)
         return 1
     finally:
         with _bound_time():

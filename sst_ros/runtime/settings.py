@@ -302,6 +302,7 @@ class ViewerParameters(Section):
     open: bool = entry("open the page in a browser, where there is a desktop", default=False)
 
 
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 USE_SIM_TIME = "use_sim_time"
 FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Parameters (or their beginning) that rclpy itself declares."""
@@ -359,6 +360,10 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
         name = rule.partition(":=")[0].rpartition(":")[2]
         if flag in ("-p", "--param") and name not in known and not name.startswith(FOREIGN):
             checks.append(unknown_name(name, known))
+        if flag == "--log-level":
+            level = rule.rpartition(":=")[2]
+            allowed = f"must be one of {', '.join(LOG_LEVELS)}"
+            checks.append((flag, level, level.lower() in LOG_LEVELS, allowed))
     options: list[str] = []
     for name, word in vars(given).items():
         spec = known[name]
@@ -376,7 +381,12 @@ def unknown_name(name: str, known: Iterable[str]) -> Check:
     names = [*known]
     near = suggestion(name, names) or f"; known are {', '.join(names)}"
     behind = ", unless behind --ros-args" if name.startswith("-") else ""
-    return name, name, False, f"is no parameter of the node{behind}{near}"
+    return (
+        "argument" if behind else "parameter",
+        name,
+        False,
+        f"is no parameter of the node{behind}{near}",
+    )
 
 
 def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:

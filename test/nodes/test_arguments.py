@@ -30,6 +30,8 @@ def values(command, *words):
          {"publish_clock": True, "use_sim_time": True}),
         ("simulator", ["--wait-for-subscribers", "joint_states,~/orientation"],
          {"wait_for_subscribers": ["joint_states", "~/orientation"]}),
+        ("recorder", ["--topics", '["/joint_states"]'], {"topics": ["/joint_states"]}),
+        ("recorder", ["--topics", "['/a', \"/b\", /c]"], {"topics": ["/a", "/b", "/c"]}),
         ("simulator", ["--tolerance", "1e-9"], {"tolerance": 1e-9}),
         ("inverse_dynamics", ["--damping", "1,2,3"], {"damping": [1.0, 2.0, 3.0]}),
         ("simulator", ["--scene", "swing", "--ros-args", "-p", "rate:=500", "-r", "__ns:=/left"],
@@ -45,6 +47,9 @@ def test_every_parameter_is_a_plain_option(command, words, expected):
     ("words", "said"),
     [
         (["--bogus"], "behind --ros-args; known are --scene, --rate"),
+        (["--ros-args", "--log-level", "loud"], "--log-level = 'loud': must be one of debug, info"),
+        (["--ros-args", "--log-level", "sst_simulator:=loud"], "must be one of debug, info, warn"),
+        (["--scen", "friction"], "argument = '--scen': is no parameter of the node"),
         (["--scen", "friction"], "did you mean '--scene'?"),
         (["scene", "friction"], "did you mean '--scene'?"),
         (["scene:=friction"], "did you mean '--scene'?"),
@@ -63,6 +68,12 @@ def test_what_is_no_argument_is_refused(words, said):
         ros_arguments("simulator", [*words, *more])
     assert said in str(caught.value)
     assert len(caught.value.problems) > 1  # every fault is listed
+
+
+@pytest.mark.parametrize("level", ["debug", "WARN", "sst_simulator:=fatal"])
+def test_log_levels_of_rcl_are_left_to_it(level):
+    words = ["--ros-args", "--log-level", level]
+    assert ros_arguments("simulator", words) == words
 
 
 @pytest.mark.parametrize(

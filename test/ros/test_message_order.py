@@ -8,13 +8,17 @@ import itertools
 
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from ros.conftest import NAMES
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sst_ros.errors import SstError
 from sst_ros.nodes.inverse_dynamics import InverseDynamicsController
+from sst_ros.nodes.process import Worker
 from sst_ros.nodes.torque_player import TorquePlayer
+from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene import scene
 from sst_ros.state import IDLE_FRAME_ID
 
@@ -66,7 +70,7 @@ class Commands:
     """Keeps the commands that a worker publishes, to one subscriber."""
 
     def __init__(self):
-        self.sent = []
+        self.sent, self.topic_name = [], "commands"
 
     def publish(self, message):
         torques = message.effort if isinstance(message, JointState) else message.data
@@ -147,6 +151,24 @@ def test_joint_states_of_another_robot_are_no_sign_of_life(make, kind):
     give(disturbed, GRIPPER)
     with pytest.raises(SstError, match=r"no joint_states for 11.*: 7 messages without gamma_1"):
         disturbed.watch()
+
+
+def test_the_result_of_a_goal_has_the_reason_of_the_end(make):
+    """Of a goal that is aborted because the node ends."""
+    worker, reasons = make(InverseDynamicsController), []
+    worker._active, worker.failure = object(), SstError("no joint_states for 10.0 s")
+    executor = SingleThreadedExecutor()
+    executor.add_node(worker.node)
+    worker._interrupt = reasons.append
+    worker.close()
+    assert reasons == ["the controller ends: no joint_states for 10.0 s"]
+
+
+def test_a_refused_parameter_is_named_with_its_node(ros):
+    worker = Worker("sst_simulator", SimulatorParameters)
+    (result,) = worker.node.set_parameters([Parameter("real_time_factor", value=1e-9)])
+    worker.node.destroy_node()
+    assert result.reason == "/sst_simulator: real_time_factor = 1e-09: must be 0 or >= 0.001"
 
 
 @pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
