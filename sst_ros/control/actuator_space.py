@@ -27,7 +27,7 @@ from sst_ros.mechanism import continuation
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.state import ZERO, Explained, Quaternion, Vector3
+from sst_ros.state import ZERO, Explained, Quaternion, Vector3, find_lost_meaning
 
 ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
 CLOSED = 1e-14  # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
@@ -66,7 +66,8 @@ class ReferenceMotion(Explained):
     @check_kinds_late
     def at(self, time: float) -> Reference:
         """Return the reference at a time [s]; raises SingularConfiguration in a singularity."""
-        if math.isnan(time):
+        lost = "" if type(time) is float else find_lost_meaning(time)
+        if lost or math.isnan(time):
             refuse_unless("motion", ("time", time, False, "must be a number [s]"))
         inside = min(max(time, 0.0), self.duration)
         try:

@@ -21,7 +21,7 @@ from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import MotionTable
 from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
-from sst_ros.errors import check_kinds, refuse_unless, require
+from sst_ros.errors import check_kinds, read_numbers, refuse_unless, require
 from sst_ros.host import compiled_module
 from sst_ros.host.many_runs import run_many
 from sst_ros.host.output import slices
@@ -277,7 +277,7 @@ def _locate_ends(
 
 
 def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
-    rows = np.asarray(value, dtype=float)
+    rows = read_numbers("batch", name, value)
     if count is not None and rows.shape == (3,):
         rows = np.tile(rows, (count, 1))
     expected = "(N, 3)" if count is None else f"(3,) or ({count}, 3)"

@@ -60,7 +60,8 @@ def default_budget(dynamics: Dynamics, equations: str, *, compiled: bool) -> int
 def _whole(value: Any) -> int:
     """Return a whole number of any type as int, 0 for anything else and from 2^63 on."""
     try:
-        found = 0 if isinstance(value, bool) else operator.index(value)
+        is_duration = isinstance(value, (bool, np.timedelta64))
+        found = 0 if is_duration else operator.index(value)
     except TypeError:
         return 0
     return found if found < 2**63 else 0
@@ -211,6 +212,9 @@ class Simulation(Explained):
         try:
             if callable(torque) and not getattr(torque, "feedback", False):
                 refuse_unless("step", ("torque", torque, count_arguments(torque) == 1, _TORQUE))
+            acts = callable(torque) or isinstance(torque, SineTorque)
+            if not acts and finite_vector(torque) is None:
+                raise ValueError
             return self._propagator.torque.acting(torque)
         except (TypeError, ValueError, OverflowError):
             raise refusal("step", "torque", torque, _TORQUE) from None

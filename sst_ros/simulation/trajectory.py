@@ -24,6 +24,7 @@ from sst_ros.errors import (
     Diverged,
     MissingDependency,
     check_kinds,
+    read_numbers,
     refusal,
     refuse_errors,
     refuse_unless,
@@ -45,7 +46,7 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array
+from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, TimesLike, freeze
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,6 +61,7 @@ _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
 
+_STATUSES = (-1, 0, 1, 2)
 _UNMET = 2
 """Status of a motion that reached its end with an error estimate above the tolerance."""
 
@@ -106,7 +108,7 @@ class Trajectory(MotionTable):
     def __init__(
         self,
         scene: Scene,
-        t: ArrayLike,
+        t: TimesLike,
         quaternion: ArrayLike | None = None,
         body_rate: ArrayLike | None = None,
         torque: ArrayLike | None = None,
@@ -123,17 +125,19 @@ class Trajectory(MotionTable):
         dense: Callable[[Array], Array] | None = None,
         parameters: Sequence[str] = (),
     ) -> None:
-        self.scene, self.t = scene, _own(t)
+        self.scene, self.t = scene, _own("t", t)
         given: dict[str, Any] = {"quaternion": quaternion, "body_rate": body_rate, "torque": torque}
         given |= {} if joints is None else {"_joints": joints}
         if dense is None or any(array is not None for array in given.values()):
-            vars(self).update({name: _own(array) for name, array in given.items()})
+            vars(self).update({name: _own(name, array) for name, array in given.items()})
         sizes = {"quaternion": 4, "body_rate": 3, "torque": 3, "_joints": 18}
         shapes = {name: (self.t.size, size) for name, size in sizes.items() if name in vars(self)}
         shaped = ((name, vars(self)[name].shape, shape) for name, shape in shapes.items())
+        known = type(status) is int and status in _STATUSES
         refuse_unless(
             "trajectory",
             ("scene", scene, isinstance(scene, Scene), "must be a Scene"),
+            ("status", status, known, f"must be one of {_STATUSES}"),
             ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
             *((name.strip("_"), x, x == y, f"must have the shape {y}") for name, x, y in shaped),
         )
@@ -165,7 +169,7 @@ class Trajectory(MotionTable):
     @cached_property
     def _states(self) -> Array:
         """Rows of quaternion, body rate and torque at the samples, by `dense`."""
-        return _own(_propagate(self, self.t))
+        return freeze(_propagate(self, self.t))
 
     @cached_property
     def quaternion(self) -> Array:  # type: ignore[override]
@@ -253,7 +257,7 @@ class Trajectory(MotionTable):
         return (*self.quaternion.T, *self.body_rate.T)
 
     @check_kinds
-    def at(self, t: ArrayLike) -> Trajectory:
+    def at(self, t: TimesLike) -> Trajectory:
         """Sample the motion at other times, ascending, to the accuracy of the run.
 
         Each state is integrated from the sample before it, under the torques that act there.
@@ -266,7 +270,7 @@ class Trajectory(MotionTable):
                 run under a function.
 
         """
-        times = np.atleast_1d(np.asarray(t, dtype=float))
+        times = np.atleast_1d(read_numbers("at", "t", t, seconds=True))
         inside = (times >= self.t[0]) & (times <= self.t[-1])
         fits = times.ndim == 1 and times.size > 0 and bool(np.all(inside))
         allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
@@ -393,18 +397,9 @@ class Trajectory(MotionTable):
         return super()._repr_html_() + svg[max(svg.find("<svg"), 0) :]
 
 
-def _own(value: ArrayLike) -> Array:
-    """Return an array that nothing can change: a copy, unless it is one already."""
-    try:
-        if np.iscomplexobj(value):
-            raise TypeError
-        array: Array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError, MemoryError):
-        raise refusal("trajectory", "array", value, "must be real numbers") from None
-    if array is value and (array.flags.writeable or not array.flags.owndata):
-        array = array.copy()
-    array.flags.writeable = False
-    return array
+def _own(name: str, value: ArrayLike) -> Array:
+    """Return an array that nothing can change, of times in seconds where it is `t`."""
+    return freeze(read_numbers("trajectory", name, value, seconds=name == "t"))
 
 
 def _propagate(trajectory: Trajectory, times: Array) -> Array:
