@@ -84,6 +84,21 @@ def freeze(array: Array) -> Array:
     return array
 
 
+class ReadOnly:
+    """An object whose arrays nobody can write to, nor to those of its copies."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a copy or a pickle, in which arrays can be written to."""
+        vars(self).update(state)
+        self._freeze()
+
+    def _freeze(self) -> None:
+        """Make all arrays read-only that the object holds."""
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+
 def _read_objects(objects: NDArray[Any], seconds: bool) -> Array:
     """Return Python objects (fractions, decimals, durations) as doubles, in their shape."""
     numbers = []

@@ -14,7 +14,7 @@ import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -100,20 +100,22 @@ def slow_down(motion: ReferenceMotion, begin: float, duration: float) -> Referen
     with d^2s/dt^2 = 0 at both. It stays on the path of the given motion, which is inside all
     limits of position, for half of `duration` more at most.
     """
-
-    def inside(time: float) -> Reference:
-        u = time / duration
-        at = motion.at(begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
-        speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
-        return replace(
-            at,
-            body_rate=multiply(speed, at.body_rate),
-            body_acceleration=axpy(speed * speed, at.body_acceleration, change, at.body_rate),
-            gamma_dot=multiply(speed, at.gamma_dot),
-            gamma_ddot=axpy(speed * speed, at.gamma_ddot, change, at.gamma_dot),
-        )
-
+    inside = partial(_slowed_down, motion, begin, duration)
     return ReferenceMotion(inside, equal_pieces(duration, 4))
+
+
+def _slowed_down(motion: ReferenceMotion, begin: float, duration: float, time: float) -> Reference:
+    """Return the reference of `slow_down` at a time [s]; a function that pickle takes."""
+    u = time / duration
+    at = motion.at(begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
+    speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
+    return replace(
+        at,
+        body_rate=multiply(speed, at.body_rate),
+        body_acceleration=axpy(speed * speed, at.body_acceleration, change, at.body_rate),
+        gamma_dot=multiply(speed, at.gamma_dot),
+        gamma_ddot=axpy(speed * speed, at.gamma_ddot, change, at.gamma_dot),
+    )
 
 
 class ActuatorSpaceMap:

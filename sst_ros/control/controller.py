@@ -59,6 +59,10 @@ class InverseDynamics(Explained):
         self._has_moment_topic, self._program = dynamics.has_moment_topic, dynamics.inverse
         self._model = dynamics.model
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the scene."""
+        return InverseDynamics, (self.scene,)
+
     def torque(
         self,
         quaternion: Quaternion,
@@ -270,9 +274,22 @@ class Controller:
         refuse_unless("control", ("integral_rate", rate, not rate or rate < min(kd), allowed))
         limit = float(law.command_limit(settings.torque_limit, model))
         known = limit if math.isfinite(limit) else None
-        functions, numbers = (self._inverse.torque, self._space.star_motion), (kp, kd, self.inertia)
-        self._law = law.ControlLaw(settings, *functions, *numbers, rate, known, period_s)
+        self._numbers = kp, kd, self.inertia, rate, known, period_s
+        self._law = self._make_law()
         self.reset()
+
+    def _make_law(self) -> law.ControlLaw:
+        functions = self._inverse.torque, self._space.star_motion
+        return law.ControlLaw(self._settings, *functions, *self._numbers)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle gets: all but compiled functions."""
+        return {name: value for name, value in vars(self).items() if name != "_law"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on where the controller was when it was copied."""
+        vars(self).update(state)
+        self._law = self._make_law()
 
     def reset(self) -> None:
         """Clear the integral, the orientation that was observed last, and a failure."""

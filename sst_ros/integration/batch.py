@@ -30,7 +30,7 @@ from sst_ros.integration.simd_source import EARLIEST, NOT_FINITE, SIMD_WIDTH, ba
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import TURN
-from sst_ros.state import Explained
+from sst_ros.state import Explained, freeze
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
@@ -111,6 +111,10 @@ class Batch(Explained):
         self._scenarios.check()
         self.model = ParametricModel(self._scenarios, profile=profile)
         self.columns = self.model.columns(self._scenarios)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what was given; programs are traced and compiled again where they are needed."""
+        return _make_batch, (self.scene, self._method, self.model.profile, self._scenarios.rows)
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios, already checked, that shares this one's compiled code.
@@ -261,6 +265,12 @@ class Batch(Explained):
         return compiled_module.load([text], {"NODES": method.c}, numba=True, nogil=True)
 
 
+def _make_batch(
+    scene: Scene, method: Tableau, profile: bool, parameters: Mapping[str, ArrayLike]
+) -> Batch:
+    return Batch(scene, method, profile=profile, parameters=parameters)
+
+
 def _locate_ends(
     advance: Advance, step: float, steps: Array, y: Array, given: Array, code: Any, time: Array
 ) -> None:
@@ -332,6 +342,7 @@ class BatchResult(MotionTable):
         self.body_rate: Array = self._state[..., 4:7]
         self.kept: BatchResult | None = None
         self._computed: dict[str, Array] = {}
+        self._freeze()
 
     @property
     def energy(self) -> Array:
@@ -351,7 +362,7 @@ class BatchResult(MotionTable):
                     for part, number in zip(found, numbers, strict=True):
                         part[..., rows] = number
             found[..., self.code < 0] = np.nan
-            self._computed[name] = np.moveaxis(found, 0, -1)
+            self._computed[name] = freeze(np.moveaxis(found, 0, -1))
         return self._computed[name]
 
     @cached_property

@@ -274,6 +274,10 @@ class Scenarios:
         if problems:
             raise InputError(scene.name, problems)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what was given."""
+        return Scenarios, (self.document, self.rows)
+
     def _rows_of(self, value: ArrayLike, shape: tuple[int, ...]) -> Array:
         rows = freeze(real_numbers(value))
         if rows.shape != (self.count or max(1, len(np.atleast_1d(rows))), *shape):

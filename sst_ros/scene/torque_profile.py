@@ -24,7 +24,16 @@ from sst_ros.errors import (
     refuse_unless,
 )
 from sst_ros.scene.schema import Section, entry
-from sst_ros.state import ZERO, Array, State, TimesLike, Vector3, finite_vector, freeze
+from sst_ros.state import (
+    ZERO,
+    Array,
+    ReadOnly,
+    State,
+    TimesLike,
+    Vector3,
+    finite_vector,
+    freeze,
+)
 
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
@@ -36,10 +45,19 @@ def ascend(times: Array) -> bool:
     return times.ndim == 1 and bool(np.isfinite(times).all() and (np.diff(times) > 0.0).all())
 
 
-class TorqueProfile:
-    """Torques that act over a motion; most are known as a function of time alone."""
+class TorqueProfile(ReadOnly):
+    """Torques that act over a motion; most are known as a function of time alone.
+
+    A motion keeps the profile that it was given, so nothing in it can change.
+    """
 
     feedback = False
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute once."""
+        if name in vars(self):
+            raise AttributeError(f"{name} is read-only: make another {type(self).__name__}")
+        super().__setattr__(name, value)
 
     def values(self, t: Array) -> Array:
         """Torques [N m] at times [s], shape (n,) -> (n, 3); nan if not known from t."""

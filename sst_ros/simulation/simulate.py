@@ -194,15 +194,7 @@ def prepare(
         given, profile, (0.0, end), times, method, tolerance, period, memoryless, inside,
         float(longest), parameters,
     )  # fmt: skip
-    reason = ""
-    if method in (AUTO, GAUSS):
-        try:
-            return PreparedRun(CollocatedMotion(task).run)
-        except NotSmooth as error:
-            if method == GAUSS:
-                _refuse("method", method, str(error))
-            reason = f" (auto: {error})"
-    return PreparedRun(partial(_integrate, task, reason))
+    return PreparedRun(task)
 
 
 class PreparedRun:
@@ -211,14 +203,31 @@ class PreparedRun:
     A torque function is called anew in each run.
     """
 
-    def __init__(self, run: Callable[[bool], Trajectory]) -> None:
-        self._run = run
+    def __init__(self, task: Task) -> None:
+        self._task, self._run = task, _choose_method(task)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what is run: it is prepared again, and its bits are the same."""
+        return PreparedRun, (self._task,)
 
     def run(self, *, progress: bool = False) -> Trajectory:
         """Compute the motion; the trajectory has arrays of its own."""
         if progress is not False and not isinstance(progress, (bool, np.bool_)):
             _refuse("progress", progress, "must be True or False")
         return self._run(progress)
+
+
+def _choose_method(task: Task) -> Callable[[bool], Trajectory]:
+    """Return the function that runs a task: collocation where it can be chosen, or steps."""
+    reason = ""
+    if task.method in (AUTO, GAUSS):
+        try:
+            return CollocatedMotion(task).run
+        except NotSmooth as error:
+            if task.method == GAUSS:
+                _refuse("method", task.method, str(error))
+            reason = f" (auto: {error})"
+    return partial(_integrate, task, reason)
 
 
 def _integrate(task: Task, reason: str, progress: bool) -> Trajectory:

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import operator
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,9 +81,16 @@ class _Instant(NamedTuple):
     torque: Torque = (0.0, 0.0, 0.0)
     moment: tuple[float, ...] = ()
 
+    def _make_portable(self) -> tuple[Any, ...]:
+        """Return the instant with the name of its method in place of the method."""
+        return self._replace(point=self.point._replace(method=self.point.method.name))
+
 
 class Simulation(Explained):
     """Direct dynamics of a scene from its initial state.
+
+    A copy, also one of pickle, goes on from where the simulation is, to the bit. Only one thread
+    at a time may advance a simulation: another one is refused, for it would lose steps.
 
     Args:
         scene: a Scene, the name of a scene that is shipped, the path of a file, or a mapping with
@@ -136,6 +145,8 @@ class Simulation(Explained):
              "needs an explicit integrator and compiled = False"),
         )  # fmt: skip
         self.scene = scene = scene_of(scene)
+        self._settings = integrator, tolerance, compiled, equations
+        self._running, self._thread = threading.Lock(), ""
         derivative = derive_by_paper(scene) if equations == "virtual_work" else None
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
@@ -207,6 +218,25 @@ class Simulation(Explained):
             warnings.warn(text, RuntimeWarning, stacklevel=3)
         self.advance(torque, length, number, moment)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy the arguments, and where the run is."""
+        instants = self._before._make_portable(), self._now._make_portable()
+        spent = self._propagator.budget.spent
+        arguments = self.scene, *self._settings, self.step_budget
+        return _continue_simulation, (arguments, instants, spent, self._warned)
+
+    @contextlib.contextmanager
+    def _advancing(self) -> Iterator[None]:
+        """Refuse another thread while one advances the simulation."""
+        if not self._running.acquire(blocking=False):
+            here, allowed = threading.current_thread().name, "must wait: {} advances the simulation"
+            raise refusal("step", "thread", here, allowed.format(self._thread))
+        self._thread = threading.current_thread().name
+        try:
+            yield
+        finally:
+            self._running.release()
+
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
         try:
@@ -221,6 +251,10 @@ class Simulation(Explained):
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""
+        with self._advancing():
+            self._advance(torque, dt_ns, count, moment)
+
+    def _advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         propagator, h = self._propagator, dt_ns / NANOSECONDS
         held = tuple(map(float, moment)) if self.dynamics.has_moment_topic else ()
         while count > 0:
@@ -262,9 +296,10 @@ class Simulation(Explained):
 
     def reset(self) -> State:
         """Go back to the initial state at time zero."""
-        self._now = self._before = _Instant(0, self._start)
-        self._shown = self._now, self._as_state(self._now)
-        self._energy = self.dynamics.total_energy(self._start.y)
+        with self._advancing():
+            self._now = self._before = _Instant(0, self._start)
+            self._shown = self._now, self._as_state(self._now)
+            self._energy = self.dynamics.total_energy(self._start.y)
         return self.state
 
     def load_code(self) -> None:
@@ -365,6 +400,22 @@ class Simulation(Explained):
         if type(at.torque) is tuple and not self._lags:
             return at.torque
         return self._propagator.acting(at.torque, at.time_ns / NANOSECONDS, at.point)
+
+
+def _continue_simulation(
+    arguments: tuple[Any, ...], instants: Sequence[_Instant], spent: int, warned: bool
+) -> Simulation:
+    """Make a simulation that goes on where another one was."""
+    scene, integrator, tolerance, compiled, equations, budget = arguments
+    copied = Simulation(
+        scene, integrator,
+        tolerance=tolerance, compiled=compiled, equations=equations, step_budget=budget,
+    )  # fmt: skip
+    copied._before, copied._now = (
+        at._replace(point=at.point._replace(method=METHODS[at.point.method])) for at in instants
+    )
+    copied._propagator.budget.spent, copied._warned = spent, warned
+    return copied
 
 
 def conditioning(geometry: Geometry, state: State) -> dict[str, float]:

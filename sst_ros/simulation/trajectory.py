@@ -196,7 +196,8 @@ class Trajectory(MotionTable):
         """Angles and rates of the joints, shape (n, 18)."""
         with np.errstate(all="ignore"):
             found = kernel.joints(self._dynamics.model, self._columns)
-        return np.stack([np.broadcast_to(x, self.t.shape) for row in found for x in row], axis=1)
+        columns = [np.broadcast_to(x, self.t.shape) for row in found for x in row]
+        return freeze(np.stack(columns, axis=1))
 
     def _joint(self, name: str) -> Array:
         first = 3 * JOINTS.index(name)
@@ -212,12 +213,12 @@ class Trajectory(MotionTable):
         with np.errstate(all="ignore"):
             slope = kernel.derivative(model, y, triple(self.torque.T))
             found = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
-        return np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1)
+        return freeze(np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1))
 
     @cached_property
     def euler_zyz(self) -> Array:
         """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], shape (n, 3)."""
-        return unwrap_zyz(super().euler_zyz)
+        return freeze(unwrap_zyz(super().euler_zyz))
 
     @cached_property
     def energy(self) -> Array:
@@ -225,7 +226,7 @@ class Trajectory(MotionTable):
         with np.errstate(all="ignore"):
             model, columns = self._dynamics.model, self._columns
             total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(model, columns)
-        return np.asarray(np.broadcast_to(total, self.t.shape))
+        return freeze(np.broadcast_to(total, self.t.shape))
 
     @cached_property
     def energy_residual(self) -> float:
