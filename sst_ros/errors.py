@@ -16,9 +16,8 @@ from numbers import Integral, Real
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]  # that of state.py; an import would lengthen every chain of imports
+from sst_ros.state import Array, NotNumbers, real_numbers
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
 SHOWN, LONGEST_PATH = 80, 4096  # characters of a value in a message, and of a path
@@ -80,11 +79,19 @@ def refuse_unless(origin: str, *checks: Check) -> None:
 _KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "bool": (lambda x: isinstance(x, (bool, np.bool_)), "must be True or False"),
     "int": (
-        lambda x: isinstance(x, Integral) and not isinstance(x, bool) and abs(int(x)) < 2**64,
+        lambda x: (
+            isinstance(x, Integral)
+            and not isinstance(x, (bool, np.timedelta64))
+            and abs(int(x)) < 2**64
+        ),
         "must be a whole number",
     ),
     "float": (
-        lambda x: isinstance(x, Real) and not isinstance(x, bool) and float(x) is not None,
+        lambda x: (
+            isinstance(x, Real)
+            and not isinstance(x, (bool, np.timedelta64))
+            and float(x) is not None
+        ),
         "must be a number",
     ),
     "str": (lambda x: isinstance(x, str), "must be text"),
@@ -92,13 +99,8 @@ _KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
         lambda x: isinstance(x, (str, os.PathLike)) and b"\0" not in os.fsencode(x),
         "must be a path",
     ),
-    "ArrayLike": (
-        lambda x: (
-            (kind := (array := np.asarray(x)).dtype.kind) in "fiub"
-            or (kind == "O" and [float(one) for one in array.flat])
-        ),
-        "must be numbers",
-    ),
+    "ArrayLike": (lambda x: real_numbers(x) is not None, "must be numbers"),
+    "TimesLike": (lambda x: real_numbers(x, seconds=True) is not None, "must be times [s]"),
     "Mapping": (
         lambda x: isinstance(x, Mapping) and all(isinstance(key, str) for key in x),
         "must be a mapping from text",
@@ -138,6 +140,8 @@ def check_kinds(function: F, *, late: bool = False) -> F:
             return allowed if wrong else ""
         try:
             return "" if good(value) else allowed
+        except NotNumbers as error:
+            return str(error)
         except (TypeError, ValueError, OverflowError, MemoryError):
             return allowed
 
@@ -180,6 +184,14 @@ def refuse_errors(
         yield
     except errors as error:
         raise refusal(origin, key, value, f"{allowed} ({error})") from None
+
+
+def read_numbers(origin: str, name: str, value: Any, *, seconds: bool = False) -> Array:
+    """Return real numbers as `real_numbers` does; InputError names the argument."""
+    try:
+        return real_numbers(value, seconds=seconds)
+    except NotNumbers as error:
+        raise refusal(origin, name, value, str(error)) from None
 
 
 class MotionRefused(InputError):

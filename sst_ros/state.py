@@ -8,10 +8,11 @@ import math
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import date, timedelta
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 NANOSECONDS = 1_000_000_000  # of a second: time is integer nanoseconds
 
@@ -21,6 +22,143 @@ ZERO: Vector3 = (0.0, 0.0, 0.0)
 Quaternion: TypeAlias = tuple[float, float, float, float]  # (x, y, z, w)
 TorqueFunction: TypeAlias = Callable[[float], Vector3]
 """Actuator torques [N m] at a simulated time [s]."""
+
+
+TimesLike: TypeAlias = ArrayLike
+"""Times [s], as numbers or as durations of NumPy, pandas or `datetime`."""
+
+SI_UNITS = frozenset(
+    ("", "1", "dimensionless", "s", "rad", "rad/s", "rad/s^2", "N m", "J", "kg", "m", "kg m^2")
+)
+"""Units that an array may carry, as those of `to_xarray` do: its numbers are taken as they are."""
+
+_DEEPEST = 32
+"""Levels of lists that are looked into: NumPy allows 64 dimensions, a list in itself has more."""
+
+
+class NotNumbers(ValueError):
+    """Something that is given as numbers has none, or means more than they say."""
+
+
+class LostMeaning(NotNumbers):
+    """A conversion to doubles would drop what is given beside the numbers."""
+
+
+def real_numbers(value: Any, *, seconds: bool = False) -> Array:
+    """Return real numbers, in whatever form they are given, as an array of doubles.
+
+    It is the given array itself where that is one already. A mask, an imaginary part, a unit, a
+    date, text and truth values are refused rather than dropped. With `seconds`, durations are
+    converted to seconds.
+
+    Raises:
+        NotNumbers: names what is allowed, and what would be lost.
+
+    """
+    if reason := find_lost_meaning(value, seconds=seconds):
+        raise LostMeaning(reason)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, OverflowError, MemoryError, RecursionError):
+        raise NotNumbers("must be numbers, in rows of equal length") from None
+    if reason := find_lost_meaning(array, seconds=seconds):  # of a table, or of a list
+        raise LostMeaning(reason)
+    if array.dtype.kind == "m":
+        return np.asarray(array / np.timedelta64(1, "s"), dtype=float)
+    if array.dtype.kind == "O":
+        array = _read_objects(array, seconds)
+    if array.dtype.kind not in "fiu":
+        raise NotNumbers("must be numbers")
+    with np.errstate(over="ignore"):  # what is too large for a double is not finite
+        return np.asarray(array, dtype=float)
+
+
+def freeze(array: Array) -> Array:
+    """Return an array that nobody can write to: a copy, unless it is one already.
+
+    A view is copied as well: who owns its numbers could write to them.
+    """
+    if array.flags.writeable or not array.flags.owndata:
+        array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+class ReadOnly:
+    """An object whose arrays nobody can write to, nor to those of its copies."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a copy or a pickle, in which arrays can be written to."""
+        vars(self).update(state)
+        self._freeze()
+
+    def _freeze(self) -> None:
+        """Make all arrays read-only that the object holds."""
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+
+def _read_objects(objects: NDArray[Any], seconds: bool) -> Array:
+    """Return Python objects (fractions, decimals, durations) as doubles, in their shape."""
+    numbers = []
+    for each in objects.flat:
+        if isinstance(each, (str, bytes, bytearray, bool, np.bool_)):
+            raise NotNumbers("must be numbers")
+        if reason := find_lost_meaning(each, seconds=seconds):
+            raise LostMeaning(reason)
+        try:
+            is_duration = isinstance(each, timedelta)
+            numbers.append(each.total_seconds() if is_duration else float(each))
+        except (TypeError, ValueError, OverflowError, ArithmeticError):
+            raise NotNumbers("must be numbers") from None
+    return np.array(numbers, dtype=float).reshape(objects.shape)
+
+
+def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> str:
+    """Say what a conversion to doubles would drop, "" if nothing; `seconds` keeps durations."""
+    if type(value) in (float, int):
+        return ""
+    if isinstance(value, (list, tuple)):
+        if depth == _DEEPEST:
+            return "must be numbers, in rows of equal length"
+        suspects = tuple(kind for kind in set(map(type, value)) if not _is_plain(kind))
+        for each in value if suspects else ():
+            if isinstance(each, suspects):
+                reason = find_lost_meaning(each, seconds=seconds, depth=depth + 1)
+                if reason:
+                    return reason
+        return ""
+    if _is_masked(value):
+        return "must be numbers without a mask: fill in what is masked, or leave it out"
+    if isinstance(value, timedelta):
+        return "" if seconds else "must be numbers, no durations"
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if kind == "c" or isinstance(value, complex):
+        return "must be real numbers, not complex ones"
+    if kind == "m":
+        is_measured = np.datetime_data(np.asarray(value).dtype)[0] not in ("generic", "Y", "M")
+        return "" if seconds and is_measured else "must be numbers, no durations"
+    if kind == "M" or isinstance(value, date):  # a datetime and a pandas Timestamp are dates
+        return "must be numbers, no dates: give seconds since the start"
+    unit = getattr(value, "units", None) or getattr(value, "unit", None)
+    if unit is not None and not callable(unit) and str(unit) not in SI_UNITS:
+        return f"must be plain numbers in SI units and radians; these are in {unit}"
+    return ""
+
+
+def _is_masked(value: Any) -> bool:
+    """Return whether a masked array has a masked number; `numpy.ma` need not be imported."""
+    if not isinstance(value, np.ndarray) or value.dtype.names is not None:
+        return False
+    return bool(np.any(getattr(value, "mask", False)))
+
+
+def _is_plain(kind: type) -> bool:
+    """Return whether a type is that of a number which is nothing more."""
+    if issubclass(kind, (bool, np.timedelta64)):
+        return False
+    return issubclass(kind, (float, int, np.floating, np.integer))
 
 
 def clamp(torque: Vector3, limit: float | None) -> Vector3:
@@ -38,8 +176,9 @@ def finite_vector(value: Any) -> Vector3 | None:
     try:
         first, second, third = value
         floats = type(first) is type(second) is type(third) is float  # as in each step of a run
-        if not floats and any(isinstance(x, np.complexfloating) for x in (first, second, third)):
-            return None  # of which `math` takes the real part
+        plain = floats or (type(value) is np.ndarray and value.dtype.kind in "fiu")
+        if not plain and find_lost_meaning([value, first, second, third]):
+            return None
         finite = math.isfinite(first) and math.isfinite(second) and math.isfinite(third)
     except (TypeError, ValueError, OverflowError):
         return None

@@ -14,7 +14,7 @@ import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.programs.expression import compile_program, trace
-from sst_ros.state import ZERO, Explained, Quaternion, Vector3
+from sst_ros.state import ZERO, Explained, Quaternion, Vector3, find_lost_meaning
 
 ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
 CLOSED = 1e-14  # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
@@ -66,7 +66,8 @@ class ReferenceMotion(Explained):
     @check_kinds_late
     def at(self, time: float) -> Reference:
         """Return the reference at a time [s]; raises SingularConfiguration in a singularity."""
-        if math.isnan(time):
+        lost = "" if type(time) is float else find_lost_meaning(time)
+        if lost or math.isnan(time):
             refuse_unless("motion", ("time", time, False, "must be a number [s]"))
         inside = min(max(time, 0.0), self.duration)
         try:
@@ -99,20 +100,22 @@ def slow_down(motion: ReferenceMotion, begin: float, duration: float) -> Referen
     with d^2s/dt^2 = 0 at both. It stays on the path of the given motion, which is inside all
     limits of position, for half of `duration` more at most.
     """
-
-    def inside(time: float) -> Reference:
-        u = time / duration
-        at = motion.at(begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
-        speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
-        return replace(
-            at,
-            body_rate=multiply(speed, at.body_rate),
-            body_acceleration=axpy(speed * speed, at.body_acceleration, change, at.body_rate),
-            gamma_dot=multiply(speed, at.gamma_dot),
-            gamma_ddot=axpy(speed * speed, at.gamma_ddot, change, at.gamma_dot),
-        )
-
+    inside = partial(_slowed_down, motion, begin, duration)
     return ReferenceMotion(inside, equal_pieces(duration, 4))
+
+
+def _slowed_down(motion: ReferenceMotion, begin: float, duration: float, time: float) -> Reference:
+    """Return the reference of `slow_down` at a time [s]; a function that pickle takes."""
+    u = time / duration
+    at = motion.at(begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
+    speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
+    return replace(
+        at,
+        body_rate=multiply(speed, at.body_rate),
+        body_acceleration=axpy(speed * speed, at.body_acceleration, change, at.body_rate),
+        gamma_dot=multiply(speed, at.gamma_dot),
+        gamma_ddot=axpy(speed * speed, at.gamma_ddot, change, at.gamma_dot),
+    )
 
 
 class ActuatorSpaceMap:

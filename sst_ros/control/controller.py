@@ -24,14 +24,22 @@ from sst_ros.errors import (
     SstError,
     check_kinds,
     check_kinds_late,
-    refuse_errors,
+    read_numbers,
     refuse_unless,
 )
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import axpy, symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import SceneInput, scene_of, terms
-from sst_ros.state import ZERO, Explained, Quaternion, State, Vector3, finite_vector
+from sst_ros.state import (
+    ZERO,
+    Explained,
+    Quaternion,
+    State,
+    Vector3,
+    find_lost_meaning,
+    finite_vector,
+)
 
 SINGULAR = 1e-10  # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
 
@@ -50,6 +58,10 @@ class InverseDynamics(Explained):
         dynamics = Dynamics.of(self.scene)
         self._has_moment_topic, self._program = dynamics.has_moment_topic, dynamics.inverse
         self._model = dynamics.model
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the scene."""
+        return InverseDynamics, (self.scene,)
 
     def torque(
         self,
@@ -70,11 +82,13 @@ class InverseDynamics(Explained):
         with contextlib.suppress(ArithmeticError, TypeError, ValueError, MemoryError):
             given = *parts[0], *parts[1], *parts[2], *parts[3]
             first, second, third, determinant, *squares = self._program(*given)
-            det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
-            # Comparisons with NaN are false: what is not finite is refused, too.
-            sound = math.isfinite(first + second + third) and det_j2 > SINGULAR
-            if sound and min(squares) > SINGULAR * SINGULAR:
-                return first, second, third
+            total = first + second + third + determinant
+            if isinstance(total, float):  # it is none of masked or complex numbers
+                det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
+                # Comparisons with NaN are false: what is not finite is refused, too.
+                sound = math.isfinite(first + second + third) and det_j2 > SINGULAR
+                if sound and min(squares) > SINGULAR * SINGULAR:
+                    return first, second, third
         raise self._refusal(quaternion, given)
 
     @check_kinds_late
@@ -107,6 +121,8 @@ class InverseDynamics(Explained):
 
         The moment and what is raised are as in `torque`.
         """
+        three = finite_vector(moment) is not None
+        refuse_unless("inverse dynamics", ("moment", moment, three, "must be three numbers [N m]"))
         q, rate = state.quaternion, state.body_rate
         rest = kernel.actuator_acceleration(self._model, (*q, *rate), ZERO)
         acceleration = np.linalg.solve(self._reduce(q)[1], np.negative(rest))
@@ -130,13 +146,13 @@ class InverseDynamics(Explained):
         """Quaternion of {E} in {B} of a state, of angles gamma or of itself."""
         pose: Any = at.quaternion if isinstance(at, State) else at
         allowed = "must be a State, three angles gamma or a quaternion"
-        with refuse_errors("inverse dynamics", "at", at, allowed, MemoryError):
-            fits = np.array(pose, object).shape in ((3,), (4,))
+        pose = read_numbers("inverse dynamics", "at", pose)
+        fits = pose.shape in ((3,), (4,))
         refuse_unless("inverse dynamics", ("at", at, fits, allowed))
         if len(pose) == 3:
             rotation = kinematics.admissible(Geometry.of(self.scene), pose).rotation
             pose = quaternion_of(rotation)
-        x, y, z, w = np.asarray(pose).tolist()
+        x, y, z, w = pose.tolist()
         return x, y, z, w
 
     def _reduce(self, q: Quaternion) -> tuple[Array, Array]:
@@ -156,7 +172,8 @@ class InverseDynamics(Explained):
 
     def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> SingularConfiguration:
         """Return why there is no torque; raises InputError where numbers are wrong."""
-        finite = False
+        lost, finite = find_lost_meaning([*given, quaternion]), False
+        refuse_unless("inverse dynamics", ("state", tuple(given), not lost, lost))
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             sizes = len(given), len(quaternion)
             finite = sizes in ((10, 4), (13, 4)) and all(map(math.isfinite, given))
@@ -257,9 +274,23 @@ class Controller:
         refuse_unless("control", ("integral_rate", rate, not rate or rate < min(kd), allowed))
         limit = float(law.command_limit(settings.torque_limit, model))
         known = limit if math.isfinite(limit) else None
-        functions, numbers = (self._inverse.torque, self._space.star_motion), (kp, kd, self.inertia)
-        self._law = law.ControlLaw(settings, *functions, *numbers, rate, known, period_s)
+        self._numbers = kp, kd, self.inertia, rate, known, period_s
+        self._law = self._make_law()
         self.reset()
+
+    def _make_law(self) -> law.ControlLaw:
+        functions = self._inverse.torque, self._space.star_motion
+        kp, kd, inertia, rate, limit, period = self._numbers
+        return law.ControlLaw(self._settings, *functions, kp, kd, inertia, rate, limit, period)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle gets: all but compiled functions."""
+        return {name: value for name, value in vars(self).items() if name != "_law"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on where the controller was when it was copied."""
+        vars(self).update(state)
+        self._law = self._make_law()
 
     def reset(self) -> None:
         """Clear the integral, the orientation that was observed last, and a failure."""
@@ -293,6 +324,8 @@ class Controller:
         """
         if self._failure is not None:
             raise self._failure
+        if lost := "" if type(time) is float else find_lost_meaning(time):
+            refuse_unless("control", ("time", time, False, lost))
         allowed, observes = "must be finite numbers", self._settings.observes
         try:
             given = (*measured.gamma, *measured.gamma_dot)

@@ -29,7 +29,7 @@ from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import ConstantTorque
-from sst_ros.state import ZERO, Array, Explained, State, finite_vector
+from sst_ros.state import ZERO, Array, Explained, ReadOnly, State, finite_vector
 
 COORDINATES = {
     "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
@@ -40,7 +40,7 @@ _MOST, _CHECKS = 20_000, 8
 
 
 @dataclass(frozen=True, repr=False)
-class LinearModel(Explained):
+class LinearModel(Explained, ReadOnly):
     """Deviations x of a motion by deviations u of its torques: x' = A x + B u.
 
     With `dt` they are those from one period to the next: x[k + 1] = A x[k] + B u[k].
@@ -57,6 +57,9 @@ class LinearModel(Explained):
     B: Array
     states: tuple[str, ...]
     dt: float | None
+
+    def __post_init__(self) -> None:
+        self._freeze()
 
     def _facts(self) -> dict[str, object]:
         return {

@@ -105,13 +105,20 @@ def reference_motion(
         return move_actuators(geometry, *_sweep_path(motion.sweep, centre), start)
     goal = motion.to_angles
     assert goal is not None
-    span, duration = axpy(1.0, goal.gamma, -1.0, gamma), goal.duration
+    span = axpy(1.0, goal.gamma, -1.0, gamma)
+    path = partial(_on_line, gamma, span, goal.duration)
+    return move_actuators(geometry, path, equal_pieces(goal.duration, 2 * PIECES), start)
 
-    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
-        s, rate, acceleration = minimum_jerk(time, duration)
-        return axpy(1.0, gamma, s, span), multiply(rate, span), multiply(acceleration, span)
 
-    return move_actuators(geometry, path, equal_pieces(duration, 2 * PIECES), start)
+# The paths below are functions of the module, which pickle takes, with their numbers in front.
+
+
+def _on_line(
+    gamma: Vector3, span: Vector3, duration: float, time: float
+) -> tuple[Vector3, Vector3, Vector3]:
+    """Return gamma and its derivatives at a time [s], straight from gamma over a span [rad]."""
+    s, rate, acceleration = minimum_jerk(time, duration)
+    return axpy(1.0, gamma, s, span), multiply(rate, span), multiply(acceleration, span)
 
 
 def minimum_jerk(time: float, duration: float = 1.0) -> tuple[float, float, float]:
@@ -131,15 +138,19 @@ def move_star(
     """Return a motion of the star along a path, with minimum jerk; it turns by `turn` [rad]."""
     space, (x, y, z, w), length = ActuatorSpaceMap(geometry), start, math.hypot(*start)
     begin = x / length, y / length, z / length, w / length
-
-    def inside(time: float) -> Reference:
-        s, rate, acceleration = minimum_jerk(time, duration)
-        turned, u, slope = path(s)
-        quaternion, moving = quaternion_product(begin, turned), multiply(rate, u)
-        return space.of_star(quaternion, moving, axpy(acceleration, u, rate * rate, slope))
-
     count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
+    inside = partial(_on_star_path, space, begin, path, duration)
     return ReferenceMotion(inside, equal_pieces(duration, count))
+
+
+def _on_star_path(
+    space: ActuatorSpaceMap, begin: Quaternion, path: StarPath, duration: float, time: float
+) -> Reference:
+    """Return the reference of `move_star` at a time [s]."""
+    s, rate, acceleration = minimum_jerk(time, duration)
+    turned, u, slope = path(s)
+    quaternion, moving = quaternion_product(begin, turned), multiply(rate, u)
+    return space.of_star(quaternion, moving, axpy(acceleration, u, rate * rate, slope))
 
 
 def geodesic_motion(
@@ -153,13 +164,15 @@ def geodesic_motion(
     turn = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
     vector = triple(turn.tolist())
     angle = math.hypot(*vector)
-
-    def path(s: float) -> tuple[Quaternion, Vector3, Vector3]:
-        half = 0.5 * s * angle
-        part = math.sin(half) / angle if angle else 0.0
-        return (*multiply(part, vector), math.cos(half)), vector, ZERO
-
+    path = partial(_on_geodesic, vector, angle)
     return move_star(geometry, start, path, duration, angle)
+
+
+def _on_geodesic(vector: Vector3, angle: float, s: float) -> tuple[Quaternion, Vector3, Vector3]:
+    """Return what `StarPath` says, of a turn about one axis."""
+    half = 0.5 * s * angle
+    part = math.sin(half) / angle if angle else 0.0
+    return (*multiply(part, vector), math.cos(half)), vector, ZERO
 
 
 def spiral_motion(geometry: Geometry, start: Quaternion, spiral: Spiral) -> ReferenceMotion:
@@ -169,24 +182,28 @@ def spiral_motion(geometry: Geometry, start: Quaternion, spiral: Spiral) -> Refe
     is smooth where ZYZ angles are not.
     """
     theta, phi, psi = spiral.theta, spiral.phi, spiral.psi
+    path, turn = partial(_on_spiral, theta, phi, psi), abs(theta) + abs(phi) + abs(psi)
+    return move_star(geometry, start, path, spiral.duration, turn)
+
+
+def _on_spiral(
+    theta: float, phi: float, psi: float, s: float
+) -> tuple[Quaternion, Vector3, Vector3]:
+    """Return what `StarPath` says, of `spiral_motion`."""
     third = psi - theta
-
-    def path(s: float) -> tuple[Quaternion, Vector3, Vector3]:
-        b, c, difference, total = s * phi, s * third, 0.5 * s * (third - theta), 0.5 * s * psi
-        sine, cosine = math.sin(0.5 * b), math.cos(0.5 * b)
-        x, y = sine * math.sin(difference), sine * math.cos(difference)
-        q = x, y, cosine * math.sin(total), cosine * math.cos(total)
-        # W by s, and its derivative.
-        sb, cb, sc, cc = math.sin(b), math.cos(b), math.sin(c), math.cos(c)
-        u = (-theta * sb * cc + phi * sc, theta * sb * sc + phi * cc, theta * cb + third)
-        slope = (
-            -theta * (phi * cb * cc - third * sb * sc) + phi * third * cc,
-            theta * (phi * cb * sc + third * sb * cc) - phi * third * sc,
-            -theta * phi * sb,
-        )
-        return q, u, slope
-
-    return move_star(geometry, start, path, spiral.duration, abs(theta) + abs(phi) + abs(psi))
+    b, c, difference, total = s * phi, s * third, 0.5 * s * (third - theta), 0.5 * s * psi
+    sine, cosine = math.sin(0.5 * b), math.cos(0.5 * b)
+    x, y = sine * math.sin(difference), sine * math.cos(difference)
+    q = x, y, cosine * math.sin(total), cosine * math.cos(total)
+    # W by s, and its derivative.
+    sb, cb, sc, cc = math.sin(b), math.cos(b), math.sin(c), math.cos(c)
+    u = (-theta * sb * cc + phi * sc, theta * sb * sc + phi * cc, theta * cb + third)
+    slope = (
+        -theta * (phi * cb * cc - third * sb * sc) + phi * third * cc,
+        theta * (phi * cb * sc + third * sb * cc) - phi * third * sc,
+        -theta * phi * sb,
+    )
+    return q, u, slope
 
 
 def move_actuators(
@@ -251,26 +268,29 @@ def _sweep_path(sweep: Sweep, centre: Vector3) -> tuple[ActuatorPath, tuple[floa
     last, fade, duration = sweep.last_frequency or sweep.frequency, sweep.fade, sweep.duration
     slopes = [(b - a) / duration for a, b in zip(sweep.frequency, last, strict=True)]
     rows = list(zip(centre, sweep.amplitude, sweep.frequency, slopes, strict=True))
-
-    def path(time: float) -> tuple[Vector3, Vector3, Vector3]:
-        e, e1, e2 = 1.0, 0.0, 0.0  # the fading, and its derivatives by time
-        if not fade <= time <= duration - fade:
-            e, e1, e2 = minimum_jerk(min(time, duration - time), fade)
-            e1 = e1 if time < fade else -e1
-        p, v, a = [], [], []
-        for middle, amplitude, first, slope in rows:
-            angle, frequency = time * (first + 0.5 * slope * time), first + slope * time
-            s, c = math.sin(angle), math.cos(angle)
-            s1, s2 = frequency * c, slope * c - frequency * frequency * s
-            p.append(middle + amplitude * e * s)
-            v.append(amplitude * (e1 * s + e * s1))
-            a.append(amplitude * (e2 * s + 2.0 * e1 * s1 + e * s2))
-        return triple(p), triple(v), triple(a)
-
     fastest = max(map(abs, (*sweep.frequency, *last)))
     quarters = math.ceil(fastest * duration / (0.5 * math.pi))
     pieces = {*equal_pieces(duration, max(quarters, 2 * PIECES)), fade, duration - fade}
-    return path, tuple(sorted(pieces))
+    return partial(_on_sines, rows, fade, duration), tuple(sorted(pieces))
+
+
+def _on_sines(
+    rows: Sequence[tuple[float, float, float, float]], fade: float, duration: float, time: float
+) -> tuple[Vector3, Vector3, Vector3]:
+    """Return gamma and its derivatives at a time [s], of `_sweep_path`."""
+    e, e1, e2 = 1.0, 0.0, 0.0  # the fading, and its derivatives by time
+    if not fade <= time <= duration - fade:
+        e, e1, e2 = minimum_jerk(min(time, duration - time), fade)
+        e1 = e1 if time < fade else -e1
+    p, v, a = [], [], []
+    for middle, amplitude, first, slope in rows:
+        angle, frequency = time * (first + 0.5 * slope * time), first + slope * time
+        s, c = math.sin(angle), math.cos(angle)
+        s1, s2 = frequency * c, slope * c - frequency * frequency * s
+        p.append(middle + amplitude * e * s)
+        v.append(amplitude * (e1 * s + e * s1))
+        a.append(amplitude * (e2 * s + 2.0 * e1 * s1 + e * s2))
+    return triple(p), triple(v), triple(a)
 
 
 def through_points(

@@ -12,7 +12,7 @@ import numpy as np
 from sst_ros.errors import require
 from sst_ros.mechanism.geometry import Array, rotation_matrix, zyz_angles
 from sst_ros.scene.scene import Scene
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Explained
+from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Explained, ReadOnly, freeze
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +25,7 @@ def _of_joints(name: str, meaning: str) -> Any:
     return property(lambda table: table._joint(name), doc=f"{meaning}, shape (..., 3).")
 
 
-class MotionTable(Explained):
+class MotionTable(Explained, ReadOnly):
     """Quantities of a motion at n instants, of N scenarios, or of both, (n, N); read-only.
 
     In shapes, ... is that of t. A `Trajectory` is one motion, a `BatchResult` many scenarios.
@@ -62,7 +62,7 @@ class MotionTable(Explained):
     @cached_property
     def euler_zyz(self) -> Array:
         """ZYZ angles (theta, phi, psi) of {E} in {B} [rad], shape (..., 3)."""
-        return np.asarray(zyz_angles(rotation_matrix(self.quaternion)))
+        return freeze(zyz_angles(rotation_matrix(self.quaternion)))
 
     def columns(self, names: Iterable[str] = (*QUANTITIES, "energy")) -> dict[str, Array]:
         """Return the time and these quantities, a column a number, by the names of `state.UNITS`.

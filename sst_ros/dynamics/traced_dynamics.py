@@ -291,7 +291,7 @@ class ParametricModel:
     """
 
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
-        self.scene, self._profile = scenarios.document, profile
+        self.scene, self.profile, self._scenarios = scenarios.document, profile, scenarios
         self._tree = self._constants_of(scenarios)[0]
         numbers = leaves(self._tree)
         self._varied = [place for place, x in numbers.items() if np.max(x) != np.min(x)]
@@ -299,6 +299,10 @@ class ParametricModel:
         rest = (place for place in numbers if place not in self._varied)
         self._fixed = {place: float(np.ravel(numbers[place])[0]) for place in rest}
         self.ode = ODE(Dynamics.of(self.scene), self.scene.torque if profile else None)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the scenarios: programs are traced again."""
+        return _make_model, (self._scenarios, self.profile)
 
     def columns(self, scenarios: Scenarios) -> ParameterColumns:
         """Return the numbers of scenarios, of which none may differ that is fixed in this model.
@@ -393,5 +397,9 @@ class ParametricModel:
         ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
         with np.errstate(invalid="ignore"):  # 0/0 is the rest of springs without stiffness
             model = kernel.model_of(columns, geometry)
-        torque = columns.torque if self._profile else None
+        torque = columns.torque if self.profile else None
         return Constants(model, ends, torque), geometries, which
+
+
+def _make_model(scenarios: Scenarios, profile: bool) -> ParametricModel:
+    return ParametricModel(scenarios, profile=profile)

@@ -54,7 +54,7 @@ from sst_ros.scene.torque_profile import (
     torque_at,
 )
 from sst_ros.scene.yaml_document import find_fields, find_number, plain, replace_values
-from sst_ros.state import Array, clamp
+from sst_ros.state import Array, clamp, freeze
 
 TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size of a parameter
 AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivatives loses its order
@@ -449,7 +449,7 @@ class Sensitivities:
         rotation = 4.0 * np.einsum("cqn,nqp->ncp", turn, slopes[:, :4])
         whole = Sensitivity(rates[:, :3], rates[:, 3:], rotation, slopes[:, 4:])
         return {
-            name: Sensitivity(*(array[..., columns] for array in whole))
+            name: Sensitivity(*(freeze(array[..., columns]) for array in whole))
             for name, columns in self._columns.items()
         }
 

@@ -38,6 +38,7 @@ from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import LINKS, Scene
 from sst_ros.scene.schema import build, build_unchecked, drop_idle
 from sst_ros.scene.yaml_document import find_number, plain, replace_values, values_at
+from sst_ros.state import ReadOnly
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 NEGLIGIBLE = 1e-12  # friction coefficient below which a scene has no such friction
@@ -140,7 +141,7 @@ def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
 
 
 @dataclass(frozen=True)
-class Identification:
+class Identification(ReadOnly):
     """Identified constants of a scene, by torques or by simulation.
 
     Attributes:
@@ -165,6 +166,9 @@ class Identification:
     covariance: Array
     undetermined: tuple[str, ...]
     warnings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        self._freeze()
 
     @property
     def deviation(self) -> Array:

@@ -20,7 +20,7 @@ from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import MotionTable
 from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
-from sst_ros.errors import check_kinds, refuse_unless
+from sst_ros.errors import check_kinds, read_numbers, refuse_unless
 from sst_ros.host.many_runs import run_many
 from sst_ros.host.output import slices
 from sst_ros.integration.batch_step import (
@@ -36,7 +36,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.llvm import LANES
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import TURN
-from sst_ros.state import Explained
+from sst_ros.state import Explained, freeze
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
@@ -119,6 +119,10 @@ class Batch(Explained):
         self._scenarios.check()
         self.model = ParametricModel(self._scenarios, profile=profile)
         self.columns = self.model.columns(self._scenarios)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what was given; programs are traced and compiled again where they are needed."""
+        return _make_batch, (self.scene, self._method, self.model.profile, self._scenarios.rows)
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios, already checked, that shares this one's programs.
@@ -280,6 +284,12 @@ def block_width(number: int, threads: int = 1) -> int:
     return max(1, -(-width // LANES)) * LANES
 
 
+def _make_batch(
+    scene: Scene, method: Tableau, profile: bool, parameters: Mapping[str, ArrayLike]
+) -> Batch:
+    return Batch(scene, method, profile=profile, parameters=parameters)
+
+
 def _locate_ends(
     advance: Advance, step: float, steps: Array, y: Array, given: Array, code: Any, time: Array
 ) -> None:
@@ -296,7 +306,7 @@ def _locate_ends(
 
 
 def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
-    rows = np.asarray(value, dtype=float)
+    rows = read_numbers("batch", name, value)
     if count is not None and rows.shape == (3,):
         rows = np.tile(rows, (count, 1))
     expected = "(N, 3)" if count is None else f"(3,) or ({count}, 3)"
@@ -352,6 +362,7 @@ class BatchResult(MotionTable):
         self.kept: BatchResult | None = None
         self.sent: Array | None = None  # torques of a controller, where they are not `torque`
         self._computed: dict[str, Array] = {}
+        self._freeze()
 
     @property
     def energy(self) -> Array:
@@ -371,7 +382,7 @@ class BatchResult(MotionTable):
                     for part, number in zip(found, numbers, strict=True):
                         part[..., rows] = number
             found[..., self.code < 0] = np.nan
-            self._computed[name] = np.moveaxis(found, 0, -1)
+            self._computed[name] = freeze(np.moveaxis(found, 0, -1))
         return self._computed[name]
 
     @cached_property

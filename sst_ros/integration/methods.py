@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,10 @@ class Tableau:
     error: tuple[float, ...] = ()  # weights of the error estimate; none for half steps
     error_order: int = 0  # p of the estimate, which shrinks like h^(p+1)
     damping: tuple[float, ...] = ()  # weights of a second estimate that scales the first (DOP853)
+
+    def __reduce__(self) -> Any:
+        """Copy a method of `METHODS` as itself: methods are compared by identity."""
+        return _reduce(self)
 
 
 def _row(entries: str) -> tuple[float, ...]:
@@ -128,6 +133,10 @@ class Rosenbrock:
     alpha: tuple[float, ...]  # nodes
     d: tuple[float, ...]  # of the derivative by time
 
+    def __reduce__(self) -> Any:
+        """Copy a method of `METHODS` as itself."""
+        return _reduce(self)
+
 
 _RODAS5P_LAST = _row(
     "-7.502846399306121 2.561846144803919 -11.627539656261098 -0.18268767659942256 "
@@ -182,3 +191,13 @@ Method = Tableau | Rosenbrock
 METHODS: dict[str, Method] = {
     method.name: method for method in (RK4, DORMAND_PRINCE, DOP853, RODAS5P)
 }
+
+
+def _reduce(method: Method) -> Any:
+    if METHODS.get(method.name) is method:
+        return _find, (method.name,)
+    return type(method), tuple(vars(method).values())
+
+
+def _find(name: str) -> Method:
+    return METHODS[name]

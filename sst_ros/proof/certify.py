@@ -289,6 +289,10 @@ class ProvenMotion(Explained):
         finally:
             self._finish()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or another process gets: all but the equations on balls."""
+        return vars(self) | {"_equations": None}
+
     def _take(self, step: Advance) -> None:
         """Take what a step proves, up to where the motion meets an end of the scene."""
         self.steps, end = self.steps + 1, step.end
@@ -322,6 +326,7 @@ class ProvenMotion(Explained):
         heads = ["t", *(f"quaternion_{part}" for part in "xyzw"), "angle", "distance"]
         heads += [name + more for name in names for more in ("", "_bound")]
         table = np.array(self._rows).reshape(-1, len(heads))
+        table.flags.writeable = False
         self.columns: dict[str, Array] = dict(zip(heads, table.T, strict=True))
         self.limits: dict[str, list[tuple[float, float]]] = {}
         for name, known in self._signs.items():

@@ -38,7 +38,7 @@ from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Explained
+from sst_ros.state import NANOSECONDS, Explained, ReadOnly, freeze
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -303,7 +303,7 @@ class Ticks:
         return int(np.count_nonzero(self.start_ns[1:] != self.end_ns[:-1]))
 
 
-class Recording(Explained):
+class Recording(Explained, ReadOnly):
     """A run from all tables of its bag. Samples are in order of time; rows belong to samples.
 
     Raises InputError, which names the fault, where they are not those of a whole run.
@@ -400,6 +400,7 @@ class Recording(Explained):
         names = ("stamp_ns", "received_ns", "values")
         columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
         self.commands = Series(topics.COMMANDS.columns, *columns)
+        self._freeze()
 
     time_ns: Integers
     received_ns: Integers
@@ -470,7 +471,7 @@ class Recording(Explained):
         """
         at = places(self.ticks.end_ns, self.time_ns)
         largest = np.abs(self.effort - self.ticks.torque[at]).max(axis=1)
-        return np.where(at >= 0, largest, np.nan)
+        return freeze(np.where(at >= 0, largest, np.nan))
 
     def _facts(self) -> dict[str, object]:
         ticks, reported = self.ticks, self.diagnostics
@@ -500,7 +501,7 @@ class Recording(Explained):
         rates = self.gamma_dot, self.mu_dot, self.beta_dot
         body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
         lagged = [self.effort] if self.scene.lags else []
-        return np.hstack([self.quaternion, body_rate, *lagged])
+        return freeze(np.hstack([self.quaternion, body_rate, *lagged]))
 
     @cached_property
     def trajectory(self) -> Trajectory:

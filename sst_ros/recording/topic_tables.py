@@ -186,12 +186,17 @@ def _find_joints(
 def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
     """Read the parts of a vector or quaternion; where `stamped`, of messages with a stamp only."""
     parts = attrgetter(*(f"{vector}.{name}" for name in names))
+    return partial(_read_parts, parts, stamped)
 
-    def rows(message: Any) -> Rows:
-        stamp = nanoseconds(message.header.stamp)
-        return [(stamp, parts(message))] if stamp or not stamped else []
 
-    return rows
+def _read_command(message: Any) -> Rows:
+    """Read three torques, which have no stamp."""
+    return [(0, message.data.tolist())] if len(message.data) == 3 else []
+
+
+def _read_parts(parts: Callable[[Any], Sequence[float]], stamped: bool, message: Any) -> Rows:
+    stamp = nanoseconds(message.header.stamp)
+    return [(stamp, parts(message))] if stamp or not stamped else []
 
 
 def _read_ticks(message: Any) -> Rows:
@@ -309,7 +314,7 @@ COMMANDS = _table(
     "commands",
     "std_msgs/msg/Float64MultiArray",
     # Others are dropped by the simulator too.
-    lambda message: [(0, message.data.tolist())] if len(message.data) == 3 else [],
+    _read_command,
     _COMMANDED,
 )
 STAMPED_COMMANDS = _table("commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED)

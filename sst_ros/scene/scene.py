@@ -23,7 +23,7 @@ from sst_ros.scene.own_loads import FormulaLoad
 from sst_ros.scene.schema import Place, Section, Spec, amount, entry, key_of
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import find_fields, plain, read, replace_values, values_at
-from sst_ros.state import Array, Explained
+from sst_ros.state import Array, Explained, LostMeaning, freeze, real_numbers
 
 LARGEST = 1e9
 """No number of a scene is larger: it is a slip of units, and its powers leave double precision."""
@@ -71,6 +71,16 @@ class Scene(Explained, Section):
         None takes one away. InputError is raised where a key names nothing that a scene has, or the
         result is refused.
         """
+        problems = []
+        for key, value in values.items():
+            try:
+                plain(value)
+            except LostMeaning as error:
+                problems.append(Problem(key, value, str(error)))
+            except RecursionError:
+                problems.append(Problem(key, value, "must not hold itself"))
+        if problems:
+            raise InputError(self.name, problems)
         try:
             changed = replace_values(self, plain(values))
         except RecursionError:
@@ -267,8 +277,12 @@ class Scenarios:
         if problems:
             raise InputError(scene.name, problems)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what was given."""
+        return Scenarios, (self.document, self.rows)
+
     def _rows_of(self, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-        rows = np.array(value, dtype=float)
+        rows = freeze(real_numbers(value))
         if rows.shape != (self.count or max(1, len(np.atleast_1d(rows))), *shape):
             words = ", ".join(map(str, (self.count or "N", *shape))) + ("" if shape else ",")
             allowed = f"must have the shape ({words}), a row a scenario"

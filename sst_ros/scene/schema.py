@@ -19,7 +19,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 import numpy as np
 
 from sst_ros.errors import InputError, Problem, refusal, refuse_unless, suggestion
-from sst_ros.state import Array, Explained
+from sst_ros.state import (
+    Array,
+    Explained,
+    LostMeaning,
+    find_lost_meaning,
+    freeze,
+    real_numbers,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
@@ -274,6 +281,8 @@ def _freeze_all(given: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:
     for key, spec, value in given:
         try:
             found[key] = accept(spec, value)
+        except LostMeaning as error:
+            problems.append(Problem(key, value, f"{spec.refuse()} ({error})"))
         except (ValueError, TypeError, OverflowError, MemoryError):
             problems.append(Problem(key, value, spec.refuse()))
         except InputError as error:
@@ -295,6 +304,8 @@ def accept(spec: Spec, value: Any) -> Any:
     if kind == "samples":
         return _freeze_samples(spec, value)
     if isinstance(value, (np.ndarray, np.generic)):
+        if reason := find_lost_meaning(value):
+            raise LostMeaning(reason)
         value = value.tolist()
     if kind == "number":
         return _freeze_numbers(spec, value, spec.shape)
@@ -334,13 +345,17 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if shape:
         if isinstance(value, (str, dict, set)) or len(value) != shape[0]:
             raise ValueError
+        if not isinstance(value, (list, tuple)) and (reason := find_lost_meaning(value)):
+            raise LostMeaning(reason)
         each = replace(spec, nonzero=False)
         found = tuple(_freeze_numbers(each, entry, shape[1:]) for entry in value)
         if spec.nonzero and not any(x * x for x in found):
             raise ValueError
         return found
+    if type(value) is not float and (reason := find_lost_meaning(value)):
+        raise LostMeaning(reason)
     text = isinstance(value, str) and not NUMBER.fullmatch(value)
-    if text or isinstance(value, (bool, np.complexfloating)):
+    if text or isinstance(value, (bool, np.bool_)):
         raise ValueError
     result = float(value)
     if not (math.isfinite(result) and spec.allows(result)):
@@ -349,7 +364,7 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _freeze_samples(spec: Spec, value: Any) -> Array:
-    array = np.array(value, dtype=float)
+    array = freeze(real_numbers(value, seconds=spec.unit == "s"))
     fits = array.ndim > 0 and array.shape[1:] == spec.shape
     refuse_unless("", ("", array.shape, fits, spec.describe()))
     for place in np.argwhere(~np.isfinite(array))[:1].tolist():

@@ -14,9 +14,26 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros.errors import InputError, Problem, check_kinds, refusal, refuse_errors, refuse_unless
+from sst_ros.errors import (
+    InputError,
+    Problem,
+    check_kinds,
+    read_numbers,
+    refusal,
+    refuse_errors,
+    refuse_unless,
+)
 from sst_ros.scene.schema import NUMBER, Section, entry
-from sst_ros.state import ZERO, Array, State, Vector3, finite_vector
+from sst_ros.state import (
+    ZERO,
+    Array,
+    ReadOnly,
+    State,
+    TimesLike,
+    Vector3,
+    finite_vector,
+    freeze,
+)
 
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
@@ -28,10 +45,19 @@ def ascend(times: Array) -> bool:
     return times.ndim == 1 and bool(np.isfinite(times).all() and (np.diff(times) > 0.0).all())
 
 
-class TorqueProfile:
-    """Torques that act over a motion; most are known as a function of time alone."""
+class TorqueProfile(ReadOnly):
+    """Torques that act over a motion; most are known as a function of time alone.
+
+    A motion keeps the profile that it was given, so nothing in it can change.
+    """
 
     feedback = False
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute once."""
+        if name in vars(self):
+            raise AttributeError(f"{name} is read-only: make another {type(self).__name__}")
+        super().__setattr__(name, value)
 
     def values(self, t: Array) -> Array:
         """Torques [N m] at times [s], shape (n,) -> (n, 3); nan if not known from t."""
@@ -115,8 +141,9 @@ class PolynomialTorque(TorqueProfile):
     """
 
     @check_kinds
-    def __init__(self, coefficients: ArrayLike, breakpoints: ArrayLike) -> None:
-        self.c, self.x = np.array(coefficients, dtype=float), np.array(breakpoints, dtype=float)
+    def __init__(self, coefficients: ArrayLike, breakpoints: TimesLike) -> None:
+        self.c = freeze(read_numbers("torque", "coefficients", coefficients))
+        self.x = freeze(read_numbers("torque", "breakpoints", breakpoints, seconds=True))
         good, pieces = self.x.size > 1 and ascend(self.x), max(self.x.size - 1, 1)
         size, shape = self.c.shape, f"must have the shape (order + 1, {pieces}, 3)"
         finite = bool(np.all(np.isfinite(self.c)))
@@ -231,9 +258,9 @@ class TorqueTable(TorqueProfile):
     """
 
     @check_kinds
-    def __init__(self, times: ArrayLike, torques: ArrayLike) -> None:
-        self.times = np.array(times, dtype=float)
-        self.torques = np.array(torques, dtype=float)
+    def __init__(self, times: TimesLike, torques: ArrayLike) -> None:
+        self.times = freeze(read_numbers("torque table", "times", times, seconds=True))
+        self.torques = freeze(read_numbers("torque table", "torques", torques))
         good = self.times.size > 0 and ascend(self.times)
         found, shape = self.torques.shape, (self.times.size, 3)
         finite = bool(np.all(np.isfinite(self.torques)))

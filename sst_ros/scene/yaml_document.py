@@ -21,6 +21,7 @@ import yaml
 
 from sst_ros.errors import InputError, Problem, refusal
 from sst_ros.scene.schema import REQUIRED, Place, S, Section, Spec, build
+from sst_ros.state import LostMeaning, find_lost_meaning
 
 NO_NUMBER = "must name a number, as star.mass does"
 
@@ -126,7 +127,10 @@ def _line_at(lines: Mapping[str, int], key: str) -> int | None:
 
 
 def plain(value: Any) -> Any:
-    """Turn sections, arrays, NumPy numbers, tuples and mappings into what YAML has."""
+    """Turn sections, arrays, NumPy numbers, tuples and mappings into what YAML has.
+
+    Raises LostMeaning where an array means more than its numbers, as a masked one does.
+    """
     if isinstance(value, Section):
         given = {name: x for name, x in vars(value).items() if x is not None and x != ()}
         notes = (name for name, spec in value.SPECS.items() if spec.kind == "notes")
@@ -134,6 +138,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if hasattr(value, "tolist"):  # arrays and numbers of NumPy, series of pandas
+        if reason := find_lost_meaning(value):
+            raise LostMeaning(reason)
         return value.tolist()
     return [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 

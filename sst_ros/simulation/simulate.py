@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.variational import Sensitivities
-from sst_ros.errors import check_kinds, refusal, refuse_unless
+from sst_ros.errors import check_kinds, read_numbers, refusal, refuse_unless
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET, EvaluationBudget
 from sst_ros.mechanism.geometry import Geometry
@@ -32,7 +32,7 @@ from sst_ros.scene.torque_profile import (
 from sst_ros.simulation.simulation import INTEGRATORS, describe_conditioning
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.trajectory import Trajectory, check_error
-from sst_ros.state import NANOSECONDS, Array
+from sst_ros.state import NANOSECONDS, Array, TimesLike
 
 _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
 """Control periods that the budget of a motion reaches: a step and its check are three steps."""
@@ -74,12 +74,12 @@ def simulate(
     *,
     initial: InitialInput = None,
     samples: int | None = None,
-    t_eval: ArrayLike | None = None,
+    t_eval: TimesLike | None = None,
     method: str = "auto",
     tolerance: float = 1e-9,
     control_period: float | None = None,
     memoryless: bool = False,
-    breaks: ArrayLike = (),
+    breaks: TimesLike = (),
     max_step: float | None = None,
     sensitivities: Sequence[str] = (),
     progress: bool = False,
@@ -138,7 +138,8 @@ def simulate(
     length = given.duration if duration is None else duration
     if length is None:
         _refuse("duration", None, "must be given: the scene has none")
-    span_ns, jumps = _nanoseconds("duration", length), np.atleast_1d(np.array(breaks, dtype=float))
+    span_ns = _nanoseconds("duration", length)
+    jumps = np.atleast_1d(read_numbers("simulate", "breaks", breaks, seconds=True))
     longest = math.inf if max_step is None else max_step
     end = span_ns / NANOSECONDS
     least = end / _MOST_PERIODS
@@ -251,7 +252,7 @@ def _check_period(period: float | None, profile: TorqueProfile, span: int) -> in
 
 
 def _times(
-    samples: int | None, t_eval: ArrayLike | None, span_ns: int, period: int | None
+    samples: int | None, t_eval: TimesLike | None, span_ns: int, period: int | None
 ) -> Array:
     """Return the times of the samples [s], in whole nanoseconds."""
     if t_eval is None:
@@ -265,8 +266,9 @@ def _times(
         return np.asarray(found / NANOSECONDS)
     if samples is not None:
         _refuse("samples", samples, "must be None where t_eval gives their times")
+    times = np.atleast_1d(read_numbers("simulate", "t_eval", t_eval, seconds=True))
     with np.errstate(over="ignore"):
-        rounded = np.rint(np.atleast_1d(np.array(t_eval, dtype=float)) * NANOSECONDS)
+        rounded = np.rint(times * NANOSECONDS)
     if not (rounded.size and ascend(rounded) and rounded[0] >= 0.0 and rounded[-1] <= span_ns):
         end = span_ns / NANOSECONDS
         _refuse(

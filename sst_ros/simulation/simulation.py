@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import operator
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,7 +66,8 @@ def default_budget(dynamics: Dynamics, equations: str) -> int:
 def _whole(value: Any) -> int:
     """Return a whole number of any type as int, 0 for anything else and from 2^63 on."""
     try:
-        found = 0 if isinstance(value, bool) else operator.index(value)
+        is_duration = isinstance(value, (bool, np.timedelta64))
+        found = 0 if is_duration else operator.index(value)
     except TypeError:
         return 0
     return found if found < 2**63 else 0
@@ -85,6 +88,9 @@ class _Instant(NamedTuple):
 
 class Simulation(Explained):
     """Direct dynamics of a scene from its initial state.
+
+    A copy, also one of pickle, goes on from where the simulation is, to the bit. Only one thread
+    at a time may advance a simulation: another one is refused, for it would lose steps.
 
     Args:
         scene: a Scene, the name of a scene that is shipped, the path of a file, or a mapping with
@@ -133,6 +139,8 @@ class Simulation(Explained):
              "needs an explicit integrator"),
         )  # fmt: skip
         self.scene = scene = scene_of(scene)
+        self._settings = integrator, tolerance, equations
+        self._running, self._thread = threading.Lock(), ""
         derivative = derive_by_paper(scene) if equations == "virtual_work" else None
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
@@ -191,17 +199,42 @@ class Simulation(Explained):
             )
         self.advance(self.acting(torque), length, number, moment)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy the arguments, and where the run is."""
+        arguments = self.scene, *self._settings, self.step_budget
+        spent = self._stepper.budget.spent
+        return _continue_simulation, (arguments, (self._before, self._now), spent)
+
+    @contextlib.contextmanager
+    def _advancing(self) -> Iterator[None]:
+        """Refuse another thread while one advances the simulation."""
+        if not self._running.acquire(blocking=False):
+            here, allowed = threading.current_thread().name, "must wait: {} advances the simulation"
+            raise refusal("step", "thread", here, allowed.format(self._thread))
+        self._thread = threading.current_thread().name
+        try:
+            yield
+        finally:
+            self._running.release()
+
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
         try:
             if callable(torque) and not getattr(torque, "feedback", False):
                 refuse_unless("step", ("torque", torque, count_arguments(torque) == 1, _TORQUE))
+            acts = callable(torque) or isinstance(torque, SineTorque)
+            if not acts and finite_vector(torque) is None:
+                raise ValueError
             return self._stepper.torque.acting(torque)
         except (TypeError, ValueError, OverflowError):
             raise refusal("step", "torque", torque, _TORQUE) from None
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""
+        with self._advancing():
+            self._advance(torque, dt_ns, count, moment)
+
+    def _advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         h, began = dt_ns / NANOSECONDS, self._now
         held = tuple(map(float, moment)) if self.dynamics.has_moment_topic else ()
         for _ in range(count):
@@ -241,9 +274,10 @@ class Simulation(Explained):
 
     def reset(self) -> State:
         """Go back to the initial state at time zero."""
-        self._now = self._before = _Instant(0, self._start)
-        self._shown = self._now, self._as_state(self._now)
-        self._energy = self.dynamics.total_energy(self._start.y)
+        with self._advancing():
+            self._now = self._before = _Instant(0, self._start)
+            self._shown = self._now, self._as_state(self._now)
+            self._energy = self.dynamics.total_energy(self._start.y)
         return self.state
 
     def load_code(self) -> None:
@@ -344,6 +378,19 @@ class Simulation(Explained):
         if type(at.torque) is tuple and not self._lags:
             return at.torque
         return self._stepper.acting(at.torque, at.time_ns / NANOSECONDS, at.point)
+
+
+def _continue_simulation(
+    arguments: tuple[Any, ...], instants: tuple[_Instant, _Instant], spent: int
+) -> Simulation:
+    """Make a simulation that goes on where another one was."""
+    scene, integrator, tolerance, equations, budget = arguments
+    copied = Simulation(
+        scene, integrator, tolerance=tolerance, equations=equations, step_budget=budget
+    )
+    copied._before, copied._now = instants
+    copied._stepper.budget.spent = spent
+    return copied
 
 
 def conditioning(geometry: Geometry, state: State) -> dict[str, float]:

@@ -25,6 +25,7 @@ from sst_ros.errors import (
     Diverged,
     MissingDependency,
     check_kinds,
+    read_numbers,
     refusal,
     refuse_errors,
     refuse_unless,
@@ -47,7 +48,7 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array
+from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, TimesLike, freeze
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,6 +64,7 @@ _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
 
+_STATUSES = (-1, 0, 1, 2)
 _UNMET = 2
 """Status of a motion that reached its end with an error estimate above the tolerance."""
 
@@ -111,7 +113,7 @@ class Trajectory(MotionTable):
     def __init__(
         self,
         scene: Scene,
-        t: ArrayLike,
+        t: TimesLike,
         quaternion: ArrayLike | None = None,
         body_rate: ArrayLike | None = None,
         torque: ArrayLike | None = None,
@@ -129,19 +131,21 @@ class Trajectory(MotionTable):
         parameters: Sequence[str] = (),
         gaps: ArrayLike = (),
     ) -> None:
-        self.scene, self.t = scene, _own(t)
-        self.gaps = _own(np.empty((0, 2)) if np.size(gaps) == 0 else gaps)
+        self.scene, self.t = scene, _own("t", t)
+        self.gaps = _own("gaps", np.empty((0, 2)) if np.size(gaps) == 0 else gaps)
         spans = self.gaps.ndim == 2 and self.gaps.shape[1] == 2 and ascend(self.gaps.ravel())
         given: dict[str, Any] = {"quaternion": quaternion, "body_rate": body_rate, "torque": torque}
         given |= {} if joints is None else {"_joints": joints}
         if dense is None or any(array is not None for array in given.values()):
-            vars(self).update({name: _own(array) for name, array in given.items()})
+            vars(self).update({name: _own(name, array) for name, array in given.items()})
         sizes = {"quaternion": 4, "body_rate": 3, "torque": 3, "_joints": 18}
         shapes = {name: (self.t.size, size) for name, size in sizes.items() if name in vars(self)}
         shaped = ((name, vars(self)[name].shape, shape) for name, shape in shapes.items())
+        known = type(status) is int and status in _STATUSES
         refuse_unless(
             "trajectory",
             ("scene", scene, isinstance(scene, Scene), "must be a Scene"),
+            ("status", status, known, f"must be one of {_STATUSES}"),
             ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
             ("gaps", gaps, spans, "must be rising pairs of times [s], shape (g, 2)"),
             *((name.strip("_"), x, x == y, f"must have the shape {y}") for name, x, y in shaped),
@@ -160,7 +164,7 @@ class Trajectory(MotionTable):
     @cached_property
     def _states(self) -> Array:
         """Rows of quaternion, body rate and torque at the samples, by `dense`."""
-        return _own(_propagate(self, self.t))
+        return freeze(_propagate(self, self.t))
 
     @cached_property
     def quaternion(self) -> Array:  # type: ignore[override]
@@ -187,7 +191,8 @@ class Trajectory(MotionTable):
         """Angles and rates of the joints, shape (n, 18)."""
         with np.errstate(all="ignore"):
             found = kernel.joints(self._dynamics.model, self._columns)
-        return np.stack([np.broadcast_to(x, self.t.shape) for row in found for x in row], axis=1)
+        columns = [np.broadcast_to(x, self.t.shape) for row in found for x in row]
+        return freeze(np.stack(columns, axis=1))
 
     def _joint(self, name: str) -> Array:
         first = 3 * JOINTS.index(name)
@@ -203,7 +208,7 @@ class Trajectory(MotionTable):
         with np.errstate(all="ignore"):
             slope = kernel.derivative(model, y, triple(self.torque.T))
             found = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
-        return np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1)
+        return freeze(np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1))
 
     @cached_property
     def reactions(self) -> Reactions:
@@ -216,7 +221,7 @@ class Trajectory(MotionTable):
     @cached_property
     def euler_zyz(self) -> Array:
         """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], shape (n, 3)."""
-        return unwrap_zyz(super().euler_zyz)
+        return freeze(unwrap_zyz(super().euler_zyz))
 
     @cached_property
     def energy(self) -> Array:
@@ -224,7 +229,7 @@ class Trajectory(MotionTable):
         with np.errstate(all="ignore"):
             model, columns = self._dynamics.model, self._columns
             total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(model, columns)
-        return np.asarray(np.broadcast_to(total, self.t.shape))
+        return freeze(np.broadcast_to(total, self.t.shape))
 
     @cached_property
     def energy_residual(self) -> float:
@@ -256,7 +261,7 @@ class Trajectory(MotionTable):
         return (*self.quaternion.T, *self.body_rate.T)
 
     @check_kinds
-    def at(self, t: ArrayLike) -> Trajectory:
+    def at(self, t: TimesLike) -> Trajectory:
         """Sample the motion at other times, ascending, to the accuracy of the run.
 
         Each state is integrated from the sample before it, under the torques that act there.
@@ -269,7 +274,7 @@ class Trajectory(MotionTable):
                 file, of a run under a function.
 
         """
-        times = np.atleast_1d(np.asarray(t, dtype=float))
+        times = np.atleast_1d(read_numbers("at", "t", t, seconds=True))
         inside = (times >= self.t[0]) & (times <= self.t[-1])
         fits = times.ndim == 1 and times.size > 0 and bool(np.all(inside))
         allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
@@ -420,18 +425,9 @@ class Trajectory(MotionTable):
         return super()._repr_html_() + svg[max(svg.find("<svg"), 0) :]
 
 
-def _own(value: ArrayLike) -> Array:
-    """Return an array that nothing can change: a copy, unless it is one already."""
-    try:
-        if np.iscomplexobj(value):
-            raise TypeError
-        array: Array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError, MemoryError):
-        raise refusal("trajectory", "array", value, "must be real numbers") from None
-    if array is value and (array.flags.writeable or not array.flags.owndata):
-        array = array.copy()
-    array.flags.writeable = False
-    return array
+def _own(name: str, value: ArrayLike) -> Array:
+    """Return an array that nothing can change, of times in seconds where it is `t`."""
+    return freeze(read_numbers("trajectory", name, value, seconds=name == "t"))
 
 
 def _propagate(trajectory: Trajectory, times: Array) -> Array:

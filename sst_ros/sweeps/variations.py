@@ -28,6 +28,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Place, Section, Spec, key_of
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
+from sst_ros.state import freeze, real_numbers
 
 KINDS = ("uniform", "normal", "grid", "linspace")
 EXPECTED = {"uniform": "low, high", "normal": "mean, standard deviation[, low, high]"}
@@ -158,7 +159,7 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
         count = numbers[2] if len(numbers) == 3 else 0
         if not (isinstance(count, Integral) and 0 < int(count) <= MOST_VALUES):
             raise ValueError(f"linspace takes low, high, count (whole, 1 to {MOST_VALUES})")
-        low, high = (np.broadcast_to(np.array(x, float), nominal.shape) for x in numbers[:2])
+        low, high = (np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers[:2])
         kind, numbers = "grid", np.linspace(low, high, int(count))
     if kind == "normal" and len(numbers) == 2:
         numbers = (*numbers, -np.inf, np.inf)
@@ -166,8 +167,8 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
     if expected and len(numbers) != expected.count(",") + 1:
         raise ValueError(f"{kind} takes {expected}")
     if kind != "grid":
-        numbers = [np.broadcast_to(np.array(x, dtype=float), nominal.shape) for x in numbers]
-    values = np.array(numbers, dtype=float)
+        numbers = [np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers]
+    values = np.array(real_numbers(numbers))
     if kind == "grid" and (values.shape[1:] != nominal.shape or not len(values)):
         raise ValueError(f"must be a list of values of shape {nominal.shape}")
     bounded = values if kind == "grid" else values[:2]
@@ -206,7 +207,7 @@ def read_table(given: Any) -> dict[str, Array]:
         if isinstance(given, Path):
             kind = "parquet" if given.suffix == ".parquet" else "csv"
             given = getattr(require("pandas"), f"read_{kind}")(given)
-        columns = {str(name): np.array(given[name], dtype=float) for name in given}
+        columns = {str(name): freeze(real_numbers(given[name])) for name in given}
         if all(column.ndim == 1 for column in columns.values()):
             return columns
         raise ValueError("a column has one number for each row")
