@@ -24,10 +24,9 @@ MOST = 5.0  # torque [N m]
 class StarTriangles(VectorEnv):
     """Robots at random starts; a robot that leaves its limits is truncated."""
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
-
     def __init__(self, num_envs: int = 64) -> None:
         self.num_envs = num_envs
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float64)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float64)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
