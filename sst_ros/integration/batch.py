@@ -23,6 +23,7 @@ from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, Parametri
 from sst_ros.errors import check_kinds, read_numbers, refuse_unless
 from sst_ros.host.many_runs import run_many
 from sst_ros.host.output import slices
+from sst_ros.integration.batch_session import BatchSession
 from sst_ros.integration.batch_step import (
     BLOCK,
     EARLIEST,
@@ -196,7 +197,7 @@ class Batch(Explained):
         begins = np.asarray(np.ceil(time / step - 0.1 * EARLIEST) - 1.0)
         steps = np.where(code > 0, begins, count)
         steps[code < 0] = 0
-        _locate_ends(loop, step, steps, y, given, code, time)
+        locate_ends(loop, step, steps, y, given, code, time)
         last = steps * step
         facts = self.model, self.columns, given[:3].T, code, time, error
         result = BatchResult(*facts, last, y)
@@ -212,6 +213,37 @@ class Batch(Explained):
             "scenarios": self._scenarios.count or "as many as are given to run",
             "varied": [*self._scenarios.rows] or "the start and the torques alone",
         }
+
+    @check_kinds
+    def start(
+        self,
+        gamma: ArrayLike,
+        gamma_dot: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        step: float,
+        substeps: int = 1,
+    ) -> BatchSession:
+        """Start robots that are driven step by step, as by a policy.
+
+        Args:
+            gamma: initial actuator angles [rad], shape (N, 3), or (3,) where parameters vary.
+            gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
+            step: length of a step of the session, in which torques are constant [s].
+            substeps: steps of the method in it.
+
+        Raises:
+            InputError: an argument is not allowed, or the batch has a profile of torques.
+
+        """
+        allowed = f"must be >= 1 and <= {_MOST:g}"
+        torque = self.model.ode.drive[:3] == TORQUE
+        refuse_unless(
+            "batch",
+            ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
+            ("substeps", substeps, 1 <= substeps <= _MOST, allowed),
+            ("profile", True, torque, "must be False: the torques are given step by step"),
+        )
+        return BatchSession(self, gamma, gamma_dot, float(step), int(substeps))
 
     def initial(self, gamma: ArrayLike, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
@@ -290,7 +322,7 @@ def _make_batch(
     return Batch(scene, method, profile=profile, parameters=parameters)
 
 
-def _locate_ends(
+def locate_ends(
     advance: Advance, step: float, steps: Array, y: Array, given: Array, code: Any, time: Array
 ) -> None:
     """Repeat the steps in which limits were passed by finer ones; `code` and `time` change."""

@@ -26,7 +26,7 @@ NODES = ("controller", "push")
 PICTURES = [
     path.stem
     for path in sorted(EXAMPLES.glob("*.py"))
-    if path.stem not in (*NODES, "bag_to_pandas")
+    if path.stem not in (*NODES, "bag_to_pandas", "vector_env")
 ]
 
 

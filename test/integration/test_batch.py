@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: every scenario is a run of its own, on any threads; what they keep, tell and refuse."""
 
+import copy
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -17,6 +21,7 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
 from sst_ros.integration.point import Drive
+from sst_ros.programs import llvm
 from sst_ros.programs.expression import compile_program
 from sst_ros.programs.llvm import LANES
 from sst_ros.scene.loads import Initial, Moment
@@ -160,6 +165,49 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(rows):
         machine = MethodSteps(ODE(Dynamics.of(scene), torque), method)
         ended = machine.fixed(0.0, rows.step, 100, y[:, n].tolist(), Drive(tuple(drive)))
         assert ended == [*result.quaternion[n], *result.body_rate[n]]
+
+
+def test_numpy_has_the_bits_of_machine_code(rows, monkeypatch):
+    monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+    plain = rows._replace(batch=copy.copy(rows.batch))
+    plain.batch.__dict__.pop("programs", None)
+    found = plain.run(threads=1)
+    assert np.array_equal(found.quaternion, rows.result.quaternion)
+    assert np.array_equal(found.body_rate, rows.result.body_rate)
+    assert np.array_equal(found.code, rows.result.code)
+    assert np.array_equal(found.fault_time, rows.result.fault_time, equal_nan=True)
+
+
+LONG_RUN = """
+import sys, threading
+from sst_ros import Batch, load_scene
+batch = Batch(load_scene("swing"))
+batch.programs
+begun = threading.Timer(0.5, lambda: print("runs", flush=True))
+begun.start()
+batch.run([(0.8, 0.8, 0.8)] * 20_000, (0.0, 0.0, 0.0), step=1e-6, count=10**8, threads={threads})
+"""
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_interrupt_ends_a_batch_at_once(threads):
+    program = [sys.executable, "-c", LONG_RUN.format(threads=threads)]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        assert run.stdout.readline() == b"runs\n"
+        run.send_signal(signal.SIGINT)
+        _, said = run.communicate(timeout=20)  # without it the run would take hours
+    assert b"KeyboardInterrupt" in said
+
+
+def test_a_batch_needs_no_numba():
+    program = """
+import sys
+sys.modules["numba"] = None
+from sst_ros import Batch
+found = Batch("example2_heavy").run((0.8, 0.8, 0.8), (0.0, 0.0, 0.0), step=1e-3, count=3)
+"""
+    program = program.replace("(0.8, 0.8, 0.8), (0.0", "[(0.8, 0.8, 0.8)], (0.0")
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
 def test_rest_at_an_end_of_the_stroke_is_no_fault():
