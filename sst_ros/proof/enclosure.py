@@ -15,6 +15,7 @@ that is proven is computed in Arb's balls, whose rounding is outward.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -46,8 +47,11 @@ GROWTH = 0.05  # of a set by the remainder of V, largest in a step
 CUT = "an angle may pass pi, where that of the model jumps"
 UNBOUNDED = "a number is not bounded: a singularity may be near"
 LEAST = 1e-9  # of a step, relative to the whole time: the proof ends
-KINK_STEP = 1e-10  # first step across a kink, relative to the whole time
-KINK_STEPS = 40  # steps across one kink, each twice as long as the last, after which the proof ends
+TIGHT = 1.1  # room of a tube around what a step was proven to reach
+LOSS = 1e-4  # of a set in a step, relative to it: more is tried to be avoided by shorter steps
+KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
+KINK_STEPS = 400  # steps across one kink before the proof ends
+KINK_LOSS = 0.02  # of a set in a step across a kink, below which the next is twice as long
 HALVINGS = 30  # of the time in which a kink is looked for
 
 
@@ -109,9 +113,54 @@ class _Kink:
     __truediv__ = __rtruediv__ = __arb__ = refuse
 
 
+class _KinkWatch:
+    """What decides on which side of a kink a number is in a span of time.
+
+    Its value anywhere in the span is that in the middle and its derivative times the time from
+    there (the mean value theorem), which is narrower than its value in interval arithmetic. So the
+    values in the middle are noted in the order in which a program computes them, then read again.
+    """
+
+    def __init__(self) -> None:
+        self._middles: list[Any] = []
+        self._reach: Any = None  # largest time from the middle, where the values are read
+        self._next = 0
+
+    @contextlib.contextmanager
+    def within(self, reach: Any = None) -> Iterator[None]:
+        """Note the values in the middle of a span, or use them for times within a reach."""
+        global _watch
+        before, _watch = _watch, self
+        self._reach, self._next = reach, 0
+        if reach is None:
+            self._middles.clear()
+        try:
+            yield
+        finally:
+            _watch = before
+
+    def narrow(self, x: Any) -> Any:
+        """Return the value of a number, narrower where its middle is known."""
+        value = _first(x)
+        if self._reach is None:
+            self._middles.append(value)
+            return value
+        middle = self._middles[self._next] if self._next < len(self._middles) else value
+        self._next += 1
+        if isinstance(value, _Kink) or isinstance(middle, _Kink) or not isinstance(x, arb_series):
+            return value
+        if x.prec < 2 or isinstance(slope := x[1], _Kink):
+            return value
+        moved = middle + slope * between(-self._reach, self._reach)
+        return moved if moved.rad() < value.rad() else value
+
+
+_watch: _KinkWatch | None = None
+
+
 def _side(x: Any) -> int | None:
     """Return 1 where x > 0, 0 where x < 0, None where neither is known."""
-    value = _first(x)
+    value = _first(x) if _watch is None else _watch.narrow(x)
     if isinstance(value, _Kink) or not (value > 0 or value < 0):
         return None
     return int(bool(value > 0))
@@ -192,6 +241,12 @@ class Region(NamedTuple):
     a: Any
     axes: Any  # B
     b: Any
+    fixed: int = 0  # how many of the last numbers never change
+
+    @property
+    def moving(self) -> int:
+        """How many of the first numbers change."""
+        return len(self.centre) - self.fixed
 
     @classmethod
     def box(cls, time: float, balls: Sequence[Any]) -> Region:
@@ -199,6 +254,24 @@ class Region(NamedTuple):
         n = len(balls)
         one, zero = arb_mat(n, n, [0] * (n * n)) + 1, column([0] * n)
         return cls(time, [x.mid() for x in balls], one, column([x.rad() for x in balls]), one, zero)
+
+    @classmethod
+    def linear(
+        cls,
+        time: float,
+        centre: Sequence[Any],
+        c: Any,
+        a: Sequence[Any],
+        rest: Sequence[Any],
+        fixed: int,
+    ) -> Region:
+        """Return the region of all centre + C a +- rest, whose numbers are balls."""
+        n, exact = len(centre), c.mid()
+        one = arb_mat(n, n, [0] * (n * n)) + 1
+        widths = column([arb(x).upper() for x in a])
+        more = column([x.rad() for x in centre]) + column([arb(x).abs_upper() for x in rest])
+        b = magnitude(magnitude(c - exact) * widths + more)
+        return cls(time, [x.mid() for x in centre], exact, widths, one, b, fixed)
 
     def spread(self, by: Any = 1) -> Any:
         """Bound each number of by e."""
@@ -211,7 +284,7 @@ class Advance(NamedTuple):
     begin: Region
     end: float
     p: list[Any]  # polynomials
-    tube: list[Any]  # balls of e in the whole step
+    tube: list[Any]  # balls of e in the whole step, once proven those that it reaches
     defect: float = 0.0  # largest integral of |d_i|, not rounded outward
     v: Sequence[Any] = ()  # coefficients of V
     w: Any = None
@@ -266,9 +339,14 @@ class Advance(NamedTuple):
         if order == 0:
             return [[x] for x in self.values(function, between(begin, end), tube)]
         part = (end - begin) / parts
-        found = self.expand(function, (begin + end) / 2, order, tube)
-        spans = [between(begin + k * part, begin + (k + 1) * part) for k in range(parts)]
-        last = [self.expand(function, one, order + 1, tube) for one in spans]
+        watch, reach = _KinkWatch(), ((end - begin) / 2).abs_upper()
+        with watch.within():
+            found = self.expand(function, (begin + end) / 2, order, tube)
+        last = []
+        for k in range(parts):
+            with watch.within(reach):
+                where = between(begin + k * part, begin + (k + 1) * part)
+                last.append(self.expand(function, where, order + 1, tube))
         return [
             [*row, reduce(arb.union, (one[i][order] for one in last))]
             for i, row in enumerate(found)
@@ -369,9 +447,10 @@ def prove(
         largest_size = reduce(arb.max, sizes)
         most += 2 * largest_size * step.half ** (k + 1) / (k + 1)
     bound = (growth * step.length).exp() * most
-    step = step._replace(w=column([(bound * x).upper() for x in weights]), weights=weights)
-    _check_tube(step, tolerance)
-    return step
+    w = [(bound * x).upper() for x in weights]
+    w[step.begin.moving :] = [arb(0)] * step.begin.fixed
+    step = step._replace(w=column(w), weights=weights)
+    return _check_tube(step, tolerance)
 
 
 def _measure_defect(
@@ -419,16 +498,20 @@ def _values_of(j: Sequence[Any], half: Any) -> Any:
     return reduce(lambda found, matrix: found * u + matrix, reversed(j))
 
 
-def _check_tube(step: Advance, tolerance: float) -> None:
-    """Refuse a step whose error may leave its tube."""
+def _check_tube(step: Advance, tolerance: float) -> Advance:
+    """Return a step with the tube that is reached; Refused: the error may leave its tube."""
     s = between(0, step.length)
     reached = entries(step.begin.spread(step.flow(s)) + step.w)
-    if all(x.is_finite() and x < e.rad() for x, e in zip(reached, step.tube, strict=True)):
-        return
+    pairs = list(zip(reached, step.tube, strict=True))[: step.begin.moving]
+    if all(x.is_finite() and x < e.rad() for x, e in pairs):
+        return step._replace(tube=[arb(0, x.upper()) for x in reached])
     widest = max(map(float, entries(step.begin.spread())))
     grows = max(map(float, entries(step.w)))
     is_slow = grows < 10.0 * tolerance + GROWTH * widest
-    wider = [arb(0, (2 * x).upper()) for x in reached] if is_slow else None
+    wider = None
+    if is_slow:
+        moving = [2 * x for x in reached[: step.begin.moving]]
+        wider = [arb(0, x.upper()) for x in moving] + step.tube[step.begin.moving :]
     raise Refused("the error may leave the tube: it grows too fast", 0.6, wider)
 
 
@@ -452,7 +535,17 @@ def region_at_end(step: Advance) -> Region:
     axes = fit_axes(moved, here.b, [float(x) for x in step.weights])
     back = axes.inv()
     b = magnitude(magnitude(back * moved) * here.b + magnitude(back) * error)
-    return Region(step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b)
+    return Region(step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b, here.fixed)
+
+
+def _loss(step: Advance) -> float:
+    """Return how much of the set at the end of a step is new, in the norm of the step."""
+    sizes = [entries(x) for x in (step.w, step.begin.spread(step.flow(step.length)))]
+    new, known = (
+        max(float(x / weight) for x, weight in zip(row, step.weights, strict=True))
+        for row in sizes
+    )
+    return new / known if known else 0.0
 
 
 def fit_axes(moved: Any, b: Any, scale: Sequence[float]) -> Any:
@@ -472,8 +565,11 @@ def fit_axes(moved: Any, b: Any, scale: Sequence[float]) -> Any:
     return arb_mat((scales * guide).tolist())
 
 
-def _tube(here: Region, room: int, tolerance: float) -> list[Any]:
-    return [arb(0, (room * (x + tolerance)).upper()) for x in entries(here.spread())]
+def _tube(here: Region, room: float, tolerance: float) -> list[Any]:
+    """Return a tube with some room around a region; what never changes needs none."""
+    spread = entries(here.spread())
+    moving = [room * (x + tolerance) for x in spread[: here.moving]]
+    return [arb(0, x.upper()) for x in (*moving, *spread[here.moving :])]
 
 
 class Stepper:
@@ -523,13 +619,18 @@ class Stepper:
         p = approximate(self._f, self._jacobian, here, order)
         sizes = [(k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)]
         longest = min([(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=self._usual)
-        h, tries, is_free = min(self._factor * longest, 2.0 * self._usual, self._most), 0, True
+        wanted, tries = self._factor * longest, 0
+        h = min(wanted, 4.0 * self._usual, self._most)
+        is_free = h == wanted or self._most < math.inf  # no kink has made it short
         tube = _tube(here, self._room, tolerance)
         while True:
             target = self._end if here.time + 1.01 * h > self._end else here.time + h
             step = Advance(here, target, list(map(arb_poly, p)), tube)
             try:
                 step = prove(self._f, self._jacobian, step, order, tolerance)
+                less_lossy = self._less_lossy(step)
+                is_free = is_free and less_lossy.end == step.end
+                step = less_lossy
                 break
             except KinkMet as kink:
                 tube, self._room = _tube(here, 3, tolerance), 3
@@ -546,7 +647,35 @@ class Stepper:
                 tube = _tube(here, self._room, tolerance)
                 if h < LEAST * self._span or here.time + h == here.time:
                     raise why from None
-        self._plan(target - here.time, longest, step.defect, is_free=is_free)
+        self._plan(step.end - here.time, longest, step.defect, is_free=is_free)
+        return step
+
+    def _less_lossy(self, step: Advance) -> Advance:
+        """Return a step, or a shorter one if it widens the set by much less.
+
+        In a stiff contact the Jacobian turns within a step, and its series is what widens.
+        """
+        loss = _loss(step)
+        if loss > LOSS + 10.0 * self._tolerance:
+            moving = [TIGHT * x for x in step.tube[: step.begin.moving]]
+            tight = step._replace(tube=[*moving, *step.tube[step.begin.moving :]])
+            try:
+                step = prove(self._f, self._jacobian, tight, self._order, self._tolerance)
+                loss = _loss(step)
+            except (ArithmeticError, ValueError):
+                pass
+        while loss > LOSS + 10.0 * self._tolerance:
+            h = 0.6 * (step.end - step.begin.time)
+            tube = _tube(step.begin, 3, self._tolerance)
+            shorter = step._replace(end=step.begin.time + h, tube=tube)
+            try:
+                shorter = prove(self._f, self._jacobian, shorter, self._order, self._tolerance)
+            except (ArithmeticError, ValueError):
+                return step
+            before, loss = loss, _loss(shorter)
+            if loss > 0.2 * before:
+                return step
+            step = shorter
         return step
 
     def _plan(self, taken: float, longest: float, defect: float, *, is_free: bool) -> None:
@@ -554,11 +683,11 @@ class Stepper:
         if self._here.time + taken >= self._end:
             return
         self._usual = max(taken, 0.1 * self._usual)
+        if self._most < math.inf:
+            self._most = 1.1 * taken
         if not is_free:
             return
         self._cruise = self._usual
-        if self._most < math.inf:
-            self._most = 1.1 * taken
         ratio = (0.5 * self._tolerance / defect) ** (1.0 / self._order) if defect else 1.3
         self._factor = taken / longest * min(max(ratio, 0.7), 1.3)
 
@@ -568,7 +697,7 @@ class Stepper:
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             try:
-                step.expand(self._f, between(0, middle), 1, step.tube)
+                step.enclose(self._f, 2, step.tube, (arb(0), arb(middle)))
                 low = middle
             except KinkMet:
                 high = middle
@@ -581,11 +710,13 @@ class Stepper:
     def _cross_kink(self, kink: KinkMet) -> Iterator[Advance]:
         """Yield steps across a kink, each twice as long, until a step of series is proven."""
         begin, h = self._here.time, KINK_STEP * self._span
+        factor, cruise = self._factor, self._cruise
         for _ in range(KINK_STEPS):
             step = self._kink_step(h, kink)
             yield step
             self._here = region_at_end(step)
-            taken, h = step.end - step.begin.time, 2.0 * h
+            taken = step.end - step.begin.time
+            h = taken * (2.0 if _loss(step) < KINK_LOSS else 0.7)
             if step.end >= self._end:
                 break
             self._usual, self._most = taken, math.inf
@@ -599,7 +730,7 @@ class Stepper:
         else:
             raise Refused(f"{kink}, for longer than {KINK_STEPS} steps")
         self.kinks.append((begin, step.end))
-        self._usual = self._cruise
+        self._usual, self._cruise, self._factor = cruise, cruise, factor
 
     def _kink_step(self, longest: float, kink: KinkMet) -> Advance:
         """Prove a step across a kink by a straight line p."""
@@ -610,7 +741,9 @@ class Stepper:
                 break
             half = (arb(target) - arb(here.time)) / 2
             time, first = arb(here.time), self._f(arb(here.time), *here.centre)
-            middle = [x + half * arb(slope).mid() for x, slope in zip(here.centre, first, strict=True)]
+            middle = [
+                x + half * arb(slope).mid() for x, slope in zip(here.centre, first, strict=True)
+            ]
             slopes = self._f(time + half, *middle)
             p = [arb_poly([x, arb(s).mid()]) for x, s in zip(here.centre, slopes, strict=True)]
             line = Advance(here, target, p, _tube(here, 3, self._tolerance))

@@ -356,9 +356,7 @@ class SceneBalls:
             derived = rebuild(self._convert(symbols), marked)
             model = kernel.model_of(derived.scene, derived.axes)
             present = {p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)}
-            return function(
-                Parts(rebuild(model, present), derived.axes, derived.scene), *given
-            )
+            return function(Parts(rebuild(model, present), derived.axes, derived.scene), *given)
 
         program = trace(traced, (*inputs, *self.inputs, *names, *derived_names), by)
         balls = [*self._symbols.values(), *constants.values()]
