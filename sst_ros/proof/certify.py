@@ -11,11 +11,12 @@ one of the parts of a range, `closed_loop` has a controller act at its ticks, `z
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -192,13 +193,15 @@ class Equations:
 
     @cached_property
     def stops(self) -> list[Limit]:
-        """Limits of the mechanism, and those at which the scene stops."""
-        return list(limits_of(self.scene, Geometry.of(self.scene)))
+        """Limits of the mechanism, at which the scene may stop or not."""
+        stop: Any = SimpleNamespace(at_end="stop", at_edge="stop")
+        every: Any = SimpleNamespace(stroke=stop, workspace=stop)
+        return list(limits_of(every, Geometry.of(self.scene)))
 
     @cached_property
     def stop_names(self) -> set[str]:
         """Names of the limits at which the motion ends."""
-        return {limit.reason for limit in self.stops}
+        return {limit.reason for limit in limits_of(self.scene, Geometry.of(self.scene))}
 
     @cached_property
     def limit_names(self) -> list[str]:

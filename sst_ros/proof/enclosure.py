@@ -456,9 +456,12 @@ def prove(
 def _measure_defect(
     step: Advance, d: Sequence[Sequence[Any]], order: int, tolerance: float
 ) -> Advance:
-    """Note the defect of a step; Refused: it is too large, but for what shorter steps keep."""
-    kept = len(d[0]) - 1
-    last = max(2 * float(row[kept] * step.half ** (kept + 1) / (kept + 1)) for row in d)
+    """Note the integral of the last term of the defect; Refused: it is too large.
+
+    The terms below it are what the balls of numbers bring, which shorter steps do not lessen.
+    """
+    size = len(d[0])
+    last = max(float(row[-1] * step.length**size / size) for row in d)
     step = step._replace(defect=last)
     if not last <= tolerance:
         excess = last / tolerance
@@ -542,8 +545,7 @@ def _loss(step: Advance) -> float:
     """Return how much of the set at the end of a step is new, in the norm of the step."""
     sizes = [entries(x) for x in (step.w, step.begin.spread(step.flow(step.length)))]
     new, known = (
-        max(float(x / weight) for x, weight in zip(row, step.weights, strict=True))
-        for row in sizes
+        max(float(x / weight) for x, weight in zip(row, step.weights, strict=True)) for row in sizes
     )
     return new / known if known else 0.0
 

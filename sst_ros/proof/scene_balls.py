@@ -292,7 +292,7 @@ class SceneBalls:
         self.scene, self.balls, self.varied = scene, balls, varied
         self.inputs = tuple(f"p{i}" for i in range(len(varied)))
         self._document = written
-        present = (p for p, x in balls.items() if p in varied or not x == 0)
+        present = (p for p, x in balls.items() if p in varied or not x.is_zero())
         self._symbols: dict[Place, Any] = {p: balls[p] for p in present if p[0] != "initial"}
         self._symbols[DEGREE] = arb.pi() / 180
         self._settled = self._convert_in_balls()

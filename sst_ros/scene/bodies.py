@@ -145,7 +145,11 @@ class Link(Section):
 
     def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
-        mass, (x, y, z), own = self.mass, self.centre, shift_inertia(self.inertia, -self.mass, self.centre)
+        mass, (x, y, z), own = (
+            self.mass,
+            self.centre,
+            shift_inertia(self.inertia, -self.mass, self.centre),
+        )
         scale = mass * (x * x + y * y + z * z)
         for part in entries_of(self.inertia):
             scale = np.maximum(scale, abs(part))

@@ -194,9 +194,7 @@ class Section:
         """Return what a copy needs: fields, and how they were written."""
         return vars(self), texts_of(self), converted_of(self)
 
-    def __setstate__(
-        self, state: tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
-    ) -> None:
+    def __setstate__(self, state: tuple[dict[str, Any], dict[str, Any], dict[str, Any]]) -> None:
         """Restore a copy."""
         vars(self).update(state[0])
         self._remember(*state[1:])
