@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """certify(): how far the motion of a scene can be from the one that `simulate` gives, proven.
 
-Numbers of a scene, its start and its torques are taken as exact, or as anything in a range that is
-given. What is made from them (unit vectors, the posture at the start) is enclosed.
+A number of a scene stands for what is written and for the double that is read, or for anything in
+a range that is given. What is made from them (unit vectors, shifted inertias, the posture at the
+start) is enclosed. The room: `balls` has Arb's numbers and their rounding, `scene_balls` the
+numbers of a scene, `enclosure` the theorem of a step; this file makes a motion of steps, `union`
+one of the parts of a range, `closed_loop` has a controller act at its ticks, `zone` maps poses.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from decimal import Decimal
 from functools import cached_property
-from itertools import groupby, pairwise
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -21,225 +23,385 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.dynamics.model import limits_of
+from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.motion_table import JOINTS
-from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
-from sst_ros.errors import check_kinds, refusal, refuse_unless, require
+from sst_ros.dynamics.traced_dynamics import MOTION, RATE, TORQUE, Dynamics
+from sst_ros.errors import check_kinds, refuse_unless, require
 from sst_ros.host.output import Bar
+from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.programs.expression import Expression, mark_present, trace
 from sst_ros.proof import enclosure
-from sst_ros.proof.enclosure import (
-    Advance,
-    Function,
-    Refused,
-    Region,
+from sst_ros.proof.balls import (
+    PRECISION,
     arb,
     arb_mat,
     arb_poly,
     between,
     column,
-    cut,
     entries,
     magnitude,
     norm,
+    precision,
     upper,
+    write_down,
+    write_up,
 )
+from sst_ros.proof.enclosure import Advance, Function, Refused, Region, Stepper
+from sst_ros.proof.scene_balls import Parts, SceneBalls, WrittenDocument, range_balls
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Place, leaves, rebuild, walk
+from sst_ros.scene.schema import Place
 from sst_ros.scene.torque_profile import FunctionTorque, LostTorque, SineTorque, TorqueProfile
-from sst_ros.scene.yaml_document import find_fields
 from sst_ros.simulation.simulate import TorqueInput, simulate
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Explained, clamp
+from sst_ros.state import NANOSECONDS, Explained
 
 Span = tuple[float, float, int]  # begin, end, sign of a number in between; 0 where not known
 PARALLEL = "parallel singularity, det J2 = 0"
-LIMIT_ORDER, SPLITS = 6, 200  # of expansions whose signs say where limits are; of a step there
-TURN, REST = ("turn_x", "turn_y", "turn_z"), (0.0, 0.0, 0.0)
-ATTEMPTS = 3
-_PHYSICAL = (
-    "star", "actuated_links", "intermediate_links", "payload", "gravity", "moment", "friction",
-    "springs", "own_loads", "actuators",
-)  # fmt: skip
-"""Parts of a scene that the equations have numbers from."""
+LIMIT_ORDER = 6  # of expansions whose signs say where limits are
+SPLITS = 200  # of a step, most of them near a limit
+TURN = ("turn_x", "turn_y", "turn_z")
+ANGLES, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
+_UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+AT_START = "the posture at the start is not proven to be the only one near"
+MOST_PARTS = 10_000  # of the box of ranges
+ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
+NARROWER = 8  # proofs by which the width of ranges is looked for that would do, each by half
+JOINT_COUNT = 18  # angles and rates of the joints
 
 
-class _Axes(NamedTuple):
-    """The arrays of `Geometry`, as balls or symbols."""
+class Equations:
+    """The motion of a scene on balls; the state has the numbers that are ranges at the end."""
 
-    v: Any
-    w: Any
-    e: Any
-    arc: Any
-    beta_max: Any
-
-    def of_leg(self, name: str, k: int) -> Any:
-        return getattr(self, name)[k]
-
-
-def _axes_of(scene: Scene) -> _Axes:
-    v = [triple(arb(x) / norm(list(map(arb, row))) for x in row) for row in scene.base.v]
-    pairs = [(v[k], v[(k + 1) % 3]) for k in range(3)]
-    normals = [cross3(*pair) for pair in pairs]
-    turn = arb.pi() / 180
-    first, second, _ = (turn * x for x in scene.star.alpha_deg)
-    return _Axes(
-        tuple(v),
-        tuple(triple(x / norm(n) for x in n) for n in normals),
-        tuple((-x.sin(), x.cos(), arb(0)) for x in (arb(0), first, first + second)),
-        tuple(arb.atan2(norm(n), dot3(*pair)) for n, pair in zip(normals, pairs, strict=True)),
-        turn * scene.workspace.beta_max_deg,
-    )
-
-
-class _Equations:
-    """A scene on balls; the state has its numbers that are ranges at the end, for they are inputs.
-
-    A ball is added to a number as radius where its place is in `ranges`.
-    """
-
-    def __init__(self, scene: Scene, profile: TorqueProfile, ranges: Mapping[Place, float]) -> None:
-        self.scene, self.profile, self.state = scene, profile, Dynamics.of(scene).state
-        numbers = leaves(scene)
-        self.ranges = {place: arb(numbers[place], radius) for place, radius in ranges.items()}
-        self.varied = [place for place in ranges if place[0] != "initial"]
-        self.inputs = (*self.state, *(f"p{i}" for i in range(len(self.varied))))
-        self._axes = _axes_of(scene)
-        axes = {place: x for place, x in walk(self._axes) if isinstance(x, arb)}
-        self._folded = {place: float(x) for place, x in axes.items() if x in (-1, 0, 1)}
-        present = (p for p, x in numbers.items() if p[0] in _PHYSICAL and x and p not in ranges)
-        self._constants = {place: arb(numbers[place]) for place in present}
-        self._constants |= {p: x for p, x in axes.items() if p not in self._folded}
-
-    def compile(
-        self, function: Callable[..., Any], inputs: Sequence[str], by: Sequence[str] = ()
-    ) -> Function:
-        """Compile function(model, *inputs), with derivatives by some inputs."""
-        size, first = len(inputs), len(self.state)
-
-        def traced(*values: Any) -> Any:
-            given = dict(zip(self._constants, values[size:], strict=True)) | self._folded
-            if inputs[: len(self.inputs)] == self.inputs:
-                given |= zip(self.varied, values[first : len(self.inputs)], strict=True)
-            numbers = {place: mark_present(x) for place, x in given.items()}
-            axes: Any = rebuild(self._axes, numbers)
-            model: Any = kernel.model_of(rebuild(self.scene, numbers), axes)
-            parts = {p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)}
-            return function(rebuild(model, parts), *values[:size])
-
-        program = trace(traced, (*inputs, *(f"c{i}" for i in range(len(self._constants)))), by)
-        return enclosure.compile_on_balls(program, list(self._constants.values()))
+    def __init__(
+        self, scene: Scene, profile: TorqueProfile | None, ranges: Mapping[Place, Any]
+    ) -> None:
+        self.scene, self._profile = scene, profile
+        self.state = Dynamics.of(scene).state
+        self.balls = SceneBalls(scene, profile, ranges)
+        self.inputs = (*self.state, *self.balls.inputs)
 
     def start(self) -> Region:
-        """Enclose the start by Krawczyk's test; Refused: it is not proven to be the only one."""
-        x, y, z, w, *_ = start_of(self.scene)
-        initial = leaves(self.scene.initial)
-        gamma, gamma_dot = (
-            [self.ranges.get(("initial", name, k), arb(initial[name, k])) for k in range(3)]
-            for name in ("gamma", "gamma_dot")
-        )
+        """Enclose the start by Krawczyk's test; Refused: it is not proven to be the only one.
 
-        def turned(a: Any, b: Any, c: Any) -> Any:
-            return quaternion_product((x, y, z, w), (a, b, c, 1.0))
+        Unknown are a small turn from the orientation that `simulate` begins with, and the body
+        rate; the set keeps how they depend on gamma, gamma_dot and the numbers that are ranges.
+        """
+        x, y, z, w, *rate = start_of(self.scene)[:7]
 
-        def angles(model: Any, *turn: Any) -> Any:
-            legs = kernel.leg_motions(model, (*turned(*turn), *REST))
-            return [kernel.joint_angle(at, 0) for at in legs]
+        def equations(parts: Parts, *inputs: Any) -> list[Any]:
+            turn, body_rate, angles, rates = (inputs[k : k + 3] for k in range(0, 12, 3))
+            q = quaternion_product((x, y, z, w), (turn[0], turn[1], turn[2], 1.0))
+            legs = list(kernel.leg_motions(parts.model, (*q, *body_rate)))
+            gaps = []
+            for leg, angle in zip(legs, angles, strict=True):
+                sine, cosine = kernel.direction_of(leg, 0)
+                gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
+            return gaps + [leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)]
 
-        run = self.compile(angles, TURN, TURN)
+        unknown, initial = (*TURN, *RATE), (*ANGLES, *ANGLE_RATES)
+        by = (*unknown, *initial, *self.balls.inputs)
+        run = self.balls.compile(equations, (*unknown, *initial), by)
+        given = [*self.balls.initial("gamma"), *self.balls.initial("gamma_dot")]
+        given += self.balls.varied_balls
+        root = krawczyk(run, [0.0, 0.0, 0.0, *rate], given, AT_START)
+        # q is linear in the turn.
+        columns = [quaternion_product((x, y, z, w), unit) for unit in _UNITS]
+        size, n = len(self.state), len(self.inputs)
+        slopes = [[arb(0)] * n for _ in range(n)]
+        rest = [arb(0)] * n
+        places = [*range(len(initial)), *range(size, n)]  # of what is given, among the columns
+        for i in range(4):
+            parts = [arb(columns[k][i]) for k in range(3)]
+            rest[i] = sum((abs(x) * r for x, r in zip(parts, root.rest[:3], strict=True)), arb(0))
+            for j, place in enumerate(places):
+                slopes[i][place] = sum((parts[k] * root.slopes[k, j] for k in range(3)), arb(0))
+        for i in range(3):
+            rest[4 + i] = root.rest[3 + i]
+            for j, place in enumerate(places):
+                slopes[4 + i][place] = root.slopes[3 + i, j]
+        for place in range(size, n):
+            slopes[place][place] = arb(1)
+        turned = quaternion_product((x, y, z, w), (*root.middle[:3], arb(1)))
+        lagged = [arb(0)] * (size - len(MOTION))
+        centre = [*turned, *root.middle[3:], *lagged, *(arb(x.mid()) for x in given[6:])]
+        radii = [arb(0)] * n
+        for ball, place in zip(given, places, strict=True):
+            radii[place] = ball.rad()
+        return Region.linear(0.0, centre, arb_mat(slopes), radii, rest, n - size)
 
-        def at(turn: Any) -> tuple[Any, Any]:  # how far gamma is off, and its derivatives
-            found = run(*entries(turn))
-            off = [arb(x) - angle for x, angle in zip(found, gamma, strict=False)]
-            slopes = [[found[3 + 3 * j + i] for j in range(3)] for i in range(3)]
-            return column(off), arb_mat(slopes)
+    def _unlimited(self, parts: Parts, time: Any, command: Sequence[Any]) -> list[Any]:
+        """Return the torques that are commanded: those given, or sines of the time."""
+        if not isinstance(self._profile, SineTorque):
+            return list(command)
+        sine = parts.scene.torque
+        rows = zip(sine.amplitude, sine.frequency, sine.phase, strict=True)
+        return [a * gm.sin(f * time + phase) if a else 0.0 for a, f, phase in rows]
 
-        middle = column([0] * 3)
-        for _ in range(5):  # Newton
-            off, slopes = at(middle)
-            inverse = slopes.mid().inv().mid()
-            middle = (middle - inverse * off).mid()
-        step = inverse * at(middle)[0]
-        least = arb(2) ** (8 - enclosure.PRECISION)
-        radii = [(4 * x + least).upper() for x in entries(magnitude(step))]
-        box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
-        image = entries(middle - step - (inverse * at(box)[1] - 1) * (box - middle))
-        if not all(b.contains_interior(t) for b, t in zip(entries(box), image, strict=True)):
-            raise Refused("the posture at the start is not proven to be the only one near")
-        q, rate = turned(*image), [arb(0)] * 3
-        if not all(x == 0 for x in gamma_dot):
-            legs = self.compile(
-                lambda model, *y: [x for at in kernel.leg_motions(model, y) for x in at.g], MOTION
-            )
-            g = [arb(x) for x in legs(*q, *rate)]
-            rate = entries(arb_mat([g[:3], g[3:6], g[6:]]).solve(column(gamma_dot)))
-        lagged = [arb(0)] * (len(self.state) - 7)
-        return Region.box(0.0, [*q, *rate, *lagged, *(self.ranges[p] for p in self.varied)])
+    def _acting(self, parts: Parts, time: Any, command: Sequence[Any]) -> list[Any]:
+        """Return the torques that act: those that are commanded, clamped."""
+        torques = self._unlimited(parts, time, command)
+        limit = getattr(parts.scene.actuators, "torque_limit", None)
+        if limit is None:
+            return torques
+        return [limit - gm.positive(2.0 * limit - gm.positive(x + limit)) for x in torques]
 
     @cached_property
-    def _derivatives(self) -> tuple[Function, Function]:
-        size, inputs = len(self.state), (*self.inputs, *TORQUE)
+    def derivatives(self) -> tuple[Function, Function]:
+        """The derivative of time, state, commands and varied numbers; it with the Jacobian."""
+        size = len(self.state)
 
-        def derivative(model: Any, *given: Any) -> Any:
-            slope = kernel.derivative(model, given[:size], triple(given[-3:]))
-            return (*slope, *[0.0] * len(self.varied))
+        def derivative(parts: Parts, time: Any, *given: Any) -> Any:
+            torque = self._acting(parts, time, given[size:])
+            slope = kernel.derivative(parts.model, given[:size], triple(torque))
+            return (*slope, *[0.0] * len(self.balls.inputs))
 
-        return self.compile(derivative, inputs), self.compile(derivative, inputs, self.inputs)
+        inputs = ("t", *self.state, *TORQUE)
+        value = self.balls.compile(derivative, inputs)
+        return value, self.balls.compile(derivative, inputs, self.inputs)
 
     def between(self, begin: float, end: float) -> tuple[Function, Function]:
         """Return the derivative, and it with the Jacobian, of time and state between two kinks."""
-        acting, limit = self.profile.acting(begin, end), self.scene.torque_limit
+        value, jacobian = self.derivatives
+        return self._commanded(value, begin, end), self._commanded(jacobian, begin, end)
 
-        def torque(t: Any) -> Sequence[Any]:
-            if isinstance(acting, SineTorque):
-                rows = zip(acting.amplitude, acting.frequency, acting.phase, strict=True)
-                found: Any = [(f * t + p).sin() * a if a else 0.0 for a, f, p in rows]
-            elif callable(acting):
-                found = acting(t)
-            else:
-                return clamp(acting, limit)
-            if limit is None:
-                return list(found)
-            return [limit - cut(2 * limit - cut(x + limit)) for x in found]
+    def limits_between(self, begin: float, end: float) -> Function:
+        """Return the numbers whose signs are named by `limit_names`, of time and state."""
+        return self._commanded(self._limits, begin, end)
 
-        f, jacobian = self._derivatives
-        return (lambda t, *y: f(*y, *torque(t))), (lambda t, *y: jacobian(*y, *torque(t)))
+    def _commanded(self, function: Function, begin: float, end: float) -> Function:
+        """Return a function of time and state, of one that has commands after the state."""
+        size = len(self.state)
+        acting: Any = (0.0, 0.0, 0.0)
+        if self._profile is not None and not isinstance(self._profile, SineTorque):
+            acting = self._profile.acting(begin, end)
+
+        def commanded(time: Any, *y: Any) -> Sequence[Any]:
+            command = acting(time) if callable(acting) else map(arb, acting)
+            return function(time, *y[:size], *command, *y[size:])
+
+        return commanded
 
     @cached_property
     def joints(self) -> Function:
-        """Angles and rates of the joints, 18 numbers, and their derivatives by quaternion and W."""
-        return self.compile(
-            lambda model, *y: [x for row in kernel.joints(model, y) for x in row], MOTION, MOTION
-        )
+        """Angles and rates of the joints, and their derivatives by quaternion, W and varied."""
+
+        def angles_and_rates(parts: Parts, *y: Any) -> list[Any]:
+            return [x for row in kernel.joints(parts.model, y) for x in row]
+
+        return self.balls.compile(angles_and_rates, MOTION, (*MOTION, *self.balls.inputs))
 
     @cached_property
-    def limits(self) -> tuple[list[str], Function]:
-        """Names of limits, and numbers of time and state that are zero there, positive inside."""
-        stop = SimpleNamespace(at_end="stop", at_edge="stop")
-        found = limits_of(SimpleNamespace(stroke=stop, workspace=stop), Geometry.of(self.scene))
-        ends = {0: self._axes.arc, 2: [self._axes.beta_max] * 3}  # enclosed, unlike those of floats
-        limits = [
-            limit._replace(end=ends[limit.joint // 3][limit.joint % 3])
-            if limit.sign < 0 and limit.joint // 3 in ends
-            else limit
-            for limit in found
-        ]
+    def stops(self) -> list[Limit]:
+        """Limits of the mechanism, at which the scene may stop or not."""
+        stop: Any = SimpleNamespace(at_end="stop", at_edge="stop")
+        every: Any = SimpleNamespace(stroke=stop, workspace=stop)
+        return list(limits_of(every, Geometry.of(self.scene)))
 
-        def watch(model: Any, *y: Any) -> Any:
-            legs = list(kernel.leg_motions(model, y))
-            first, *others = (at.g for at in legs)
-            angles = (kernel.joint_angle(at, kind) for kind in range(3) for at in legs)
-            return (*angles, dot3(first, cross3(*others)))
+    @cached_property
+    def stop_names(self) -> set[str]:
+        """Names of the limits at which the motion ends."""
+        return {limit.reason for limit in limits_of(self.scene, Geometry.of(self.scene))}
 
-        run = self.compile(watch, MOTION)
+    @cached_property
+    def limit_names(self) -> list[str]:
+        """Names of limits: of joints, of singularities, of contacts and of torques."""
+        names = [*(limit.reason for limit in self.stops), PARALLEL]
+        if self.scene.stroke.at_end == "elastic":
+            names += [
+                f"contact of gamma_{leg} at {end}" for leg in (1, 2, 3) for end in ("0", "arc")
+            ]
+        if self.scene.torque_limit is not None:
+            names += [f"torque_{leg} at its limit" for leg in (1, 2, 3)]
+        return names
 
-        def distances(_: Any, *y: Any) -> list[Any]:
-            *angles, determinant = run(*y[:7])
-            return [*(limit.distance(angles) for limit in limits), determinant]
+    @cached_property
+    def _limits(self) -> Function:
+        """Numbers of time, state, commands and varied: zero at a limit, positive inside."""
+        size, elastic = len(self.state), self.scene.stroke.at_end == "elastic"
 
-        return [*(limit.reason for limit in limits), PARALLEL], distances
+        def distances(parts: Parts, time: Any, *given: Any) -> list[Any]:
+            legs = list(kernel.leg_motions(parts.model, given))
+            first, second, third = (leg.g for leg in legs)
+            angles = [kernel.joint_angle(leg, kind) for kind in range(3) for leg in legs]
+            ends = {0: parts.axes.arc, 2: [parts.axes.beta_max] * 3}
+            values = []
+            for limit in self.stops:
+                kind, k = divmod(limit.joint, 3)
+                end = ends[kind][k] if limit.sign < 0.0 and kind in ends else limit.end
+                values.append(limit.sign * (angles[limit.joint] - end))
+            values.append(dot3(first, cross3(second, third)))
+            for k in range(3 if elastic else 0):
+                values += [angles[k], parts.axes.arc[k] - angles[k]]
+            most = getattr(parts.scene.actuators, "torque_limit", None)
+            if most is not None:
+                unlimited = self._unlimited(parts, time, given[size:])
+                values += [(most - x) * (most + x) for x in unlimited]
+            return values
+
+        return self.balls.compile(distances, ("t", *self.state, *TORQUE))
+
+
+class Root(NamedTuple):
+    """Where the unknowns of equations are: middle + slopes (given - its middle) +- rest."""
+
+    middle: list[Any]
+    slopes: Any
+    rest: list[Any]
+
+
+def krawczyk(run: Function, near: Sequence[float], given: Sequence[Any], reason: str) -> Root:
+    """Enclose the root of equations near some numbers, for all that is given as balls.
+
+    `run` returns the values of the equations at unknowns and givens, then their derivatives by
+    each. Raises Refused, with the reason, where the root is not proven to exist and to be the only
+    one in a box.
+    """
+    n, middles = len(near), [x.mid() for x in given]
+    off = column([x - middle for x, middle in zip(given, middles, strict=True)])
+
+    def at(unknown: Any, parameters: Sequence[Any]) -> tuple[Any, Any, Any]:
+        flat = [arb(x) for x in run(*entries(unknown), *parameters)]
+        rows = [[flat[n * (j + 1) + i] for j in range(n + len(given))] for i in range(n)]
+        by_unknown = arb_mat([row[:n] for row in rows])
+        return column(flat[:n]), by_unknown, arb_mat([row[n:] for row in rows])
+
+    middle = column([arb(x) for x in near])
+    for _ in range(6):  # Newton
+        values, slopes, _ = at(middle, middles)
+        inverse = slopes.mid().inv().mid()
+        middle = (middle - inverse * values).mid()
+    values = at(middle, middles)[0] + at(middle, given)[2] * off  # for all that is given
+    step = inverse * values
+    least = arb(2) ** (8 - PRECISION)
+    radii = [(2 * x + least).upper() for x in entries(magnitude(step))]
+    box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
+    _, slopes, by_given = at(box, given)
+    image = entries(middle - step - (inverse * slopes - 1) * (box - middle))
+    if not all(b.contains_interior(x) for b, x in zip(entries(box), image, strict=True)):
+        raise Refused(reason)
+    back = slopes.inv()
+    linear = -1 * (back * by_given)
+    kept = linear.mid()
+    rest = magnitude(back * at(middle, middles)[0]) + magnitude(linear - kept) * magnitude(off)
+    return Root(entries(middle), kept, entries(rest))
+
+
+class Row(NamedTuple):
+    """What is proven at an instant."""
+
+    time: float
+    quaternion: list[float]
+    angle: float  # of the true orientation to `quaternion`, at most [rad]
+    distance: float  # of the true orientation to that of `simulate`, at most [rad]
+    values: list[tuple[float, float]]  # body rates, angles and rates of joints; their bounds
+
+
+class Follower:
+    """A proof of one motion, step by step, for all numbers in the balls of its equations."""
+
+    def __init__(self, equations: Equations, trajectory: Trajectory) -> None:
+        self._equations, self._trajectory = equations, trajectory
+        self._left = trajectory.t.tolist()
+        self.rows: list[Row] = []
+        self.signs: dict[str, list[Span]] = {name: [] for name in equations.limit_names}
+        self.until, self.reason, self.steps = 0.0, "", 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the motion is proven to its end: the duration, or a limit that stops it."""
+        return not self.reason or self.reason in self._equations.stop_names
+
+    @property
+    def largest(self) -> float:
+        """Largest angle [rad]; inf without a row."""
+        return max((row.angle for row in self.rows), default=math.inf)
+
+    def follow(self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar) -> None:
+        """Prove step by step from one break in time to the next, as far as that goes."""
+        order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
+        try:
+            here = self._equations.start()
+            for begin, end in pairwise(breaks):
+                f, jacobian = self._equations.between(begin, end)
+                limits = self._equations.limits_between(begin, end)
+                for step in Stepper(f, jacobian, here, end, tolerance, order):
+                    self._take(step, limits)
+                    bar.draw(step.end / breaks[-1])
+                    if self.reason:
+                        return
+                    if self.steps >= max_steps and step.end < breaks[-1]:
+                        raise Refused(f"{max_steps} steps are not enough")
+                here = enclosure.region_at_end(step)
+        except Refused as refused:
+            self.reason = str(refused)
+        except (ArithmeticError, ValueError):
+            self.reason = enclosure.UNBOUNDED
+
+    def _take(self, step: Advance, limits: Function) -> None:
+        """Take what a step proves, up to where the motion meets an end of the scene."""
+        self.steps, end = self.steps + 1, step.end
+        names, stops = self._equations.limit_names, self._equations.stop_names
+        for low, high, signs in _signs(step, limits, len(names)):
+            for name, sign in zip(names, signs, strict=True):
+                self.signs[name].append((low, high, sign))
+                if name in stops and sign <= 0 and low < end:
+                    self.reason, end = name, low
+        self.until = end
+        while self._left and self._left[0] <= end:
+            self.rows.append(self._row(step, self._left.pop(0)))
+
+    def _row(self, step: Advance, time: float) -> Row:
+        p, e = step.at(time)
+        size = len(self._equations.state)
+        known = [*range(len(MOTION)), *range(size, len(p))]  # of the state, without a lag
+        centre = [p[i] for i in known]
+        values = [*zip(p[4:7], e[4:7], strict=True)]
+        try:
+            joints = self._equations.joints(*centre)
+            slopes = self._equations.joints(*(arb(p[i], e[i]) for i in known))
+            by = [[arb(0)] * len(p) for _ in range(JOINT_COUNT)]
+            for place, i in enumerate(known):
+                for row in range(JOINT_COUNT):
+                    by[row][i] = arb(slopes[JOINT_COUNT * (place + 1) + row])
+            bounds = step.at(time, arb_mat(by))[1]
+            values += zip(joints[:JOINT_COUNT], bounds, strict=True)
+        except Refused:  # an angle passes pi
+            half = JOINT_COUNT // 2
+            values += [(0, arb.pi())] * half + [(0, arb("inf"))] * half
+        floats = [float(x) for x, _ in values]
+        pairs = [(x, upper(abs(ball - x) + r)) for x, (ball, r) in zip(floats, values, strict=True)]
+        length, wrong = norm(p[:4]), norm(e[:4]) / norm(p[:4])
+        quaternion = [float(x / length) for x in p[:4]]
+        other = self._trajectory.quaternion[len(self.rows)].tolist()
+        angles = [arb.pi(), arb.pi()]
+        if wrong < 1:
+            angles = [2 * wrong.asin() + _turn(p[:4], q) for q in (quaternion, other)]
+        return Row(time, quaternion, upper(angles[0]), upper(angles[1]), pairs)
+
+
+def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
+    """Return the rows that hold for all motions of some proofs, and the spans of all of them."""
+    first, until = parts[0], min(part.until for part in parts)
+    rows = []
+    for rows_at in zip(*(part.rows for part in parts), strict=False):
+        if rows_at[0].time > until:
+            break
+        centre = rows_at[0].quaternion
+        turns = [_turn([arb(x) for x in row.quaternion], centre) for row in rows_at]
+        angles = [upper(turn + row.angle) for turn, row in zip(turns, rows_at, strict=True)]
+        values = []
+        for pairs in zip(*(row.values for row in rows_at), strict=True):
+            ball = between(pairs[0][0], pairs[0][0])
+            for x, bound in pairs:
+                ball = ball.union(arb(x, bound))
+            values.append((float(ball), upper(abs(ball - float(ball)))))
+        distance = max(row.distance for row in rows_at)
+        rows.append(Row(rows_at[0].time, centre, max(angles), distance, values))
+    if len(parts) == 1:
+        rows = first.rows
+    spans = {name: sorted(x for part in parts for x in part.signs[name]) for name in first.signs}
+    return rows, spans
 
 
 class ProvenMotion(Explained):
@@ -254,118 +416,94 @@ class ProvenMotion(Explained):
         until: time to which the motion is proven to exist and to be within the bounds [s].
         reason: why it ends there; "" where that is the duration.
         limits: for each limit of the mechanism the spans of time [s] in which the motion may be on
-            it; at all other times until `until` it is proven not to be.
+            it; at all other times until `until` it is proven not to be. Contacts with elastic stops
+            and torques at their limit are among them: they begin and end in these spans.
         trajectory: what `simulate` gives.
         bound: what the angle was to be at most [rad].
         steps: number of steps of the proof.
 
     """
 
-    def __init__(self, equations: _Equations, bound: float, trajectory: Trajectory) -> None:
-        self.scene, self.bound, self._equations = equations.scene, bound, equations
-        self.until, self.reason, self.steps, self.trajectory = 0.0, "", 0, trajectory
-        self._times, self._rows = trajectory.t.tolist(), list[list[float]]()
-        self._signs: dict[str, list[Span]] = {name: [] for name in equations.limits[0]}
-        stops = limits_of(equations.scene, Geometry.of(equations.scene))
-        self._stops = {limit.reason for limit in stops}
-
-    def _follow(self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar) -> None:
-        """Prove step by step from one break in time to the next, as far as that goes."""
-        order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
-        try:
-            here = self._equations.start()
-            for begin, end in pairwise(breaks):
-                f, jacobian = self._equations.between(begin, end)
-                for step in enclosure.enclose(f, jacobian, here, end, tolerance, order):
-                    self._take(step)
-                    bar.draw(step.end / breaks[-1])
-                    if self.reason:
-                        return
-                    if self.steps >= max_steps and step.end < breaks[-1]:
-                        raise Refused(f"{max_steps} steps are not enough")
-                here = enclosure.region_at_end(step)
-        except Refused as refused:
-            self.reason = str(refused)
-        finally:
-            self._finish()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy or another process gets: all but the equations on balls."""
-        return vars(self) | {"_equations": None}
-
-    def _take(self, step: Advance) -> None:
-        """Take what a step proves, up to where the motion meets an end of the scene."""
-        self.steps, end = self.steps + 1, step.end
-        names, run = self._equations.limits
-        for low, high, signs in _signs(step, run, len(names)):
-            for name, sign in zip(names, signs, strict=True):
-                self._signs[name].append((low, high, sign))
-                if name in self._stops and sign <= 0 and low < end:
-                    self.reason, end = name, low
-        self.until = end
-        while self._times and self._times[0] <= end:
-            self._rows.append(self._row(step, self._times.pop(0)))
-
-    def _row(self, step: Advance, time: float) -> list[float]:
-        p, e = step.at(time)
-        box = [arb(x, r) for x, r in zip(p[:7], e, strict=False)]
-        joints, slopes = (self._equations.joints(*y) for y in (p[:7], box))
-        by = [[slopes[18 + 18 * j + i] for j in range(7)] + [0] * (len(p) - 7) for i in range(18)]
-        found = [*zip(p[4:7], e[4:7], strict=True)]
-        found += zip(joints, step.at(time, arb_mat(by))[1], strict=False)
-        pairs = [(float(x), upper(abs(x - float(x)) + r)) for x, r in found]
-        wrong, q = norm(e[:4]) / norm(p[:4]), [float(x / norm(p[:4])) for x in p[:4]]
-        others = q, self.trajectory.quaternion[len(self._rows)].tolist()
-        known = wrong < 1
-        angle = [2 * wrong.asin() + _turn(p[:4], q) if known else arb.pi() for q in others]
-        return [time, *q, *map(upper, angle), *(x for pair in pairs for x in pair)]
-
-    def _finish(self) -> None:
+    def __init__(self, parts: Sequence[Follower], bound: float, trajectory: Trajectory) -> None:
+        self.scene, self.bound, self.trajectory = trajectory.scene, bound, trajectory
+        shortest = min(parts, key=lambda part: part.until)
+        failed = [part for part in parts if not part.is_whole]
+        self.until, self.reason = shortest.until, (failed or [shortest])[0].reason
+        self.steps = sum(part.steps for part in parts)
+        self._is_whole = not failed
+        rows, spans = unite(parts)
         names = [*(f"body_rate_{part}" for part in "xyz")]
         names += [f"{joint}_{leg}" for joint in JOINTS for leg in (1, 2, 3)]
-        heads = ["t", *(f"quaternion_{part}" for part in "xyzw"), "angle", "distance"]
-        heads += [name + more for name in names for more in ("", "_bound")]
-        table = np.array(self._rows).reshape(-1, len(heads))
-        table.flags.writeable = False
-        self.columns: dict[str, Array] = dict(zip(heads, table.T, strict=True))
+        quaternion = np.array([row.quaternion for row in rows]).reshape(-1, 4)
+        values = np.array([row.values for row in rows]).reshape(-1, len(names), 2)
+        self.columns: dict[str, Array] = {"t": np.array([row.time for row in rows])}
+        for k, part in enumerate("xyzw"):
+            self.columns[f"quaternion_{part}"] = quaternion[:, k]
+        self.columns["angle"] = np.array([row.angle for row in rows])
+        self.columns["distance"] = np.array([row.distance for row in rows])
+        for k, name in enumerate(names):
+            self.columns[name] = values[:, k, 0]
+            self.columns[f"{name}_bound"] = values[:, k, 1]
+        for numbers in self.columns.values():
+            numbers.flags.writeable = False
         self.limits: dict[str, list[tuple[float, float]]] = {}
-        for name, known in self._signs.items():
-            groups = (list(spans) for _, spans in groupby(known, lambda span: span[2]))
-            unknown = (spans for spans in groups if spans[0][2] == 0 and spans[0][0] <= self.until)
-            self.limits[name] = [(spans[0][0], spans[-1][1]) for spans in unknown]
+        for name, known in spans.items():
+            self.limits[name] = _unknown_spans(known, self.until)
 
     @property
     def largest(self) -> float:
         """Largest angle between true orientation and that of the table [rad]; inf without one."""
-        return float(np.max(self.columns["angle"], initial=0.0 if self._rows else math.inf))
+        return float(np.max(self.columns["angle"], initial=0.0 if len(self) else math.inf))
 
     @property
     def error(self) -> float:
         """Largest distance of `simulate` from the true motion [rad]; inf without one."""
-        return float(np.max(self.columns["distance"], initial=0.0 if self._rows else math.inf))
+        return float(np.max(self.columns["distance"], initial=0.0 if len(self) else math.inf))
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.columns["t"])
 
     @property
     def success(self) -> bool:
         """Whether the motion is proven to its end, within the bound asked for."""
-        ended = not self.reason or self.reason in self._stops
-        return ended and self.largest <= self.bound
+        return self._is_whole and self.largest <= self.bound
 
     def to_pandas(self) -> Any:
         """Table of `columns`."""
         return require("pandas").DataFrame(self.columns)
 
     def _facts(self) -> dict[str, object]:
-        met = [f"{name}: {a:.12g} to {b:.12g} s" for name, x in self.limits.items() for a, b in x]
-        until = f"to {self.until:.12g} s" + f": {self.reason}" * bool(self.reason)
+        met = [
+            f"{name}: {write_down(begin, 15)} to {write_up(end, 15)} s"
+            for name, spans in self.limits.items()
+            for begin, end in spans
+        ]
+        until = f"to {write_down(self.until, 15)} s"
+        if self.reason:
+            until = f"{until}: {self.reason}"
         facts: dict[str, object] = {"scene": self.scene.name, "proven": until}
-        if self._rows:
+        if len(self):
             estimate = self.trajectory.error_estimate
-            facts["orientation"] = f"within {self.largest:.2g} rad of the table"
+            facts["orientation"] = f"within {write_up(self.largest)} rad of the table"
             facts["error of simulate"] = (
-                f"below {self.error:.2g} rad; its estimate is {estimate:.2g} rad"
+                f"not above {write_up(self.error)} rad; its estimate is {estimate:.2g} rad"
             )
             facts["limits"] = met or "no limit is reached and no singularity is passed"
         return facts | {"steps": self.steps}
+
+
+def _unknown_spans(known: Sequence[Span], until: float) -> list[tuple[float, float]]:
+    """Join the spans whose sign is not known, of those that begin by a time."""
+    joined: list[tuple[float, float]] = []
+    for begin, end, sign in known:
+        if sign != 0 or begin > until:
+            continue
+        if joined and begin <= joined[-1][1]:
+            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
+        else:
+            joined.append((begin, end))
+    return joined
 
 
 def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
@@ -395,6 +533,60 @@ def _signs(
             todo += [(0.5 * (low + high), high), (low, 0.5 * (low + high))]
 
 
+def split_ranges(ranges: Mapping[Place, Any], parts: int) -> list[dict[Place, Any]]:
+    """Split a box of ranges by halves, the one of most its first width first."""
+    boxes = [dict(ranges)]
+    while len(boxes) < parts:
+        box = boxes.pop(0)
+        widest = max(box, key=lambda place: float(box[place].rad() / ranges[place].rad()))
+        middle, quarter = box[widest].mid(), box[widest].rad() / 2
+        for centre in (middle - quarter, middle + quarter):
+            boxes.append(box | {widest: arb(centre.mid(), (quarter + centre.rad()).upper())})
+    return boxes
+
+
+class Task(NamedTuple):
+    """What is to be proven, and how hard to try."""
+
+    trajectory: Trajectory
+    profile: TorqueProfile
+    breaks: list[float]
+    bound: float
+    max_steps: int
+    progress: bool
+
+    def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
+        """Prove the motion for all numbers of ranges."""
+        equations = Equations(self.trajectory.scene, self.profile, ranges)
+        tolerance = 1e-6 * self.bound
+        for _ in range(ATTEMPTS):
+            follower = Follower(equations, self.trajectory)
+            follower.follow(self.breaks, tolerance, self.max_steps, Bar(label, self.progress))
+            if follower.largest <= self.bound or ranges or follower.largest == math.inf:
+                break
+            tolerance *= 0.1 * self.bound / follower.largest
+        return follower
+
+    def prove_part(self, ranges: Mapping[Place, Any]) -> Follower:
+        """Prove the motion for all numbers of ranges; where they are too wide, say what is not."""
+        follower = self.prove(ranges)
+        if not ranges or not follower.reason or follower.steps >= self.max_steps:
+            return follower
+        exact = {place: arb(x.mid()) for place, x in ranges.items()}
+        if follower.is_whole and self.prove(exact, "no range").until <= follower.until:
+            return follower  # a limit that ends the motion without a range, too
+        for halvings in range(1, NARROWER + 1):
+            share = 0.5**halvings
+            narrow = {place: arb(x.mid(), x.rad() * share) for place, x in ranges.items()}
+            if self.prove(narrow, "narrower").is_whole:
+                advice = f"{share:g} of their width would do, or split={2**halvings} or more"
+                break
+        else:
+            advice = f"{share:g} of their width would not do either"
+        follower.reason = f"the ranges are too wide: {advice} ({follower.reason})"
+        return follower
+
+
 @check_kinds
 def certify(
     scene: Scene | Mapping[str, Any] | str | Path,
@@ -402,26 +594,32 @@ def certify(
     duration: float | None = None,
     *,
     bound: float = 1e-9,
-    ranges: Mapping[str, float | str] | None = None,
+    ranges: Mapping[str, Any] | None = None,
+    split: int = 1,
     max_steps: int = 100_000,
     progress: bool = False,
     **options: Any,
 ) -> ProvenMotion:
     """Enclose the true motion of a scene, and bound the error of `simulate`, with proof.
 
-    Numbers are taken as exact, or as anything in a range; rounding is outward. The proof ends where
-    a term has a kink (a contact, a torque at its limit), where the motion meets an end of the
-    scene, or where no step is proven: `until` and `reason` say so.
+    A number of the scene stands for what is written and for the double that is read, or for all
+    of a range; rounding is outward. The proof passes contacts and torques at their limit. It ends
+    where the motion meets an end of the scene, or where no step is proven: `until` and `reason`
+    say so. One proof runs at a time, whatever the threads.
 
     Args:
         scene: as `simulate` takes it.
         torque: as `simulate` takes it, but for functions.
         duration: as `simulate` takes it.
         bound: angle [rad] within which the orientation is to be proven; steps are chosen for it.
-        ranges: how far numbers of the scene may be from those given, by key, as in
-            {"star.inertia.zz": 5e-4, "initial.gamma": 1e-6}; "digits" for half a unit of the last
-            digit that a number has. Keys may name bodies, loads, and initial angles and rates.
-        max_steps: number of steps after which the proof ends, some 20 ms each.
+        ranges: how far numbers of the document may be from those given, by key, as in
+            {"star.inertia.zz": 5e-4, "star.alpha_deg": (119.0, 121.0), "star.mass": "digits"}: a
+            half-width, an interval, or half a unit of the last digit that the document has. Keys
+            may name all numbers that act on the motion, those of its geometry, limits and torques
+            included; others are refused.
+        split: number of parts that the box of ranges is split into; what holds for all of them is
+            returned.
+        max_steps: number of steps after which the proof of a part ends, some 20 ms each.
         progress: draw a bar on a terminal.
         options: of `simulate`, as initial, method, tolerance, and t_eval, the times of the table.
 
@@ -433,45 +631,32 @@ def certify(
     """
     trajectory = simulate(scene, torque, duration, **options)
     given, profile, end = trajectory.scene, trajectory.law, duration or trajectory.scene.duration
-    known = profile is not None and not isinstance(profile, (FunctionTorque, LostTorque))
+    is_known = profile is not None and not isinstance(profile, (FunctionTorque, LostTorque))
     refuse_unless(
         "certify",
-        ("torque", torque, known, "must be numbers, sines, a table or polynomials"),
+        ("torque", torque, is_known, "must be numbers, sines, a table or polynomials"),
         ("bound", bound, 0.0 < bound < math.inf, "must be a number > 0 [rad]"),
         ("max_steps", max_steps, max_steps > 0, "must be > 0"),
+        (
+            "split",
+            split,
+            1 <= split <= MOST_PARTS,
+            f"must be a whole number from 1 to {MOST_PARTS}",
+        ),
+        ("split", split, split == 1 or bool(ranges), "splits ranges: give some"),
     )
     assert profile is not None and end is not None
-    end, kinks, tolerance = round(end * NANOSECONDS) / NANOSECONDS, profile.kinks(), 1e-6 * bound
+    end, kinks = round(end * NANOSECONDS) / NANOSECONDS, profile.kinks()
     breaks = [0.0, *np.unique(kinks[(kinks > 0.0) & (kinks < end)]).tolist(), end]
-    places = _places(given, ranges or {})
-    with enclosure.precision():
-        equations = _Equations(given, profile, places)
-        for _ in range(ATTEMPTS):
-            found = ProvenMotion(equations, bound, trajectory)
-            found._follow(breaks, tolerance, max_steps, Bar("certify", progress))
-            if found.largest <= bound or places or found.largest == math.inf:
-                break
-            tolerance *= 0.1 * bound / found.largest
-        return found
-
-
-def _places(scene: Scene, ranges: Mapping[str, float | str]) -> dict[Place, float]:
-    """Return the half width of each number that is a range."""
-    places, numbers = dict[Place, float](), leaves(scene)
-    for key, width in ranges.items():
-        try:
-            named = [place for place, _, _ in find_fields(scene, key, components=True)]
-        except ValueError as error:
-            raise refusal("certify", "ranges", key, str(error)) from None
-        below = [p for p in numbers if any(p[: len(place)] == place for place in named)]
-        known = all(p[0] in _PHYSICAL or p[1:2] in (("gamma",), ("gamma_dot",)) for p in below)
-        good = width == "digits" or (isinstance(width, (int, float)) and 0.0 <= width < math.inf)
-        refuse_unless(
-            "certify",
-            ("ranges", key, bool(below) and known, "must name bodies, loads or the start"),
-            (f"ranges[{key}]", width, good, "must be a number >= 0, or 'digits'"),
+    with precision():
+        balls = range_balls(
+            WrittenDocument.of(given),
+            ranges or {},
+            own_torque=profile == given.torque,
+            origin="certify",
         )
-        for place in below:
-            last = Decimal(repr(numbers[place])).as_tuple().exponent
-            places[place] = 0.5 * 10.0 ** int(last) if width == "digits" else float(width)
-    return places
+        task = Task(trajectory, profile, breaks, bound, max_steps, progress)
+        wide = {place: x for place, x in balls.items() if x.rad() > 0}
+        boxes = split_ranges(wide, split) if wide else [{}]
+        parts = [task.prove_part({**balls, **box}) for box in boxes]
+        return ProvenMotion(parts, bound, trajectory)

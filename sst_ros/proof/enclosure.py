@@ -25,22 +25,34 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from sst_ros.errors import require
 from sst_ros.programs.expression import FUNCTIONS, Program
-
-_flint = require("flint")
-arb, arb_mat, arb_poly, arb_series, ctx = (
-    getattr(_flint, name) for name in ("arb", "arb_mat", "arb_poly", "arb_series", "ctx")
+from sst_ros.proof.balls import (
+    arb,
+    arb_mat,
+    arb_poly,
+    arb_series,
+    between,
+    column,
+    entries,
+    magnitude,
 )
+
 Function = Callable[..., Sequence[Any]]
 
-PRECISION, LONGEST = 128, 100  # bits; coefficients of a series
 J_ORDER, V_ORDER = 8, 16  # of the Jacobian and of V
+KINK_V_ORDER = 4  # of V in a step across a kink
 AHEAD = 4  # coefficients of the Jacobian that p is found by
 SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogonal
 GROWTH = 0.05  # of a set by the remainder of V, largest in a step
+CUT = "an angle may pass pi, where that of the model jumps"
 UNBOUNDED = "a number is not bounded: a singularity may be near"
 LEAST = 1e-9  # of a step, relative to the whole time: the proof ends
+TIGHT = 1.1  # room of a tube around what a step was proven to reach
+LOSS = 1e-4  # of a set in a step, relative to it: more is tried to be avoided by shorter steps
+KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
+KINK_STEPS = 400  # steps across one kink before the proof ends
+KINK_LOSS = 0.02  # of a set in a step across a kink, below which the next is twice as long
+HALVINGS = 30  # of the time in which a kink is looked for
 
 
 class Refused(ArithmeticError):
@@ -51,46 +63,8 @@ class Refused(ArithmeticError):
         self.shorter, self.wider = shorter, wider
 
 
-@contextlib.contextmanager
-def precision() -> Iterator[None]:
-    """Compute with PRECISION bits, and long series."""
-    before, ctx.prec, ctx.cap = (ctx.prec, ctx.cap), PRECISION, LONGEST
-    try:
-        yield
-    finally:
-        ctx.prec, ctx.cap = before
-
-
-def upper(x: Any) -> float:
-    """Return a float that is not less than a ball."""
-    value = arb(x).upper()
-    found = float(value)
-    return found if value <= found else math.nextafter(found, math.inf)
-
-
-def between(low: Any, high: Any) -> Any:
-    """Return a ball of all numbers between two."""
-    return arb(low).union(arb(high))
-
-
-def norm(numbers: Sequence[Any]) -> Any:
-    """Return the root of the sum of squares."""
-    return sum((x * x for x in numbers), arb(0)).sqrt()
-
-
-def column(numbers: Sequence[Any]) -> Any:
-    """Return a matrix of one column."""
-    return arb_mat([[x] for x in numbers])
-
-
-def magnitude(matrix: Any) -> Any:
-    """Return upper bounds of the absolute values of the entries, as exact numbers."""
-    return arb_mat([[x.abs_upper() for x in row] for row in matrix.tolist()])
-
-
-def entries(matrix: Any) -> list[Any]:
-    """Return the numbers of a matrix, row by row."""
-    return [x for row in matrix.tolist() for x in row]
+class KinkMet(Refused):
+    """A function has a kink, or may have one, in what is looked at."""
 
 
 def _middles(matrix: Any) -> np.ndarray[Any, Any]:
@@ -109,7 +83,10 @@ def _tanh(x: Any) -> Any:
 
 
 def _atan2(y: Any, x: Any) -> Any:
-    angle = arb.atan2(arb(_first(y)), arb(_first(x)))
+    sine, cosine = arb(_first(y)), arb(_first(x))
+    if sine.contains(0) and not cosine > 0:
+        raise Refused(CUT)
+    angle = arb.atan2(sine, cosine)
     if not isinstance(y, arb_series) and not isinstance(x, arb_series):
         return angle
     y, x = arb_series(y), arb_series(x)
@@ -130,22 +107,90 @@ class _Kink:
     __rmul__ = __mul__
 
     def refuse(self, *_: object) -> NoReturn:
-        raise Refused("a kink: a contact begins or ends, or a torque meets its limit")
+        raise KinkMet("a kink: a contact begins or ends, or a torque meets its limit")
 
     __add__ = __radd__ = __sub__ = __rsub__ = __neg__ = refuse
     __truediv__ = __rtruediv__ = __arb__ = refuse
 
 
+class _KinkWatch:
+    """What decides on which side of a kink a number is in a span of time.
+
+    Its value anywhere in the span is that in the middle and its derivative times the time from
+    there (the mean value theorem), which is narrower than its value in interval arithmetic. So the
+    values in the middle are noted in the order in which a program computes them, then read again.
+    """
+
+    def __init__(self) -> None:
+        self._middles: list[Any] = []
+        self._reach: Any = None  # largest time from the middle, where the values are read
+        self._next = 0
+
+    @contextlib.contextmanager
+    def within(self, reach: Any = None) -> Iterator[None]:
+        """Note the values in the middle of a span, or use them for times within a reach."""
+        global _watch
+        before, _watch = _watch, self
+        self._reach, self._next = reach, 0
+        if reach is None:
+            self._middles.clear()
+        try:
+            yield
+        finally:
+            _watch = before
+
+    def narrow(self, x: Any) -> Any:
+        """Return the value of a number, narrower where its middle is known."""
+        value = _first(x)
+        if self._reach is None:
+            self._middles.append(value)
+            return value
+        middle = self._middles[self._next] if self._next < len(self._middles) else value
+        self._next += 1
+        if isinstance(value, _Kink) or isinstance(middle, _Kink) or not isinstance(x, arb_series):
+            return value
+        if x.prec < 2 or isinstance(slope := x[1], _Kink):
+            return value
+        moved = middle + slope * between(-self._reach, self._reach)
+        return moved if moved.rad() < value.rad() else value
+
+
+_watch: _KinkWatch | None = None
+
+
+def _side(x: Any) -> int | None:
+    """Return 1 where x > 0, 0 where x < 0, None where neither is known."""
+    value = _first(x) if _watch is None else _watch.narrow(x)
+    if isinstance(value, _Kink) or not (value > 0 or value < 0):
+        return None
+    return int(bool(value > 0))
+
+
+def _is_constant(x: Any) -> bool:
+    """Whether a number does not change in time: no series has another coefficient.
+
+    About the middle of a span these coefficients prove nothing of its ends; but whatever is
+    enclosed is also expanded about all of the span, where they do.
+    """
+    if not isinstance(x, arb_series):
+        return not isinstance(x, _Kink)
+    return x.prec > 1 and all(coefficient == 0 for coefficient in x.coeffs()[1:])
+
+
 def _step(x: Any) -> Any:
-    value = _first(x)
-    known = not isinstance(value, _Kink) and (value > 0 or value < 0)
-    return int(bool(value > 0)) if known else _Kink()
+    """Return the slope of max(x, 0); on both sides of the kink it is any number from 0 to 1."""
+    side = _side(x)
+    if side is None:
+        return between(0, 1) if _is_constant(x) else _Kink()
+    return side
 
 
 def cut(x: Any, _zero: float = 0.0) -> Any:
-    """Return x where x > 0 and 0 elsewhere, or what may be both."""
-    side = _step(x)
-    return side if isinstance(side, _Kink) else x * side
+    """Return x where x > 0 and 0 elsewhere; of a number on both sides, all that may be."""
+    side = _side(x)
+    if side is not None:
+        return x * side
+    return arb(_first(x)).max(arb(0)) if _is_constant(x) else _Kink()
 
 
 _ON_BALLS: dict[str, Callable[..., Any]] = {name: methodcaller(name) for name in FUNCTIONS}
@@ -173,10 +218,15 @@ def _series(polynomial: Any, size: int) -> Any:
 
 
 def _coefficients(x: Any, size: int) -> list[Any]:
+    """Return the coefficients of a series below `size`, which are known."""
     if isinstance(x, _Kink):
         x.refuse()
-    found = x.coeffs() if isinstance(x, arb_series) else [arb(x)]
-    return [*found, *[arb(0)] * size][:size]
+    if not isinstance(x, arb_series):
+        return [arb(x), *[arb(0)] * (size - 1)]
+    if x.prec < size:
+        raise Refused("a series is shorter than asked: another thread uses python-flint")
+    known = x.coeffs()
+    return [*known, *[arb(0)] * size][:size]
 
 
 # Sets, and what a step proves.
@@ -191,6 +241,12 @@ class Region(NamedTuple):
     a: Any
     axes: Any  # B
     b: Any
+    fixed: int = 0  # how many of the last numbers never change
+
+    @property
+    def moving(self) -> int:
+        """How many of the first numbers change."""
+        return len(self.centre) - self.fixed
 
     @classmethod
     def box(cls, time: float, balls: Sequence[Any]) -> Region:
@@ -198,6 +254,24 @@ class Region(NamedTuple):
         n = len(balls)
         one, zero = arb_mat(n, n, [0] * (n * n)) + 1, column([0] * n)
         return cls(time, [x.mid() for x in balls], one, column([x.rad() for x in balls]), one, zero)
+
+    @classmethod
+    def linear(
+        cls,
+        time: float,
+        centre: Sequence[Any],
+        c: Any,
+        a: Sequence[Any],
+        rest: Sequence[Any],
+        fixed: int,
+    ) -> Region:
+        """Return the region of all centre + C a +- rest, whose numbers are balls."""
+        n, exact = len(centre), c.mid()
+        one = arb_mat(n, n, [0] * (n * n)) + 1
+        widths = column([arb(x).upper() for x in a])
+        more = column([x.rad() for x in centre]) + column([arb(x).abs_upper() for x in rest])
+        b = magnitude(magnitude(c - exact) * widths + more)
+        return cls(time, [x.mid() for x in centre], exact, widths, one, b, fixed)
 
     def spread(self, by: Any = 1) -> Any:
         """Bound each number of by e."""
@@ -210,7 +284,7 @@ class Advance(NamedTuple):
     begin: Region
     end: float
     p: list[Any]  # polynomials
-    tube: list[Any]  # balls of e in the whole step
+    tube: list[Any]  # balls of e in the whole step, once proven those that it reaches
     defect: float = 0.0  # largest integral of |d_i|, not rounded outward
     v: Sequence[Any] = ()  # coefficients of V
     w: Any = None
@@ -243,6 +317,11 @@ class Advance(NamedTuple):
         found = function(time, *(_series(row, size) for row in rows))
         return [_coefficients(x, size) for x in found]
 
+    def values(self, function: Function, where: Any, tube: Sequence[Any]) -> list[Any]:
+        """Enclose the values of a function of t and y = p + e at s in `where`, e in `tube`."""
+        state = (p(where) + e for p, e in zip(self.p, tube, strict=True))
+        return [arb(x) for x in function(arb(self.begin.time) + where, *state)]
+
     def enclose(
         self,
         function: Function,
@@ -257,10 +336,17 @@ class Advance(NamedTuple):
         the begin of the step [s], and is all of it by default.
         """
         begin, end = span or (arb(0), self.length)
+        if order == 0:
+            return [[x] for x in self.values(function, between(begin, end), tube)]
         part = (end - begin) / parts
-        found = self.expand(function, (begin + end) / 2, order, tube)
-        spans = [between(begin + k * part, begin + (k + 1) * part) for k in range(parts)]
-        last = [self.expand(function, one, order + 1, tube) for one in spans]
+        watch, reach = _KinkWatch(), ((end - begin) / 2).abs_upper()
+        with watch.within():
+            found = self.expand(function, (begin + end) / 2, order, tube)
+        last = []
+        for k in range(parts):
+            with watch.within(reach):
+                where = between(begin + k * part, begin + (k + 1) * part)
+                last.append(self.expand(function, where, order + 1, tube))
         return [
             [*row, reduce(arb.union, (one[i][order] for one in last))]
             for i, row in enumerate(found)
@@ -308,59 +394,127 @@ def _matrices(flat: Sequence[Sequence[Any]], n: int) -> list[Any]:
 
 
 def bound_defect(f: Function, step: Advance, order: int) -> list[list[Any]]:
-    """Return bounds of coefficients of the defect about the middle; `order` is that of p."""
-    found = step.enclose(f, order, [arb(0)] * len(step.p), parts=2)
-    slopes = [p.derivative()(arb_poly([step.half, 1])) for p in step.p]
-    d = [
-        [(x - slope[k]).abs_upper() for k, x in enumerate(row)]
-        for row, slope in zip(found, slopes, strict=True)
-    ]
+    """Return bounds of coefficients of the defect about the middle.
+
+    `order` is that of p, or 0 for a bound of all of it, which holds across kinks.
+    """
+    values = step.enclose(f, order, [arb(0)] * len(step.p), parts=2)
+    about_middle = arb_poly([step.half, 1])
+    d = []
+    for p, row in zip(step.p, values, strict=True):
+        slope = p.derivative()
+        slopes = slope(about_middle) if order else [slope(between(0, step.length))]
+        d.append([(x - slopes[k]).abs_upper() for k, x in enumerate(row)])
     if not all(x.is_finite() for row in d for x in row):  # max() of Python would skip a nan
         raise Refused(UNBOUNDED)
     return d
 
 
-def prove(f: Function, jacobian: Function, step: Advance, order: int, tolerance: float) -> Advance:
-    """Prove a step with e in its tube, or raise Refused; `order` is that of p."""
-    n, h, half = len(step.p), step.length, step.half
-    s, u = between(0, h), between(-half, half)  # from the begin, from the middle
-    d = bound_defect(f, step, order)
-    step = step._replace(defect=max(2 * float(arb_poly(row).integral()(half)) for row in d))
-    if not (excess := step.defect / tolerance) <= 1.0:
-        shorter = 0.9 * excess ** (-1.0 / order) if excess < math.inf else 0.5
-        raise Refused("the defect is too large", max(shorter, 0.2))
-    j = _matrices(step.enclose(jacobian, J_ORDER, step.tube)[n:], n)
-    middles, v = shift([_middles(x) for x in j], -float(half)), [np.eye(n)]
-    for k in range(V_ORDER):
-        some = range(min(k, J_ORDER) + 1)
-        v.append(np.sum([middles[i] @ v[k - i] for i in some], axis=0) / (k + 1))
-    step = step._replace(v=[arb_mat(matrix.tolist()) for matrix in v])
-    about, zero = shift(step.v, half), arb_mat(n, n, [0] * (n * n))
-    rest = zero  # J V - V' in the whole step
-    for k in reversed(range(J_ORDER + V_ORDER + 1)):
-        some = range(max(0, k - V_ORDER), min(k, J_ORDER) + 1)
-        term = sum((j[i] * about[k - i] for i in some), zero)
-        rest = rest * u + (term - about[k + 1] * (k + 1) if k < V_ORDER else term)
+def prove(
+    f: Function,
+    jacobian: Function,
+    step: Advance,
+    order: int,
+    tolerance: float,
+    *,
+    across_kink: bool = False,
+) -> Advance:
+    """Prove a step with e in its tube, or raise Refused; `order` is that of p.
+
+    Across a kink no derivative by time exists: f and J are enclosed by their values alone, with
+    each slope between those of both sides (the mean value theorem of Lipschitz functions).
+    """
+    n = len(step.p)
+    j_order, v_order = (0, KINK_V_ORDER) if across_kink else (J_ORDER, V_ORDER)
+    defect_order = 0 if across_kink else order
+    d = bound_defect(f, step, defect_order)
+    step = _measure_defect(step, d, order, math.inf if across_kink else tolerance)
+    j = _matrices(step.enclose(jacobian, j_order, step.tube)[n:], n)
+    step = step._replace(v=_fundamental(j, step.half, v_order))
+    rest = _remainder(j, step)
+    whole = _values_of(j, step.half)
+    weights = _weights(whole)
     source = entries(step.begin.spread(rest))
-    whole = reduce(lambda found, matrix: found * u + matrix, reversed(j))
-    size, weights = magnitude(whole), _weights(whole)
+    size = magnitude(whole)
     growth, largest = arb(0), arb(0)  # logarithmic norm of J; norm of (J V - V') e(0)
     for i in range(n):
         others = sum((size[i, k] * weights[k] for k in range(n) if k != i), arb(0))
         growth = growth.max((whole[i, i] + others / weights[i]).upper())
         largest = largest.max((source[i] / weights[i]).upper())
-    most = largest * h  # integral of the norm of both, which is no less than the norm of it
-    for k in range(order + 1):
+    most = largest * step.length  # integral of the norm of both: not less than its norm
+    for k in range(defect_order + 1):
         sizes = [(row[k] / x).upper() for row, x in zip(d, weights, strict=True)]
-        most += 2 * max(sizes) * half ** (k + 1) / (k + 1)
-    w = [((growth * h).exp() * most * x).upper() for x in weights]
+        largest_size = reduce(arb.max, sizes)
+        most += 2 * largest_size * step.half ** (k + 1) / (k + 1)
+    bound = (growth * step.length).exp() * most
+    w = [(bound * x).upper() for x in weights]
+    w[step.begin.moving :] = [arb(0)] * step.begin.fixed
     step = step._replace(w=column(w), weights=weights)
+    return _check_tube(step, tolerance)
+
+
+def _measure_defect(
+    step: Advance, d: Sequence[Sequence[Any]], order: int, tolerance: float
+) -> Advance:
+    """Note the integral of the last term of the defect; Refused: it is too large.
+
+    The terms below it are what the balls of numbers bring, which shorter steps do not lessen.
+    """
+    size = len(d[0])
+    last = max(float(row[-1] * step.length**size / size) for row in d)
+    step = step._replace(defect=last)
+    if not last <= tolerance:
+        excess = last / tolerance
+        shorter = 0.9 * excess ** (-1.0 / order) if excess < math.inf else 0.5
+        raise Refused("the defect is too large", max(shorter, 0.2))
+    return step
+
+
+def _fundamental(j: Sequence[Any], half: Any, order: int) -> list[Any]:
+    """Return the coefficients of V, nearly a fundamental matrix of J about the middle."""
+    middles = shift([_middles(x) for x in j], -float(half))
+    v = [np.eye(len(middles[0]))]
+    for k in range(order):
+        terms = [middles[i] @ v[k - i] for i in range(min(k, len(j) - 1) + 1)]
+        v.append(np.sum(terms, axis=0) / (k + 1))
+    return [arb_mat(matrix.tolist()) for matrix in v]
+
+
+def _remainder(j: Sequence[Any], step: Advance) -> Any:
+    """Enclose J V - V' in the whole step."""
+    n, u = len(step.p), between(-step.half, step.half)
+    zero = arb_mat(n, n, [0] * (n * n))
+    about, degree = shift(step.v, step.half), len(step.v) - 1
+    rest = zero
+    for k in reversed(range(len(j) + degree)):
+        some = range(max(0, k - degree), min(k, len(j) - 1) + 1)
+        term = sum((j[i] * about[k - i] for i in some), zero)
+        if k < degree:
+            term = term - about[k + 1] * (k + 1)
+        rest = rest * u + term
+    return rest
+
+
+def _values_of(j: Sequence[Any], half: Any) -> Any:
+    """Enclose the values of a polynomial matrix in the whole step."""
+    u = between(-half, half)
+    return reduce(lambda found, matrix: found * u + matrix, reversed(j))
+
+
+def _check_tube(step: Advance, tolerance: float) -> Advance:
+    """Return a step with the tube that is reached; Refused: the error may leave its tube."""
+    s = between(0, step.length)
     reached = entries(step.begin.spread(step.flow(s)) + step.w)
-    if all(x.is_finite() and x < e.rad() for x, e in zip(reached, step.tube, strict=True)):
-        return step
-    widest, grows = max(map(float, entries(step.begin.spread()))), max(map(float, w))
-    slow = grows < 10.0 * tolerance + GROWTH * widest
-    wider = [arb(0, (2 * x).upper()) for x in reached] if slow else None
+    pairs = list(zip(reached, step.tube, strict=True))[: step.begin.moving]
+    if all(x.is_finite() and x < e.rad() for x, e in pairs):
+        return step._replace(tube=[arb(0, x.upper()) for x in reached])
+    widest = max(map(float, entries(step.begin.spread())))
+    grows = max(map(float, entries(step.w)))
+    is_slow = grows < 10.0 * tolerance + GROWTH * widest
+    wider = None
+    if is_slow:
+        moving = [2 * x for x in reached[: step.begin.moving]]
+        wider = [arb(0, x.upper()) for x in moving] + step.tube[step.begin.moving :]
     raise Refused("the error may leave the tube: it grows too fast", 0.6, wider)
 
 
@@ -381,63 +535,235 @@ def region_at_end(step: Advance) -> Region:
     flow, reached = step.flow(h), [p(h) for p in step.p]
     moved, c = flow * here.axes, flow * here.c
     error = magnitude(c - c.mid()) * here.a + step.w + column([x.rad() for x in reached])
-    scale = np.array([[float(x)] for x in step.weights])
-    guide = _middles(moved) / scale
-    guide /= np.linalg.norm(guide, axis=0)
-    if not np.linalg.cond(guide) < SKEW:
-        guide = _middles(moved) / scale * np.array([list(map(float, entries(here.b)))])
-        guide = np.linalg.qr(guide[:, np.argsort(-np.linalg.norm(guide, axis=0))])[0]
-    axes = arb_mat((scale * guide).tolist())
+    axes = fit_axes(moved, here.b, [float(x) for x in step.weights])
     back = axes.inv()
     b = magnitude(magnitude(back * moved) * here.b + magnitude(back) * error)
-    return Region(step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b)
+    return Region(step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b, here.fixed)
 
 
-def _tube(here: Region, room: int, tolerance: float) -> list[Any]:
-    return [arb(0, (room * (x + tolerance)).upper()) for x in entries(here.spread())]
+def _loss(step: Advance) -> float:
+    """Return how much of the set at the end of a step is new, in the norm of the step."""
+    sizes = [entries(x) for x in (step.w, step.begin.spread(step.flow(step.length)))]
+    new, known = (
+        max(float(x / weight) for x, weight in zip(row, step.weights, strict=True)) for row in sizes
+    )
+    return new / known if known else 0.0
 
 
-def enclose(
-    f: Function, jacobian: Function, here: Region, end: float, tolerance: float, order: int
-) -> Iterator[Advance]:
-    """Yield proven steps from a region to a time [s]; Refused says why one cannot be proven.
+def fit_axes(moved: Any, b: Any, scale: Sequence[float]) -> Any:
+    """Return axes for a set moved b: its own, or orthogonal ones where these are skew."""
+    scales = np.array(scale)[:, None]
+    guide = _middles(moved) / scales
+    lengths = np.linalg.norm(guide, axis=0)
+    is_skew = not np.all(lengths > 0.0)
+    if not is_skew:
+        is_skew = not np.linalg.cond(guide / lengths) < SKEW
+    if is_skew:
+        weighted = guide * np.array([list(map(float, entries(b)))])
+        order = np.argsort(-np.linalg.norm(weighted, axis=0))
+        guide = np.linalg.qr(weighted[:, order])[0]
+    else:
+        guide = guide / lengths
+    return arb_mat((scales * guide).tolist())
+
+
+def _tube(here: Region, room: float, tolerance: float) -> list[Any]:
+    """Return a tube with some room around a region; what never changes needs none."""
+    spread = entries(here.spread())
+    moving = [room * (x + tolerance) for x in spread[: here.moving]]
+    return [arb(0, x.upper()) for x in (*moving, *spread[here.moving :])]
+
+
+class Stepper:
+    """Proven steps from a region to a time [s]; Refused says why one cannot be proven.
 
     Args:
         f: derivative of the time and each number of the state, as series.
         jacobian: f, then its derivatives by each number of the state.
         here: where the solution begins.
         end: time [s].
-        tolerance: what the defect may add to an error in a step; `order` is that of p.
+        tolerance: what the defect may add to an error in a step.
         order: degree of p.
 
     """
-    factor, usual, most, room = 0.4, end - here.time, math.inf, 3
-    least = LEAST * usual
-    while here.time < end:
-        p = approximate(f, jacobian, here, order)
-        sizes = [(k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)]
-        longest = min([(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=usual)
-        h, tries = min(factor * longest, 2.0 * usual, most), 0
-        tube = _tube(here, room, tolerance)
-        while True:
-            target = end if here.time + 1.01 * h > end else here.time + h
+
+    def __init__(
+        self,
+        f: Function,
+        jacobian: Function,
+        here: Region,
+        end: float,
+        tolerance: float,
+        order: int,
+    ) -> None:
+        self._f, self._jacobian, self._here, self._end = f, jacobian, here, end
+        self._tolerance, self._order = tolerance, order
+        self._span = end - here.time
+        self._room, self._factor = 3, 0.4  # of a tube; of a step by its longest
+        self._usual, self._most = self._span, math.inf  # steps: the last, the longest next
+        self._cruise = self._span  # last step before a kink was near
+        self.kinks: list[tuple[float, float]] = []  # spans of time across kinks [s]
+
+    def __iter__(self) -> Iterator[Advance]:
+        """Yield the steps."""
+        while self._here.time < self._end:
             try:
-                step = Advance(here, target, list(map(arb_poly, p)), tube)
-                step = prove(f, jacobian, step, order, tolerance)
+                step = self._smooth_step()
+            except KinkMet as kink:
+                yield from self._cross_kink(kink)
+                continue
+            yield step
+            self._here = region_at_end(step)
+
+    def _smooth_step(self) -> Advance:
+        """Prove a step of Taylor series; KinkMet where one lies ahead within KINK_STEP."""
+        here, tolerance, order = self._here, self._tolerance, self._order
+        p = approximate(self._f, self._jacobian, here, order)
+        sizes = [(k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)]
+        longest = min([(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=self._usual)
+        wanted, tries = self._factor * longest, 0
+        h = min(wanted, 4.0 * self._usual, self._most)
+        is_free = h == wanted or self._most < math.inf  # no kink has made it short
+        tube = _tube(here, self._room, tolerance)
+        while True:
+            target = self._end if here.time + 1.01 * h > self._end else here.time + h
+            step = Advance(here, target, list(map(arb_poly, p)), tube)
+            try:
+                step = prove(self._f, self._jacobian, step, order, tolerance)
+                less_lossy = self._less_lossy(step)
+                is_free = is_free and less_lossy.end == step.end
+                step = less_lossy
                 break
+            except KinkMet as kink:
+                tube, self._room = _tube(here, 3, tolerance), 3
+                h, is_free = self._clear_length(step._replace(tube=tube)), False
+                if h < KINK_STEP * self._span or here.time + h == here.time:
+                    raise kink from None
             except (ArithmeticError, ValueError) as error:
                 why = error if isinstance(error, Refused) else Refused(UNBOUNDED)
                 if why.wider is not None and tries < 4:
-                    tube, tries, room = why.wider, tries + 1, min(2 * room, 100)
+                    tube, tries = why.wider, tries + 1
+                    self._room = min(2 * self._room, 100)
                     continue
-                h, tries, most, room = why.shorter * (target - here.time), 0, 0.0, 3
-                tube = _tube(here, room, tolerance)
-                if h < least or here.time + h == here.time:
+                h, tries, self._most, self._room = why.shorter * (target - here.time), 0, 0.0, 3
+                tube = _tube(here, self._room, tolerance)
+                if h < LEAST * self._span or here.time + h == here.time:
                     raise why from None
-        yield step
-        taken = target - here.time
-        if target < end:
-            usual, most = max(taken, 0.1 * usual), 1.1 * taken if most < math.inf else most
-            ratio = (0.5 * tolerance / step.defect) ** (1.0 / order) if step.defect else 1.3
-            factor = taken / longest * min(max(ratio, 0.7), 1.3)
-        here = region_at_end(step)
+        self._plan(step.end - here.time, longest, step.defect, is_free=is_free)
+        return step
+
+    def _less_lossy(self, step: Advance) -> Advance:
+        """Return a step, or a shorter one if it widens the set by much less.
+
+        In a stiff contact the Jacobian turns within a step, and its series is what widens.
+        """
+        loss = _loss(step)
+        if loss > LOSS + 10.0 * self._tolerance:
+            moving = [TIGHT * x for x in step.tube[: step.begin.moving]]
+            tight = step._replace(tube=[*moving, *step.tube[step.begin.moving :]])
+            try:
+                step = prove(self._f, self._jacobian, tight, self._order, self._tolerance)
+                loss = _loss(step)
+            except (ArithmeticError, ValueError):
+                pass
+        while loss > LOSS + 10.0 * self._tolerance:
+            h = 0.6 * (step.end - step.begin.time)
+            tube = _tube(step.begin, 3, self._tolerance)
+            shorter = step._replace(end=step.begin.time + h, tube=tube)
+            try:
+                shorter = prove(self._f, self._jacobian, shorter, self._order, self._tolerance)
+            except (ArithmeticError, ValueError):
+                return step
+            before, loss = loss, _loss(shorter)
+            if loss > 0.2 * before:
+                return step
+            step = shorter
+        return step
+
+    def _plan(self, taken: float, longest: float, defect: float, *, is_free: bool) -> None:
+        """Choose what the next step is made from."""
+        if self._here.time + taken >= self._end:
+            return
+        self._usual = max(taken, 0.1 * self._usual)
+        if self._most < math.inf:
+            self._most = 1.1 * taken
+        if not is_free:
+            return
+        self._cruise = self._usual
+        ratio = (0.5 * self._tolerance / defect) ** (1.0 / self._order) if defect else 1.3
+        self._factor = taken / longest * min(max(ratio, 0.7), 1.3)
+
+    def _clear_length(self, step: Advance) -> float:
+        """Return how long no kink is near, nearly, by halving a step that has one."""
+        low, high = 0.0, step.end - step.begin.time
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            try:
+                step.enclose(self._f, 2, step.tube, (arb(0), arb(middle)))
+                low = middle
+            except KinkMet:
+                high = middle
+            except (ArithmeticError, ValueError):
+                high = middle
+            if low > 0.9 * high:
+                break
+        return 0.95 * low
+
+    def _cross_kink(self, kink: KinkMet) -> Iterator[Advance]:
+        """Yield steps across a kink, each twice as long, until a step of series is proven."""
+        begin, h = self._here.time, KINK_STEP * self._span
+        factor, cruise = self._factor, self._cruise
+        for _ in range(KINK_STEPS):
+            step = self._kink_step(h, kink)
+            yield step
+            self._here = region_at_end(step)
+            taken = step.end - step.begin.time
+            h = taken * (2.0 if _loss(step) < KINK_LOSS else 0.7)
+            if step.end >= self._end:
+                break
+            self._usual, self._most = taken, math.inf
+            try:
+                ahead = self._smooth_step()
+            except KinkMet:
+                continue
+            yield ahead
+            self._here = region_at_end(ahead)
+            break
+        else:
+            raise Refused(f"{kink}, for longer than {KINK_STEPS} steps")
+        self.kinks.append((begin, step.end))
+        self._usual, self._cruise, self._factor = cruise, cruise, factor
+
+    def _kink_step(self, longest: float, kink: KinkMet) -> Advance:
+        """Prove a step across a kink by a straight line p."""
+        here, h = self._here, longest
+        for _ in range(HALVINGS):
+            target = min(self._end, here.time + h)
+            if target == here.time:
+                break
+            half = (arb(target) - arb(here.time)) / 2
+            time, first = arb(here.time), self._f(arb(here.time), *here.centre)
+            middle = [
+                x + half * arb(slope).mid() for x, slope in zip(here.centre, first, strict=True)
+            ]
+            slopes = self._f(time + half, *middle)
+            p = [arb_poly([x, arb(s).mid()]) for x, s in zip(here.centre, slopes, strict=True)]
+            line = Advance(here, target, p, _tube(here, 3, self._tolerance))
+            for _ in range(4):
+                try:
+                    return prove(
+                        self._f, self._jacobian, line, 1, self._tolerance, across_kink=True
+                    )
+                except Refused as why:
+                    if why.wider is None:
+                        break
+                    line = line._replace(tube=why.wider)
+            h *= 0.25
+        raise kink
+
+
+def enclose(
+    f: Function, jacobian: Function, here: Region, end: float, tolerance: float, order: int
+) -> Iterator[Advance]:
+    """Yield the steps of a `Stepper`."""
+    yield from Stepper(f, jacobian, here, end, tolerance, order)

@@ -444,7 +444,7 @@ class Recording(Explained, ReadOnly):
     @cached_property
     def exact_gamma(self) -> Array:
         """Angles of the actuators in the recorded orientations [rad], (n, 3); nan where lost."""
-        return self._shown_joints[:, :3]
+        return freeze(self._shown_joints[:, :3])
 
     @cached_property
     def measured_error(self) -> Array:
@@ -455,7 +455,7 @@ class Recording(Explained, ReadOnly):
         truth = self.exact_gamma if self._truth is None else self._truth.gamma
         at = places(self.time_ns, self.measured.time_ns)
         turns = np.exp(1j * (self.measured.gamma - truth[at]))
-        return np.where((at >= 0)[:, None], np.abs(np.angle(turns)), np.nan)
+        return freeze(np.where((at >= 0)[:, None], np.abs(np.angle(turns)), np.nan))
 
     @property
     def period_ns(self) -> int:

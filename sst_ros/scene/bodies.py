@@ -71,6 +71,7 @@ class Base(Section):
     """
 
     ONE_OF = "v", "arcs_deg"
+    CONVERTED = ("v",)
 
     v: tuple[Vector3, Vector3, Vector3] = entry(
         "directions of P1, P2, P3 seen from O, right-handed, of any length", "1", default=None
@@ -119,6 +120,8 @@ def _directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3
 class Link(Section):
     """One rigid link of a leg; without `inertia` it has none, without `mass` no weight."""
 
+    CONVERTED = "inertia", "mass", "centre"
+
     inertia: Inertia | None = entry("inertia of the link in its own frame")
     mass: float = coefficient("mass, for gravity", "kg")
     centre: Vector3 = entry(
@@ -137,12 +140,16 @@ class Link(Section):
             if self.mass == 0.0 or self.inertia is None:
                 yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
                 return
-            shifted = _inertia_of(_shift(self.inertia, self.mass, self.centre))
+            shifted = _inertia_of(shift_inertia(self.inertia, self.mass, self.centre))
             vars(self).update(inertia=shifted, inertia_about=ABOUT_O)
 
     def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
-        mass, (x, y, z), own = self.mass, self.centre, _shift(self.inertia, -self.mass, self.centre)
+        mass, (x, y, z), own = (
+            self.mass,
+            self.centre,
+            shift_inertia(self.inertia, -self.mass, self.centre),
+        )
         scale = mass * (x * x + y * y + z * z)
         for part in entries_of(self.inertia):
             scale = np.maximum(scale, abs(part))
@@ -185,7 +192,7 @@ class Payload(Section):
     @property
     def entries(self) -> list[Any]:
         """Inertia about O in {E}: xx, yy, zz, xy, xz, yz [kg m^2]."""
-        return _shift(self.inertia, self.mass, self.centre)
+        return shift_inertia(self.inertia, self.mass, self.centre)
 
     @property
     def about_o(self) -> Array:
@@ -241,7 +248,7 @@ def entries_of(inertia: Inertia | None) -> list[Any]:
     return [0.0] * 6 if inertia is None else [*vars(inertia).values()]
 
 
-def _shift(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
+def shift_inertia(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
     """Six numbers about O of an inertia about the centre of mass (parallel axes), or columns."""
     square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
     point = [mass * (square * float(i == j) - centre[i] * centre[j]) for i, j in PLACES]

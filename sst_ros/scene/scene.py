@@ -88,7 +88,9 @@ class Scene(Explained, Section):
         except KeyError as error:
             key, allowed = error.args[0], "names nothing in this scene"
             raise refusal(self.name, str(key), values[key], allowed) from None
-        return schema.build(Scene, changed, self.name)
+        scene = schema.build(Scene, changed, self.name)
+        schema.keep_texts(self, scene)
+        return scene
 
     @property
     def torque_limit(self) -> float | None:

@@ -152,8 +152,15 @@ class Section:
     ONE_OF: ClassVar[tuple[str, ...]] = ()
     """Fields of which a document gives exactly one."""
 
+    CONVERTED: ClassVar[tuple[str, ...]] = ()
+    """Fields that `settle` converts, and those that it converts them by."""
+
     SPECS: ClassVar[dict[str, Spec]] = {}
     """What each field may hold, in order."""
+
+    __slots__ = ("_converted", "_texts")
+    _texts: dict[str, Any]  # numbers that were given as text, by field, as in a YAML file
+    _converted: dict[str, Any]  # fields that `settle` has replaced, as they were given
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -177,11 +184,27 @@ class Section:
         kept = (one for one in given if one[2] is not None or one[1].default is not None)
         try:
             vars(self).update(_freeze_all(kept))
+            before = dict(vars(self))
             problems = [*self.settle()] or [*self._find_idle(), *self._find_broken()]
+            changed = {name: x for name, x in before.items() if vars(self)[name] is not x}
+            self._remember({}, changed)
         except InputError as error:
             problems = [*error.problems]
         if problems:
             raise InputError(self.ORIGIN or type(self).__name__.lower(), problems)
+
+    def _remember(self, texts: dict[str, Any], converted: dict[str, Any]) -> None:
+        object.__setattr__(self, "_texts", texts)
+        object.__setattr__(self, "_converted", converted)
+
+    def __getstate__(self) -> Any:
+        """Return what a copy needs: fields, and how they were written."""
+        return vars(self), texts_of(self), converted_of(self)
+
+    def __setstate__(self, state: Any) -> None:
+        """Restore a copy."""
+        vars(self).update(state[0])
+        self._remember(*state[1:])
 
     def __dir__(self) -> list[str]:
         """Show what a document has, and nothing of how it is checked."""
@@ -268,10 +291,51 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
     try:
         frozen = _freeze_all((name, known[name], value) for name, value in given.items())
         if not problems:
-            return cls(**frozen)
+            section = cls(**frozen)
+            numbers = {name: x for name, x in given.items() if known[name].kind == "number"}
+            texts_of(section).update((name, x) for name, x in numbers.items() if _has_text(x))
+            return section
     except InputError as error:
         problems += error.problems
     raise InputError(origin, problems)
+
+
+# How numbers were written: `certify` proves for all that a document says, and no less.
+
+
+def texts_of(section: Section) -> dict[str, Any]:
+    """Return the numbers of a section that were given as text, by field; lists where they were."""
+    texts: dict[str, Any] = getattr(section, "_texts", {})
+    return texts
+
+
+def converted_of(section: Section) -> dict[str, Any]:
+    """Return the fields that were converted when the section was read, as they were given."""
+    converted: dict[str, Any] = getattr(section, "_converted", {})
+    return converted
+
+
+def _has_text(value: Any) -> bool:
+    """Return whether a number, or any in a list, has digits: text, or a whole number."""
+    if isinstance(value, (list, tuple)):
+        return any(map(_has_text, value))
+    return isinstance(value, (str, int))
+
+
+def keep_texts(old: Any, new: Any) -> None:
+    """Let a tree of sections remember how another one was written, where their numbers agree."""
+    if isinstance(old, tuple) and isinstance(new, tuple):
+        for before, after in zip(old, new, strict=False):
+            keep_texts(before, after)
+    if not isinstance(old, Section) or type(old) is not type(new):
+        return
+    for name, text in texts_of(old).items():
+        if vars(old)[name] == vars(new)[name]:
+            texts_of(new).setdefault(name, text)
+    if all(vars(old)[name] == vars(new)[name] for name in old.CONVERTED) and not converted_of(new):
+        converted_of(new).update(converted_of(old))
+    for name, part in vars(old).items():
+        keep_texts(part, vars(new)[name])
 
 
 def _freeze_all(given: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:

@@ -101,6 +101,10 @@ class SineTorque(TorqueProfile, Section):
     frequency: Vector3 = entry("angular frequencies", "rad/s", least=0.0)
     phase: Vector3 = entry("phases", "rad", default=ZERO)
 
+    # A section of a scene, which nothing can change, is copied as one.
+    __getstate__ = Section.__getstate__
+    __setstate__ = Section.__setstate__
+
     def at(self, time: float) -> Vector3:
         """Torques [N m] at a time [s]."""
         rows = zip(self.amplitude, self.frequency, self.phase, strict=True)

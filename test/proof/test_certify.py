@@ -2,6 +2,8 @@
 """What is proven holds for solutions of 60 digits, and no longer where a part breaks."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -19,9 +21,10 @@ from sst_ros import (
 from sst_ros.__main__ import main
 from sst_ros.dynamics.motion_table import JOINTS
 from sst_ros.mechanism.geometry import angle_between
+from sst_ros.proof import balls, enclosure, scene_balls
 from sst_ros.proof import certify as certify_module
-from sst_ros.proof import enclosure
-from sst_ros.proof.enclosure import Region, arb, arb_poly, arb_series
+from sst_ros.proof.balls import arb, arb_poly, arb_series
+from sst_ros.proof.enclosure import Region
 from sst_ros.report.accuracy import proven_error
 from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
 from studies.sixty_digits import Motion, angle
@@ -108,7 +111,7 @@ def last(f, jacobian, box, end, tolerance=1e-20, order=24):
 
 
 def test_an_oscillator_is_not_wrapped():
-    with enclosure.precision():
+    with balls.precision():
         step = last(*oscillator(1e-3), 20.0)
         p, e = step.at(20.0)
     with mp.workdps(40):
@@ -129,7 +132,7 @@ def test_a_halved_defect_misses_the_solution(monkeypatch):
     h = arb(0.125)
 
     def miss():
-        with enclosure.precision():
+        with balls.precision():
             p, tube = [enclosure.arb_poly([0])], [arb(0, 1)]
             step = enclosure.Advance(Region.box(0.0, [arb(0)]), 0.125, p, tube)
 
@@ -153,7 +156,7 @@ def test_the_norm_of_an_integral_is_no_bound(monkeypatch):
     def f(t, x, y):
         return 100 * (y - x) + 100 * t + (order + 1) * (t * (1 / h)) ** order, 0 * t
 
-    with enclosure.precision():
+    with balls.precision():
         p = [enclosure.arb_poly([0]), enclosure.arb_poly([0, -1])]
         step = enclosure.Advance(Region.box(0.0, [arb(0)] * 2), h, p, [arb(0, 1e3)] * 2)
         given = (lambda *y: (*f(*y), -100, 0, 100, 0)), step, order, 1e3
@@ -166,7 +169,7 @@ def test_the_norm_of_an_integral_is_no_bound(monkeypatch):
 
 @pytest.mark.parametrize("unknown", ["nan", "inf"])
 def test_a_slope_that_is_not_a_number_is_refused(unknown):
-    with enclosure.precision():
+    with balls.precision():
         p, tube = [arb_poly([0])] * 2, [arb(0, 1)] * 2
         step = enclosure.Advance(Region.box(0.0, [arb(0)] * 2), 0.125, p, tube)
 
@@ -188,10 +191,10 @@ def remove_rounding(patch):
 
 def test_without_rounding_the_solution_is_missed(monkeypatch):
     # 40 bits, so that nearly all of the bound is rounding; -cos(1) is known better.
-    monkeypatch.setattr(enclosure, "PRECISION", 40)
+    monkeypatch.setattr(balls, "PRECISION", 40)
 
     def miss():
-        with enclosure.precision():
+        with balls.precision():
             p, e = last(*oscillator(), 1.0, 1e-12, 24).at(1.0)
             return abs(float(p[0]) - math.cos(1.0)), float(e[0])
 
@@ -204,7 +207,7 @@ def test_without_rounding_the_solution_is_missed(monkeypatch):
 
 def test_a_wrong_jacobian_misses_a_motion_of_the_range(monkeypatch):
     f, jacobian, box = oscillator(1e-3)
-    with enclosure.precision():
+    with balls.precision():
         e = last(f, jacobian, box, 1.0).at(1.0)[1]
         approximate = enclosure.approximate  # by the right one
         monkeypatch.setattr(
@@ -229,7 +232,7 @@ def ratios(step, motion):
 
 def equations_of(scene, torque):
     """The derivative, it with the Jacobian, and the start of a proof."""
-    equations = certify_module._Equations(scene, torque, {})
+    equations = certify_module.Equations(scene, torque, {})
     return *equations.between(0.0, 1.0), equations.start()
 
 
@@ -239,12 +242,12 @@ def test_without_rounding_a_motion_of_60_digits_is_missed(monkeypatch):
 
     def reach(size):
         with monkeypatch.context() as patch:
-            patch.setattr(enclosure, "PRECISION", 40)
-            with enclosure.precision():
+            patch.setattr(balls, "PRECISION", 40)
+            with balls.precision():
                 f, jacobian, here = equations_of(scene, SINE)
-                here = here._replace(a=size * here.a)
+                here = here._replace(a=size * here.a, b=size * here.b)
                 step = last(f, jacobian, here, 0.02, 1e-11, 24)
-        with enclosure.precision():
+        with balls.precision():
             return max(ratios(step, motion))
 
     assert 1e-3 < reach(1) < 1.0
@@ -259,7 +262,7 @@ def test_a_halved_defect_misses_a_motion_of_60_digits(monkeypatch):
     monkeypatch.setattr(enclosure, "_weights", lambda _: [arb(1)] * 7)
 
     def found():
-        with enclosure.precision():
+        with balls.precision():
             f, jacobian, here = equations_of(scene, SINE)
             p = enclosure.approximate(f, jacobian, here, 20)
             for row in p:
@@ -324,12 +327,12 @@ def test_limits_that_are_passed_are_enclosed():
     assert all(len(spans) == 1 and spans[0][1] - spans[0][0] < 1e-11 for spans in passed.values())
 
 
-def test_nothing_is_said_beyond_a_kink():
+def test_a_torque_passes_its_limit_where_the_time_is_enclosed():
     scene = load_scene("example2_heavy").with_values({"actuators": {"torque_limit": 4.5}})
     proven, kink = certify(scene, None, 0.1), math.acos(4.5 / 5.0) / 12.0  # of 5 cos(12 t)
-    assert "kink" in proven.reason and not proven.success and proven.largest < 1e-12
-    assert kink - 1e-6 < proven.until < kink + 1e-15
-    assert proven.columns["t"].max() <= proven.until
+    ((begin, end),) = proven.limits["torque_2 at its limit"]
+    assert proven.success and proven.until == 0.1 and proven.largest < 1e-12
+    assert begin - 1e-15 < kink < end + 1e-15 and end - begin < 1e-12
 
 
 def test_a_proof_ends_after_its_steps():
@@ -359,21 +362,26 @@ def test_a_range_around_a_rate_of_zero_widens_what_is_proven():
 
 @pytest.mark.parametrize("number", [arb(0, 1e-3), 0.5, arb_series([0, 1])])
 def test_only_what_is_exactly_zero_hides_a_kink(number):
-    unknown = enclosure.cut(arb(0, 1))
+    unknown = enclosure.cut(arb_series([arb(0, 1), 1], 4))
     assert (unknown * arb(0), arb_series([0]) * unknown, 0.0 * unknown) == (0, 0, 0)
     for product in (unknown * number, number * unknown):
         with pytest.raises(enclosure.Refused, match="kink"):
             product + 1.0
 
 
-def test_elastic_stops_end_the_proof_at_the_first_contact():
+def test_elastic_stops_are_passed_and_the_contact_is_enclosed():
     proven, motion = (
-        certify("impacts", None, 1.0),
-        simulate("impacts", None, 1.0, t_eval=[0.9, 1.0]),
+        certify("impacts", None, 0.95, t_eval=[0.9, 0.95]),
+        simulate("impacts", None, 0.95, t_eval=[0.9, 0.95], tolerance=1e-12),
     )
     first = certify("example2_stroke").limits["gamma_1 > 1.570796 rad"][0]
-    assert "kink" in proven.reason and motion.success
-    assert first[0] - 1e-6 < proven.until <= first[1]
+    contact = proven.limits["contact of gamma_1 at arc"]
+    assert proven.success and proven.until == 0.95 and len(contact) == 2
+    assert contact[0][0] <= first[1] and first[0] <= contact[0][1]
+    assert all(end - begin < 1e-8 for begin, end in contact)
+    for leg in range(3):
+        off = abs(motion.gamma[:, leg] - proven.columns[f"gamma_{leg + 1}"])
+        assert (off <= proven.columns[f"gamma_{leg + 1}_bound"] + 1e-11).all()
 
 
 def test_held_torques_are_followed_over_their_ticks():
@@ -413,14 +421,128 @@ def test_torques_at_their_limit_are_clamped_exactly():
     assert clamped.success and clamped.columns["angle"] == same.columns["angle"]
 
 
+SHORT = {"duration": 0.05, "t_eval": [0.05]}
+
+
+def widest_distance(scene, changes):
+    """Angle between the motion of a scene and those with other values, by simulate [rad]."""
+    at = {**SHORT, "tolerance": 1e-12}
+    centre = simulate(scene, **at).quaternion[-1]
+    return [
+        float(angle_between(simulate(scene.with_values(one), **at).quaternion[-1], centre))
+        for one in changes
+    ]
+
+
+@pytest.mark.parametrize(
+    ("values", "ranges", "changes"),
+    [
+        ({}, {"star.alpha_deg": 0.01}, [{"star.alpha_deg": (120.01, 119.99, 120.0)}]),
+        (
+            {"actuators": {"torque_limit": 2.0}},
+            {"actuators.torque_limit": 0.01},
+            [{"actuators.torque_limit": 1.99}, {"actuators.torque_limit": 2.01}],
+        ),
+        ({}, {"star.inertia.zz": (0.205, 0.211)}, [{"star.inertia.zz": 0.205}]),
+        ({}, {"torque.amplitude[1]": 0.01}, [{"torque.amplitude": (4.0, 5.01, 3.0)}]),
+    ],
+)
+def test_ranges_reach_the_motion(values, ranges, changes):
+    scene = load_scene("example2").with_values({**FREE, **values})
+    proven = certify(scene, ranges=ranges, max_steps=2000, **SHORT)
+    apart = widest_distance(scene, changes)
+    if proven.reason:  # nothing is said at the time
+        assert "too wide" in proven.reason and proven.error == math.inf
+    else:
+        assert 1e-9 < max(apart) <= proven.error
+
+
+def about_centre(**values):
+    inertia = {"xx": "0.31", "yy": "0.31", "zz": "0.20"}
+    star = {"inertia": inertia, "mass": 2.6, "centre": [0.0, 0.01, 0.05], "radius": 0.4}
+    star |= {"inertia_about": "centre_of_mass", "alpha_deg": [120.0, 120.0, 120.0], **values}
+    return load_scene("example2").with_values({**FREE, "star": star})
+
+
+def test_a_range_of_what_reading_converts_is_one_of_the_document():
+    scene = about_centre()
+    proven = certify(scene, ranges={"star.mass": 0.02}, **SHORT)
+    at = {**SHORT, "tolerance": 1e-12}
+    centre, other = (simulate(x, **at).quaternion[-1] for x in (scene, about_centre(mass=2.62)))
+    assert not proven.reason and 1e-9 < float(angle_between(centre, other)) <= proven.error
+
+
+def test_digits_are_those_that_are_written():
+    def width(text):
+        document = scene_balls.WrittenDocument.of(
+            load_scene("example2").with_values({"star.inertia.zz": text})
+        )
+        given = {"star.inertia.zz": "digits"}
+        with balls.precision():
+            found = scene_balls.range_balls(document, given, own_torque=True, origin="certify")
+            return float(found["star", "inertia", "zz"].rad())
+
+    assert width("0.20") == pytest.approx(0.005) and width("0.2") == pytest.approx(0.05)
+    assert width("2.0e-1") == pytest.approx(0.005)
+    with pytest.raises(InputError, match="no written digits"):
+        width(0.25)
+
+
+@pytest.mark.parametrize("number", [8.7e-15, 1.23e-9, 0.3, 7.0, 1e-300, 123456.789])
+def test_bounds_are_written_outward(number):
+    for digits in (2, 12, 15):
+        assert Decimal(balls.write_up(number, digits)) >= Decimal(number)
+        assert Decimal(balls.write_down(number, digits)) <= Decimal(number)
+
+
+def test_all_that_is_printed_of_a_motion_is_outward():
+    proven = certify("example2", duration=0.1, t_eval=[0.05, 0.1])
+    facts = proven._facts()
+    assert float(str(facts["orientation"]).split()[1]) >= proven.largest
+    assert float(str(facts["error of simulate"]).split()[2]) >= proven.error
+    assert float(str(facts["proven"]).split()[1]) <= proven.until
+
+
+def test_two_threads_prove_at_once():
+    alone = certify("example2", **SHORT).columns["angle"]
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda _: certify("example2", **SHORT), range(6)))
+    assert all(np.array_equal(one.columns["angle"], alone) for one in found)
+
+
+def test_a_short_series_is_refused():
+    with balls.precision(), pytest.raises(enclosure.Refused, match="shorter"):
+        enclosure._coefficients(arb_series([1, 2], 3), 5)
+
+
+def test_an_angle_across_the_cut_is_refused():
+    with balls.precision(), pytest.raises(enclosure.Refused, match="jumps"):
+        enclosure._atan2(arb_series([arb(0, 0.1), 1], 4), arb_series([-1, 0.5], 4))
+
+
+def test_damping_by_restitution_is_enclosed():
+    with balls.precision():
+        damping = scene_balls.damping_ball(arb("0.6"), arb("1.5"))
+    with mp.workdps(40):
+        e, v = mpf("0.6"), mpf("1.5")
+        d = mp.findroot(lambda d: d * (1 + e) - mp.log((1 + d) / (1 - d * e)), 0.5)
+        assert abs(mpf(damping.str(35, radius=False)) - d / v) < 1e-30
+    assert float(damping.rad()) < 1e-30
+
+
 @pytest.mark.parametrize(
     ("given", "word"),
     [
         ({"torque": lambda t: (0.0, 0.0, 0.0)}, "torque"),
         ({"bound": 0.0}, "bound"),
-        ({"ranges": {"base.v": 0.1}}, "must name bodies"),
-        ({"ranges": {"star.inertia.zz": -1.0}}, "must be a number >= 0"),
+        ({"ranges": {"base.radius": 0.1}}, "does not act on the motion"),
+        ({"ranges": {"star.inertia.zz": -1.0}}, "must be a half-width >= 0"),
         ({"ranges": {"no.key": 1.0}}, "no"),
+        ({"ranges": {"star.inertia.zz": (0.5, 0.4)}}, "an interval"),
+        ({"ranges": {"star.inertia.zz": (0.5, 0.6)}}, "must hold the number"),
+        ({"ranges": {"duration": 0.1}}, "argument `duration`"),
+        ({"ranges": {"actuators.velocity_limit": 0.1}}, "no actuators"),
+        ({"split": 2}, "splits ranges"),
     ],
 )
 def test_what_cannot_be_proven_is_refused(given, word):

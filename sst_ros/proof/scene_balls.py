@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of a scene in balls, from the document on, and functions of them as programs.
+
+Reading a scene converts some of it in floats: arcs to directions, an inertia about the centre of
+mass to one about O, a restitution to a damping. Here these conversions are made again, in balls,
+from what the document says. What no range touches is computed once; what a range touches becomes
+part of the programs, so that one number of the document is the same number wherever it acts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from sst_ros.dynamics import kernel
+from sst_ros.errors import refusal, refuse_unless
+from sst_ros.mechanism import generic_math as gm
+from sst_ros.mechanism.generic_math import Triple, cross3, dot3, triple
+from sst_ros.programs.expression import Expression, Program, mark_present, trace
+from sst_ros.proof import enclosure
+from sst_ros.proof.balls import PRECISION, arb, between, half_unit, number_ball
+from sst_ros.scene.bodies import ABOUT_CENTRE, Base, Inertia, Link, shift_inertia
+from sst_ros.scene.scene import Scene
+from sst_ros.scene.schema import (
+    Place,
+    Section,
+    build_unchecked,
+    converted_of,
+    key_of,
+    leaves,
+    rebuild,
+    texts_of,
+    walk,
+)
+from sst_ros.scene.torque_profile import SineTorque, TorqueProfile
+from sst_ros.scene.yaml_document import find_fields
+
+Range = float | tuple[float, float] | str
+"""A half-width, an interval, or "digits": half a unit of the last digit that is written."""
+
+DEGREE: Place = ("degree",)  # place of pi / 180 among the constants
+DAMPING: Place = ("stroke", "damping")
+RESTITUTION: tuple[Place, Place] = (("stroke", "restitution"), ("stroke", "impact_rate"))
+_NO_EFFECT: dict[Place, str] = {
+    ("base", "radius"): "does not act on the motion",
+    ("star", "radius"): "does not act on the motion",
+    ("initial", "orientation"): "only selects the assembly",
+    ("actuators", "idle_damping"): "acts on a node alone, not on a simulated motion",
+    ("actuators", "velocity_limit"): "does not act on a simulated motion",
+    ("actuators", "acceleration_limit"): "does not act on a simulated motion",
+    ("motion",): "does not act under given torques",
+    ("duration",): "is given by the argument `duration`",
+}
+"""Numbers of a scene that no motion depends on, and why a range of them is refused."""
+
+
+class Axes(NamedTuple):
+    """The arrays of `Geometry` as triples of symbols or balls."""
+
+    v: Any
+    w: Any
+    e: Any
+    arc: Any
+    beta_max: Any
+
+    def of_leg(self, name: str, k: int) -> Any:
+        """Return what an array has for leg k."""
+        return getattr(self, name)[k]
+
+
+class Derived(NamedTuple):
+    """What a document is converted to: symbols, or what they stand for."""
+
+    scene: Any  # as a `Scene` is once it is read
+    axes: Axes
+
+
+class Parts(NamedTuple):
+    """What a traced function is given of a scene, in symbols."""
+
+    model: kernel.Model
+    axes: Axes
+    scene: Any
+
+
+class WrittenDocument(NamedTuple):
+    """A scene before its conversions, unchecked, and the texts of its numbers by place."""
+
+    scene: Any
+    texts: dict[Place, str]
+
+    @classmethod
+    def of(cls, scene: Scene) -> WrittenDocument:
+        """Return the document that a scene was read from."""
+        texts: dict[Place, str] = {}
+        return cls(_unconvert(scene, (), texts), texts)
+
+
+def _unconvert(part: Any, place: Place, texts: dict[Place, str]) -> Any:
+    """Undo the conversions in a part of a scene; collect the texts of its numbers."""
+    if isinstance(part, tuple):
+        return tuple(_unconvert(x, (*place, i), texts) for i, x in enumerate(part))
+    if not isinstance(part, Section):
+        return part
+    for name, written in texts_of(part).items():
+        _collect_texts(written, (*place, name), texts)
+    fields = vars(part) | converted_of(part)
+    return build_unchecked(
+        type(part), {name: _unconvert(x, (*place, name), texts) for name, x in fields.items()}
+    )
+
+
+def _collect_texts(written: Any, place: Place, texts: dict[Place, str]) -> None:
+    if isinstance(written, (list, tuple)):
+        for i, number in enumerate(written):
+            _collect_texts(number, (*place, i), texts)
+    elif isinstance(written, (str, int)):
+        texts[place] = str(written)
+
+
+# Conversions of a document: of symbols, whose zeros alone are floats.
+
+
+def convert(scene: Any, degree: Any) -> Derived:
+    """Convert a document in symbols as reading it does; `degree` is pi / 180."""
+    values: dict[Place, Any] = {}
+    for place, part in walk(scene):
+        if isinstance(part, Base) and part.arcs_deg is not None:
+            arcs = triple(degree * arc for arc in part.arcs_deg)
+            corners: Place = (*place, "v")
+            values[corners] = _triangle(*arcs)
+        if isinstance(part, Link) and part.inertia_about == ABOUT_CENTRE:
+            numbers = shift_inertia(part.inertia, part.mass, part.centre)
+            named = dict(zip(Inertia.SPECS, numbers, strict=True))
+            shifted: Place = (*place, "inertia")
+            values[shifted] = build_unchecked(Inertia, named)
+    converted = rebuild(scene, values)
+    return Derived(converted, _axes_of(converted, degree))
+
+
+def _triangle(arc_12: Any, arc_23: Any, arc_31: Any) -> tuple[Triple, Triple, Triple]:
+    """Return the corners of a spherical triangle of given arcs, as `Base` describes them."""
+    sine, cosine = gm.sin(arc_12), gm.cos(arc_12)
+    x = gm.cos(arc_31)
+    y = (gm.cos(arc_23) - x * cosine) / sine
+    z = gm.sqrt(1.0 - x * x - y * y)
+    return (1.0, 0.0, 0.0), (cosine, sine, 0.0), (x, y, z)
+
+
+def _length(vector: Triple) -> Any:
+    return gm.sqrt(dot3(vector, vector))
+
+
+def _axes_of(scene: Any, degree: Any) -> Axes:
+    """Return the axes of a converted scene; see `Geometry`."""
+    v = []
+    for direction in scene.base.v:
+        length = _length(direction)
+        v.append(triple(x / length for x in direction))
+    w, arcs = [], []
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        normal = cross3(v[first], v[second])
+        sine = _length(normal)
+        w.append(triple(x / sine for x in normal))
+        arcs.append(gm.atan2(sine, dot3(v[first], v[second])))
+    alpha_12, alpha_23, _ = (degree * alpha for alpha in scene.star.alpha_deg)
+    e = [(0.0, 1.0, 0.0)]
+    for angle in (alpha_12, alpha_12 + alpha_23):
+        e.append((-gm.sin(angle), gm.cos(angle), 0.0))
+    return Axes(tuple(v), tuple(w), tuple(e), tuple(arcs), degree * scene.workspace.beta_max_deg)
+
+
+def damping_ball(restitution: Any, impact_rate: Any) -> Any:
+    """Enclose the damping [s/rad] of `model.damping_of`, by the monotony of Langevin's function."""
+    ratio = (1 - restitution) / (1 + restitution)
+    x = between(_langevin_bound(ratio.lower(), -1), _langevin_bound(ratio.upper(), 1))
+    return 2 * x / ((1 + restitution) * impact_rate)
+
+
+def _langevin_bound(y: Any, side: int) -> Any:
+    """Return a number below (side -1) or above (1) the x with coth x - 1/x = y, 0 <= y < 1."""
+    if not y > 0:
+        return arb(0)
+    # x/3 > coth x - 1/x > 1 - 1/x for x > 0.
+    low, high = (3 * y).mid(), (1 / (1 - y)).upper()
+    for _ in range(PRECISION):
+        middle = ((low + high) / 2).mid()
+        value = middle.coth() - 1 / middle
+        if value < y:
+            low = middle
+        elif value > y:
+            high = middle
+        else:
+            break
+    return low if side < 0 else high
+
+
+# Ranges of numbers.
+
+
+def range_balls(
+    document: WrittenDocument, ranges: Mapping[str, Range], *, own_torque: bool, origin: str
+) -> dict[Place, Any]:
+    """Return the ball of each number that is a range.
+
+    Raises InputError where a key names no number that acts on the motion, or a range is none.
+    """
+    balls: dict[Place, Any] = {}
+    numbers = leaves(document.scene)
+    for key, width in ranges.items():
+        try:
+            fields = [place for place, _, _ in find_fields(document.scene, key, components=True)]
+        except ValueError as error:
+            raise refusal(origin, "ranges", key, str(error)) from None
+        places = [p for p in numbers if any(p[: len(field)] == field for field in fields)]
+        refuse_unless(origin, ("ranges", key, bool(places), "must name numbers that the scene has"))
+        for place in places:
+            _refuse_no_effect(key, place, own_torque=own_torque, origin=origin)
+        for place, ball in _balls_of(key, width, places, document, origin):
+            refuse_unless(origin, ("ranges", key, place not in balls, "names a number twice"))
+            balls[place] = ball
+    return balls
+
+
+def _refuse_no_effect(key: str, place: Place, *, own_torque: bool, origin: str) -> None:
+    for idle, reason in _NO_EFFECT.items():
+        refuse_unless(origin, ("ranges", key, place[: len(idle)] != idle, reason))
+    replaced = place[0] == "torque" and not own_torque
+    refuse_unless(origin, ("ranges", key, not replaced, "is replaced by the argument `torque`"))
+
+
+def _balls_of(
+    key: str, width: Range, places: Sequence[Place], document: WrittenDocument, origin: str
+) -> Iterator[tuple[Place, Any]]:
+    numbers, name = leaves(document.scene), f"ranges[{key}]"
+    if width == "digits":
+        written = [place for place in places if place in document.texts]
+        allowed = "has no written digits: give a half-width, or the scene as a document"
+        refuse_unless(origin, (name, width, bool(written), allowed))
+        for place in written:
+            text = document.texts[place]
+            yield place, number_ball(numbers[place], text) + arb(0, half_unit(text).upper())
+        return
+    allowed = 'must be a half-width >= 0, an interval (low, high), or "digits"'
+    if isinstance(width, (tuple, list)):
+        is_interval = len(width) == 2 and all(isinstance(x, (int, float)) for x in width)
+        refuse_unless(origin, (name, width, is_interval and width[0] <= width[1], allowed))
+        low, high = map(float, width)
+        for place in places:
+            inside = low <= numbers[place] <= high
+            number = f"must hold the number of the scene, {numbers[place]}"
+            refuse_unless(origin, (name, width, inside, number))
+            yield place, between(arb(low), arb(high)).union(number_ball(numbers[place]))
+        return
+    is_number = isinstance(width, (int, float)) and not isinstance(width, bool)
+    refuse_unless(origin, (name, width, is_number and 0.0 <= float(width) < 1e300, allowed))
+    for place in places:
+        digits = document.texts.get(place)
+        yield place, number_ball(numbers[place], digits) + arb(0, float(width))
+
+
+class SceneBalls:
+    """A scene in balls, and functions of it as programs.
+
+    The numbers that are ranges, `varied`, are inputs of the programs; those of the start are not.
+
+    Args:
+        scene: what moves.
+        profile: its torques; a sine replaces that of the scene.
+        ranges: as `range_balls` returns.
+
+    """
+
+    def __init__(
+        self, scene: Scene, profile: TorqueProfile | None, ranges: Mapping[Place, Any]
+    ) -> None:
+        document = WrittenDocument.of(scene)
+        written = document.scene
+        texts = dict(document.texts)
+        if isinstance(profile, SineTorque) and profile != scene.torque:
+            written = rebuild(written, {("torque",): profile})
+            texts = {place: text for place, text in texts.items() if place[0] != "torque"}
+        balls: dict[Place, Any] = {}
+        for place, number in leaves(written).items():
+            balls[place] = number_ball(number, texts.get(place))
+        balls |= ranges
+        varied = [place for place in ranges if place[0] != "initial"]
+        if written.stroke.restitution is not None:
+            rate = [balls.pop(place) for place in RESTITUTION]
+            balls[DAMPING] = damping_ball(*rate)
+            if any(place in ranges for place in RESTITUTION):
+                varied = [*(p for p in varied if p not in RESTITUTION), DAMPING]
+            written = rebuild(written, dict.fromkeys(RESTITUTION))
+        self.scene, self.balls, self.varied = scene, balls, varied
+        self.inputs = tuple(f"p{i}" for i in range(len(varied)))
+        self._document = written
+        present = (p for p, x in balls.items() if p in varied or not x.is_zero())
+        self._symbols: dict[Place, Any] = {p: balls[p] for p in present if p[0] != "initial"}
+        self._symbols[DEGREE] = arb.pi() / 180
+        self._settled = self._convert_in_balls()
+
+    @property
+    def varied_balls(self) -> list[Any]:
+        """Balls of the numbers that are ranges."""
+        return [self.balls[place] for place in self.varied]
+
+    def initial(self, name: str) -> list[Any]:
+        """Return the balls of gamma or gamma_dot at the start."""
+        return [self.balls["initial", name, k] for k in range(3)]
+
+    def _convert_in_balls(self) -> dict[Place, Any]:
+        """Convert in balls; return what no range touches: balls, or floats where exactly 0, +-1."""
+        places: list[Place] = []
+        names = [*self.inputs, *(f"c{i}" for i in range(len(self._symbols)))]
+
+        def traced(*symbols: Any) -> list[Any]:
+            derived = self._convert(symbols)
+            rows = [(p, x) for p, x in walk(derived) if isinstance(x, Expression)]
+            places[:] = [place for place, _ in rows]
+            return [x for _, x in rows]
+
+        program = trace(traced, names)
+        function = enclosure.compile_on_balls(program, list(self._symbols.values()))
+        values = function(*self.varied_balls)
+        late = _depend_on_first(program, len(self.inputs))
+        settled: dict[Place, Any] = {}
+        for place, value, touched in zip(places, values, late, strict=True):
+            if not touched:
+                settled[place] = float(value) if value in (-1, 0, 1) else value
+        return settled
+
+    def _convert(self, symbols: Sequence[Any]) -> Derived:
+        """Convert the document; its symbols are the varied numbers, then the constants."""
+        count = len(self.inputs)
+        numbers = dict(zip(self._symbols, symbols[count:], strict=False))
+        numbers |= zip(self.varied, symbols[:count], strict=True)
+        marked = {place: mark_present(x) for place, x in numbers.items()}
+        return convert(rebuild(self._document, marked), numbers[DEGREE])
+
+    def compile(
+        self, function: Callable[..., Any], inputs: Sequence[str], by: Sequence[str] = ()
+    ) -> enclosure.Function:
+        """Compile function(parts, *inputs), whose `Parts` depend on the inputs `self.inputs`.
+
+        The compiled function has the inputs, then the varied numbers; with `by` it returns the
+        derivatives by these inputs, too.
+        """
+        constants = {place: x for place, x in self._settled.items() if not isinstance(x, float)}
+        folded = {place: x for place, x in self._settled.items() if isinstance(x, float)}
+        size, count = len(inputs), len(self.inputs)
+        names = [f"c{i}" for i in range(len(self._symbols))]
+        derived_names = [f"d{i}" for i in range(len(constants))]
+
+        def traced(*values: Any) -> Any:
+            given, symbols = values[:size], values[size : size + count + len(names)]
+            known = dict(zip(constants, values[size + count + len(names) :], strict=True))
+            marked = {place: mark_present(x) for place, x in (known | folded).items()}
+            derived = rebuild(self._convert(symbols), marked)
+            model = kernel.model_of(derived.scene, derived.axes)
+            present = {p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)}
+            return function(Parts(rebuild(model, present), derived.axes, derived.scene), *given)
+
+        program = trace(traced, (*inputs, *self.inputs, *names, *derived_names), by)
+        balls = [*self._symbols.values(), *constants.values()]
+        return enclosure.compile_on_balls(program, balls)
+
+
+def _depend_on_first(program: Program, count: int) -> list[bool]:
+    """Return whether each output of a program depends on one of its first inputs."""
+    depends = [number < count for number in range(len(program.inputs))]
+    for _, operands in program.steps:
+        depends.append(any(depends[x] for x in operands if isinstance(x, int)))
+    return [isinstance(x, int) and depends[x] for x in program.outputs]
+
+
+def name_ranges(places: Sequence[Place]) -> str:
+    """Name the numbers of ranges."""
+    return ", ".join(map(key_of, places))
