@@ -43,7 +43,6 @@ RELEASED_FOR = ("debian", "ubuntu")
 BRINGS = {
     "distributed": "dask[distributed]",
     "flint": "python-flint>=",
-    "llvmlite": "numba",
     "lz4": "rosbags",
     "pinocchio": "pin>=",
     "trimesh": "viser",

@@ -67,6 +67,12 @@ LOCKSTEP_PLUGIN = "sst_ros_hardware/LockstepSystem"
 TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
 """Of commands and states, by which ros2_control drives a simulator."""
 
+NEGLIGIBLE_MASS, NEGLIGIBLE_INERTIA = 1e-12, 2e-14
+"""Of a moving link that has none in the scene [kg, kg m^2]: MuJoCo refuses less than 1e-14.
+
+Beside the star's inertia, some 1e-2 kg m^2, they are lost in the rounding of a few operations.
+"""
+
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -207,7 +213,8 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
     and no command starts the run.
     """
     geometry, drawn = Geometry.of(scene), shapes(scene)
-    joints, bodies = joints_of(geometry), {body.name: body for body in bodies_of(scene)}
+    joints, own = joints_of(geometry), {body.name: body for body in bodies_of(scene)}
+    bodies = {body.name: body for body in _with_negligible_bodies(own, joints)}
     ranges = {joint: ends for joint, *ends in ranges_of([*limits_of(scene, geometry)])}
     limited = []
     for joint in joints:
@@ -295,6 +302,14 @@ def bodies_of(scene: Scene) -> Iterator[Body]:
             behind = motor.gear_ratio**2 * motor.rotor_inertia
             disc = np.diag([behind / 2.0, behind / 2.0, behind])
             yield body(f"rotor_{leg}", base.radius, disc)._replace(link=ACTUATED[k])
+
+
+def _with_negligible_bodies(bodies: Mapping[str, _Body], joints: Iterable[Joint]) -> list[_Body]:
+    """Give each moving link that has no body one that changes no motion."""
+    tensor, at_o = NEGLIGIBLE_INERTIA * np.eye(3), np.zeros(3)
+    bare = (joint.child for joint in joints if joint.child not in bodies)
+    negligible = [_Body(link, link, NEGLIGIBLE_MASS, at_o, tensor) for link in bare]
+    return [*bodies.values(), *negligible]
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
