@@ -47,7 +47,7 @@ from sst_ros.proof.balls import (
     write_down,
     write_up,
 )
-from sst_ros.proof.enclosure import Advance, Function, Refused, Region, Stepper
+from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
 from sst_ros.proof.scene_balls import Parts, SceneBalls, WrittenDocument, range_balls
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Place
@@ -70,7 +70,7 @@ NARROWER = 8  # proofs by which the width of ranges is looked for that would do,
 JOINT_COUNT = 18  # angles and rates of the joints
 
 
-class Equations:
+class BallEquations:
     """The motion of a scene on balls; the state has the numbers that are ranges at the end."""
 
     def __init__(
@@ -300,7 +300,7 @@ class Row(NamedTuple):
 class Follower:
     """A proof of one motion, step by step, for all numbers in the balls of its equations."""
 
-    def __init__(self, equations: Equations, trajectory: Trajectory) -> None:
+    def __init__(self, equations: BallEquations, trajectory: Trajectory) -> None:
         self._equations, self._trajectory = equations, trajectory
         self._left = trajectory.t.tolist()
         self.rows: list[Row] = []
@@ -325,7 +325,7 @@ class Follower:
             for begin, end in pairwise(breaks):
                 f, jacobian = self._equations.between(begin, end)
                 limits = self._equations.limits_between(begin, end)
-                for step in Stepper(f, jacobian, here, end, tolerance, order):
+                for step in ProvenSteps(f, jacobian, here, end, tolerance, order):
                     self._take(step, limits)
                     bar.draw(step.end / breaks[-1])
                     if self.reason:
@@ -545,7 +545,7 @@ def split_ranges(ranges: Mapping[Place, Any], parts: int) -> list[dict[Place, An
     return boxes
 
 
-class Task(NamedTuple):
+class ProofTask(NamedTuple):
     """What is to be proven, and how hard to try."""
 
     trajectory: Trajectory
@@ -557,7 +557,7 @@ class Task(NamedTuple):
 
     def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
         """Prove the motion for all numbers of ranges."""
-        equations = Equations(self.trajectory.scene, self.profile, ranges)
+        equations = BallEquations(self.trajectory.scene, self.profile, ranges)
         tolerance = 1e-6 * self.bound
         for _ in range(ATTEMPTS):
             follower = Follower(equations, self.trajectory)
@@ -655,7 +655,7 @@ def certify(
             own_torque=profile == given.torque,
             origin="certify",
         )
-        task = Task(trajectory, profile, breaks, bound, max_steps, progress)
+        task = ProofTask(trajectory, profile, breaks, bound, max_steps, progress)
         wide = {place: x for place, x in balls.items() if x.rad() > 0}
         boxes = split_ranges(wide, split) if wide else [{}]
         parts = [task.prove_part({**balls, **box}) for box in boxes]

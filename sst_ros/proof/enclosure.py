@@ -574,7 +574,7 @@ def _tube(here: Region, room: float, tolerance: float) -> list[Any]:
     return [arb(0, x.upper()) for x in (*moving, *spread[here.moving :])]
 
 
-class Stepper:
+class ProvenSteps:
     """Proven steps from a region to a time [s]; Refused says why one cannot be proven.
 
     Args:
@@ -765,5 +765,5 @@ class Stepper:
 def enclose(
     f: Function, jacobian: Function, here: Region, end: float, tolerance: float, order: int
 ) -> Iterator[Advance]:
-    """Yield the steps of a `Stepper`."""
-    yield from Stepper(f, jacobian, here, end, tolerance, order)
+    """Yield the steps of a `ProvenSteps`."""
+    yield from ProvenSteps(f, jacobian, here, end, tolerance, order)

@@ -138,6 +138,10 @@ def convert(scene: Any, degree: Any) -> Derived:
     return Derived(converted, _axes_of(converted, degree))
 
 
+def _below(place: Place, name: str) -> Place:
+    return (*place, name)
+
+
 def _triangle(arc_12: Any, arc_23: Any, arc_31: Any) -> tuple[Triple, Triple, Triple]:
     """Return the corners of a spherical triangle of given arcs, as `Base` describes them."""
     sine, cosine = gm.sin(arc_12), gm.cos(arc_12)

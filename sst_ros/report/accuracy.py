@@ -147,15 +147,17 @@ def proven_error(*given: Any, **options: Any) -> str:
     proven there is a dash, and both have a reason.
     """
     try:
-        from sst_ros.proof.certify import certify  # needs python-flint, which others do not
+        # They need python-flint, which others do not.
+        from sst_ros.proof.balls import write_down, write_up
+        from sst_ros.proof.certify import certify
 
         proven = certify(*given, **options)
     except SstError as refused:
         return f"-: {str(refused).splitlines()[0]}"
     if math.isinf(proven.error):
         return f"-: {proven.reason}"
-    until = f" to {proven.until:.4g} s: {proven.reason}" if proven.reason else ""
-    return f"{proven.error:.1e} rad{until}"
+    until = f" to {write_down(proven.until, 4)} s: {proven.reason}" if proven.reason else ""
+    return f"{write_up(proven.error)} rad{until}"
 
 
 class SolverSetting(NamedTuple):

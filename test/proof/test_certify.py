@@ -232,7 +232,7 @@ def ratios(step, motion):
 
 def equations_of(scene, torque):
     """The derivative, it with the Jacobian, and the start of a proof."""
-    equations = certify_module.Equations(scene, torque, {})
+    equations = certify_module.BallEquations(scene, torque, {})
     return *equations.between(0.0, 1.0), equations.start()
 
 
