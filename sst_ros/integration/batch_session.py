@@ -181,9 +181,10 @@ class BatchSession:
         return self._y, self._given, self.state.code, self.fault_time, self._error
 
     def _spread(self, values: ArrayLike) -> Array:
-        rows: Array = np.broadcast_to(np.asarray(values, dtype=float), (self._y.shape[1], 3))
-        own: Array = rows.copy()
-        return own
+        spread: Array = np.broadcast_to(
+            np.asarray(values, dtype=float), (self._y.shape[1], 3)
+        ).copy()
+        return spread
 
     def _each(self, work: Callable[[_Robots], None]) -> None:
         """Do something with all robots, by threads where that is worth it."""

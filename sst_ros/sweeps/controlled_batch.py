@@ -275,8 +275,8 @@ class ControlledBatch:
         blocks = divide(self._memory_sizes, memory)  # views of its rows
         earlier = control.count(gamma - control.period * rate).T if control.counts else ()
         for name, values in (("observed", start.quaternion), ("before", earlier)):
-            for row, value in zip(blocks[name], values, strict=False):
-                row[:] = value
+            for place, value in zip(blocks[name], values, strict=False):
+                place[:] = value
         noise = streams(self._seed, rows) if self._noise else np.zeros(0, dtype=np.uint64)
         samples = [tuple(row) for row in self._references.tolist()]
         gains = self._make_gains(batch, given, count)
