@@ -304,11 +304,11 @@ def bodies_of(scene: Scene) -> Iterator[Body]:
             yield body(f"rotor_{leg}", base.radius, disc)._replace(link=ACTUATED[k])
 
 
-def _with_negligible_bodies(bodies: Mapping[str, _Body], joints: Iterable[Joint]) -> list[_Body]:
+def _with_negligible_bodies(bodies: Mapping[str, Body], joints: Iterable[Joint]) -> list[Body]:
     """Give each moving link that has no body one that changes no motion."""
     tensor, at_o = NEGLIGIBLE_INERTIA * np.eye(3), np.zeros(3)
     bare = (joint.child for joint in joints if joint.child not in bodies)
-    negligible = [_Body(link, link, NEGLIGIBLE_MASS, at_o, tensor) for link in bare]
+    negligible = [Body(link, link, NEGLIGIBLE_MASS, at_o, tensor) for link in bare]
     return [*bodies.values(), *negligible]
 
 

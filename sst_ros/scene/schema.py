@@ -197,14 +197,15 @@ class Section:
         object.__setattr__(self, "_texts", texts)
         object.__setattr__(self, "_converted", converted)
 
-    def __getstate__(self) -> Any:
+    def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: fields, and how they were written."""
-        return vars(self), texts_of(self), converted_of(self)
+        return {**vars(self), "_texts": texts_of(self), "_converted": converted_of(self)}
 
-    def __setstate__(self, state: Any) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy."""
-        vars(self).update(state[0])
-        self._remember(*state[1:])
+        fields = dict(state)
+        self._remember(fields.pop("_texts", {}), fields.pop("_converted", {}))
+        vars(self).update(fields)
 
     def __dir__(self) -> list[str]:
         """Show what a document has, and nothing of how it is checked."""
