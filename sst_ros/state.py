@@ -74,7 +74,7 @@ def real_numbers(value: Any, *, seconds: bool = False) -> Array:
 
 
 def freeze(array: Array) -> Array:
-    """Return an array that nobody can write to: a copy, unless it is one already.
+    """Return a read-only array: a copy, unless it is one already.
 
     A view is copied as well: who owns its numbers could write to them.
     """
@@ -85,7 +85,7 @@ def freeze(array: Array) -> Array:
 
 
 class ReadOnly:
-    """An object whose arrays nobody can write to, nor to those of its copies."""
+    """An object whose arrays are read-only, as are those of its copies."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of a copy or a pickle, in which arrays can be written to."""

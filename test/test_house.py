@@ -194,7 +194,7 @@ MOST_FILES = {
     "step": 7,
     "answer": 10,  # to joint_states from a torque message
     "simulation": 14,  # from the name of a scene
-    "simulate": 22,
+    "simulate": 23,
     "bag": 8,
     "report": 25,  # from a bag to the table of `report run`
 }

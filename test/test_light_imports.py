@@ -5,7 +5,7 @@ import pytest
 from programs import python
 
 HEAVY = {"scipy", "matplotlib", "llvmlite", "numba", "rclpy", "pandas", "rosbags", "dask"}
-DOCUMENTS = {"cli", "description", "dynamics", "host", "mechanism", "nodes", "scene"}
+DOCUMENTS = {"cli", "description", "dynamics", "host", "mechanism", "nodes", "programs", "scene"}
 """Rooms that a command needs which prints documents; of `nodes` the handler of signals."""
 COMMAND = "from sst_ros.__main__ import main; main({!r})"
 RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_000_000)"

@@ -59,6 +59,10 @@ STUDY = {"scene": SCENE, "vary": {"star.inertia.zz": [0.26, 0.27]}, "duration": 
 STUDY |= {"seed": 0, "out": None, "client": None, "workers": 1, "resume": False, "progress": False}
 
 
+def push_back(state):
+    return (0.0, 0.0, -0.1)
+
+
 def of(**arguments):
     return arguments
 
@@ -93,6 +97,8 @@ def calls():
         (load_scene, of(scene="example2")),
         (SCENE.with_values, of(values={"star.mass": 1.0})),
         (lambda k, x: SCENE.with_values({key(k): x}), of(k="star.mass", x=1.0)),
+        (sst_ros.equations, of(scene=SCENE, target="numpy", parameters=(), outputs=None)),
+        (sst_ros.own_load, of(name="load", potential=None, moment=push_back, parameters=None)),
         (sst_ros.arc_inertia, of(mass=1.0, radius=1.0, begin=[1, 0, 0], end=[0, 1, 0])),
         (sst_ros.Geometry.of, of(scene=SCENE)),
         (sst_ros.Geometry.build, of(v=np.eye(3), alpha=[2.0, 2.0, 2.28], beta_max=1.5)),
@@ -210,5 +216,13 @@ def test_each_public_name_is_thrown_at(calls):
     others = {name for name in sst_ros.__all__ if getattr(sst_ros, name) not in thrown}
     errors = {name for name in others if name.endswith(("Error", "Stopped", "Configuration"))}
     # A version, what gives others by methods above, and what only results have.
-    results = {"Scene", "Geometry", "Identification", "LinearModel", "ProvenMotion", "State"}
+    results = {
+        "Equations",
+        "Scene",
+        "Geometry",
+        "Identification",
+        "LinearModel",
+        "ProvenMotion",
+        "State",
+    }
     assert others - errors == {"__version__", *results}

@@ -222,7 +222,7 @@ def fit_torques(
         ("noise", noise, three, "must be three finite standard deviations > 0 [N m]"),
         ("delay", delay, late, f"must be from -{LONGEST_DELAY:g} to {LONGEST_DELAY:g} s"),
     )
-    equations = Equations(segments.parts, Regressor(scene, names), cutoff)
+    equations = RegressionEquations(segments.parts, Regressor(scene, names), cutoff)
     fitted = equations.fit(weights, delay)
     base, estimate, root, spread = fitted.base, fitted.estimate, fitted.root, fitted.noise
     given = parameters.values(scene, names)
@@ -256,7 +256,7 @@ def fit_torques(
 
 
 class WeightedFit(NamedTuple):
-    """What `Equations.fit` finds; root, R^T R, is the inverse of the covariance."""
+    """What `RegressionEquations.fit` finds; root, R^T R, is the inverse of the covariance."""
 
     base: BaseParameters
     estimate: Array  # of the base parameters, shape (b,)
@@ -268,7 +268,7 @@ class WeightedFit(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Equations:
+class RegressionEquations:
     """The equation of motion along measured segments, as a function of the delay of the angles.
 
     Attributes:

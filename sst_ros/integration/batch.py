@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import os
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property, partial
 from typing import Any
 
@@ -28,9 +28,11 @@ from sst_ros.integration.batch_step import (
     BLOCK,
     EARLIEST,
     NOT_FINITE,
+    Advance,
     Block,
     ColumnStep,
     advance_blocks,
+    locate_ends,
 )
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.mechanism.geometry import Array
@@ -43,9 +45,6 @@ _UNUSED = {
     "initial": "is given to run, not as a parameter",
     **dict.fromkeys(("motion", "duration"), "has no effect on a batch"),
 }
-
-FINE = 16
-"""Parts of a step that is repeated to locate an end: the error of a cubic falls 65,536 times."""
 
 _BLOCK = 1024
 """States whose joints are computed at once: all numbers of the program are arrays as long."""
@@ -68,11 +67,6 @@ _REASONS = {
 
 _SCENARIO = {"status": "", "message": "", "fault_time": "s", "local_error": ""}
 """What is known of a scenario beside its motion, with units."""
-
-Advance = Callable[..., None]
-"""(first, count, step, *arrays, rows=None): advances states by steps from step `first`, and changes
-`arrays`: states, drives, codes, times and errors. `rows` are those whose last step is repeated;
-None for all."""
 
 
 class Batch(Explained):
@@ -124,6 +118,13 @@ class Batch(Explained):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what was given; programs are traced and compiled again where they are needed."""
         return _make_batch, (self.scene, self._method, self.model.profile, self._scenarios.rows)
+
+    def result_of(
+        self, code: NDArray[np.int64], fault_time: Array, error: Array, t: Array, torque: Array,
+        y: Array,
+    ) -> BatchResult:  # fmt: skip
+        """Return states of all scenarios as a result, see `BatchResult` for the arguments."""
+        return BatchResult(self.model, self.columns, torque, code, fault_time, error, t, y)
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios, already checked, that shares this one's programs.
@@ -320,21 +321,6 @@ def _make_batch(
     scene: Scene, method: Tableau, profile: bool, parameters: Mapping[str, ArrayLike]
 ) -> Batch:
     return Batch(scene, method, profile=profile, parameters=parameters)
-
-
-def locate_ends(
-    advance: Advance, step: float, steps: Array, y: Array, given: Array, code: Any, time: Array
-) -> None:
-    """Repeat the steps in which limits were passed by finer ones; `code` and `time` change."""
-    ended = np.flatnonzero((code > 0) & (code < NOT_FINITE))
-    for number in np.unique(steps[ended]):
-        rows = ended[steps[ended] == number]
-        found, when = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), np.nan)
-        arrays = np.ascontiguousarray(y[:, rows]), np.ascontiguousarray(given[:, rows]), found, when
-        first = int(number) * FINE
-        advance(first, FINE, step / FINE, *arrays, np.zeros(len(rows)), rows=rows)
-        located = (found > 0) & (found < NOT_FINITE)
-        code[rows[located]], time[rows[located]] = found[located], when[located]
 
 
 def _rows(name: str, value: ArrayLike, count: int | None) -> Array:

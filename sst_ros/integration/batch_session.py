@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import check_kinds, refuse_unless
-from sst_ros.integration.batch_step import EARLIEST, Block
+from sst_ros.integration.batch_step import EARLIEST, Block, locate_ends
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
@@ -106,7 +106,7 @@ class BatchSession:
     @check_kinds
     def reset(
         self,
-        rows: ArrayLike | None = None,
+        rows: Any = None,
         gamma: ArrayLike | None = None,
         gamma_dot: ArrayLike | None = None,
     ) -> BatchState:
@@ -146,27 +146,14 @@ class BatchSession:
 
     def result(self) -> BatchResult:
         """Return a copy of all robots' states with every quantity of a `BatchResult`."""
-        from sst_ros.integration.batch import BatchResult  # which makes sessions
-
         time = (self._done - np.maximum(self._begun, 0)) * self._substeps * self._h
         batch, code, fault = self._batch, self.state.code.copy(), self.fault_time.copy()
         torque = self._given[:3].T.copy()
         last = np.where(np.isnan(fault), time, fault)
-        return BatchResult(
-            batch.model,
-            batch.columns,
-            torque,
-            code,
-            fault,
-            self._error.copy(),
-            last,
-            self._y.copy(),
-        )
+        return batch.result_of(code, fault, self._error.copy(), last, torque, self._y.copy())
 
     def _locate(self, rows: NDArray[np.intp]) -> None:
         """Find when robots that ended in this step did so, from their last reset on."""
-        from sst_ros.integration.batch import locate_ends  # which makes sessions
-
         time, code = self.fault_time[rows], self.state.code[rows]
         begins = np.ceil(time / self._h - 0.1 * EARLIEST) - 1.0
         y = np.ascontiguousarray(self._y[:, rows])

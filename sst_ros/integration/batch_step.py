@@ -17,7 +17,7 @@ cubic in its values and rates at both ends (Hermite). Its error is at most h^4 m
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import add
 from typing import Any
@@ -319,3 +319,27 @@ def advance_blocks(
         block.load(part, *columns)
         block.run(part, first, count, h, *columns)
         block.store(part, *columns)
+
+
+FINE = 16
+"""Parts of a step that is repeated to locate an end: the error of a cubic falls 65,536 times."""
+
+Advance = Callable[..., None]
+"""(first, count, step, *arrays, rows=None): advances states by steps from step `first`, and changes
+`arrays`: states, drives, codes, times and errors. `rows` are those whose last step is repeated;
+None for all."""
+
+
+def locate_ends(
+    advance: Advance, step: float, steps: Array, y: Array, given: Array, code: Any, time: Array
+) -> None:
+    """Repeat the steps in which limits were passed by finer ones; `code` and `time` change."""
+    ended = np.flatnonzero((code > 0) & (code < NOT_FINITE))
+    for number in np.unique(steps[ended]):
+        rows = ended[steps[ended] == number]
+        found, when = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), np.nan)
+        arrays = np.ascontiguousarray(y[:, rows]), np.ascontiguousarray(given[:, rows]), found, when
+        first = int(number) * FINE
+        advance(first, FINE, step / FINE, *arrays, np.zeros(len(rows)), rows=rows)
+        located = (found > 0) & (found < NOT_FINITE)
+        code[rows[located]], time[rows[located]] = found[located], when[located]

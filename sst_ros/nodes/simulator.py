@@ -213,7 +213,7 @@ class FollowedClock(SteadyTime):
         self._clock = node.get_clock()
         self._moved = threading.Event()
         self._moved_s = time.monotonic()  # the steady time of the last move
-        self._jumps: list[float] = []  # back [s], which nobody has been warned of
+        self._jumps: list[float] = []  # back [s], of which no warning was given yet
         least = Duration(nanoseconds=1)
         threshold = JumpThreshold(min_forward=least, min_backward=Duration(nanoseconds=-1))
         self._handle = self._clock.create_jump_callback(threshold, post_callback=self._take_move)

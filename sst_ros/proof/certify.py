@@ -4,8 +4,7 @@
 A number of a scene stands for what is written and for the double that is read, or for anything in
 a range that is given. What is made from them (unit vectors, shifted inertias, the posture at the
 start) is enclosed. The room: `balls` has Arb's numbers and their rounding, `scene_balls` the
-numbers of a scene, `enclosure` the theorem of a step; this file makes a motion of steps, `union`
-one of the parts of a range, `closed_loop` has a controller act at its ticks, `zone` maps poses.
+numbers of a scene, `enclosure` the theorem of a step; this file makes a motion of steps.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class TorqueProfile(ReadOnly):
         return np.empty(0)
 
     def acting(self, begin: float, end: float) -> Any:
-        """Return what acts on [begin, end], in which no kink lies, as a `Propagator` takes it."""
+        """Return what acts on [begin, end], in which no kink lies, as a `Stepper` takes it."""
         return self
 
 

@@ -218,7 +218,7 @@ def test_inertias_that_no_bodies_have_do_not_enter_the_scene():
     ("names", "message"),
     [
         ((), "must be keys of numbers"),
-        (("base.radius",), "is geometry"),
+        (("base.v",), "is geometry"),
         (("friction.gamma.smoothing",), "must be the key of a number that the scene has"),
         (("star.moment.x",), "must be the key of a number that the scene has"),
     ],
