@@ -117,7 +117,7 @@ def run_in_loop(
         states.append(simulation.state)
         times.append(time.thread_time())
 
-    def nothing(*_: Any) -> None: ...
+    def nothing(*_: Any, **__: Any) -> None: ...
 
     # Input and output of a run without messages: no torque gets old, and nobody listens.
     ends: Any = SimpleNamespace(

@@ -12,6 +12,7 @@ from sst_ros import (
     InverseDynamics,
     Simulation,
     certify,
+    equations,
     linearize,
     load_scene,
     read_bag,
@@ -39,6 +40,7 @@ def made(bag):
         simulate(scene, duration=0.1).reactions,
         certify("example2", duration=0.01, t_eval=[0.01]),
         linearize(scene, None, (0.0, 0.0, 0.0)),
+        equations("example2", "numpy"),
     )
 
 

@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,9 +22,6 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
 from sst_ros.programs.llvm import LANES
-
-if TYPE_CHECKING:
-    from sst_ros.integration.batch import Batch, BatchResult
 
 _WORTH_A_THREAD = 512
 """Robots: their step takes ten times as long as to wake a thread."""
@@ -54,7 +51,7 @@ class BatchSession:
     """
 
     def __init__(
-        self, batch: Batch, gamma: ArrayLike, gamma_dot: ArrayLike, step: float, substeps: int
+        self, batch: Any, gamma: ArrayLike, gamma_dot: ArrayLike, step: float, substeps: int
     ) -> None:
         self._batch, self._h, self._substeps = batch, step / substeps, substeps
         self._y, code = batch.initial(gamma, gamma_dot)
@@ -144,7 +141,7 @@ class BatchSession:
         self._each(lambda robots: robots.load(*self._columns))
         return self.state
 
-    def result(self) -> BatchResult:
+    def result(self) -> Any:
         """Return a copy of all robots' states with every quantity of a `BatchResult`."""
         time = (self._done - np.maximum(self._begun, 0)) * self._substeps * self._h
         batch, code, fault = self._batch, self.state.code.copy(), self.fault_time.copy()
@@ -185,7 +182,7 @@ class BatchSession:
 class _Robots:
     """Robots of one thread: a block and the joints of its columns."""
 
-    def __init__(self, batch: Batch, part: slice, width: int, joints: Array) -> None:
+    def __init__(self, batch: Any, part: slice, width: int, joints: Array) -> None:
         programs = batch.programs
         self._part, self._block = part, Block(programs, width)
         self._number = len(range(*part.indices(joints.shape[1])))
@@ -214,7 +211,7 @@ class _Robots:
         self._whole[:, self._part] = self._found[:, : self._number]
 
 
-def joints_of(batch: Batch) -> Any:
+def joints_of(batch: Any) -> Any:
     """Return the program of actuator angles and rates, of the first seven numbers of a state."""
     model = batch.model
 
