@@ -206,7 +206,7 @@ class Stepper:
         import scipy.optimize  # noqa: F401  # takes 0.4 s, too long for a step in real time
 
         held = self._hold((0.0, 0.0, 0.0), 0.0, (0.0,) * len(self.dynamics.drive[3:]))
-        for method in self._methods:
+        for method in self._methods if self._chooses else self._methods[:1]:
             self._steps_of(held, method).load()
         if self._chooses:
             _ = self.ode.linearised
