@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import MissingDependency, refuse_errors, refuse_unless, require
+from sst_ros.errors import MissingDependency, check_regular, refuse_errors, refuse_unless, require
 
 TEMPORARY = ".part-"
 """How the name of a file begins that is not whole yet, or that a killed process has left."""
@@ -164,6 +164,7 @@ def load_table(
 
     """
     try:
+        check_regular(path)
         with path.open("rb") as file:
             zipped = file.read(2) == b"PK"
         if zipped:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.control.law import ControlChannel, ControllerSettings
@@ -25,7 +24,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.schema import Rules, Section, anything, build, choice, entry, positive
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.scene.yaml_document import plain
+from sst_ros.scene.yaml_document import plain, read_file, read_values, resolve_numbers
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
     SAMPLINGS,
@@ -123,11 +122,15 @@ class SweepStudy(Section):
     def read(cls, path: Path) -> SweepStudy:
         """Read a YAML file; `scene` is a name, a path relative to the file, or a document."""
         refused = "STUDY", str(path), "must be a readable .yaml file"
-        with refuse_errors("sweep", *refused, OSError, UnicodeDecodeError, yaml.YAMLError):
-            values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        with refuse_errors("sweep", *refused, OSError, UnicodeDecodeError):
+            source = read_file(path)
+        values = read_values(source, str(path))
         mapping = isinstance(values, dict) and isinstance(values.get("vary", {}), dict)
         allowed = "must be a mapping with the keys scene and vary"
         refuse_unless(str(path), ("", type(values).__name__, mapping, allowed))
+        # Sections take numbers as text; what only `rules` check has them as numbers.
+        for name in [name for name in ("vary", "table", "torque") if name in values]:
+            values[name] = resolve_numbers(values[name])
         return cls.from_values(values, path.parent)
 
     @classmethod
