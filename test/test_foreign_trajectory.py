@@ -111,3 +111,11 @@ def test_a_device_is_refused_at_once(tmp_path):
 def test_an_unchanged_copy_is_read(saved, tmp_path):
     again = Trajectory.load(crafted(saved, tmp_path, ".npz", lambda columns, about: None))
     assert np.array_equal(again.gamma, Trajectory.load(saved).gamma)
+
+
+def test_a_name_that_is_too_long_is_refused(saved, tmp_path):
+    path = tmp_path / f"{'x' * 300}.npz"
+    with pytest.raises(InputError, match="must be writable"):
+        Trajectory.load(saved).save(path)
+    with pytest.raises(InputError, match="File name too long"):
+        Trajectory.load(path)

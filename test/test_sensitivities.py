@@ -183,5 +183,5 @@ def test_an_inertia_means_its_six_numbers():
 
 
 def test_a_refusal_names_the_argument():
-    with pytest.raises(InputError, match="^simulate: sensitivities = 'star.wool': must be"):
+    with pytest.raises(InputError, match=r"^simulate: sensitivities = 'star\.wool': must be"):
         simulate("example2", CONSTANT, 0.05, sensitivities=["star.wool"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -366,7 +367,7 @@ class Trajectory(MotionTable):
 
         """
         path, ends = Path(path), f"must end in {' or '.join(SUFFIXES)}"
-        free = overwrite or not path.exists()
+        free = overwrite or not os.path.exists(path)  # noqa: PTH110  # Path's raises on long names
         refuse_unless(
             "save",
             ("path", str(path), path.suffix in SUFFIXES, ends),

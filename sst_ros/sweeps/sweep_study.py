@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 import re
 import warnings
 from collections.abc import Mapping
@@ -47,6 +48,8 @@ OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
 """What `outputs` may name: of the final state; extremes of joints and reactions over a run."""
 
 MOST = 10_000_000
+MOST_ROWS = 1_000_000_000
+"""Of a study: some 200 GB, which takes two weeks at 1000 runs a second."""
 
 _count: Any = partial(entry, default=None, least=1, most=MOST)
 _NO_TORQUE = "has no effect: the controller gives the torques"
@@ -66,7 +69,7 @@ class SweepStudy(Section):
         "distribution or values by key of the scene, see `variations`", default_factory=dict
     )
     n: int | None = _count(
-        "number of runs; by default that of the grid or of the table", most=2**53
+        "number of runs; by default that of the grid or of the table", most=MOST_ROWS
     )
     seed: int = entry("of the random numbers", default=0, least=0, most=2**64 - 1)
     sampling: str = choice("of random numbers", SAMPLINGS)
@@ -137,7 +140,8 @@ class SweepStudy(Section):
     def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
         """Build a study from a mapping; names of files are relative to a folder."""
         given = {"scene": None} | {key: x for key, x in values.items() if x is not None}
-        if isinstance(given["scene"], str) and (folder / given["scene"]).is_file():
+        # Of os.path, which is False where a name is too long for the file system.
+        if isinstance(given["scene"], str) and os.path.isfile(folder / given["scene"]):  # noqa: PTH113
             given["scene"] = folder / given["scene"]
         if isinstance(given.get("table"), str):
             given["table"] = folder / given["table"]
