@@ -5,14 +5,17 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import functools
 import importlib
 import inspect
 import math
 import os
+import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -184,6 +187,13 @@ def refuse_errors(
         yield
     except errors as error:
         raise refusal(origin, key, value, f"{allowed} ({error})") from None
+
+
+def check_regular(path: Path) -> None:
+    """Raise OSError where a path is a pipe or a device, which may never end, or is not there."""
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "it is no regular file")
 
 
 def read_numbers(origin: str, name: str, value: Any, *, seconds: bool = False) -> Array:

@@ -33,6 +33,7 @@ from sst_ros.host import processes
 from sst_ros.nodes import topics
 from sst_ros.runtime.settings import SimulatorParameters, default_topics, ros_arguments
 from sst_ros.scene.scene import load, share_directory
+from sst_ros.scene.yaml_document import read_file, read_values
 from sst_ros.state import BASE_FRAME
 
 
@@ -226,7 +227,7 @@ def ros2_control(given: Given, controller: str, controllers: str) -> list[Action
     hardware = "sst_ros_hardware" if lockstep else "joint_state_topic_hardware_interface"
     names = ["controller_manager", hardware, "robot_state_publisher"]
     spawned = ["joint_state_broadcaster", controller]
-    for listed in yaml.safe_load(Path(path).read_text(encoding="utf-8")).values():
+    for listed in read_values(read_file(Path(path)), path).values():
         given_there = listed.get("ros__parameters", {})
         types = [given_there[name].get("type", "") for name in spawned if name in given_there]
         names += [plugin.partition("/")[0] for plugin in types if plugin]

@@ -114,7 +114,7 @@ def test_a_key_of_several_numbers_means_each_of_them():
         (CONSTANT, "base.radius", "is no number of the equations of motion"),
         (CONSTANT, "workspace.beta_max_deg", "is no number of the equations of motion"),
         (CONSTANT, "duration", "is no number of the equations of motion"),
-        (CONSTANT, "star.inertia", "must be the key of a number"),
+        (CONSTANT, "name", "sensitivities = .name.: must be the key of a number"),
         (lambda t: CONSTANT, "torque", "three numbers or a profile, not a function"),
         (lambda t, state: CONSTANT, "star.inertia.zz", "not a function of the state"),
     ],
@@ -171,3 +171,17 @@ def test_the_orientation_at_given_angles_by_the_geometry():
     assert of_alpha == pytest.approx(traced["star.alpha_deg"].rotation[0], abs=1e-13)
     many = rates.orientation_sensitivity(geometry, rotation_matrix(motion.quaternion[:5]))
     assert many.v.shape == (5, 3, 3, 3) and np.all(many.v[0] == found.v)
+
+
+def test_an_inertia_means_its_six_numbers():
+    parts = [f"star.inertia.{part}" for part in ("xx", "yy", "zz", "xy", "xz", "yz")]
+    motion = simulate("example2", CONSTANT, 0.05, sensitivities=["star.inertia", *parts])
+    found = motion.sensitivities
+    assert found["star.inertia"].gamma.shape == (len(motion), 3, 6)
+    for number, part in enumerate(parts):
+        assert np.array_equal(found["star.inertia"].gamma[..., number], found[part].gamma[..., 0])
+
+
+def test_a_refusal_names_the_argument():
+    with pytest.raises(InputError, match=r"^simulate: sensitivities = 'star\.wool': must be"):
+        simulate("example2", CONSTANT, 0.05, sensitivities=["star.wool"])

@@ -43,7 +43,7 @@ from sst_ros.mechanism.generic_math import (
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.programs.expression import compile_for_arrays, compile_program, mark_present, trace
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import build_unchecked, key_of
+from sst_ros.scene.schema import Section, build_unchecked, key_of, leaves
 from sst_ros.scene.torque_profile import (
     FunctionTorque,
     LostTorque,
@@ -117,7 +117,7 @@ class VariationalEquations:
         found = self.integrate(state, slopes, t, values, scene=scene)
         if found is None:
             allowed = "leave no motion to the last time"
-            raise refusal(self._caller, "parameters", values.tolist(), allowed)
+            raise refusal(self._caller, _argument(self._caller), values.tolist(), allowed)
         return found
 
     def integrate(
@@ -260,7 +260,12 @@ def refuse_other_numbers(scene: Scene, names: Sequence[str], caller: str) -> Non
         elif find_number(scene, name) is None:
             allowed = "must be the key of a number that the scene has"
         if allowed:
-            raise refusal(caller, "parameters", name, allowed)
+            raise refusal(caller, _argument(caller), name, allowed)
+
+
+def _argument(caller: str) -> str:
+    """Return the name of the argument by which a caller was given names of numbers."""
+    return "sensitivities" if caller == "simulate" else "parameters"
 
 
 class _TracedAxes(NamedTuple):
@@ -455,9 +460,17 @@ class Sensitivities:
 
 
 def list_numbers(scene: Scene, name: str) -> list[str]:
-    """Return the key of each number that a key names; itself where it names nothing."""
+    """Return the key of each number that a key names; itself where it names nothing.
+
+    A section means all of its numbers, as "star.inertia" its six.
+    """
     try:
         fields = list(find_fields(scene, name, components=True))
     except ValueError:
         return [name]
-    return [key_of((*place, *i)) for place, x, _ in fields for i in np.ndindex(np.shape(x))]
+    found = []
+    for place, value, _ in fields:
+        section = isinstance(value, Section)
+        below = leaves(value) if section else np.ndindex(np.shape(value))
+        found += [key_of((*place, *rest)) for rest in below]
+    return found

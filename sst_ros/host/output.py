@@ -9,6 +9,8 @@ besides, for other readers. CSV has the columns alone, for other programs.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import sys
 import uuid
@@ -21,7 +23,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.errors import MissingDependency, refuse_errors, refuse_unless, require
+from sst_ros.errors import (
+    MissingDependency,
+    check_regular,
+    refusal,
+    refuse_errors,
+    refuse_unless,
+    require,
+)
 
 TEMPORARY = ".part-"
 """How the name of a file begins that is not whole yet, or that a killed process has left."""
@@ -58,6 +67,29 @@ def write_into(out: Path, origin: str) -> Iterator[None]:
     with refuse_errors(origin, "--out", str(out), "must be a folder that can be written", OSError):
         out.mkdir(parents=True, exist_ok=True)
         yield
+
+
+@contextmanager
+def hold_folder(out: Path, origin: str) -> Iterator[None]:
+    """Make the folder `out` for a block that alone writes into it; remove it if it stays empty.
+
+    Raises InputError of `origin` where another writer has it, in this process or another.
+    """
+    with write_into(out, origin):
+        lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            allowed = "is being written by another run: wait until that has ended"
+            raise refusal(origin, "--out", str(out), allowed) from None
+        except OSError:  # a network file system may not lock folders
+            pass
+        yield
+    finally:
+        os.close(lock)
+        with contextlib.suppress(OSError):  # it is not empty
+            out.rmdir()
 
 
 @contextmanager
@@ -130,7 +162,7 @@ def write_table(
     which need pyarrow and pandas.
     """
     texts = dict(texts or {})
-    texts[_CHECKSUM] = _checksum(texts, columns)
+    texts[_CHECKSUM] = compute_checksum(texts, columns)
     with replace_file(path) as own:
         if path.suffix == ".npz":
             named: dict[str, Any] = {**columns, **texts}
@@ -164,6 +196,7 @@ def load_table(
 
     """
     try:
+        check_regular(path)
         with path.open("rb") as file:
             zipped = file.read(2) == b"PK"
         if zipped:
@@ -182,13 +215,13 @@ def load_table(
         raise
     except Exception as error:  # pyarrow and zipfile raise anything on bad bytes
         raise ValueError(" ".join(str(error).split())) from None
-    checksum = _checksum(asked, numbers)
+    checksum = compute_checksum(asked, numbers)
     if found.get(_CHECKSUM, checksum) != checksum:
         raise ValueError("its checksum is another")
     return numbers, asked
 
 
-def _checksum(texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> str:
+def compute_checksum(texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> str:
     """CRC-32 of texts and of the bits of columns."""
     checksum = zlib.crc32("".join(texts.values()).encode())
     for column in columns.values():

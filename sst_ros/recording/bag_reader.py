@@ -28,7 +28,6 @@ from functools import cache
 from pathlib import Path, PurePath
 from typing import IO, Any, NamedTuple, TypeAlias
 
-import yaml
 import zstandard
 from mcap import records
 from mcap.opcode import Opcode
@@ -39,6 +38,7 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, refusal
+from sst_ros.scene.yaml_document import read_file, read_values
 
 _DATA_END_SIZE = 9 + 4  # bytes of opcode and length, and of its content
 _HEAD = struct.Struct("<BQ")  # opcode and length, with which each record of MCAP begins
@@ -184,15 +184,16 @@ class Bag:
         files, counts = list[Path](), dict[str, int]()
         text = self.path / "metadata.yaml"
         try:
-            found = yaml.safe_load(text.read_text(encoding="utf-8"))
+            found = read_values(read_file(text), "metadata.yaml")
             found = found["rosbag2_bagfile_information"]
             files = [self.path / PurePath(name).name for name in found["relative_file_paths"]]
             for one in found.get("topics_with_message_count") or ():
                 name = str(one["topic_metadata"]["name"])
                 counts[name] = counts.get(name, 0) + int(one["message_count"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, InputError) as error:
             if not self._damaged and (text.exists() or not self._listed()):
-                raise self._not_whole(f"metadata.yaml: {error}") from None
+                reason = str(error).removeprefix("metadata.yaml: ")
+                raise self._not_whole(f"metadata.yaml: {reason}") from None
         if not (files and all(map(Path.exists, files))) and (self._damaged or not files):
             files = self._listed()
         return files, counts

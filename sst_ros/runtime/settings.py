@@ -19,13 +19,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
-import yaml
-
 from sst_ros.control.law import ControlChannel, ControllerSettings
-from sst_ros.errors import Check, refuse_unless, suggestion
+from sst_ros.errors import Check, refuse_errors, refuse_unless, suggestion
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import Rules, Section, Spec, accept, choice, entry
+from sst_ros.scene.yaml_document import read_file, read_values
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
 from sst_ros.state import BASE_FRAME, NANOSECONDS
 
@@ -395,8 +394,10 @@ def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:
     The files are those that rcl has read from the ROS arguments.
     """
     for path in (path for flag, path in pairwise(ros) if flag == "--params-file"):
-        text = Path(path).read_text(encoding="utf-8", errors="replace")
-        patterns = [*_nodes_of(yaml.load(text, yaml.BaseLoader))]
+        allowed = "must be a readable file"
+        with refuse_errors(node, "--params-file", path, allowed, OSError, ValueError):
+            text = read_file(Path(path))
+        patterns = [*_nodes_of(read_values(text, path))]
         # ** stands for any number of names, * for one.
         forms = [re.escape(one).replace(r"/\*\*", "(/[^/]+)*") for one in patterns]
         if not any(re.fullmatch(form.replace(r"/\*", "/[^/]+"), node) for form in forms):

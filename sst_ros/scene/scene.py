@@ -225,7 +225,7 @@ def text_of(name_or_path: str | Path) -> tuple[str, str]:
     if is_name := path.suffix not in (".yaml", ".yml"):
         path = share_directory() / "config" / "scenes" / f"{name_or_path}.yaml"
     try:
-        return path.read_text(encoding="utf-8"), str(path)
+        return yaml_document.read_file(path), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         allowed = f"must be a readable .yaml file or one of {', '.join(names())}"
         reason = getattr(error, "strerror", None) or error  # without the path, which is said

@@ -14,16 +14,20 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from sst_ros.errors import InputError, Problem, refusal
-from sst_ros.scene.schema import REQUIRED, Place, S, Section, Spec, build
+from sst_ros.errors import InputError, Problem, check_regular, refusal
+from sst_ros.scene.schema import NUMBER, REQUIRED, Place, S, Section, Spec, build
 from sst_ros.state import LostMeaning, find_lost_meaning
 
 NO_NUMBER = "must name a number, as star.mass does"
+
+_WHOLE = re.compile("[-+]?[0-9]{1,18}")  # longer ones are doubles
+_INFINITE = re.compile(r"[-+]?\.inf")
 
 LONGEST, MOST_NODES, DEEPEST = 1_000_000, 20_000, 20
 LIMITS = (
@@ -55,20 +59,68 @@ def read(cls: type[S], source: str, origin: str) -> S:
     lines: dict[str, int] = {}
     problems: list[Problem] = []
     try:
-        if len(source) > LONGEST:
-            raise refusal("", "", "more", LIMITS)
-        values = _values(yaml.compose(source, Loader=_Loader), "", lines, problems)
+        values = _parse(source, lines, problems)
         result = build(cls, values, origin)
     except InputError as refused:
         for one in refused.problems:
             problems.append(replace(one, line=one.line or _line_at(lines, one.key)))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        reason = getattr(error, "problem", None) or str(error)
-        problems.append(Problem("", reason, "must be YAML", mark and mark.line + 1))
     if problems:
         raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
     return result
+
+
+def read_values(source: str, origin: str) -> Any:
+    """Return YAML text as dicts, lists and text, numbers as text too.
+
+    Raises InputError where it is no YAML, breaks a limit of `read`, or has a key twice.
+    """
+    problems: list[Problem] = []
+    try:
+        values = _parse(source, {}, problems)
+    except InputError as refused:
+        problems += refused.problems
+    if problems:
+        raise InputError(origin, problems)
+    return values
+
+
+def read_file(path: Path) -> str:
+    """Return the text of a YAML file, or its beginning, if `read` refuses it as too long.
+
+    Raises OSError where there is no such file, or a pipe or a device, which may never
+    end; and UnicodeDecodeError.
+    """
+    check_regular(path)
+    with path.open(encoding="utf-8") as file:
+        return file.read(LONGEST + 1)
+
+
+def resolve_numbers(value: Any) -> Any:
+    """Turn text in what `read_values` returns into numbers and truth values, as in YAML 1.2."""
+    if isinstance(value, dict):
+        return {key: resolve_numbers(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [resolve_numbers(entry) for entry in value]
+    if not isinstance(value, str):
+        return value
+    if _WHOLE.fullmatch(value):
+        return int(value)
+    if NUMBER.fullmatch(value) or _INFINITE.fullmatch(value):
+        return float(value.replace(".inf", "inf"))
+    return {"true": True, "false": False}.get(value.lower(), value)
+
+
+def _parse(source: str, lines: dict[str, int], problems: list[Problem]) -> Any:
+    """Return `_values` of YAML text within the limits; InputError says what is wrong with it."""
+    try:
+        if len(source) > LONGEST:
+            raise refusal("", "", "more", LIMITS)
+        return _values(yaml.compose(source, Loader=_Loader), "", lines, problems)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        reason = getattr(error, "problem", None) or str(error)
+        line = mark and mark.line + 1
+        raise InputError("", [Problem("", reason, "must be YAML", line)]) from None
 
 
 def dump(document: Section) -> str:

@@ -120,9 +120,10 @@ def simulate(
             found without it, unless a pulse is shorter than a step.
         max_step: longest step [s]; by default the error alone decides.
         sensitivities: numbers by which `Trajectory.sensitivities` differentiates the motion: keys
-            of the scene, as "star.inertia.zz", "initial.gamma" (three numbers), "base.v" (nine) or
-            "stroke.stiffness", and "torque" for all numbers of the torques. Not with a function of
-            the state. By "star.alpha_deg[0]" the third angle takes what the first leaves.
+            of the scene, as "star.inertia.zz", "star.inertia" (its six numbers),
+            "initial.gamma" (three), "base.v" (nine) or "stroke.stiffness", and "torque" for
+            all numbers of the torques. Not with a function of the state. By
+            "star.alpha_deg[0]" the third angle takes what the first leaves.
         progress: draw a bar on a terminal.
 
     Raises:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -60,6 +61,9 @@ _FIGURES = (
 )  # fmt: skip
 """What a run says of itself, in its files and in xarray."""
 
+_TEXTS = ("message", "method")
+"""Those of the figures that are text; the others are numbers."""
+
 _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
@@ -75,6 +79,35 @@ def check_error(error: float, tolerance: float, status: int, message: str) -> tu
         return status, message
     unmet = f"the error estimate {error:.1e} rad exceeds the tolerance {tolerance:g} rad"
     return status or _UNMET, f"{message}; {unmet}"
+
+
+_UNIT = 1e-6
+"""Largest deviation of the length of a quaternion from 1 in a file."""
+_CLOSURE = 0.02
+"""Largest abs(r_k . t_k) in a file. A simulated motion has 1e-15; a recorded one has the
+noise of its encoders. What exceeds this is the orientation of another motion."""
+
+
+def _check_columns(path: str | Path, columns: dict[str, Array]) -> None:
+    """Refuse columns of a file that are no numbers, not finite, or not of equal length."""
+    count = columns["t"].shape
+    for name, column in columns.items():
+        number = column.dtype.kind in "fiu"
+        refuse_unless(
+            f"load: {path}",
+            (name, str(column.dtype), number, "must be numbers"),
+            (name, column.shape, column.shape == count, f"must have the shape {count}"),
+            (name, "nan", not number or bool(np.isfinite(column).all()), "must be finite"),
+        )
+
+
+def _check_figures(about: dict[str, Any]) -> None:
+    """Raise TypeError where what a run says of itself is of another kind."""
+    for name in _FIGURES:
+        value = about.get(name, "" if name in _TEXTS else 0)
+        fits = type(value) is str if name in _TEXTS else type(value) in (int, float)
+        if not fits:
+            raise TypeError(f"{name} = {value!r}")
 
 
 class Trajectory(MotionTable):
@@ -334,7 +367,7 @@ class Trajectory(MotionTable):
 
         """
         path, ends = Path(path), f"must end in {' or '.join(SUFFIXES)}"
-        free = overwrite or not path.exists()
+        free = overwrite or not os.path.exists(path)  # noqa: PTH110  # Path's raises on long names
         refuse_unless(
             "save",
             ("path", str(path), path.suffix in SUFFIXES, ends),
@@ -368,24 +401,43 @@ class Trajectory(MotionTable):
         try:
             columns, texts = load_table(Path(path), list(UNITS), [_KEY])
             about = json.loads(texts[_KEY])
-        except (KeyError, ValueError) as error:
-            reason = f" ({error})" if isinstance(error, ValueError) else ""
+        except (KeyError, ValueError, RecursionError) as error:
+            reason = "" if isinstance(error, KeyError) else f" ({error})"
             raise refusal("load", "path", str(path), allowed + reason) from None
-        form = about["format"]
+        form = about.get("format") if isinstance(about, dict) else None
         refuse_unless("load", ("format", form, form == _FORMAT, f"must be {_FORMAT}"))
+        _check_columns(path, columns)
         arrays = {
             name: np.stack([columns[f"{name}_{part}"] for part in DIMENSIONS[dimension]], axis=1)
             for name, (_, dimension) in QUANTITIES.items()
         }
-        return cls(
-            read(Scene, about["scene"], str(path)),
-            columns["t"],
-            *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
-            joints=np.hstack([arrays[name] for name in JOINTS]),
-            law=about["torque"] and profile_from(about["torque"]),
-            gaps=about.get("gaps", ()),
-            **{name: about[name] for name in _FIGURES if name in about},
+        try:
+            _check_figures(about)
+            found = cls(
+                read(Scene, about["scene"], str(path)),
+                columns["t"],
+                *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
+                joints=np.hstack([arrays[name] for name in JOINTS]),
+                law=about["torque"] and profile_from(about["torque"]),
+                gaps=about.get("gaps", ()),
+                **{name: about[name] for name in _FIGURES if name in about},
+            )
+        except (TypeError, ValueError, LookupError, AttributeError) as error:
+            reason = f" (its metadata: {type(error).__name__}: {error})"
+            raise refusal("load", "path", str(path), allowed + reason) from None
+        lengths = np.linalg.norm(found.quaternion, axis=1)
+        off = float(np.abs(lengths - 1.0).max(initial=0.0))
+        refuse_unless(
+            "load",
+            ("quaternion", off, off <= _UNIT, f"must be of length 1 to {_UNIT:g}"),
+            (
+                "quaternion",
+                found.closure_error,
+                found.closure_error <= _CLOSURE,
+                f"must close the loops with gamma: abs(r_k . t_k) <= {_CLOSURE:g}",
+            ),
         )
+        return found
 
     def _of_run(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in _FIGURES}

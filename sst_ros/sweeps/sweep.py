@@ -8,6 +8,7 @@ so that it explains itself and `--resume` knows which chunks are there.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -24,7 +25,15 @@ from numpy.typing import NDArray
 from sst_ros.dynamics.reactions import LINK_JOINTS, SIZES, ScenarioReactions
 from sst_ros.errors import InputError, check_kinds, refusal, refuse_unless, require
 from sst_ros.host.many_runs import SweepFailed, run_many
-from sst_ros.host.output import TEMPORARY, Bar, replace_file, require_free, write_into
+from sst_ros.host.output import (
+    TEMPORARY,
+    Bar,
+    compute_checksum,
+    hold_folder,
+    replace_file,
+    require_free,
+    write_into,
+)
 from sst_ros.integration.batch import Batch, BatchResult
 from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.report.results import render
@@ -128,9 +137,21 @@ def run_study(
         ("workers", workers, whole, "must be a whole number from 0 to 1024"),
         ("resume", resume, out is not None or not resume, "needs out"),
     )
+    if out is None:
+        return _compute(study, None, client=client, workers=workers, progress=progress)
+    out = out.resolve() if resume else require_free(out.resolve(), "sweep")
+    with hold_folder(out, "sweep"):
+        if not resume:  # another run may have written since
+            require_free(out, "sweep")
+        return _compute(study, out, client=client, workers=workers, progress=progress)
+
+
+def _compute(
+    study: SweepStudy, out: Path | None, *, client: Any, workers: int, progress: bool
+) -> pd.DataFrame:
+    """Compute the chunks of a study that are not in `out`, and return the whole table."""
     complete, steps = set[int](), None
     if out is not None:
-        out = out.resolve() if resume else require_free(out.resolve(), "sweep")
         # With the number of steps that was chosen when it was started.
         complete, steps = find_complete(out, study)
     ready = PreparedSweep(study, steps)
@@ -389,13 +410,60 @@ def find_range_ends(study: SweepStudy) -> dict[str, Array]:
 
 def write_part(table: pa.Table, folder: Path, index: int, about: Mapping[str, Any]) -> None:
     """Write the table of a chunk as a file that is there whole or not at all."""
-    table = table.replace_schema_metadata({METADATA: json.dumps(about).encode()})
-    with replace_file(folder / f"part-{index:07d}.parquet") as own:
+    told = {**about, "part": index}
+    told["checksum"] = _checksum(told, table)
+    table = table.replace_schema_metadata({METADATA: json.dumps(told).encode()})
+    with replace_file(folder / _part_name(index)) as own:
         # Random mantissas do not compress, and their least and greatest help no reader.
         require("pyarrow.parquet").write_table(
             table, own, compression="none", use_dictionary=["reason"], write_statistics=False
         )
         own.chmod(0o644)
+
+
+def _checksum(about: Mapping[str, Any], table: pa.Table) -> str:
+    """Return the checksum of what a file says of itself, and of the bits of its columns."""
+    said = {key: value for key, value in about.items() if key != "checksum"}
+    columns: dict[str, NDArray[Any]] = {}
+    texts = {"about": json.dumps(said, sort_keys=True)}
+    for name in table.column_names:
+        if name == "reason":
+            texts[name] = "\0".join(table[name].to_pylist())
+        else:
+            columns[name] = table[name].to_numpy()
+    return compute_checksum(texts, columns)
+
+
+def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
+    """Return metadata and table of a file; None where it is not whole.
+
+    Raises InputError where its numbers are not those that were written, or it was written
+    under another name. Files of earlier versions have neither number nor checksum.
+    """
+    with contextlib.suppress(*_unreadable()):
+        table = require("pyarrow.parquet").read_table(str(path), partitioning=None)
+        about = json.loads(table.schema.metadata[METADATA])
+        if not isinstance(about, dict):
+            return None
+        found = about.get("checksum")
+        intact = found is None or found == _checksum(about, table)
+        name = _part_name(about["part"]) if "part" in about else path.name
+        refuse_unless(
+            "sweep",
+            ("DIR", str(path), intact, "is damaged (its checksum is another): delete it"),
+            ("DIR", str(path), name == path.name, f"was written as {name}: delete or rename it"),
+        )
+        return about, table
+    return None
+
+
+def _part_name(index: int) -> str:
+    return f"part-{index:07d}.parquet"
+
+
+def _unreadable() -> tuple[type[Exception], ...]:
+    """Return what reading a file raises that is none of a study, or is cut."""
+    return OSError, ValueError, KeyError, TypeError, require("pyarrow").ArrowException
 
 
 def read_about(path: Path) -> dict[str, Any] | None:
@@ -404,39 +472,55 @@ def read_about(path: Path) -> dict[str, Any] | None:
         with require("pyarrow.parquet").ParquetFile(path) as file:
             found: dict[str, Any] = json.loads(file.schema_arrow.metadata[METADATA])
             return found | {"rows": file.metadata.num_rows}
-    except (OSError, ValueError, KeyError, TypeError, require("pyarrow").ArrowException):
+    except _unreadable():
         return None
 
 
 def find_complete(folder: Path, study: SweepStudy) -> tuple[set[int], int | None]:
     """Return the chunks whose files are there, and the number of steps of their runs.
 
-    Raises InputError at a file of another study or version.
+    Raises InputError at a file of another study or version, of none of its chunks, or
+    whose numbers are not those that were written.
     """
     expected: dict[str, Any] = {"digest": study.digest, "version": VERSION}
+    names = {_part_name(index): index for index in range(study.chunks)}
     found = set()
     for path in sorted(folder.glob("part-*.parquet")):
-        about = read_about(path)
-        if about is None:
+        part = read_part(path)
+        index = names.get(path.name)
+        allowed = f"is none of the {study.chunks} parts of this study: delete it"
+        refuse_unless("sweep", ("--resume", str(path), index is not None, allowed))
+        if part is None or index is None:
             continue
-        same = all(about[key] == value for key, value in expected.items())
+        about, table = part
+        same = all(about.get(key) == value for key, value in expected.items())
+        same = same and "checksum" in about
         allowed = "is of another study or version: choose another --out"
         refuse_unless("sweep", ("--resume", str(path), same, allowed))
         expected["steps"] = about["steps"]
-        index = int(path.stem.removeprefix("part-"))
-        if about["rows"] == len(study.rows_of(index)):
+        if table.num_rows == len(study.rows_of(index)):
             found.add(index)
     return found, expected.get("steps")
 
 
 def read_sweep(folder: Path) -> pd.DataFrame:
     """Read the results in a folder as one table, units and study in its `attrs`, or refuse it."""
-    paths = sorted(folder.glob("part-*.parquet"))
-    about = next(filter(None, map(read_about, paths)), None)
-    if about is None:
+    read = [(path, read_part(path)) for path in sorted(folder.glob("part-*.parquet"))]
+    parts = [(path, *part) for path, part in read if part is not None]
+    if not parts:
         allowed = "must be a folder with files part-*.parquet of `sst-ros sweep`"
         raise refusal("sweep", "DIR", str(folder), allowed)
-    return to_frame(require("pyarrow.parquet").read_table(list(map(str, paths))), about)
+    for path, part in read:
+        allowed = "is not whole: --resume computes it again"
+        refuse_unless("sweep", ("DIR", str(path), part is not None, allowed))
+    first = parts[0][1]
+    for path, about, _ in parts:
+        same = all(about.get(key) == first.get(key) for key in ("digest", "version", "steps"))
+        allowed = f"is of another study or version than {parts[0][0].name}"
+        refuse_unless("sweep", ("DIR", str(path), same, allowed))
+    tables = [table.replace_schema_metadata(None) for *_, table in parts]
+    known = {key: value for key, value in first.items() if key not in ("part", "checksum")}
+    return to_frame(require("pyarrow").concat_tables(tables), known)
 
 
 def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:

@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 import re
 import warnings
 from collections.abc import Mapping
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.control.law import ControlChannel, ControllerSettings
@@ -25,7 +25,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.schema import Rules, Section, anything, build, choice, entry, positive
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.scene.yaml_document import plain
+from sst_ros.scene.yaml_document import plain, read_file, read_values, resolve_numbers
 from sst_ros.state import QUANTITIES, finite_vector
 from sst_ros.sweeps.variations import (
     SAMPLINGS,
@@ -48,6 +48,8 @@ OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
 """What `outputs` may name: of the final state; extremes of joints and reactions over a run."""
 
 MOST = 10_000_000
+MOST_ROWS = 1_000_000_000
+"""Of a study: some 200 GB, which takes two weeks at 1000 runs a second."""
 
 _count: Any = partial(entry, default=None, least=1, most=MOST)
 _NO_TORQUE = "has no effect: the controller gives the torques"
@@ -67,7 +69,7 @@ class SweepStudy(Section):
         "distribution or values by key of the scene, see `variations`", default_factory=dict
     )
     n: int | None = _count(
-        "number of runs; by default that of the grid or of the table", most=2**53
+        "number of runs; by default that of the grid or of the table", most=MOST_ROWS
     )
     seed: int = entry("of the random numbers", default=0, least=0, most=2**64 - 1)
     sampling: str = choice("of random numbers", SAMPLINGS)
@@ -123,18 +125,23 @@ class SweepStudy(Section):
     def read(cls, path: Path) -> SweepStudy:
         """Read a YAML file; `scene` is a name, a path relative to the file, or a document."""
         refused = "STUDY", str(path), "must be a readable .yaml file"
-        with refuse_errors("sweep", *refused, OSError, UnicodeDecodeError, yaml.YAMLError):
-            values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        with refuse_errors("sweep", *refused, OSError, UnicodeDecodeError):
+            source = read_file(path)
+        values = read_values(source, str(path))
         mapping = isinstance(values, dict) and isinstance(values.get("vary", {}), dict)
         allowed = "must be a mapping with the keys scene and vary"
         refuse_unless(str(path), ("", type(values).__name__, mapping, allowed))
+        # Sections take numbers as text; what only `rules` check has them as numbers.
+        for name in [name for name in ("vary", "table", "torque") if name in values]:
+            values[name] = resolve_numbers(values[name])
         return cls.from_values(values, path.parent)
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
         """Build a study from a mapping; names of files are relative to a folder."""
         given = {"scene": None} | {key: x for key, x in values.items() if x is not None}
-        if isinstance(given["scene"], str) and (folder / given["scene"]).is_file():
+        # Of os.path, which is False where a name is too long for the file system.
+        if isinstance(given["scene"], str) and os.path.isfile(folder / given["scene"]):  # noqa: PTH113
             given["scene"] = folder / given["scene"]
         if isinstance(given.get("table"), str):
             given["table"] = folder / given["table"]

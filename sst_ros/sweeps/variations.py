@@ -208,6 +208,8 @@ def read_table(given: Any) -> dict[str, Array]:
             kind = "parquet" if given.suffix == ".parquet" else "csv"
             given = getattr(require("pandas"), f"read_{kind}")(given)
         columns = {str(name): freeze(real_numbers(given[name])) for name in given}
+        if not columns or not all(map(np.size, columns.values())):
+            raise ValueError("it is empty")
         if all(column.ndim == 1 for column in columns.values()):
             return columns
         raise ValueError("a column has one number for each row")

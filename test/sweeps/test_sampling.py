@@ -144,3 +144,26 @@ def test_a_study_keeps_its_table_when_the_one_given_changes():
     study = SweepStudy.from_values({"scene": SCENE, "table": {"star.mass": column}, "vary": {}})
     column[0] = 7.0
     assert study.table["star.mass"].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("table", [{}, {"star.mass": []}])
+def test_an_empty_table_is_refused(table):
+    frame = pytest.importorskip("pandas").DataFrame(table, dtype=float)
+    with pytest.raises(InputError, match=r"table = .*it is empty"):
+        SweepStudy.from_values({"scene": SCENE, "table": frame, "vary": {}})
+
+
+def test_more_rows_than_anyone_can_run_are_refused():
+    values = {"scene": SCENE, "vary": {KEY: ("uniform", 0.2, 0.3)}, "n": 10**14}
+    with pytest.raises(InputError, match="n = 100000000000000: must be a whole number from 1 to"):
+        SweepStudy.from_values(values)
+
+
+def test_a_range_is_a_list_of_values():
+    study = SweepStudy.from_values({"scene": SCENE, "vary": {"star.mass": range(1, 4)}})
+    assert study.draw(0, 3)["star.mass"].ravel().tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_name_that_is_too_long_is_refused():
+    with pytest.raises(InputError, match="scene = 'xxx"):
+        SweepStudy.from_values({"scene": "x" * 300, "vary": {"star.mass": [1.0]}})
