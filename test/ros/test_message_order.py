@@ -5,6 +5,7 @@ The workers are called here as their executor calls them; no time passes.
 """
 
 import itertools
+from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -156,7 +157,8 @@ def test_joint_states_of_another_robot_are_no_sign_of_life(make, kind):
 def test_the_result_of_a_goal_has_the_reason_of_the_end(make):
     """Of a goal that is aborted because the node ends."""
     worker, reasons = make(InverseDynamicsController), []
-    worker._active, worker.failure = object(), SstError("no joint_states for 10.0 s")
+    goal = SimpleNamespace(handle=SimpleNamespace(is_cancel_requested=False))
+    worker._active, worker.failure = goal, SstError("no joint_states for 10.0 s")
     executor = SingleThreadedExecutor()
     executor.add_node(worker.node)
     worker._interrupt = reasons.append
