@@ -125,7 +125,7 @@ def run_in_loop(
         constant=lambda _: False,
         now_ns=lambda: NANOSECONDS,
         sample=sample,
-        **dict.fromkeys(("refresh", "ticks", "idle"), nothing),
+        **dict.fromkeys(("refresh", "ticks", "idle", "accept_idle"), nothing),
         moment=ZERO,
         unread=False,
     )

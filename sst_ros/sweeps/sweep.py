@@ -410,9 +410,9 @@ def find_range_ends(study: SweepStudy) -> dict[str, Array]:
 
 def write_part(table: pa.Table, folder: Path, index: int, about: Mapping[str, Any]) -> None:
     """Write the table of a chunk as a file that is there whole or not at all."""
-    told = {**about, "part": index}
-    told["checksum"] = _checksum(told, table)
-    table = table.replace_schema_metadata({METADATA: json.dumps(told).encode()})
+    record = {**about, "part": index}
+    record["checksum"] = _checksum(record, table)
+    table = table.replace_schema_metadata({METADATA: json.dumps(record).encode()})
     with replace_file(folder / _part_name(index)) as own:
         # Random mantissas do not compress, and their least and greatest help no reader.
         require("pyarrow.parquet").write_table(
