@@ -59,7 +59,7 @@ EXTRAS |= {
         "sphinx-gallery>=0.16",
     ],
     "engines": ["mujoco>=4", "pin>=4"],
-    "peers": ["mpmath", "mujoco>=4", "numba>=0.57", "pin>=4"],
+    "peers": ["mpmath", "mujoco>=4", "pin>=4"],
     "test": [
         "argcomplete",
         "build",
