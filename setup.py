@@ -69,6 +69,7 @@ EXTRAS |= {
         "colcon-common-extensions",
         "control",
         "fmpy>=0.3.20",
+        "gymnasium",
         "hypothesis",
         "jax>=0.4.35",
         "jsonschema",
