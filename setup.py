@@ -8,8 +8,10 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "sst_ros"
-HERE = Path(__file__).resolve().parent  # `colcon build --symlink-install` builds beside a link
-PACKAGE = ET.parse(HERE / "package.xml").getroot()  # the one place of version and metadata
+# `colcon build --symlink-install` builds beside a link
+HERE = Path(__file__).resolve().parent
+# the one place of version and metadata
+PACKAGE = ET.parse(HERE / "package.xml").getroot()
 ROS_MESSAGES = (
     "std",
     "sensor",
@@ -36,7 +38,12 @@ EXTRAS = {
     "plot": ["matplotlib>=3.5", "pandas>=2"],
     "fast": ["llvmlite>=0.42"],
     "sweep": ["llvmlite>=0.42", "pandas>=2", "pyarrow>=14"],
-    "cluster": ["dask[distributed]>=2024.5", "llvmlite>=0.42", "pandas>=2", "pyarrow>=14"],
+    "cluster": [
+        "dask[distributed]>=2024.5",
+        "llvmlite>=0.42",
+        "pandas>=2",
+        "pyarrow>=14",
+    ],
     "view": ["viser>=1.1,<2"],
     "control": ["control>=0.9.4"],
     "proof": ["python-flint>=0.8"],
@@ -109,7 +116,9 @@ setup(
     long_description_content_type="text/markdown",
     url=URLS.pop("Website"),
     project_urls=URLS,
-    keywords="parallel manipulator, spherical mechanism, direct dynamics, robotics, ROS 2",
+    keywords=(
+        "parallel manipulator, spherical mechanism, direct dynamics, robotics, ROS 2"
+    ),
     classifiers=[
         "Development Status :: 4 - Beta",
         "Intended Audience :: Science/Research",
@@ -124,7 +133,9 @@ setup(
     maintainer_email=PACKAGE.find("maintainer").get("email"),
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "nodes/*.xml", "host/*.mplstyle", "*/templates/*"]},
+    package_data={
+        NAME: ["py.typed", "nodes/*.xml", "host/*.mplstyle", "*/templates/*"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

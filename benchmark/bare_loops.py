@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processor time of the simulator's node, beside loops that only sleep, or sleep and publish.
+"""Processor time of the simulator's node, beside loops that only sleep, or sleep and
+publish.
 
 python -m benchmark.bare_loops [--seconds 20] [--rounds 3]   # scene swing, compiled, 1 kHz
 
-All keep the deadlines of the node, one after the other, several times in turn, each with a recorder
-of its own where messages are published. The loops make and publish the messages of the node, of one
-state with a new stamp, look for commands as the node does, and do nothing else: no program with
-these topics costs less by rclpy.
-Each is measured as the machine is, and where it is asked to let no core sleep (cpu_dma_latency 0).
+All keep the deadlines of the node, one after the other, several times in turn, each
+with a recorder of its own where messages are published. The loops make and publish the
+messages of the node, of one state with a new stamp, look for commands as the node does,
+and do nothing else: no program with these topics costs less by rclpy. Each is measured
+as the machine is, and where it is asked to let no core sleep (cpu_dma_latency 0).
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ LOOPS: dict[str, tuple[int, int, int]] = {
 
 
 def exchange(number: int, read: int) -> Callable[[int], None]:
-    """Return a function that reads the first command topics and publishes on the first topics.
+    """Return a function that reads the first command topics and publishes on the first
+    topics.
 
     It takes the stamp of the sample [ns].
     """
@@ -65,7 +67,11 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     states, log = state_messages(), TorqueLog(TICK_NS)
     y, joints, torque = Simulation("swing").sample
     numbers = y[:4], joints, torque
-    wait_for(lambda: all(one.get_subscription_count() for one in publishers), "recorder", 60.0)
+    wait_for(
+        lambda: all(one.get_subscription_count() for one in publishers),
+        "recorder",
+        60.0,
+    )
 
     def publish(stamp_ns: int) -> None:
         for reader in readers:
@@ -103,13 +109,18 @@ def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
         if publish is not None:
             publish(deadline)
     wall_ns, used = time.monotonic_ns() - began, time.process_time() - used
-    return {"processor": 1e11 * used / wall_ns, "missed": 100.0 * missed * TICK_NS / wall_ns}
+    return {
+        "processor": 1e11 * used / wall_ns,
+        "missed": 100.0 * missed * TICK_NS / wall_ns,
+    }
 
 
 class Beside:
-    """A loop in a process of its own that only sleeps to the deadlines of the node's samples.
+    """A loop in a process of its own that only sleeps to the deadlines of the node's
+    samples.
 
-    What it misses beside the node, at the same priority and by the same rule, is the machine's.
+    What it misses beside the node, at the same priority and by the same rule, is the
+    machine's.
     """
 
     def __init__(self, priority: int) -> None:
@@ -151,10 +162,14 @@ def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
         counts[2] = max(counts[2], pacer.late_ns)
 
 
-def measure(watch: Client, name: str, seconds: float, latency_us: int = -1) -> dict[str, float]:
+def measure(
+    watch: Client, name: str, seconds: float, latency_us: int = -1
+) -> dict[str, float]:
     """Measure a loop, or the node, in a process of its own, with this cpu_dma_latency."""
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
+        folder = Path(
+            stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
+        )
         stack.callback(Process("recorder", output=folder / "bag").end)
         if name != NODE:
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
@@ -174,7 +189,10 @@ def measure(watch: Client, name: str, seconds: float, latency_us: int = -1) -> d
 
 
 def compare(watch: Client, seconds: float, rounds: int) -> str:
-    """Measure all in turn; Markdown, a row for each, a table for each cpu_dma_latency."""
+    """Measure all in turn.
+
+    Markdown, a row for each, a table for each cpu_dma_latency.
+    """
     settings = {-1: "no limit of the exit latency, the default"}
     said = processes.CpuDmaLatency().request(0)
     if processes.NO_LIMIT not in said:

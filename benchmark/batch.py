@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a step of many scenarios costs: machine code in lanes, and the same program in C with SIMD.
+"""What a step of many scenarios costs: machine code in lanes, and the same program in C
+with SIMD.
 
 python -m benchmark.batch [--scene example2_heavy] [--scenarios 10000] [--rounds 9]
 """
@@ -18,7 +19,13 @@ from typing import Any
 import numpy as np
 
 from benchmark import c_floor
-from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
+from benchmark.measure import (
+    Costs,
+    describe_machine,
+    join_line,
+    read_options,
+    time_in_turn,
+)
 from sst_ros.integration.batch import Batch, block_width
 from sst_ros.integration.batch_step import Block, ColumnStep, advance_blocks
 from sst_ros.integration.methods import DOP853, RK4, Tableau
@@ -27,7 +34,10 @@ from sst_ros.scene.scene import Scene
 
 METHODS = {"rk4": RK4, "dop853": DOP853}
 SIMD = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
-"""The last two change no bit; without them gcc leaves square roots and choices scalar."""
+"""The last two change no bit.
+
+Without them gcc leaves square roots and choices scalar.
+"""
 
 FLAGS = {
     "C SIMD": SIMD,
@@ -41,7 +51,10 @@ SPREAD = 0.05
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
+    """Measure, print, and say whether the targets are met.
+
+    The exit status is 0 either way.
+    """
     options = read_options(
         "batch", __doc__, arguments, scene="example2_heavy", scenarios=10_000, rounds=9
     )
@@ -53,11 +66,19 @@ def main(arguments: list[str] | None = None) -> int:
     host = describe_machine("numpy", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
-    counts = {key: STEPS * options.scenarios * len(METHODS[key[0]].b) for key in seconds}
+    counts = {
+        key: STEPS * options.scenarios * len(METHODS[key[0]].b) for key in seconds
+    }
     costs = Costs(seconds, counts, FLOOR)
     print(f"Scene {options.scene}, {options.scenarios} scenarios.")
-    print("Time per evaluation and scenario: a step with limits and error, over its stages.")
-    print(f"Medians of {options.rounds} interleaved rounds; ratios are medians of quotients.\n")
+    print(
+        "Time per evaluation and scenario: a step with limits and error, over its"
+        " stages."
+    )
+    print(
+        f"Medians of {options.rounds} interleaved rounds; ratios are medians of"
+        " quotients.\n"
+    )
     print("\n".join(work.notes), "\n")
     costs.print()
     for name in METHODS:
@@ -73,9 +94,15 @@ class _Work:
     def __init__(self, scene: Scene, number: int, folder: Path | None) -> None:
         self.calls: dict[tuple[str, str], Callable[[], Any]] = {}
         self.notes: list[str] = []
-        self._scene, self._number, self._profile = scene, number, scene.torque is not None
+        self._scene, self._number, self._profile = (
+            scene,
+            number,
+            scene.torque is not None,
+        )
         centre = np.array(scene.initial.gamma)
-        self._gamma = centre + np.random.default_rng(1).uniform(-SPREAD, SPREAD, (number, 3))
+        self._gamma = centre + np.random.default_rng(1).uniform(
+            -SPREAD, SPREAD, (number, 3)
+        )
         for name, method in METHODS.items():
             self._add(name, method, folder)
 
@@ -86,7 +113,13 @@ class _Work:
 
         def start() -> tuple[np.ndarray, ...]:
             number = self._number
-            return y.copy(), given, code.copy(), np.full(number, np.nan), np.zeros(number)
+            return (
+                y.copy(),
+                given,
+                code.copy(),
+                np.full(number, np.nan),
+                np.zeros(number),
+            )
 
         def run(threads: int) -> Any:
             arrays = start()
@@ -111,7 +144,9 @@ class _Work:
         for index, (who, flags) in enumerate(FLAGS.items()):
             in_c = copy.copy(programs)
             program = programs.traced["advance"]
-            in_c.advance = c_floor.RowsInC(program, 2, folder, f"{name}_{index}", *flags)
+            in_c.advance = c_floor.RowsInC(
+                program, 2, folder, f"{name}_{index}", *flags
+            )
 
             def run(in_c: ColumnStep = in_c) -> Any:
                 arrays = start()
@@ -120,11 +155,18 @@ class _Work:
 
             apart = float(np.abs(run()[0] - expected[0]).max())
             if not apart < 1e-12:
-                raise RuntimeError(f"{who} {name} is not the same program: {apart:.1e} apart")
-            same = "the bits of the batch" if apart == 0.0 else f"{apart:.0e} from the batch"
+                raise RuntimeError(
+                    f"{who} {name} is not the same program: {apart:.1e} apart"
+                )
+            same = (
+                "the bits of the batch"
+                if apart == 0.0
+                else f"{apart:.0e} from the batch"
+            )
             loop = "vectorised" if in_c.advance.vectorised else "did NOT vectorise"
             self.notes.append(
-                f"{name}, {who} ({' '.join(flags)} -fopenmp-simd): gcc {loop} the loop; {same}."
+                f"{name}, {who} ({' '.join(flags)} -fopenmp-simd): gcc {loop} the loop;"
+                f" {same}."
             )
             self.calls[name, who] = run
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The same programs in C, one state or many at a time: the floor for machine code.
 
-A line of C is made of each operation of a program; it is written to a temporary folder, compiled by
-gcc, and forgotten. Of
+A line of C is made of each operation of a program; it is written to a temporary folder,
+compiled by gcc, and forgotten. Of
 
     x1 = q0 * q0
     x2 = (a if x1 > 0.0 else c)
@@ -12,7 +12,8 @@ it makes
     const double x1 = q0 * q0;
     const double x2 = (x1 > 0.0) ? (a) : (c);
 
-Of many states at a time these are the lines of a loop over columns, under `#pragma omp simd`.
+Of many states at a time these are the lines of a loop over columns, under `#pragma omp
+simd`.
 """
 
 from __future__ import annotations
@@ -87,11 +88,15 @@ def has_gcc() -> bool:
 
 def read_version() -> str:
     """First line of gcc --version."""
-    done = subprocess.run(["gcc", "--version"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["gcc", "--version"], capture_output=True, text=True, check=True
+    )
     return done.stdout.splitlines()[0].removeprefix("gcc ")
 
 
-def compile_c(text: str, folder: Path, name: str, *flags: str) -> tuple[ctypes.CDLL, str]:
+def compile_c(
+    text: str, folder: Path, name: str, *flags: str
+) -> tuple[ctypes.CDLL, str]:
     """Compile with gcc and load; also return what gcc says."""
     file, library = folder / f"{name}.c", folder / f"{name}.so"
     file.write_text(text, encoding="utf-8")
@@ -123,7 +128,13 @@ def compile_step(text: str, folder: Path, name: str, *flags: str) -> ctypes.CDLL
     loaded, _ = compile_c(text, folder, name, *flags)
     numbers = ctypes.POINTER(ctypes.c_double)
     loaded.slopes.argtypes = [ctypes.c_long, numbers]
-    loaded.march.argtypes = [ctypes.c_double, ctypes.c_double, ctypes.c_long, numbers, numbers]
+    loaded.march.argtypes = [
+        ctypes.c_double,
+        ctypes.c_double,
+        ctypes.c_long,
+        numbers,
+        numbers,
+    ]
     loaded.slopes.restype = loaded.march.restype = ctypes.c_double
     return loaded
 
@@ -153,7 +164,10 @@ def _stores(results: Sequence[str], place: str) -> list[str]:
 
 
 def write_batch(program: Program, shared: int) -> str:
-    """C text of a program over the columns of arrays; the first inputs are shared by all."""
+    """C text of a program over the columns of arrays.
+
+    The first inputs are shared by all.
+    """
     names = program.inputs
     before, after, results = program.split(range(shared, len(names)))
     head = [f"const double {name} = s[{i}];" for i, name in enumerate(names[:shared])]
@@ -165,16 +179,21 @@ def write_batch(program: Program, shared: int) -> str:
     for i in range(len(results)):
         head.append(f"double *restrict out{i} = outs[{i}];")
     inside += [*map(_statement, after), *_stores(results, "out{}[k]")]
-    return HEAD + BATCH.format(before="\n    ".join(head), inside="\n        ".join(inside))
+    return HEAD + BATCH.format(
+        before="\n    ".join(head), inside="\n        ".join(inside)
+    )
 
 
 class RowsInC:
-    """A program over rows of arrays, compiled by gcc: what `RowFunction` is in LLVM's code.
+    """A program over rows of arrays, compiled by gcc: what `RowFunction` is in LLVM's
+    code.
 
     `vectorised` says whether gcc reports its loop as vectorised.
     """
 
-    def __init__(self, program: Program, shared: int, folder: Path, name: str, *flags: str) -> None:
+    def __init__(
+        self, program: Program, shared: int, folder: Path, name: str, *flags: str
+    ) -> None:
         simd = (*flags, "-fopenmp-simd", "-fopt-info-vec-optimized")
         loaded, said = compile_c(write_batch(program, shared), folder, name, *simd)
         self.vectorised = "loop vectorized" in said

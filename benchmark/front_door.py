@@ -3,8 +3,9 @@
 
 python -m benchmark.front_door [--rounds 9]
 
-One second of each class of scene, its 200 samples read; the first call in a new process, a later
-one, and the calls of its compiled steps alone. MuJoCo's best setting for Example 2 stands beside.
+One second of each class of scene, its 200 samples read; the first call in a new
+process, a later one, and the calls of its compiled steps alone. MuJoCo's best setting
+for Example 2 stands beside.
 """
 
 from __future__ import annotations
@@ -77,12 +78,16 @@ class StepCall(NamedTuple):
 
 
 def own_steps(**options: Any) -> Callable[[], None]:
-    """Return a function that repeats the calls of compiled steps of a call of `simulate`."""
+    """Return a function that repeats the calls of compiled steps of a call of
+    `simulate`.
+    """
     calls: list[StepCall] = []
     originals = {kind: kind.pair for kind in (MethodSteps, FunctionSteps)}
 
     def record(kind: Any) -> Any:
-        def pair(self: Any, t: float, h: float, at: Point, drive: Drive, other: Any = None) -> Any:
+        def pair(
+            self: Any, t: float, h: float, at: Point, drive: Drive, other: Any = None
+        ) -> Any:
             calls.append(StepCall(self, t, h, at, drive, other))
             return originals[kind](self, t, h, at, drive, other)
 
@@ -145,7 +150,9 @@ def measure_steps(rounds: int) -> Sequence[str]:
     """Return lines on single steps of a `Simulation`."""
     run = Simulation("example2_heavy")
     run.load_code()
-    taken = time_in_turn({"step": partial(_ticks, run, 100)}, rounds, clock=time.process_time)
+    taken = time_in_turn(
+        {"step": partial(_ticks, run, 100)}, rounds, clock=time.process_time
+    )
     return [f"Simulation.step, 1 ms: {1e6 * median(taken['step']) / 100:.1f} us"]
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one step costs: machine code by LLVM, plain Python, and C from the same traced program.
+"""What one step costs: machine code by LLVM, plain Python, and C from the same traced
+program.
 
 python -m benchmark.kernel [--scene example2_heavy] [--rounds 15]
 """
@@ -17,7 +18,13 @@ from statistics import median
 from typing import Any
 
 from benchmark import c_floor
-from benchmark.measure import Costs, describe_machine, join_line, read_options, time_in_turn
+from benchmark.measure import (
+    Costs,
+    describe_machine,
+    join_line,
+    read_options,
+    time_in_turn,
+)
 from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.integration.method_steps import MethodSteps
@@ -34,8 +41,13 @@ AT_MOST_C, AT_MOST_PLAIN = 1.3, 60e-6
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, print, and say whether the targets are met; the exit status is 0 either way."""
-    options = read_options("kernel", __doc__, arguments, scene="example2_heavy", rounds=15)
+    """Measure, print, and say whether the targets are met.
+
+    The exit status is 0 either way.
+    """
+    options = read_options(
+        "kernel", __doc__, arguments, scene="example2_heavy", rounds=15
+    )
     scene = scenes.load(options.scene)
     system = ODE(Dynamics.of(scene), scene.torque)
     start = Simulation(scene).state
@@ -45,15 +57,23 @@ def main(arguments: list[str] | None = None) -> int:
     with_c = c_floor.has_gcc()
     with tempfile.TemporaryDirectory() as folder:
         calls = _calls(system, y, Path(folder) if with_c else None)
-        seconds = time_in_turn(calls, options.rounds, shortest=5e-3, clock=time.process_time)
+        seconds = time_in_turn(
+            calls, options.rounds, shortest=5e-3, clock=time.process_time
+        )
     host = describe_machine("numpy", "llvmlite")
     if with_c:
         host["gcc"] = c_floor.read_version()
     counts = {key: STEPS // 10 if key[1] == PLAIN else STEPS for key in seconds}
     costs = Costs(seconds, counts, "C -O3")
     size = sum(system.program.operations.values())
-    print(f"Scene {options.scene}: {size} operations an evaluation, torques as sines included.")
-    print(f"Processor time: medians of {options.rounds} interleaved rounds, and of quotients.\n")
+    print(
+        f"Scene {options.scene}: {size} operations an evaluation, torques as sines"
+        " included."
+    )
+    print(
+        f"Processor time: medians of {options.rounds} interleaved rounds, and of"
+        " quotients.\n"
+    )
     costs.print()
     for work in dict.fromkeys(work for work, _ in seconds):
         costs.judge(work, LLVM, "C -O3", AT_MOST_C)
@@ -78,7 +98,9 @@ def _calls(
         calls[work, LLVM] = partial(fast.fixed, 0.0, STEP, STEPS, y, Drive(()))
         calls[work, PLAIN] = partial(plain.fixed, 0.0, STEP, STEPS // 10, y, Drive(()))
         if folder is not None:
-            _add_c(calls, c_floor.write_step(system.program, method), y, folder, name, fast)
+            _add_c(
+                calls, c_floor.write_step(system.program, method), y, folder, name, fast
+            )
     return calls
 
 
@@ -93,7 +115,9 @@ def _add_c(
         library.march(0.0, STEP, STEPS, state, error)
         apart = max(abs(a - b) for a, b in zip(state, expected, strict=True))
         if not apart < 1e-12:
-            raise RuntimeError(f"{who} {name} is not the same program: {apart:.1e} apart")
+            raise RuntimeError(
+                f"{who} {name} is not the same program: {apart:.1e} apart"
+            )
 
         def march(library: Any = library, error: Any = error) -> Any:
             return library.march(0.0, STEP, STEPS, array(*y), error)

@@ -3,8 +3,9 @@
 
 python -m benchmark.long_bag [--seconds 600] [--bag FOLDER]   # is kept there, used if it exists
 
-The bag is a true run: Example 2 with springs and friction in its actuators, so that it stays inside
-for ever, solved by single steps at 1 kHz. Its messages are made by the code of the nodes.
+The bag is a true run: Example 2 with springs and friction in its actuators, so that it
+stays inside for ever, solved by single steps at 1 kHz. Its messages are made by the
+code of the nodes.
 """
 
 from __future__ import annotations
@@ -63,7 +64,9 @@ SHOWN = (
 def endless() -> Scene:
     """Return a scene whose motion goes on inside for ever."""
     example = scenes.load("example2_heavy")
-    springs = tuple(Spring(joint=f"gamma_{k}", stiffness=40.0, rest=math.pi / 4) for k in (1, 2, 3))
+    springs = tuple(
+        Spring(joint=f"gamma_{k}", stiffness=40.0, rest=math.pi / 4) for k in (1, 2, 3)
+    )
     friction = JointFriction(gamma=Friction(viscous=1.0))
     return dataclasses.replace(
         example, name="endless", springs=springs, friction=friction, duration=None
@@ -84,7 +87,9 @@ def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
     text = yaml_document.dump(scene).encode() + b"\x00"
     send("/sst_simulator/scene", START_NS, CDR + struct.pack("<I", len(text)) + text)
     for rows, *arrays in _run(scene, samples, shown):
-        columns = zip(range(rows.start, rows.stop), *(a.tolist() for a in arrays), strict=True)
+        columns = zip(
+            range(rows.start, rows.stop), *(a.tolist() for a in arrays), strict=True
+        )
         for number, y, joints, torque in columns:
             at_ns = START_NS + number * SAMPLE_NS
             if number:  # a start has no torques before it
@@ -94,25 +99,41 @@ def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
                 log.append(torque, (), TICKS_A_SAMPLE)
                 received_ns = at_ns + SENT_NS
                 send("/sst_simulator/applied_torques", received_ns, log.take(asked_ns))
-            at, numbers = stamp(at_ns), (y, joints, torque if number else (0.0, 0.0, 0.0))
+            at, numbers = (
+                stamp(at_ns),
+                (y, joints, torque if number else (0.0, 0.0, 0.0)),
+            )
             send("/joint_states", at_ns + SENT_NS, joint_states(at, numbers))
-            send("/sst_simulator/orientation", at_ns + SENT_NS, orientation(at, numbers))
+            send(
+                "/sst_simulator/orientation", at_ns + SENT_NS, orientation(at, numbers)
+            )
             send("/sst_simulator/euler_zyz", at_ns + SENT_NS, euler_zyz(at, numbers))
     writer.close()
     return path
 
 
-def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array, Array, Array]]:
-    """Solve the scene; yield rows of samples in turn: quaternions, joints, and torques before."""
+def _run(
+    scene: Scene, samples: int, shown: bool
+) -> Iterator[tuple[slice, Array, Array, Array]]:
+    """Solve the scene.
+
+    Yield rows of samples in turn: quaternions, joints, and torques before.
+    """
     torque = scene.torque
     assert torque is not None
     motion = TickStepper(scene, None)
     y = np.array(initial_state(scene, Geometry.of(scene)))
     for rows in slices(samples + 1, _CHUNK, "writing a run", shown):
         # Each sample is answered by a torque, which is held until the next one.
-        answered = np.maximum(np.arange(rows.start, rows.stop) - 1, 0)[:, None] * SAMPLE_NS / 1e9
+        answered = (
+            np.maximum(np.arange(rows.start, rows.stop) - 1, 0)[:, None]
+            * SAMPLE_NS
+            / 1e9
+        )
         held = torque.amplitude * np.sin(torque.frequency * answered + torque.phase)
-        ticks = np.arange((rows.start - 1) * TICKS_A_SAMPLE, (rows.stop - 1) * TICKS_A_SAMPLE)
+        ticks = np.arange(
+            (rows.start - 1) * TICKS_A_SAMPLE, (rows.stop - 1) * TICKS_A_SAMPLE
+        )
         run = ticks >= 0
         start = ticks[run] * TICK_NS
         drives = np.repeat(held, TICKS_A_SAMPLE, axis=0)[run]
@@ -126,25 +147,47 @@ def _run(scene: Scene, samples: int, shown: bool) -> Iterator[tuple[slice, Array
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the bag, report it, print what that took and the verdict; the exit status is 0."""
+    """Write the bag, report it, print what that took and the verdict.
+
+    The exit status is 0.
+    """
     options = read_options("long_bag", __doc__, arguments, seconds=600.0, bag=Path)
     with tempfile.TemporaryDirectory() as folder:
         bag = options.bag or Path(folder) / "bag"
         if not bag.exists():
             write(bag, options.seconds, shown=True)
         size = sum(file.stat().st_size for file in bag.iterdir()) / 1e9
-        words = ["-m", "sst_ros", "report", "run", str(bag), "--out", str(Path(folder) / "report")]
+        words = [
+            "-m",
+            "sst_ros",
+            "report",
+            "run",
+            str(bag),
+            "--out",
+            str(Path(folder) / "report"),
+        ]
         began = time.perf_counter()
         subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL)
-        wall, used = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+        wall, used = (
+            time.perf_counter() - began,
+            resource.getrusage(resource.RUSAGE_CHILDREN),
+        )
         busy, memory = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
-        summary = json.loads((Path(folder) / "report" / "summary.json").read_text(encoding="utf-8"))
+        summary = json.loads(
+            (Path(folder) / "report" / "summary.json").read_text(encoding="utf-8")
+        )
     found = {"bag_GB": size, "wall_s": wall, "processor_s": busy, "peak_GB": memory}
     found |= {name: summary[name] for name in SHOWN}
     for name, value in found.items():
-        print(f"{name:40} {value:.4g}" if isinstance(value, float) else f"{name:40} {value}")
+        print(
+            f"{name:40} {value:.4g}"
+            if isinstance(value, float)
+            else f"{name:40} {value}"
+        )
     good = wall < AT_MOST_S and memory < AT_MOST_GB
-    print(f"{'met' if good else 'NOT MET'}: under {AT_MOST_S:g} s and {AT_MOST_GB:g} GB")
+    print(
+        f"{'met' if good else 'NOT MET'}: under {AT_MOST_S:g} s and {AT_MOST_GB:g} GB"
+    )
     print(join_line(describe_machine("numpy", "llvmlite", "rosbags", "matplotlib")))
     return 0
 

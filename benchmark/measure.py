@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How all benchmarks measure and say it: times in rounds, the machine, tables, pages, JSON."""
+"""How all benchmarks measure and say it: times in rounds, the machine, tables, pages,
+JSON.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 def read_options(
     name: str, doc: str | None, arguments: list[str] | None = None, **defaults: Any
 ) -> argparse.Namespace:
-    """Read the options of a benchmark: flags where the default is False, else values of its type.
+    """Read the options of a benchmark: flags where the default is False, else values of
+    its type.
 
     A default that is a type stands for an option that may be left out.
     """
@@ -41,7 +44,9 @@ def read_options(
         elif isinstance(default, type):
             parser.add_argument(option, type=default)
         else:
-            parser.add_argument(option, type=type(default), default=default, help="%(default)s")
+            parser.add_argument(
+                option, type=type(default), default=default, help="%(default)s"
+            )
     return parser.parse_args(arguments)
 
 
@@ -54,12 +59,15 @@ def time_in_turn(
 ) -> dict[Key, list[float]]:
     """Seconds of each call, one number a round.
 
-    Every round times every call, so that what slows the machine for a while slows all of them.
-    A call that is shorter than `shortest` is repeated until it is not, and divided. A `clock` of
-    processor time leaves out what others do on the machine meanwhile, which long calls would
-    otherwise have more of than short ones; it is for work of one thread.
+    Every round times every call, so that what slows the machine for a while slows all
+    of them. A call that is shorter than `shortest` is repeated until it is not, and
+    divided. A `clock` of processor time leaves out what others do on the machine
+    meanwhile, which long calls would otherwise have more of than short ones; it is for
+    work of one thread.
     """
-    repeats = {key: _count_repeats(call, shortest, clock) for key, call in calls.items()}
+    repeats = {
+        key: _count_repeats(call, shortest, clock) for key, call in calls.items()
+    }
     seconds: dict[Key, list[float]] = {key: [] for key in calls}
     collecting = gc.isenabled()
     gc.disable()
@@ -79,7 +87,9 @@ def divide(seconds: dict[Key, list[float]], first: Key, second: Key) -> float:
     return median(a / b for a, b in zip(seconds[first], seconds[second], strict=True))
 
 
-def _count_repeats(call: Callable[[], Any], shortest: float, clock: Callable[[], float]) -> int:
+def _count_repeats(
+    call: Callable[[], Any], shortest: float, clock: Callable[[], float]
+) -> int:
     call()
     once = _time(call, 1, clock)
     return max(1, round(shortest / once)) if once < shortest else 1
@@ -93,9 +103,14 @@ def _time(call: Callable[[], Any], repeats: int, clock: Callable[[], float]) -> 
 
 
 def describe_machine(*packages: str) -> dict[str, str]:
-    """Date, processor, load and versions; packages that are not installed are left out."""
+    """Date, processor, load and versions.
+
+    Packages that are not installed are left out.
+    """
     host = {
-        "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        "date": datetime.datetime.now(datetime.timezone.utc).strftime(
+            "%Y-%m-%d %H:%M UTC"
+        ),
         "processor": processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "load": f"{os.getloadavg()[0]:.2f} at the end, over 1 min",
@@ -143,12 +158,16 @@ class Costs:
         floor: str,
     ) -> None:
         self._ns = {
-            key: [1e9 * one / counts[key] for one in taken] for key, taken in seconds.items()
+            key: [1e9 * one / counts[key] for one in taken]
+            for key, taken in seconds.items()
         }
         self.floor = floor
 
     def ratio(self, work: str, who: str, other: str) -> float | None:
-        """Median over the rounds of a cost over another's; None where one is not known."""
+        """Median over the rounds of a cost over another's.
+
+        None where one is not known.
+        """
         if (work, who) not in self._ns or (work, other) not in self._ns:
             return None
         return divide(self._ns, (work, who), (work, other))
@@ -171,7 +190,9 @@ class Costs:
 
 
 def fill(text: str, parts: dict[str, str]) -> str:
-    """Return a page with new parts, each between <!-- begin NAME --> and <!-- end NAME -->."""
+    """Return a page with new parts, each between <!-- begin NAME --> and <!-- end NAME
+    -->.
+    """
     for name, part in parts.items():
         begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
         before, _, rest = text.partition(begin)

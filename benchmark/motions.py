@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bits of motions, before and after a change of the code that should change none.
 
-`python -m benchmark.motions FILE` writes a line a motion: what it is, and a hash of its numbers:
-shipped scenes by all methods, steps, a batch, a sweep, a lockstep run through
+`python -m benchmark.motions FILE` writes a line a motion: what it is, and a hash of its
+numbers: shipped scenes by all methods, steps, a batch, a sweep, a lockstep run through
 the nodes and the evaluation of its recording. `diff` shows what changed.
 """
 
@@ -45,7 +45,9 @@ def simulated(name: str, method: str) -> str:
     even = np.linspace(0.0, DURATION, 26)
     found: list[Any] = []
     for times in (None, even):
-        motion = simulate(name, duration=DURATION, t_eval=times, method=method, tolerance=1e-8)
+        motion = simulate(
+            name, duration=DURATION, t_eval=times, method=method, tolerance=1e-8
+        )
         found += [motion.t, motion.quaternion, motion.gamma, motion.gamma_dot]
         found.append([motion.error_estimate, motion.status])
     return digest(*found)
@@ -55,7 +57,9 @@ def whole(name: str) -> str:
     """Simulate a shipped scene over its own duration, up to its limits."""
     duration = load_scene(name).duration or 1.0
     times = np.linspace(0.0, duration, 11)
-    motion = simulate(name, duration=duration, t_eval=times, method="dop853", tolerance=1e-8)
+    motion = simulate(
+        name, duration=duration, t_eval=times, method="dop853", tolerance=1e-8
+    )
     found = digest(motion.t, motion.quaternion, motion.body_rate, motion.torque)
     return f"{found} {motion.message}"
 
@@ -74,7 +78,9 @@ def batched() -> str:
     """Run a batch of 64 starts."""
     scene = load_scene("example2_heavy")
     gamma = np.random.default_rng(5).uniform(0.7, 0.85, (64, 3))
-    result = Batch(scene).run(gamma, np.zeros((64, 3)), (0.1, 0.2, -0.1), step=1e-3, count=100)
+    result = Batch(scene).run(
+        gamma, np.zeros((64, 3)), (0.1, 0.2, -0.1), step=1e-3, count=100
+    )
     return digest(result.quaternion, result.body_rate, result.gamma)
 
 
@@ -92,7 +98,8 @@ def recorded(folder: Path) -> Iterator[tuple[str, str]]:
     """Run the demo in lockstep; hash the recorded states, and list the evaluation."""
     command = [sys.executable, "-m", "sst_ros", "demo", "--out", str(folder), "--force"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=300)
-    # Stamps are times of the wall: the states and torques between them are what must not change.
+    # Stamps are times of the wall: the states and torques between them are what must
+    # not change.
     run = read_bag(folder / "bag")
     columns = (run.time_ns, run.quaternion, run.gamma, run.gamma_dot, run.effort)
     yield "lockstep states", digest(*columns)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes in processes of their own and in a ROS domain of their own, as benchmarks start them."""
+"""Nodes in processes of their own and in a ROS domain of their own, as benchmarks start
+them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ _TICK = os.sysconf("SC_CLK_TCK")
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Give the processes that are started inside a ROS domain of their own, on localhost."""
+    """Give the processes that are started inside a ROS domain of their own, on
+    localhost.
+    """
     number, lock = processes.lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:
@@ -34,7 +38,8 @@ def own_domain() -> Iterator[int]:
 
 
 class Process(subprocess.Popen[str]):
-    """A process, by default a node as `ros2 run` starts it, and the kernel's account of it.
+    """A process, by default a node as `ros2 run` starts it, and the kernel's account of
+    it.
 
     Args:
         command: which node; or code with `python`.
@@ -42,7 +47,6 @@ class Process(subprocess.Popen[str]):
         python: the command is a program in Python.
         stderr: where its messages go.
         given: parameters of the node.
-
     """
 
     def __init__(
@@ -54,7 +58,9 @@ class Process(subprocess.Popen[str]):
         stderr: int = subprocess.DEVNULL,
         **given: Any,
     ) -> None:
-        words = [sys.executable, "-c", command] if python else [str(EXECUTABLES / command)]
+        words = (
+            [sys.executable, "-c", command] if python else [str(EXECUTABLES / command)]
+        )
         options = processes.words(given)
         if namespace:
             options += ["-r", f"__ns:={namespace}"]
@@ -85,10 +91,17 @@ class Process(subprocess.Popen[str]):
     def memory_kb(self) -> int:
         """Memory that it uses [kB]."""
         text = Path(f"/proc/{self.pid}/status").read_text(encoding="utf-8")
-        return next(int(row.split()[1]) for row in text.splitlines() if row.startswith("VmRSS"))
+        return next(
+            int(row.split()[1]) for row in text.splitlines() if row.startswith("VmRSS")
+        )
 
-    def end(self, number: int = signal.SIGINT, timeout: float = 60.0) -> tuple[int, str]:
-        """Send a signal, wait for the end; return the exit status and all that was printed."""
+    def end(
+        self, number: int = signal.SIGINT, timeout: float = 60.0
+    ) -> tuple[int, str]:
+        """Send a signal, wait for the end.
+
+        Return the exit status and all that was printed.
+        """
         if self.poll() is None:
             self.send_signal(number)
         try:
@@ -103,11 +116,15 @@ class Process(subprocess.Popen[str]):
 
 
 def start_simulator(namespace: str = "", **given: Any) -> Process:
-    """Start a simulator, which in lockstep by default would end with the scene's duration."""
+    """Start a simulator, which in lockstep by default would end with the scene's
+    duration.
+    """
     return Process("simulator", namespace, **{"duration": 0.0, **given})
 
 
-def wait_for(condition: Callable[[], object], what: str, timeout: float = 120.0) -> None:
+def wait_for(
+    condition: Callable[[], object], what: str, timeout: float = 120.0
+) -> None:
     """Wait for a condition."""
     deadline = time.monotonic() + timeout
     while not condition():
@@ -117,12 +134,12 @@ def wait_for(condition: Callable[[], object], what: str, timeout: float = 120.0)
 
 
 class Client:
-    """A node of this process that publishes, calls and receives the diagnostics of simulators.
+    """A node of this process that publishes, calls and receives the diagnostics of
+    simulators.
 
     Attributes:
         node: the node, in a context of its own.
         values: of the last diagnostics, by full name of the simulator.
-
     """
 
     def __init__(self, number: int) -> None:
@@ -131,7 +148,8 @@ class Client:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import QoSProfile
 
-        # Replies to all clients of a service arrive at each: ten, the default, displace its own.
+        # Replies to all clients of a service arrive at each: ten, the default, displace
+        # its own.
         self.qos = QoSProfile(depth=1000)
         self.values: dict[str, dict[str, str]] = {}
         self._rclpy, self._context = rclpy, rclpy.Context()
@@ -139,7 +157,9 @@ class Client:
         self.node = rclpy.create_node("benchmark", context=self._context)
         self.executor = SingleThreadedExecutor(context=self._context)
         self.executor.add_node(self.node)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._receive, 100)
+        self.node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._receive, 100
+        )
 
     def _receive(self, message: Any) -> None:
         name = message.status[0].name.removesuffix(": run")
@@ -172,7 +192,9 @@ class Client:
             self.executor.spin_once(timeout_sec=min(left, 0.02))
         return True
 
-    def wait_for(self, condition: Callable[[], Any], what: str, timeout: float = 120.0) -> None:
+    def wait_for(
+        self, condition: Callable[[], Any], what: str, timeout: float = 120.0
+    ) -> None:
         """Receive until a condition holds."""
         if not self.until(condition, timeout):
             raise SystemExit(f"no {what} within {timeout:g} s")
@@ -181,11 +203,15 @@ class Client:
         """Wait until simulators, by their full names, say that they run."""
 
         def are_running() -> bool:
-            return all(self.values.get(name, {}).get("phase") == "running" for name in names)
+            return all(
+                self.values.get(name, {}).get("phase") == "running" for name in names
+            )
 
         self.wait_for(are_running, f"run of {', '.join(names)}", 240.0)
 
-    def call(self, kind: Any, name: str, timeout: float = 10.0, **fields: Any) -> tuple[Any, float]:
+    def call(
+        self, kind: Any, name: str, timeout: float = 10.0, **fields: Any
+    ) -> tuple[Any, float]:
         """Call a service; return the reply, or None, and how long it took [s]."""
         client: Any = self.node.create_client(kind, name, qos_profile=self.qos)
         try:
@@ -207,7 +233,10 @@ class Account:
 
     def _ticks(self) -> dict[str, tuple[int, int]]:
         values = {name: self._watch.values[name] for name in self._nodes}
-        return {name: (int(one["ticks"]), int(one["ticks_missed"])) for name, one in values.items()}
+        return {
+            name: (int(one["ticks"]), int(one["ticks_missed"]))
+            for name, one in values.items()
+        }
 
     def _processor_s(self) -> float:
         return sum(node.processor_s() for node in self._nodes.values())
@@ -221,7 +250,11 @@ class Account:
         """Return the ticks missed by each, and by all under "", in percent."""
         now, before = self._ticks(), self._before
         found = {
-            name: [a - b for a, b in zip(now[name], before[name], strict=True)] for name in now
+            name: [a - b for a, b in zip(now[name], before[name], strict=True)]
+            for name in now
         }
         found[""] = [sum(column) for column in zip(*found.values(), strict=True)]
-        return {name: 100.0 * lost / max(1, kept + lost) for name, (kept, lost) in found.items()}
+        return {
+            name: 100.0 * lost / max(1, kept + lost)
+            for name, (kept, lost) in found.items()
+        }

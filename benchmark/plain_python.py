@@ -11,15 +11,24 @@ from typing import Any
 from sst_ros.dynamics import traced_dynamics
 from sst_ros.integration.method_steps import steps_of
 
-_CACHED: tuple[Any, ...] = (traced_dynamics.recent, traced_dynamics.recent_ode, steps_of)
+_CACHED: tuple[Any, ...] = (
+    traced_dynamics.recent,
+    traced_dynamics.recent_ode,
+    steps_of,
+)
 """What keeps functions that are machine code or not."""
 
 
 @contextlib.contextmanager
 def without_llvmlite() -> Iterator[None]:
-    """Run what is made inside of it as plain Python; not for several threads at once."""
+    """Run what is made inside of it as plain Python.
+
+    Not for several threads at once.
+    """
     modules: dict[str, Any] = sys.modules
-    before = {name: modules[name] for name in modules if name.split(".")[0] == "llvmlite"}
+    before = {
+        name: modules[name] for name in modules if name.split(".")[0] == "llvmlite"
+    }
     for name in before:
         del modules[name]
     modules["llvmlite"] = None

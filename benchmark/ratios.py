@@ -3,8 +3,9 @@
 
 python -m benchmark.ratios [--write] [--tests]    # adds a row of this version to docs/ratios.csv
 
-Each ratio is of two things that run in turn, by processor time, so that machines and loads differ
-less in them than in times. Functions have the names that asv looks for: benchmark/asv.conf.json.
+Each ratio is of two things that run in turn, by processor time, so that machines and
+loads differ less in them than in times. Functions have the names that asv looks for:
+benchmark/asv.conf.json.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ LONGEST_S = 600.0
 FIRST = "from sst_ros import Simulation; Simulation('example2').step((0, 0, 0), 1)"
 
 
-def _turns(calls: dict[str, Callable[[], Any]], clock: Any = time.process_time) -> float:
+def _turns(
+    calls: dict[str, Callable[[], Any]], clock: Any = time.process_time
+) -> float:
     """Return the first of two calls over the second."""
     first, second = calls
     return divide(time_in_turn(calls, ROUNDS, clock=clock), first, second)
@@ -65,11 +68,16 @@ def track_kernel_over_c() -> float:
     with tempfile.TemporaryDirectory() as folder:
         y = [*start.quaternion, *start.body_rate]
         calls = kernel._calls(ODE(Dynamics.of(scene), scene.torque), y, Path(folder))
-        return _turns({who: calls["dop853 step", who] for who in (kernel.LLVM, "C -O3")})
+        return _turns(
+            {who: calls["dop853 step", who] for who in (kernel.LLVM, "C -O3")}
+        )
 
 
 def track_simulate_over_bound() -> float:
-    floor, run = find_floor(Task(), (1e-9,)), partial(simulate, load_scene("example2_heavy"))
+    floor, run = (
+        find_floor(Task(), (1e-9,)),
+        partial(simulate, load_scene("example2_heavy")),
+    )
     assert floor.seconds is not None
     taken = median(time_in_turn({"": run}, ROUNDS, clock=time.process_time)[""])
     return taken / (floor.evaluations[1e-9] * floor.seconds)
@@ -97,7 +105,9 @@ def track_node_over_bare_loop() -> float:
 
     with Client.start() as watch:
         node, loop = (
-            median(bare_loops.measure(watch, name, 5.0, -1)["processor"] for _ in range(3))
+            median(
+                bare_loops.measure(watch, name, 5.0, -1)["processor"] for _ in range(3)
+            )
             for name in (bare_loops.NODE, bare_loops.LEAST)
         )
     return node / loop
@@ -123,7 +133,11 @@ def track_tests_over_ten_minutes() -> float:
     return (sum(os.times()[2:4]) - sum(before[2:4])) / LONGEST_S
 
 
-TRACKS = {name[6:].replace("_", " "): f for name, f in globals().items() if name[:6] == "track_"}
+TRACKS = {
+    name[6:].replace("_", " "): f
+    for name, f in globals().items()
+    if name[:6] == "track_"
+}
 
 
 @styled
@@ -153,9 +167,16 @@ def main(arguments: list[str] | None = None) -> int:
             old = pd.read_csv(file, dtype={"release": str})
             frame = pd.concat([old[old.release != row["release"]], frame])
         frame.to_csv(file, index=False)
-        table = frame.set_index("release").T.rename_axis("ratio").reset_index().fillna("not yet")
+        table = (
+            frame.set_index("release")
+            .T.rename_axis("ratio")
+            .reset_index()
+            .fillna("not yet")
+        )
         fill_page(DOCS / "ratios.md", {"ratios": markdown(table)})
-        save_figure(draw(frame.reindex(columns=["release", *TRACKS])), DOCS / "ratios.png")
+        save_figure(
+            draw(frame.reindex(columns=["release", *TRACKS])), DOCS / "ratios.png"
+        )
     return 0
 
 

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well the simulator keeps time: missed ticks, processor, memory; and its fastest speed.
+"""How well the simulator keeps time: missed ticks, processor, memory.
+
+And its fastest speed.
 
 python -m benchmark.realtime --minutes 10 --write   # the official figures, on an idle machine
 python -m benchmark.realtime --fleet 10 --rate 200  # namespaced simulators side by side
 
-Simulator and recorder run for so long with SCHED_FIFO, half as long with cpu_dma_latency 0 as well,
-and as long with neither; in the same minutes a loop that only sleeps to the same deadlines, in a
-process of its own at the same priority, measures what the machine itself misses. Then the simulator
-runs as fast as possible, without and with a subscriber to joint_states, then a fleet. Commands of
-zero torque come at 100 Hz.
+Simulator and recorder run for so long with SCHED_FIFO, half as long with
+cpu_dma_latency 0 as well, and as long with neither; in the same minutes a loop that
+only sleeps to the same deadlines, in a process of its own at the same priority,
+measures what the machine itself misses. Then the simulator runs as fast as possible,
+without and with a subscriber to joint_states, then a fleet. Commands of zero torque
+come at 100 Hz.
 
---minutes is that of each run at 1 kHz (0: none), --usual that of the two others; --rounds and
---seconds those beside the bare loops (0 rounds: none); --fleet measures only so many at once, at
---rate [Hz]; --plain runs no machine code.
+--minutes is that of each run at 1 kHz (0: none), --usual that of the two others;
+--rounds and --seconds those beside the bare loops (0 rounds: none); --fleet measures
+only so many at once, at --rate [Hz]; --plain runs no machine code.
 """
 
 from __future__ import annotations
@@ -64,7 +67,9 @@ Figures = dict[str, str]
 def command(watch: Client, topic: str, readers: int) -> Iterator[None]:
     """Publish zero torques at 100 Hz to a simulator, and perhaps a recorder."""
     commands = watch.node.create_publisher(Float64MultiArray, topic, 10)
-    watch.wait_for(lambda: commands.get_subscription_count() >= readers, f"readers of {topic}")
+    watch.wait_for(
+        lambda: commands.get_subscription_count() >= readers, f"readers of {topic}"
+    )
     stop, message = threading.Event(), Float64MultiArray(data=[0.0, 0.0, 0.0])
 
     def publish() -> None:
@@ -132,16 +137,25 @@ def keep_time(watch: Client, minutes: float, given: dict[str, Any]) -> Figures:
 
 
 def free_run(
-    watch: Client, seconds: float, publish_rate: int, given: dict[str, Any], *, read: bool
+    watch: Client,
+    seconds: float,
+    publish_rate: int,
+    given: dict[str, Any],
+    *,
+    read: bool,
 ) -> Figures:
-    """As fast as possible, without a recorder, and without or with a reader of joint_states."""
+    """As fast as possible, without a recorder, and without or with a reader of
+    joint_states.
+    """
     name = "/sst_simulator"
     watch.values.clear()
     topic = "joint_states" if read else "unpublished"
     reader = watch.node.create_subscription(
         JointState, topic, print, qos_profile_sensor_data, callback_group=NeverSpun()
     )
-    simulator = start_simulator(real_time_factor=0.0, publish_rate=publish_rate, **given)
+    simulator = start_simulator(
+        real_time_factor=0.0, publish_rate=publish_rate, **given
+    )
     try:
         watch.wait_for_runs(name)
         watch.spin(seconds)
@@ -158,7 +172,9 @@ def free_run(
         watch.spin(1.5)  # its last diagnostics are not those of the next run
 
 
-def fleet(watch: Client, number: int, rate: int, seconds: float, given: dict[str, Any]) -> Figures:
+def fleet(
+    watch: Client, number: int, rate: int, seconds: float, given: dict[str, Any]
+) -> Figures:
     """Namespaced simulators side by side, each publishing at its rate."""
     names = [f"/sst_{k}/sst_simulator" for k in range(number)]
     watch.values.clear()
@@ -187,7 +203,8 @@ def fleet(watch: Client, number: int, rate: int, seconds: float, given: dict[str
 
 
 def _compare(blocks: np.ndarray) -> Figures:
-    """Missed ticks of the node and of the loop beside it, of rows with ticks and missed of both.
+    """Missed ticks of the node and of the loop beside it, of rows with ticks and missed
+    of both.
 
     The standard error of their ratio is that of the jackknife over the rows.
     """
@@ -195,7 +212,9 @@ def _compare(blocks: np.ndarray) -> Figures:
     found = {
         MISSED: f"{100.0 * missed / (ticks + missed):.4f}",
         "of ticks": str(ticks + missed),
-        "a loop that only sleeps, beside it: missed [%]": f"{100.0 * lost / (kept + lost):.4f}",
+        "a loop that only sleeps, beside it: missed [%]": (
+            f"{100.0 * lost / (kept + lost):.4f}"
+        ),
     }
     others = blocks.sum(axis=0) - blocks
     if not others[:, 3].all():
@@ -220,9 +239,16 @@ def _count_recorded(bag: Path) -> str:
 
 
 def main() -> None:
-    of_runs: dict[str, Any] = {"minutes": 1.0, "usual": float, "rounds": 3, "seconds": 20.0}
+    of_runs: dict[str, Any] = {
+        "minutes": 1.0,
+        "usual": float,
+        "rounds": 3,
+        "seconds": 20.0,
+    }
     of_nodes = {"scene": "example2_heavy", "priority": 20, "fleet": 0, "rate": 200}
-    options = read_options("realtime", __doc__, None, **of_runs, **of_nodes, write=False)
+    options = read_options(
+        "realtime", __doc__, None, **of_runs, **of_nodes, write=False
+    )
     given = {"scene": options.scene, "realtime_priority": options.priority}
     with Client.start() as watch:
         parts = dict(_measure(watch, options, given))

@@ -3,10 +3,10 @@
 
 python -m benchmark.soak --minutes 10
 
-A simulator and a controller at 1 kHz, a recorder, the viewer and a subscriber with the queues of
-robot_state_publisher and RViz run side by side in a ROS domain of their own. Then the memory of
-each process must be flat, the recording complete, and no shared memory of theirs left. Else the
-status is 1.
+A simulator and a controller at 1 kHz, a recorder, the viewer and a subscriber with the
+queues of robot_state_publisher and RViz run side by side in a ROS domain of their own.
+Then the memory of each process must be flat, the recording complete, and no shared
+memory of theirs left. Else the status is 1.
 """
 
 from __future__ import annotations
@@ -53,14 +53,21 @@ except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
 
 
 def start_all(stack: ExitStack, folder: Path, seconds: float) -> dict[str, Process]:
-    """Start all processes; the controller when the recorder listens to the simulator."""
+    """Start all processes.
+
+    The controller when the recorder listens to the simulator.
+    """
     rates: dict[str, Any] = {"scene": SCENE, "rate": 1000}
     waits: dict[str, Any] = {
         "publish_rate": 1000,
         "wait_for_command": True,
         "publish_description": True,
     }
-    held: dict[str, Any] = {"mode": "computed_torque", "hold": seconds + 60.0, "min_subscribers": 2}
+    held: dict[str, Any] = {
+        "mode": "computed_torque",
+        "hold": seconds + 60.0,
+        "min_subscribers": 2,
+    }
     processes = {
         "recorder": Process("recorder", output=folder / "bag"),
         "simulator": start_simulator(**rates, **waits),
@@ -84,12 +91,15 @@ def list_shared(pids: Iterable[int | str]) -> set[Path]:
             names.update(re.findall(r"/dev/shm/fast\S+", (folder / "maps").read_text()))
             for path in (folder / "fd").iterdir():
                 with contextlib.suppress(OSError):
-                    names.update(re.findall(r"^/dev/shm/fast\S+$", str(path.readlink())))
+                    names.update(
+                        re.findall(r"^/dev/shm/fast\S+$", str(path.readlink()))
+                    )
     return {Path(name) for name in names}
 
 
 def list_left(files: set[Path], seconds: float = 10.0) -> list[str]:
-    """Return which of them still exist after at most so long, unless a living process uses them.
+    """Return which of them still exist after at most so long, unless a living process
+    uses them.
 
     Other programs on this machine may use the same ports.
     """
@@ -118,7 +128,9 @@ def soak(folder: Path, seconds: float) -> tuple[list[dict[str, str]], list[str]]
         files = list_shared(process.pid for process in processes.values()) - before
         columns = []
         for name, process in processes.items():
-            later = memory[name][int(len(memory[name]) * min(60.0 / seconds, 1.0 / 3.0)) :]
+            later = memory[name][
+                int(len(memory[name]) * min(60.0 / seconds, 1.0 / 3.0)) :
+            ]
             growth = max(later) - later[0]
             busy = 100.0 * (process.processor_s() - used[name]) / passed
             column = {

@@ -3,8 +3,8 @@
 
 python -m benchmark.sweep [--rows 1000000]
 
-Example 2, one second, DOP853 by the steps that reach 1e-9 rad, the inertia of every body varied by
-a factor of its own, final states to Parquet.
+Example 2, one second, DOP853 by the steps that reach 1e-9 rad, the inertia of every
+body varied by a factor of its own, final states to Parquet.
 """
 
 from __future__ import annotations
@@ -29,7 +29,11 @@ from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 
 BODIES = (
     "star",
-    *(f"{links}[{k}]" for links in ("actuated_links", "intermediate_links") for k in range(3)),
+    *(
+        f"{links}[{k}]"
+        for links in ("actuated_links", "intermediate_links")
+        for k in range(3)
+    ),
 )
 VARY = {f"{body}.inertia": ("uniform", 0.9, 1.1, "relative") for body in BODIES}
 ROUNDS, CHUNKS = 3, 16
@@ -43,10 +47,14 @@ def study_of(rows: int) -> SweepStudy:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print; the exit status is 0."""
     options = read_options("sweep", __doc__, arguments, rows=1_000_000)
-    found: dict[str, Any] = {"machine": describe_machine("numpy", "llvmlite", "dask", "pyarrow")}
+    found: dict[str, Any] = {
+        "machine": describe_machine("numpy", "llvmlite", "dask", "pyarrow")
+    }
     began = time.perf_counter()
     sweep("example2_heavy", VARY, n=1000, progress=False)
-    found["seconds of the first 1,000 rows, imports and code"] = time.perf_counter() - began
+    found["seconds of the first 1,000 rows, imports and code"] = (
+        time.perf_counter() - began
+    )
     found |= _study(options.rows)
     began = time.perf_counter()
     _arrays(PreparedSweep(study_of(100_000), found["steps"]))
@@ -67,7 +75,10 @@ def _study(rows: int) -> dict[str, float]:
         ready = PreparedSweep(study)
         prepared_s = time.perf_counter() - began
         _chunks(ready, folder)
-        seconds, processor = time.perf_counter() - began, time.process_time() - processor
+        seconds, processor = (
+            time.perf_counter() - began,
+            time.process_time() - processor,
+        )
         size = sum(path.stat().st_size for path in Path(folder).iterdir())
         table = read_sweep(Path(folder))
         reading = time.perf_counter() - began - seconds
@@ -94,7 +105,8 @@ def _arrays(ready: PreparedSweep) -> tuple[Any, list[Any]]:
 
 
 def _ratios(steps: int) -> dict[str, float]:
-    """Chunks, files included, against the compiled loop alone on prepared arrays, on all cores.
+    """Chunks, files included, against the compiled loop alone on prepared arrays, on
+    all cores.
 
     Also in processor time, which a busy machine changes less.
     """

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documentation as a site: `make docs`. Nothing is fetched, neither to build nor to read it."""
+"""The documentation as a site: `make docs`.
+
+Nothing is fetched, neither to build nor to read it.
+"""
 
 import os
 import shutil
@@ -23,7 +26,12 @@ from live_equations import live_scene, write_equations
 project = "sst_ros"
 copyright = "2026, the founders of sst_ros"
 version = release = __version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_gallery.gen_gallery",
+]
 html_theme = "furo"
 html_title = f"sst_ros {__version__}"
 html_static_path = ["_static"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The equations of motion of a scene as JavaScript, for the simulation on the first page."""
+"""Write the equations of motion as JavaScript, for the simulation on the first page."""
 
 from __future__ import annotations
 
@@ -22,20 +22,22 @@ const manipulator = {numbers};
 
 
 def live_scene() -> Scene:
-    """Return what the page simulates: the scene of `make view`, with friction that calms it."""
+    """Return the scene of `make view` with friction that calms the motion."""
     changes = {"friction.gamma.viscous": 0.6, "actuators.torque_limit": 6.0}
     return load_scene("swing").with_values(changes)
 
 
 def write_equations(scene: Scene) -> str:
-    """Write the derivative of the state and the joint angles as functions, numbers as an object."""
+    """Write derivative and joint angles as functions, the numbers as an object."""
     dynamics, geometry = Dynamics.of(scene), Geometry.of(scene)
     programs = {"derivative": ODE(dynamics).program, "joints": dynamics.joints_program}
     shapes = {link: [*map(_draw, found)] for link, found in robot.shapes(scene).items()}
     numbers = {
         "initial": start_of(scene),
         "torque_limit": scene.torque_limit,
-        "limits": [limit._asdict() | {"error": ""} for limit in limits_of(scene, geometry)],
+        "limits": [
+            limit._asdict() | {"error": ""} for limit in limits_of(scene, geometry)
+        ],
         "chain": [
             joint._asdict() | {"origin": joint.origin.tolist()}
             for joint in robot.joints_of(geometry)
@@ -43,13 +45,18 @@ def write_equations(scene: Scene) -> str:
         ],
         "shapes": shapes,
     }
-    functions = "\n".join(_function(name, program) for name, program in programs.items())
+    functions = "\n".join(
+        _function(name, program) for name, program in programs.items()
+    )
     text = json.dumps(numbers, allow_nan=False)
     return _TEXT.format(name=scene.name, functions=functions, numbers=text)
 
 
 def _function(name: str, program: Program) -> str:
-    """Write a program; its lines are JavaScript, too, as they have only operators and functions."""
+    """Write a program.
+
+    Its lines are JavaScript, too, as they have only operators and functions.
+    """
     lines, _, results = program.split(())
     body = "".join(f"  const {line};\n" for line in lines)
     given = ", ".join(program.inputs)
@@ -57,7 +64,10 @@ def _function(name: str, program: Program) -> str:
 
 
 def _draw(shape: robot.Shape) -> dict[str, object]:
-    """Return a shape as a line of points [m] with a radius [m] and a colour; a ball has one."""
+    """Return a shape as a line of points [m] with a radius [m] and a colour.
+
+    A ball has one.
+    """
     if isinstance(shape, robot.Arc):
         points, size = shape.points(), shape.thickness
     elif isinstance(shape, robot.Rod):
@@ -69,4 +79,8 @@ def _draw(shape: robot.Shape) -> dict[str, object]:
     colour = [round(255.0 * part) for part in shape.colour]
     opacity = getattr(shape, "opacity", 1.0)
     text = f"rgba({', '.join(map(str, (*colour, opacity)))})"
-    return {"points": [[float(x) for x in point] for point in points], "size": size, "colour": text}
+    return {
+        "points": [[float(x) for x in point] for point in points],
+        "size": size,
+        "colour": text,
+    }

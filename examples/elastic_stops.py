@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Elastic stops at the ends of the stroke
+"""Elastic stops at the ends of the stroke
 =========================================
 
-The actuators of the scene ``impacts`` bounce off stiff stops with Hunt-Crossley damping.
+The actuators of the scene ``impacts`` bounce off stiff stops with Hunt-Crossley
+damping.
 """
 
 import matplotlib.pyplot as plt
@@ -12,7 +12,9 @@ import numpy as np
 from sst_ros import Geometry, load_scene, simulate
 
 scene = load_scene("impacts")
-motion = simulate(scene, duration=2.2, t_eval=np.linspace(0.0, 2.2, 441), tolerance=1e-6)
+motion = simulate(
+    scene, duration=2.2, t_eval=np.linspace(0.0, 2.2, 441), tolerance=1e-6
+)
 ends = np.degrees(Geometry.of(scene).arc)
 print(motion.message, motion.method)
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Error estimate against true error
+"""Error estimate against true error
 =================================
 
-The global error of the orientation is estimated online. Here it is compared, over the length of
-the motion, with the difference from a much finer solution.
+The global error of the orientation is estimated online. Here it is compared, over the
+length of the motion, with the difference from a much finer solution.
 """
 
 import matplotlib.pyplot as plt
@@ -27,7 +26,11 @@ for _ in range(COUNT):
 figure, axes = plt.subplots(figsize=(6.5, 4.0), layout="constrained")
 axes.semilogy(time, error, label="true error")
 axes.semilogy(time, estimate, "--", label="error estimate")
-axes.set(xlabel="time t [s]", ylabel="orientation [rad]", title="dopri5, tolerance 1e-8 per step")
+axes.set(
+    xlabel="time t [s]",
+    ylabel="orientation [rad]",
+    title="dopri5, tolerance 1e-8 per step",
+)
 axes.grid(alpha=0.3)
 axes.legend(loc="lower right")
 figure.savefig("error_estimate.png")

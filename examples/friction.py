@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Friction: phase portrait with and without
+"""Friction: phase portrait with and without
 =========================================
 
-The same torques act on Example 2 with and without viscous, Coulomb and Stribeck friction.
+The same torques act on Example 2 with and without viscous, Coulomb and Stribeck
+friction.
 """
 
 import matplotlib.pyplot as plt
@@ -21,7 +21,9 @@ motions = {
 figure, axes = plt.subplots(1, 3, figsize=(9.0, 3.4), layout="constrained")
 for (name, motion), style in zip(motions.items(), ("-", "--"), strict=True):
     for k in range(3):
-        axes[k].plot(np.degrees(motion.gamma[:, k]), motion.gamma_dot[:, k], style, label=name)
+        axes[k].plot(
+            np.degrees(motion.gamma[:, k]), motion.gamma_dot[:, k], style, label=name
+        )
         axes[k].set_xlabel(f"γ{'₁₂₃'[k]} [deg]")
 axes[0].set_ylabel("rate [rad/s]")
 axes[0].legend(fontsize=8)

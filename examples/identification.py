@@ -14,7 +14,12 @@ from sst_ros import InverseDynamics, identify, load_scene, reference_motion
 
 CUTOFF = 10.0  # Hz; the default, 42 Hz here, would bias zz, which hardly moves
 COUNT, NOISE = 2.0 * np.pi / 65536, 0.02  # rad, N m
-NAMES = ("star.inertia.xx", "star.inertia.yy", "star.inertia.zz", "friction.gamma.viscous")
+NAMES = (
+    "star.inertia.xx",
+    "star.inertia.yy",
+    "star.inertia.zz",
+    "friction.gamma.viscous",
+)
 
 plant = load_scene("reach")
 motion, model = reference_motion(plant), InverseDynamics(plant)
@@ -34,8 +39,12 @@ inertia = plant.star.inertia
 true = np.array([inertia.xx, inertia.yy, inertia.zz, plant.friction.gamma.viscous])
 given = np.array([0.312, 0.312, 0.25, 0.1])
 figure, axes = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
-estimate, interval = (np.array(x)[rows] / true for x in (found.estimate, 1.96 * found.deviation))
-axes.errorbar(estimate, range(4), xerr=interval, fmt="o", capsize=4, label="identified, 95 %")
+estimate, interval = (
+    np.array(x)[rows] / true for x in (found.estimate, 1.96 * found.deviation)
+)
+axes.errorbar(
+    estimate, range(4), xerr=interval, fmt="o", capsize=4, label="identified, 95 %"
+)
 axes.plot(given / true, range(4), "x", label="model to start from")
 axes.axvline(1.0, color="k", linestyle=":")
 axes.set_yticks(range(4), NAMES)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Inverse dynamics of Example 1
+"""Inverse dynamics of Example 1
 =============================
 
-The torques of a simulated motion are computed back from orientation, angular velocity and angular
-acceleration, and compared with those that were applied, 1.13 sin 12t.
+The torques of a simulated motion are computed back from orientation, angular velocity
+and angular acceleration, and compared with those that were applied, 1.13 sin 12t.
 """
 
 import matplotlib.pyplot as plt
@@ -27,7 +26,9 @@ torque = np.array(
 )
 applied = 1.13 * np.sin(12.0 * times)
 
-figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(6.5, 5.0), layout="constrained")
+figure, (above, below) = plt.subplots(
+    2, 1, sharex=True, figsize=(6.5, 5.0), layout="constrained"
+)
 above.plot(times, applied, linewidth=5, alpha=0.4, label="applied, 1.13 sin 12t")
 above.plot(times, torque[:, 0], label="inverse dynamics, τ₁")
 above.set(ylabel="torque [N m]")

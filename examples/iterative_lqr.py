@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Iterative LQR
+"""Iterative LQR
 =============
 
-A swing of the star under gravity from rest to rest: each iteration linearises the motion once, by
-its sensitivities, and improves the held torques and their feedback by a linear-quadratic regulator.
+A swing of the star under gravity from rest to rest: each iteration linearises the
+motion once, by its sensitivities, and improves the held torques and their feedback by a
+linear-quadratic regulator.
 """
 
 import matplotlib.pyplot as plt
@@ -22,10 +22,17 @@ PARAMETERS = ("initial.gamma", "initial.gamma_dot", "torque")
 
 
 def linearise(u):
-    """Return states x, shape (N + 1, 6), and A, B of dx[k + 1] = A[k] dx[k] + B[k] du[k]."""
+    """Return states x, shape (N + 1, 6), and A, B of dx[k + 1] = A[k] dx[k] + B[k]
+    du[k].
+    """
     table = TorqueTable(TIMES[:N], u)
     motion = simulate(
-        scene, table, initial=START, duration=TIMES[-1], t_eval=TIMES, sensitivities=PARAMETERS
+        scene,
+        table,
+        initial=START,
+        duration=TIMES[-1],
+        t_eval=TIMES,
+        sensitivities=PARAMETERS,
     )
     parts = [motion.sensitivities[name] for name in PARAMETERS]
     slopes = [np.hstack([part.gamma, part.gamma_dot]) for part in parts]
@@ -36,14 +43,19 @@ def linearise(u):
 
 
 def improve(x, a, b, u):
-    """Return changes of torques, shape (N, 3), and gains, shape (N, 3, 6), of least cost."""
+    """Return changes of torques, shape (N, 3), and gains, shape (N, 3, 6), of least
+    cost.
+    """
     p, steps, gains = WEIGHT * np.eye(6), np.zeros((N, 3)), np.zeros((N, 3, 6))
     slope = p @ (x[N] - GOAL)
     for k in reversed(range(N)):
         cross, inner = b[k].T @ p @ a[k], np.eye(3) + b[k].T @ p @ b[k]
         steps[k] = -np.linalg.solve(inner, u[k] + b[k].T @ slope)
         gains[k] = -np.linalg.solve(inner, cross)
-        slope, p = a[k].T @ slope + cross.T @ steps[k], a[k].T @ p @ a[k] + cross.T @ gains[k]
+        slope, p = (
+            a[k].T @ slope + cross.T @ steps[k],
+            a[k].T @ p @ a[k] + cross.T @ gains[k],
+        )
     return steps, gains
 
 
@@ -64,9 +76,14 @@ for iteration in range(6):
     simulate(scene, control, TIMES[-1], initial=START, control_period=PERIOD)
     errors.append(np.abs(x[N] - GOAL).max())
     changes.append(np.abs(held - torques).max())
-    print(f"{iteration}: error at the end {errors[-1]:.1e}, largest change {changes[-1]:.1e} N m")
+    print(
+        f"{iteration}: error at the end {errors[-1]:.1e}, largest change"
+        f" {changes[-1]:.1e} N m"
+    )
     torques = np.array(held)
-    axes.plot(TIMES, x[:, 0], label=f"iteration {iteration}: {errors[-1]:.0e} rad, rad/s")
+    axes.plot(
+        TIMES, x[:, 0], label=f"iteration {iteration}: {errors[-1]:.0e} rad, rad/s"
+    )
 axes.plot(TIMES[-1], GOAL[0], "ko", label="goal")
 axes.set(xlabel="time t [s]", ylabel="angle of actuator 1, γ [rad]")
 axes.grid(alpha=0.3)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Least effort from rest to rest, with exact gradients
+"""Least effort from rest to rest, with exact gradients
 ====================================================
 
-SciPy chooses 15 held torques that turn the star to given actuator angles with the least effort. The
-derivatives of its end by the torques come from the variational equations, in place of differences.
+SciPy chooses 15 held torques that turn the star to given actuator angles with the least
+effort. The derivatives of its end by the torques come from the variational equations,
+in place of differences.
 """
 
 import matplotlib.pyplot as plt
@@ -15,7 +15,8 @@ from sst_ros import TorqueTable, load_scene, simulate
 
 FREE = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore", "torque": None}
 scene = load_scene("example2_heavy").with_values(FREE)
-START, GOAL, END = np.array([0.8, 0.8, 0.8]), np.array([1.0, 0.6, 0.9]), 1.0  # rad, rad, s
+# rad, rad, s
+START, GOAL, END = np.array([0.8, 0.8, 0.8]), np.array([1.0, 0.6, 0.9]), 1.0
 TIMES = np.linspace(0.0, END, 5, endpoint=False)
 calls = 0  # of simulate
 
@@ -26,7 +27,9 @@ def move(x, sensitivities=()):
     calls += 1
     table = TorqueTable(TIMES, x.reshape(-1, 3))
     start = (START, np.zeros(3))
-    return simulate(scene, table, END, initial=start, t_eval=[END], sensitivities=sensitivities)
+    return simulate(
+        scene, table, END, initial=start, t_eval=[END], sensitivities=sensitivities
+    )
 
 
 def miss(x):
@@ -53,11 +56,16 @@ for name, exact in (("differences", {}), ("exact derivatives", {"jac": slope})):
         effort, np.zeros(15), jac=True, method="SLSQP", constraints=[goal], tol=1e-10
     )
     motions[name], errors[name] = calls, np.abs(miss(found[name].x)).max()
-    print(f"{name}: {calls} motions, largest error at the end {errors[name]:.1e} rad, rad/s")
+    print(
+        f"{name}: {calls} motions, largest error at the end {errors[name]:.1e} rad,"
+        " rad/s"
+    )
 
 table = TorqueTable(TIMES, found["exact derivatives"].x.reshape(-1, 3))
 motion = simulate(scene, table, END, initial=(START, np.zeros(3)))
-figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(6.5, 5.0), layout="constrained")
+figure, (above, below) = plt.subplots(
+    2, 1, sharex=True, figsize=(6.5, 5.0), layout="constrained"
+)
 for k in range(3):
     (line,) = above.plot(motion.t, motion.gamma[:, k], label=f"leg {k + 1}")
     above.plot(END, GOAL[k], "o", color=line.get_color())

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Model predictive control at 500 Hz
+"""Model predictive control at 500 Hz
 ==================================
 
-The scene ``reach`` follows a spiral that asks for more torque than its actuators have. A controller
-that plans 0.2 s ahead with these limits is compared with computed torque, with and without noise.
+The scene ``reach`` follows a spiral that asks for more torque than its actuators have.
+A controller that plans 0.2 s ahead with these limits is compared with computed torque,
+with and without noise.
 
-Every 2 ms CasADi predicts and linearises the motion under the last plan. A quadratic program in
-its 30 torques, with the limits as bounds, corrects the plan: one real-time iteration (Diehl et
-al., J. Process Control 12 (2002) 577-585). Needs the extra ``casadi``.
+Every 2 ms CasADi predicts and linearises the motion under the last plan. A quadratic
+program in its 30 torques, with the limits as bounds, corrects the plan: one real-time
+iteration (Diehl et al., J. Process Control 12 (2002) 577-585). Needs the extra
+``casadi``.
 """
 
 import time
@@ -22,8 +23,10 @@ import sst_ros
 from sst_ros import Controller, ControllerSettings, State, equations, load_scene
 
 PERIOD, STAGE, STAGES = 2e-3, 2e-2, 10  # of control and of the plan [s]
-LIMIT, DURATION, SPIRAL = 11.0, 1.3, 0.8  # [N m], where 15.2 are asked for; run, motion [s]
-ANGLE_NOISE, RATE_NOISE = 2e-4, 1e-2  # of measurements, standard deviation [rad], [rad/s]
+# [N m], where 15.2 are asked for; run, motion [s]
+LIMIT, DURATION, SPIRAL = 11.0, 1.3, 0.8
+# of measurements, standard deviation [rad], [rad/s]
+ANGLE_NOISE, RATE_NOISE = 2e-4, 1e-2
 ANGLES, RATES, TORQUES = 1e5, 1e2, 1e-2  # weights of squared errors, of squared torques
 
 changes = {"actuators.torque_limit": LIMIT, "motion.spiral.duration": SPIRAL}
@@ -35,7 +38,9 @@ goal = np.array([[*at.gamma, *at.gamma_dot] for at in grid])
 
 
 def predict():
-    """Return the function of a state and a plan: joints of each stage, and what changes them."""
+    """Return the function of a state and a plan: joints of each stage, and what changes
+    them.
+    """
     model = equations(scene, "casadi", outputs=["derivative", "joints"])
     y, torque = casadi.SX.sym("y", 7), casadi.SX.sym("torque", 3)
     slope, total = model.derivative(y, torque), 0.0
@@ -44,7 +49,9 @@ def predict():
         slope = model.derivative(y + STAGE * part * slope, torque)
     after = y + total
     actuators = casadi.vertcat(model.joints(y)[:3], model.joints(y)[9:12])
-    of_state = casadi.Function("of_state", [y], [actuators, casadi.jacobian(actuators, y)])
+    of_state = casadi.Function(
+        "of_state", [y], [actuators, casadi.jacobian(actuators, y)]
+    )
     slopes = casadi.jacobian(after, y), casadi.jacobian(after, torque)
     results = [after, *slopes, *of_state(after)]
     return casadi.Function("step", [y, torque], results).mapaccum(STAGES)
@@ -78,14 +85,18 @@ class Predictive:
         hessian = weighted @ effect + TORQUES * np.eye(3 * STAGES)
         slope = weighted @ error + TORQUES * old
         better = self.solver(h=hessian, g=slope, lbx=-LIMIT - old, ubx=LIMIT - old)["x"]
-        self.plan = np.clip(old + better.full().ravel(), -LIMIT, LIMIT).reshape(STAGES, 3)
+        self.plan = np.clip(old + better.full().ravel(), -LIMIT, LIMIT).reshape(
+            STAGES, 3
+        )
         self.seconds.append(time.perf_counter() - begin)
         return self.plan[0]
 
 
 def measured(state, noise):
     """Return a state as sensors show it; `noise` are six numbers."""
-    turn = Rotation.from_quat(state.quaternion) * Rotation.from_rotvec(ANGLE_NOISE * noise[:3])
+    turn = Rotation.from_quat(state.quaternion) * Rotation.from_rotvec(
+        ANGLE_NOISE * noise[:3]
+    )
     y = np.concatenate([turn.as_quat(), state.body_rate + RATE_NOISE * noise[3:]])
     return State.of(state.time_ns, y.tolist(), joints(y).tolist(), state.torque)
 
@@ -94,7 +105,10 @@ figure, axes = plt.subplots(2, 1, figsize=(6.5, 6.0), sharex=True, layout="const
 errors, seconds = {}, []
 settings = ControllerSettings(mode="computed_torque", bandwidth=60.0)
 for word, size in (("no noise", 0.0), ("noise", 1.0)):
-    laws = {"computed torque": Controller(scene, motion, settings, PERIOD), "MPC": Predictive()}
+    laws = {
+        "computed torque": Controller(scene, motion, settings, PERIOD),
+        "MPC": Predictive(),
+    }
     for name, law in laws.items():
         rng = np.random.default_rng(1)
 

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Rates from encoders by an extended Kalman filter
+"""Rates from encoders by an extended Kalman filter
 ================================================
 
-Encoders measure the three actuator angles at 500 Hz. The filter estimates angles and rates of the
-scene ``gravity_payload``, under torques with a disturbance that it knows by its variance alone. It
-predicts by a step of ``Simulation`` from its estimate, and its covariance by the discrete pair
-(A, B) of ``linearize``.
+Encoders measure the three actuator angles at 500 Hz. The filter estimates angles and
+rates of the scene ``gravity_payload``, under torques with a disturbance that it knows
+by its variance alone. It predicts by a step of ``Simulation`` from its estimate, and
+its covariance by the discrete pair (A, B) of ``linearize``.
 
-The normalised estimation error squared (NEES) shows whether the covariance that a filter states is
-that of its errors: 95 % of the averages over the runs then lie between the dashed lines
-(Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation, Wiley 2001,
-section 5.4).
+The normalised estimation error squared (NEES) shows whether the covariance that a
+filter states is that of its errors: 95 % of the averages over the runs then lie between
+the dashed lines (Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking
+and Navigation, Wiley 2001, section 5.4).
 """
 
 import matplotlib.pyplot as plt
@@ -21,7 +20,8 @@ from scipy.stats import chi2
 from sst_ros import Simulation, equilibrium, linearize, load_scene
 
 PERIOD, STEPS, RUNS = 2e-3, 100, 20
-ENCODER, DISTURBANCE = 2e-4, 0.3  # standard deviations: of an angle [rad], of a held torque [N m]
+# standard deviations: of an angle [rad], of a held torque [N m]
+ENCODER, DISTURBANCE = 2e-4, 0.3
 FIRST = np.diag([ENCODER**2] * 3 + [0.05**2] * 3)  # covariance of the first estimate
 
 scene = load_scene("gravity_payload")
@@ -33,7 +33,9 @@ rng = np.random.default_rng(5)
 
 def begin(x):
     """Return a simulation that begins with the angles and rates x, shape (6,)."""
-    return Simulation(scene.with_values({"initial": {"gamma": x[:3], "gamma_dot": x[3:]}}))
+    return Simulation(
+        scene.with_values({"initial": {"gamma": x[:3], "gamma_dot": x[3:]}})
+    )
 
 
 def coordinates(state):
@@ -42,7 +44,9 @@ def coordinates(state):
 
 
 def run():
-    """Return errors of the estimate, shape (STEPS, 6), standard deviations of it, and the NEES."""
+    """Return errors of the estimate, shape (STEPS, 6), standard deviations of it, and
+    the NEES.
+    """
     plant, p = begin(START), FIRST
     x = rng.multivariate_normal(START, FIRST)
     errors, deviations, nees = [], [], []
@@ -72,8 +76,12 @@ t = PERIOD * np.arange(1, STEPS + 1)
 for errors, *_ in runs:
     axes[0].plot(t, errors[:, 3], color="tab:blue", lw=0.5)
 _, deviations, _ = runs[0]
-axes[0].plot(t, 2.0 * deviations[:, 3], "k--", t, -2.0 * deviations[:, 3], "k--", lw=1.0)
-axes[0].set(ylabel="error of the rate 1 [rad/s]", ylim=(-0.1, 0.1), title="±2 stated deviations")
+axes[0].plot(
+    t, 2.0 * deviations[:, 3], "k--", t, -2.0 * deviations[:, 3], "k--", lw=1.0
+)
+axes[0].set(
+    ylabel="error of the rate 1 [rad/s]", ylim=(-0.1, 0.1), title="±2 stated deviations"
+)
 axes[1].plot(t, average, label=f"average of {RUNS} runs, {100 * inside:.0f} % inside")
 axes[1].hlines([low, high], 0.0, t[-1], "k", "dashed", lw=1.0)
 axes[1].set(xlabel="time t [s]", ylabel="NEES of 6 numbers", ylim=(0.0, 12.0))

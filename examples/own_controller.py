@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Own controller without ROS: PD with gravity compensation
+"""Own controller without ROS: PD with gravity compensation
 ========================================================
 
-A function of time and state, sampled and held at 500 Hz (zero-order hold), as a digital controller.
-As a ROS 2 node, free running or in lockstep, it is ``controller.py``.
+A function of time and state, sampled and held at 500 Hz (zero-order hold), as a digital
+controller. As a ROS 2 node, free running or in lockstep, it is ``controller.py``.
 """
 
 import numpy as np

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Own scene and own torque function
+"""Own scene and own torque function
 =================================
 
-A geometry of your own with a payload, driven by torques that are a function of time: arrays, a
-table and a picture.
+A geometry of your own with a payload, driven by torques that are a function of time:
+arrays, a table and a picture.
 """
 
 from math import cos, sin

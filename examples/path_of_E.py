@@ -1,22 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Path of E on the sphere
+"""Path of E on the sphere
 =======================
 
-The scene ``spiral`` is tracked by a computed-torque controller; the path of E is drawn on the base
-triangle.
+The scene ``spiral`` is tracked by a computed-torque controller; the path of E is drawn
+on the base triangle.
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from sst_ros import Controller, ControllerSettings, Geometry, load_scene, reference_motion, simulate
+from sst_ros import (
+    Controller,
+    ControllerSettings,
+    Geometry,
+    load_scene,
+    reference_motion,
+    simulate,
+)
 from sst_ros.mechanism.geometry import rotation_matrix
 
 scene = load_scene("spiral")
 geometry, reference = Geometry.of(scene), reference_motion(scene)
 settings = ControllerSettings(mode="computed_torque", bandwidth=60.0)
-motion = simulate(scene, Controller(scene, reference, settings, 5e-3), control_period=5e-3)
+motion = simulate(
+    scene, Controller(scene, reference, settings, 5e-3), control_period=5e-3
+)
 E = np.array([rotation_matrix(q)[:, 2] for q in motion.quaternion])
 
 figure = plt.figure(figsize=(6.0, 5.5), layout="constrained")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Publish torques as a ROS 2 node
+"""Publish torques as a ROS 2 node
 ===============================
 
-A square wave of torque on the first actuator, ten commands a second. A simulator must be running::
+A square wave of torque on the first actuator, ten commands a second. A simulator must
+be running::
 
     python examples/push.py
 

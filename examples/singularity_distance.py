@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Distance to singularities along a motion
+"""Distance to singularities along a motion
 ========================================
 
-Condition number of the Jacobian from actuator rates to the angular velocity of the star, and the
-determinant of J2, which is zero at a parallel singularity.
+Condition number of the Jacobian from actuator rates to the angular velocity of the
+star, and the determinant of J2, which is zero at a parallel singularity.
 """
 
 import matplotlib.pyplot as plt
@@ -19,7 +18,9 @@ motion = simulate(scene, t_eval=np.linspace(0.0, 1.0, 201))
 rotation = np.array([rotation_matrix(q) for q in motion.quaternion])
 found = measures(Geometry.of(scene), motion.gamma, rotation)
 
-figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(6.5, 5.0), layout="constrained")
+figure, (above, below) = plt.subplots(
+    2, 1, sharex=True, figsize=(6.5, 5.0), layout="constrained"
+)
 above.plot(motion.t, found.cond_j)
 above.set(ylabel="condition number of J")
 below.plot(motion.t, found.det_j2, label="det J2")

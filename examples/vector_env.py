@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Many robots for reinforcement learning
+"""Many robots for reinforcement learning
 ======================================
 
-A vector environment of gymnasium: reach desired angles by three torques, 500 steps a second.
+A vector environment of gymnasium: reach desired angles by three torques, 500 steps a
+second.
 """
 
 from typing import Any
@@ -27,7 +27,9 @@ class StarTriangles(VectorEnv):
     def __init__(self, num_envs: int = 64) -> None:
         self.num_envs = num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float64)
+        self.single_observation_space = gymnasium.spaces.Box(
+            -np.inf, np.inf, (9,), np.float64
+        )
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float64)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -39,7 +41,9 @@ class StarTriangles(VectorEnv):
         self._count = np.zeros(num_envs, dtype=int)
         self._ended = np.zeros(num_envs, dtype=bool)
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: Any = None, options: Any = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start all robots again."""
         super().reset(seed=seed)
         self._begin(np.ones(self.num_envs, dtype=bool))
@@ -54,15 +58,25 @@ class StarTriangles(VectorEnv):
         self._count += 1
         self._count[again] = 0
         observed = self._observe()
-        reward = np.where(again, 0.0, -np.square(observed[:, :3] - observed[:, 6:]).sum(axis=1))
+        reward = np.where(
+            again, 0.0, -np.square(observed[:, :3] - observed[:, 6:]).sum(axis=1)
+        )
         truncated = (self._session.state.code != 0) | (self._count >= LONGEST)
         self._ended = truncated & ~again
-        return observed, reward, np.zeros(self.num_envs, dtype=bool), self._ended.copy(), {}
+        return (
+            observed,
+            reward,
+            np.zeros(self.num_envs, dtype=bool),
+            self._ended.copy(),
+            {},
+        )
 
     def _begin(self, chosen: np.ndarray) -> None:
         shape = (np.count_nonzero(chosen), 3)
         self._desired[chosen] = HOME + self.np_random.uniform(-SPREAD, SPREAD, shape)
-        self._session.reset(chosen, HOME + self.np_random.uniform(-SPREAD, SPREAD, shape))
+        self._session.reset(
+            chosen, HOME + self.np_random.uniform(-SPREAD, SPREAD, shape)
+        )
         self._count[chosen], self._ended[chosen] = 0, False
 
     def _observe(self) -> np.ndarray:
@@ -76,4 +90,7 @@ if __name__ == "__main__":
     for _ in range(LONGEST - 1):
         wanted = 20.0 * (seen[:, 6:] - seen[:, :3]) - 4.0 * seen[:, 3:6]
         seen, rewards, *_ = robots.step(np.clip(wanted / MOST, -1.0, 1.0))
-    print(f"largest error after a second: {np.abs(seen[:, :3] - seen[:, 6:]).max():.3f} rad")
+    print(
+        "largest error after a second:"
+        f" {np.abs(seen[:, :3] - seen[:, 6:]).max():.3f} rad"
+    )

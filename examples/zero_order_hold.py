@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Zero-order hold: error of sampled torques
+"""Zero-order hold: error of sampled torques
 =========================================
 
-Torques that are held over a period and taken at its start give an error of first order in the
-period; taken at its middle, of second order.
+Torques that are held over a period and taken at its start give an error of first order
+in the period; taken at its middle, of second order.
 """
 
 import matplotlib.pyplot as plt
@@ -21,7 +20,11 @@ for period in periods:
     for (_, values), shift in zip(errors.items(), (0.0, 0.5), strict=True):
         a, f, p = (
             np.array(x)
-            for x in (scene.torque.amplitude, scene.torque.frequency, scene.torque.phase)
+            for x in (
+                scene.torque.amplitude,
+                scene.torque.frequency,
+                scene.torque.phase,
+            )
         )
         held = TorqueTable(times, a * np.sin(f * (times[:, None] + shift * period) + p))
         end = simulate(scene, held, 1.0, t_eval=[0.0, 1.0]).gamma[-1]

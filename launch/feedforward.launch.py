@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the simulator, the controller that follows the scene's motion, and a recorder.
 
-The controller's model may be another scene than the simulator's. The launch ends with the motion.
+The controller's model may be another scene than the simulator's. The launch ends with
+the motion.
 """
 
 from launch import LaunchDescription
@@ -21,13 +22,19 @@ RUN = {
     "scene": ("reach", "scene that is simulated, by name or by path of a .yaml file"),
     "rate": ("", "steps per second of simulated time [Hz]"),
     "duration": ("0.0", "length of the run [s]; 0 until the motion has ended"),
-    "real_time_factor": ("", "simulated time per time of the clock; 0 for as fast as possible"),
+    "real_time_factor": (
+        "",
+        "simulated time per time of the clock; 0 for as fast as possible",
+    ),
     "sync": ("lockstep", "free, or lockstep with the commands"),
 }
 ARGUMENTS = {
     **RUN,
     "model": ("", "scene of the controller's model; by default the simulated one"),
-    "control_rate": ("500", "commands per second of simulated time [Hz], a divisor of rate"),
+    "control_rate": (
+        "500",
+        "commands per second of simulated time [Hz], a divisor of rate",
+    ),
     **CONTROL,
     "record": ("true", "record the run, which starts when it is recorded"),
     **launch_parts.recording_arguments("feedforward_bag"),
@@ -47,9 +54,11 @@ def actions(given: Given) -> list[Action]:
         "scene": given["model"] or given["scene"],
         "rate": given["control_rate"],
         "stamped": "true" if given["sync"] == "lockstep" else "",
-        "timeout": launch_parts.Default(launch_parts.WAIT_S),  # also until the simulator is up
+        # also until the simulator is up
+        "timeout": launch_parts.Default(launch_parts.WAIT_S),
         "wait_for_recorder": given["record"],
-        "min_subscribers": "2" if recorded else "",  # the recorder reads the commands, too
+        # the recorder reads the commands, too
+        "min_subscribers": "2" if recorded else "",
     }
     return [
         *([launch_parts.recorder(given)] if recorded else []),

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start a simulator as the hardware of ros2_control: controller manager, broadcaster, a controller.
+"""Start a simulator as the hardware of ros2_control.
 
-The run starts at the first command. With sync:=lockstep each sample waits for an update of the
-controllers, at publish_rate. The launch ends with the simulator.
+Controller manager, joint state broadcaster and a controller start with it.
+The run starts at the first command. With sync:=lockstep each sample waits for an update
+of the controllers, at publish_rate. The launch ends with the simulator.
 """
 
 from launch import LaunchDescription
@@ -16,7 +17,10 @@ RUN = {
     "rate": ("", "steps per second of simulated time [Hz]"),
     "publish_rate": ("", "published samples per second [Hz]"),
     "duration": ("0.0", "length of the run [s]; 0 for no end"),
-    "real_time_factor": ("", "simulated time per time of the clock; 0.0 for as fast as possible"),
+    "real_time_factor": (
+        "",
+        "simulated time per time of the clock; 0.0 for as fast as possible",
+    ),
     "sync": ("", "free, or lockstep: one update of the controllers for each sample"),
     "publish_clock": ("", "true: publish the simulated time on /clock"),
 }
@@ -24,9 +28,15 @@ ARGUMENTS = {
     **RUN,
     "controller": (
         "trajectory_controller",
-        "controller that is started: effort_controller, trajectory_controller or pid_controller",
+        (
+            "controller that is started: effort_controller, trajectory_controller or"
+            " pid_controller"
+        ),
     ),
-    "controllers": ("", "parameters of the controllers; by default config/controllers.yaml"),
+    "controllers": (
+        "",
+        "parameters of the controllers; by default config/controllers.yaml",
+    ),
 }
 
 
@@ -37,7 +47,8 @@ def actions(given: Given) -> list[Action]:
         **({"publish_clock": "true"} if given["sync"] == "lockstep" else {}),
         "wait_for_command": "true",
         "partial_commands": "true",
-        "publish_description": "false",  # robot_state_publisher publishes that with the tag
+        # robot_state_publisher publishes that with the tag
+        "publish_description": "false",
     }
     return [
         launch_parts.simulator(given, run, recorded=False),

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the simulator and, as asked, the player of the scene's torques, a recorder and RViz.
+"""Start the simulator and, if asked, torque player, recorder and RViz.
 
-The launch ends with the simulator, that is after `duration` if there is one, in lockstep by default
-that of the scene; without one it ends with the player of play:=true, or when it is stopped.
+The launch ends with the simulator, that is after `duration` if there is one, in
+lockstep by default that of the scene; without one it ends with the player of
+play:=true, or when it is stopped.
 """
 
 from launch import LaunchDescription
@@ -15,10 +16,19 @@ RUN = {
     "scene": ("example2", "scene, by name or by path of a .yaml file"),
     "rate": ("", "steps per second of simulated time [Hz]"),
     "publish_rate": ("", "published samples per second [Hz]"),
-    "duration": ("", "length of the run [s]; 0 for no end; in lockstep by default the scene's"),
-    "real_time_factor": ("", "simulated time per time of the clock; 0 for as fast as possible"),
+    "duration": (
+        "",
+        "length of the run [s]; 0 for no end; in lockstep by default the scene's",
+    ),
+    "real_time_factor": (
+        "",
+        "simulated time per time of the clock; 0 for as fast as possible",
+    ),
     "publish_clock": ("", "true: publish the simulated time on /clock"),
-    "sync": ("", "free, or lockstep with the commands; by default lockstep with play:=true"),
+    "sync": (
+        "",
+        "free, or lockstep with the commands; by default lockstep with play:=true",
+    ),
 }
 ARGUMENTS = {
     **RUN,
@@ -46,7 +56,8 @@ def actions(given: Given) -> list[Action]:
         played = {
             "scene": given["scene"],
             "rate": given["publish_rate"],
-            "timeout": launch_parts.Default(launch_parts.WAIT_S),  # also until the simulator is up
+            # also until the simulator is up
+            "timeout": launch_parts.Default(launch_parts.WAIT_S),
             "stamped": "" if run["sync"] == "lockstep" else "false",
             "min_subscribers": "2" if recorded else "",  # the recorder reads them, too
         }

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulator of the 3-RRP spherical star-triangle parallel manipulator.
 
-`simulate` returns a whole motion as a `Trajectory`; `Simulation` goes step by step, for control
-loops; `sweep` runs a study of many runs, on this machine or on a cluster. All names are imported
-when they are first used.
+`simulate` returns a whole motion as a `Trajectory`; `Simulation` goes step by step, for
+control loops; `sweep` runs a study of many runs, on this machine or on a cluster. All
+names are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import importlib
 
 from sst_ros.version import VERSION
 
-TYPE_CHECKING = False  # typing takes long to import, and a node handles signals only after this
+# typing takes long to import, and a node handles signals only after this
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from sst_ros.code_generation.equations import Equations as Equations
     from sst_ros.code_generation.equations import equations as equations
@@ -35,7 +36,9 @@ if TYPE_CHECKING:
     from sst_ros.integration.batch import Batch as Batch
     from sst_ros.mechanism import kinematics as _kinematics
     from sst_ros.mechanism.geometry import Geometry as Geometry
-    from sst_ros.mechanism.workspace import distance_to_singularity as distance_to_singularity
+    from sst_ros.mechanism.workspace import (
+        distance_to_singularity as distance_to_singularity,
+    )
     from sst_ros.mechanism.workspace import workspace as workspace
     from sst_ros.plot.workspace import plot_workspace as plot_workspace
     from sst_ros.proof.certify import ProvenMotion as ProvenMotion
@@ -89,7 +92,9 @@ _MODULES = {
 }
 
 if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all others
-    _WORDS = [(module, word) for module, words in _MODULES.items() for word in words.split()]
+    _WORDS = [
+        (module, word) for module, words in _MODULES.items() for word in words.split()
+    ]
     _EXPORTS = {word.partition(":")[0]: (module, word) for module, word in _WORDS}
     __all__ = ["__version__", *sorted(_EXPORTS)]
 

@@ -12,8 +12,9 @@ NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
 def main(arguments: list[str] | None = None) -> int:
     """Run a command or a node; return the exit status.
 
-    While modules are imported a SIGINT ends the process of a command at once and in silence: a
-    KeyboardInterrupt there would come out of them as it is, or as an ImportError of numpy's.
+    While modules are imported a SIGINT ends the process of a command at once and in
+    silence: a KeyboardInterrupt there would come out of them as it is, or as an
+    ImportError of numpy's.
     """
     given = sys.argv[1:] if arguments is None else arguments
     try:

@@ -31,9 +31,9 @@ _END_S = 30.0
 def record(name: str, folder: Path) -> Path:
     """Play a scene's torques to its simulator, in processes of their own, and record the run.
 
-    It goes by the clock, and in lockstep: to the same bits however busy the machine is. The bag in
-    `folder` takes the place of an earlier one. An SstError names a node that failed or did not end
-    in time.
+    It goes by the clock, and in lockstep: to the same bits however busy the machine is.
+    The bag in `folder` takes the place of an earlier one. An SstError names a node that
+    failed or did not end in time.
     """
     seconds = load(name).duration or 1.0
     run = {"scene": name, "duration": seconds}
@@ -43,22 +43,34 @@ def record(name: str, folder: Path) -> Path:
 def follow(name: str, folder: Path, mode: str, *, model: str | None = None) -> Path:
     """Have the controller node follow a scene's motion in lockstep, and record the run.
 
-    The controller's model and motion are those of the scene `model`, by default the plant's own.
-    Bag and errors are as with `record`; a scene without a motion is refused before the folder is
-    touched.
+    The controller's model and motion are those of the scene `model`, by default the
+    plant's own. Bag and errors are as with `record`; a scene without a motion is
+    refused before the folder is touched.
     """
     motion = reference_motion(load(model or name))
     seconds = math.ceil((motion.duration + _HOLD_S) * _RATE) / _RATE
-    run = {"scene": name, "duration": seconds, "publish_rate": _RATE, "real_time_factor": 0.0}
+    run = {
+        "scene": name,
+        "duration": seconds,
+        "publish_rate": _RATE,
+        "real_time_factor": 0.0,
+    }
     followed = {"scene": model or name, "mode": mode, "hold": _HOLD_S, "rate": _RATE}
     followed |= {"feedforward_at": "middle", "wait_for_recorder": True}
     return _record(folder, run, "inverse_dynamics", followed, 20.0 * seconds + _END_S)
 
 
 def _record(
-    folder: Path, run: dict[str, object], command: str, given: dict[str, object], most_s: float
+    folder: Path,
+    run: dict[str, object],
+    command: str,
+    given: dict[str, object],
+    most_s: float,
 ) -> Path:
-    """Record a run of the simulator under the commands of a node; all end by themselves."""
+    """Record a run of the simulator under the commands of a node.
+
+    All end by themselves.
+    """
     bag = folder / "bag"
     if bag.exists():
         shutil.rmtree(bag)
@@ -67,8 +79,15 @@ def _record(
         with _node("simulator", _END_S, sync="lockstep", **run):
             # One line when it receives all topics, none where it gives up, or is stuck.
             said = recorder.stdout
-            if not (said and select.select([said], [], [], 2.0 * _READY_S)[0] and said.readline()):
-                text = f"the recorder received nothing from a simulator within {_READY_S:g} s"
+            if not (
+                said
+                and select.select([said], [], [], 2.0 * _READY_S)[0]
+                and said.readline()
+            ):
+                text = (
+                    "the recorder received nothing from a simulator within"
+                    f" {_READY_S:g} s"
+                )
                 raise SstError(text)
             with _node(command, most_s, stamped=True, min_subscribers=2, **given):
                 pass
@@ -77,7 +96,9 @@ def _record(
 
 
 @contextmanager
-def _node(command: str, end_s: float, **given: object) -> Iterator[subprocess.Popen[str]]:
+def _node(
+    command: str, end_s: float, **given: object
+) -> Iterator[subprocess.Popen[str]]:
     """Have a node beside a block, after which it ends within a time [s], or raise an SstError."""
     with processes.run_beside(command, given, stdout=subprocess.PIPE) as process:
         yield process

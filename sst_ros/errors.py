@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors that sst_ros raises on purpose, with values that explain them; optional modules."""
+"""The errors that sst_ros raises on purpose, with values that explain them.
+
+Optional modules.
+"""
 
 from __future__ import annotations
 
@@ -50,14 +53,18 @@ class Problem:
             text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
         with contextlib.suppress(Exception):
             text = repr(self.value)
-        path = isinstance(self.value, str) and os.sep in text  # is whole: it can be copied
+        # is whole: it can be copied
+        path = isinstance(self.value, str) and os.sep in text
         if len(text) > (LONGEST_PATH if path else SHOWN):
             text = f"{text[:half]}...{text[-half:]}"
         return f"{where}{self.key or 'document'} = {text}: {self.allowed}"
 
 
 class InputError(SstError):
-    """User input (a scene, a parameter, a file) is refused; `problems` lists every fault."""
+    """User input (a scene, a parameter, a file) is refused.
+
+    `problems` lists every fault.
+    """
 
     def __init__(self, origin: str, problems: Sequence[Problem]) -> None:
         self.origin = origin
@@ -74,7 +81,11 @@ Check: TypeAlias = tuple[str, object, bool, str]
 
 def refuse_unless(origin: str, *checks: Check) -> None:
     """Raise InputError with each argument that is not good."""
-    problems = [Problem(name, value, allowed) for name, value, good, allowed in checks if not good]
+    problems = [
+        Problem(name, value, allowed)
+        for name, value, good, allowed in checks
+        if not good
+    ]
     if problems:
         raise InputError(origin, problems)
 
@@ -103,7 +114,10 @@ _KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
         "must be a path",
     ),
     "ArrayLike": (lambda x: real_numbers(x) is not None, "must be numbers"),
-    "TimesLike": (lambda x: real_numbers(x, seconds=True) is not None, "must be times [s]"),
+    "TimesLike": (
+        lambda x: real_numbers(x, seconds=True) is not None,
+        "must be times [s]",
+    ),
     "Mapping": (
         lambda x: isinstance(x, Mapping) and all(isinstance(key, str) for key in x),
         "must be a mapping from text",
@@ -116,7 +130,14 @@ _KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
 }
 """Whether an argument is what an annotation says up to its brackets, and this in words."""
 
-_FAILURES = TypeError, ValueError, AttributeError, LookupError, ArithmeticError, MemoryError
+_FAILURES = (
+    TypeError,
+    ValueError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+    MemoryError,
+)
 """Of a function that was given something else."""
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -125,8 +146,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 def check_kinds(function: F, *, late: bool = False) -> F:
     """Refuse arguments of another kind than the annotations of a function say, by InputError.
 
-    Annotations are those of `_KINDS`, and classes, with or without `| None`. What else an argument
-    must be is checked by the function itself.
+    Annotations are those of `_KINDS`, and classes, with or without `| None`. What else
+    an argument must be is checked by the function itself.
     """
     names = inspect.signature(function).parameters
     texts = {name: str(function.__annotations__.get(name, "")) for name in names}
@@ -139,7 +160,11 @@ def check_kinds(function: F, *, late: bool = False) -> F:
         known = function.__globals__.get(kind)
         good, allowed = _KINDS.get(kind.partition("[")[0], (None, f"must be a {kind}"))
         if good is None:
-            wrong = isinstance(known, type) and known is not Any and not isinstance(value, known)
+            wrong = (
+                isinstance(known, type)
+                and known is not Any
+                and not isinstance(value, known)
+            )
             return allowed if wrong else ""
         try:
             return "" if good(value) else allowed
@@ -150,7 +175,10 @@ def check_kinds(function: F, *, late: bool = False) -> F:
 
     def check(args: tuple[Any, ...], options: dict[str, Any]) -> None:
         given = [*zip(texts, args, strict=False), *options.items()]
-        found = [(name, value, find_fault(texts.get(name, ""), value)) for name, value in given]
+        found = [
+            (name, value, find_fault(texts.get(name, ""), value))
+            for name, value in given
+        ]
         if problems := [Problem(*one) for one in found if one[2]]:
             raise InputError(origin, problems)
 
@@ -213,7 +241,9 @@ class AssemblyError(SstError):
 
     def __init__(self, message: str, gamma: Array) -> None:
         self.gamma = gamma
-        super().__init__(f"{message} at gamma = {np.array2string(gamma, precision=9)} rad")
+        super().__init__(
+            f"{message} at gamma = {np.array2string(gamma, precision=9)} rad"
+        )
 
 
 class NoAdmissibleAssembly(AssemblyError):
@@ -221,20 +251,32 @@ class NoAdmissibleAssembly(AssemblyError):
 
 
 class AmbiguousAssembly(AssemblyError):
-    """More than one assembly is admissible; `candidates` are all of them, each a `state.Assembly`.
+    """More than one assembly is admissible.
+
+    `candidates` are all of them, each a `state.Assembly`.
 
     `quaternions` (x, y, z, w) are their orientations, shape (n, 4).
     """
 
-    def __init__(self, gamma: Array, candidates: Sequence[Any], quaternions: Array) -> None:
+    def __init__(
+        self, gamma: Array, candidates: Sequence[Any], quaternions: Array
+    ) -> None:
         self.candidates = tuple(candidates)
-        listed = ", ".join(np.array2string(q, precision=6, separator=", ") for q in quaternions)
-        found = f"{len(self.candidates)} admissible assemblies, with the orientations {listed}"
+        listed = ", ".join(
+            np.array2string(q, precision=6, separator=", ") for q in quaternions
+        )
+        found = (
+            f"{len(self.candidates)} admissible assemblies, with the orientations"
+            f" {listed}"
+        )
         super().__init__(f"{found}: name one", gamma)
 
 
 class SingularConfiguration(SstError):
-    """A matrix that must be inverted is singular; `measure` is the number that shows it."""
+    """A matrix that must be inverted is singular.
+
+    `measure` is the number that shows it.
+    """
 
     def __init__(self, message: str, measure: float) -> None:
         self.measure = measure
@@ -242,7 +284,10 @@ class SingularConfiguration(SstError):
 
 
 class RunStopped(SstError):
-    """The motion cannot continue; `state`, a `State`, is the last valid one, `time` [s] its end."""
+    """The motion cannot continue.
+
+    `state`, a `State`, is the last valid one, `time` [s] its end.
+    """
 
     def __init__(self, reason: str, time: float, state: Any) -> None:
         self.reason = reason
@@ -274,7 +319,11 @@ class StepBudgetExceeded(Diverged):
 def printable(text: str) -> str:
     """Return one line of text with all that a terminal would act on written as an escape."""
     return "".join(
-        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
+        (
+            letter
+            if letter.isprintable()
+            else letter.encode("unicode_escape").decode("ascii")
+        )
         for letter in text
     )
 
@@ -285,16 +334,31 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
-EXTRAS = dict.fromkeys(("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard"), "record")
+EXTRAS = dict.fromkeys(
+    ("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard"), "record"
+)
 EXTRAS |= {"distributed": "cluster", "matplotlib": "plot", "pinocchio": "engines"}
-EXTRAS |= {"argcomplete": "all", "control": "control", "flint": "proof", "llvmlite": "fast"}
+EXTRAS |= {
+    "argcomplete": "all",
+    "control": "control",
+    "flint": "proof",
+    "llvmlite": "fast",
+}
 EXTRAS |= {**dict.fromkeys(("trimesh", "viser", "websockets"), "view"), "xarray": "all"}
 EXTRAS |= {"casadi": "casadi", "jax": "jax", "mpmath": "mpmath"}
 """Extra of this package that installs a module."""
 
 _APT = ("argcomplete", "llvmlite", "lz4", "matplotlib", "pandas", "xarray", "zstandard")
-_PIP = {**dict.fromkeys(("mcap", "rosbags"), "mcap rosbags"), "distributed": "dask[distributed]"}
-_PIP |= {"flint": "python-flint", "pinocchio": "pin", "trimesh": "viser", "websockets": "viser"}
+_PIP = {
+    **dict.fromkeys(("mcap", "rosbags"), "mcap rosbags"),
+    "distributed": "dask[distributed]",
+}
+_PIP |= {
+    "flint": "python-flint",
+    "pinocchio": "pin",
+    "trimesh": "viser",
+    "websockets": "viser",
+}
 _ROS = ("ament_index_python", "rclpy", "rcl_interfaces", "builtin_interfaces")
 _NO_WHEEL = ("launch", "launch_ros")  # only a ROS installation has them
 _BUILT = {
@@ -304,7 +368,10 @@ _BUILT = {
 
 
 class MissingDependency(SstError, ImportError):
-    """An optional dependency is not installed; the message names the command that installs it."""
+    """An optional dependency is not installed.
+
+    The message names the command that installs it.
+    """
 
 
 def require(module: str) -> Any:
@@ -318,16 +385,26 @@ def require(module: str) -> Any:
 
 
 def explanation(error: ModuleNotFoundError) -> str | None:
-    """Return how to install what is missing; None for a module that is no optional dependency."""
+    """Return how to install what is missing.
+
+    None for a module that is no optional dependency.
+    """
     module = (error.name or "").partition(".")[0]
     if module in _NO_WHEEL:
         return f"{module} is not installed: source a ROS 2 installation"
     ros = module in _ROS or module.endswith(("_msgs", "_srvs"))
     extra = "ros" if ros else EXTRAS.get(module)
-    how = f"pip install 'sst_ros[{extra}]' (in the source folder: pip install '.[{extra}]')"
+    how = (
+        f"pip install 'sst_ros[{extra}]' (in the source folder: pip install"
+        f" '.[{extra}]')"
+    )
     more = "source a ROS 2 installation, or " * ros
-    if os.environ.get("ROS_DISTRO") and not ros:  # beside a ROS installation, of a workspace there
-        apt, pip = f"apt install python3-{module}", f"pip install {_PIP.get(module, module)}"
+    # beside a ROS installation, of a workspace there
+    if os.environ.get("ROS_DISTRO") and not ros:
+        apt, pip = (
+            f"apt install python3-{module}",
+            f"pip install {_PIP.get(module, module)}",
+        )
         more = f"{apt if module in _APT else pip}, or "
     return f"{module} is not installed: {more}{how}" if extra else None
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the launch files share: arguments, nodes, recorders, RViz, and when a launch ends.
 
-Only launch files import this module: it needs `launch` and `launch_ros` of a ROS installation.
+Only launch files import this module: it needs `launch` and `launch_ros` of a ROS
+installation.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ from typing import Any
 import yaml
 from ament_index_python.packages import get_packages_with_prefixes
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    ExecuteProcess,
+    OpaqueFunction,
+)
 from launch.events.process import ProcessExited, ShutdownProcess
 from launch.launch_context import LaunchContext
 from launch.launch_description import LaunchDescription
@@ -57,14 +63,22 @@ _CHOICES = {"sync": ["", "free", "lockstep"], "bag": ["ros2", "sst"]}
 _FLAG = ["true", "false"]
 _SHARED = {
     "namespace": ("", "namespace of the nodes"),
-    "params_file": ("", "YAML file of parameters; arguments that are given here go before it"),
+    "params_file": (
+        "",
+        "YAML file of parameters; arguments that are given here go before it",
+    ),
     "log_level": ("info", "log level of the nodes: debug, info, warn, error or fatal"),
 }
 _SIGNAL_AGAIN_S = "10"
-"""Wait for the end after SIGINT, before SIGTERM asks for the same: `ros2 bag record` can lose the
-first signal while it starts, when the handler of rclcpp is there and its own is not yet."""
+"""Wait for the end after SIGINT, before SIGTERM asks for the same: `ros2 bag record`
+can lose the first signal while it starts, when the handler of rclcpp is there and its
+own is not yet.
+"""
 _CLOSING_S = "60"  # time that a recorder has to write its index before it is killed
-_ENDS: dict[str, Any] = {"sigterm_timeout": _SIGNAL_AGAIN_S, "sigkill_timeout": _CLOSING_S}
+_ENDS: dict[str, Any] = {
+    "sigterm_timeout": _SIGNAL_AGAIN_S,
+    "sigkill_timeout": _CLOSING_S,
+}
 WAIT_S = "60.0"  # [s] of the nodes for each other; on a busy machine one starts in 20 s
 
 
@@ -73,12 +87,17 @@ def recording_arguments(name: str) -> dict[str, tuple[str, str]]:
     dated = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
     return {
         "output": (dated, "folder of the recording, which must not exist yet"),
-        "bag": ("ros2", "recorder: ros2 for `ros2 bag record`, sst for the node of this package"),
+        "bag": (
+            "ros2",
+            "recorder: ros2 for `ros2 bag record`, sst for the node of this package",
+        ),
     }
 
 
 def description(
-    file: str, arguments: Mapping[str, tuple[str, str]], actions: Callable[[Given], list[Action]]
+    file: str,
+    arguments: Mapping[str, tuple[str, str]],
+    actions: Callable[[Given], list[Action]],
 ) -> LaunchDescription:
     """Describe a launch: `actions` makes its nodes from the values of its launch arguments.
 
@@ -89,7 +108,9 @@ def description(
     given = set[str]()
 
     def perform(context: LaunchContext) -> list[Action]:
-        ours = any(word.endswith(Path(file).name) for word in sys.argv)  # not one that is included
+        ours = any(
+            word.endswith(Path(file).name) for word in sys.argv
+        )  # not one that is included
         for word in context.argv if ours else ():
             name, assigned, _ = word.partition(":=")
             if assigned and name not in every:
@@ -97,10 +118,13 @@ def description(
         values = context.launch_configurations
         if (path := values["params_file"]) and not Path(path).is_file():
             raise RuntimeError(f"params_file:={path}: no such file")
-        chosen = Given({n: values[n] if n in given else Default(values[n]) for n in every})
+        chosen = Given(
+            {n: values[n] if n in given else Default(values[n]) for n in every}
+        )
         pushed = prefix_namespace(values.get("ros_namespace"), values["namespace"])
         chosen["namespace"] = make_namespace_absolute(pushed or "")
-        if "output" in every and "output" not in given:  # not that of another robot's recording
+        # not that of another robot's recording
+        if "output" in every and "output" not in given:
             words = [*filter(None, chosen["namespace"].split("/")), chosen["output"]]
             chosen["output"] = Default("_".join(words))
         for name in every.keys() - given:
@@ -124,11 +148,14 @@ def description(
     return LaunchDescription([named, *declared, OpaqueFunction(function=perform)])
 
 
-def node(given: Given, executable: str, values: Mapping[str, str], *, ends: bool = True) -> Node:
+def node(
+    given: Given, executable: str, values: Mapping[str, str], *, ends: bool = True
+) -> Node:
     """Describe a node of this package, which ends with the launch, however that ends.
 
-    Values that are empty are left to params_file or the default; an InputError lists what the
-    node would refuse. Where it `ends`, its end is that of its partners; its failure always is.
+    Values that are empty are left to params_file or the default; an InputError lists
+    what the node would refuse. Where it `ends`, its end is that of its partners; its
+    failure always is.
     """
     defaults = {k: str(v) for k, v in values.items() if v and isinstance(v, Default)}
     set_here = {k: v for k, v in values.items() if v and k not in defaults}
@@ -140,14 +167,21 @@ def node(given: Given, executable: str, values: Mapping[str, str], *, ends: bool
         executable,
         ends,
         arguments=words,
-        parameters=[one for one in (defaults, given["params_file"]) if one],  # the later goes first
+        parameters=[
+            one for one in (defaults, given["params_file"]) if one
+        ],  # the later goes first
         ros_arguments=["--log-level", given["log_level"]],
         additional_env={processes.PARENT: str(os.getpid())},
     )
 
 
-def _node(given: Given, package: str, executable: str = "", ends: bool = True, **more: Any) -> Node:
-    """Describe a node of a package, by default of the same name; its end may be its partners'."""
+def _node(
+    given: Given, package: str, executable: str = "", ends: bool = True, **more: Any
+) -> Node:
+    """Describe a node of a package, by default of the same name.
+
+    Its end may be its partners'.
+    """
     return Node(
         package=package,
         executable=executable or package,
@@ -164,24 +198,43 @@ def simulator(given: Given, parameters: Mapping[str, str], *, recorded: bool) ->
 
     In a namespace its frame has that as a prefix, as those of robot_state_publisher.
     """
-    parameters = {**parameters, "base_frame": Default(f"{_frame_prefix(given)}{BASE_FRAME}")}
-    waits = {"wait_for_subscribers": ",".join(topics.SAMPLED), "subscriber_timeout": WAIT_S}
+    parameters = {
+        **parameters,
+        "base_frame": Default(f"{_frame_prefix(given)}{BASE_FRAME}"),
+    }
+    waits = {
+        "wait_for_subscribers": ",".join(topics.SAMPLED),
+        "subscriber_timeout": WAIT_S,
+    }
     return node(given, "simulator", {**parameters, **waits} if recorded else parameters)
 
 
 def recorder(given: Given) -> Action:
     """Describe what records the topics of config/topics.txt into `output`."""
-    shared, prefix = topics.SIMULATOR["diagnostics"].name, given["namespace"].rstrip("/")
+    shared, prefix = (
+        topics.SIMULATOR["diagnostics"].name,
+        given["namespace"].rstrip("/"),
+    )
     names = {t: t if t == shared else prefix + t for t in default_topics()}
     if given["bag"] == "sst":
         recorded = {"output": given["output"], "topics": ",".join(names.values())}
         return node(given, "recorder", recorded)
     require("ros2bag", "rosbag2_storage_mcap")
-    profiles = yaml.safe_load((share_directory() / "config" / "rosbag2_qos.yaml").read_text())
+    profiles = yaml.safe_load(
+        (share_directory() / "config" / "rosbag2_qos.yaml").read_text()
+    )
     profiles = {names[topic]: profile for topic, profile in profiles.items()}
     return ExecuteProcess(
         cmd=[
-            *("ros2", "bag", "record", "--storage", "mcap", "--output", given["output"]),
+            *(
+                "ros2",
+                "bag",
+                "record",
+                "--storage",
+                "mcap",
+                "--output",
+                given["output"],
+            ),
             *("--disable-keyboard-controls", "--qos-profile-overrides-path"),
             _temporary_file(yaml.safe_dump(profiles)),
             *("--topics", *names.values()),
@@ -208,8 +261,12 @@ def rviz(given: Given, scene_name: str) -> list[Action]:
     layout, prefix = share_directory() / "config" / "sst_ros.rviz", _frame_prefix(given)
     path = str(layout)
     if prefix:
-        text = layout.read_text(encoding="utf-8").replace("base_link", f"{prefix}base_link")
-        path = _temporary_file(text.replace('TF Prefix: ""', f"TF Prefix: {prefix[:-1]}"))
+        text = layout.read_text(encoding="utf-8").replace(
+            "base_link", f"{prefix}base_link"
+        )
+        path = _temporary_file(
+            text.replace('TF Prefix: ""', f"TF Prefix: {prefix[:-1]}")
+        )
     state_publisher = _state_publisher(given, urdf(load(scene_name)))
     return [state_publisher, _node(given, "rviz2", arguments=["-d", path])]
 
@@ -217,37 +274,52 @@ def rviz(given: Given, scene_name: str) -> list[Action]:
 def ros2_control(given: Given, controller: str, controllers: str) -> list[Action]:
     """Describe a controller manager whose hardware is the simulator, and the controllers.
 
-    Beside joint_state_broadcaster it starts the controller of this name, by the file of parameters
-    `controllers`, config/controllers.yaml where empty.
+    Beside joint_state_broadcaster it starts the controller of this name, by the file of
+    parameters `controllers`, config/controllers.yaml where empty.
     """
     path = controllers or str(share_directory() / "config" / "controllers.yaml")
     if not Path(path).is_file():
         raise RuntimeError(f"controllers:={path}: no such file")
     lockstep = given["sync"] == "lockstep"
-    hardware = "sst_ros_hardware" if lockstep else "joint_state_topic_hardware_interface"
+    hardware = (
+        "sst_ros_hardware" if lockstep else "joint_state_topic_hardware_interface"
+    )
     names = ["controller_manager", hardware, "robot_state_publisher"]
     spawned = ["joint_state_broadcaster", controller]
     for listed in read_values(read_file(Path(path)), path).values():
         given_there = listed.get("ros__parameters", {})
-        types = [given_there[name].get("type", "") for name in spawned if name in given_there]
+        types = [
+            given_there[name].get("type", "") for name in spawned if name in given_there
+        ]
         names += [plugin.partition("/")[0] for plugin in types if plugin]
     require(*names)
     topics_there = [given["namespace"].rstrip("/") + topic for topic in TOPICS]
-    words = [*spawned, "--param-file", path, "--switch-timeout", WAIT_S]  # /clock may come late
+    # /clock may come late
+    words = [*spawned, "--param-file", path, "--switch-timeout", WAIT_S]
     timed: dict[str, Any] = {"use_sim_time": lockstep}
     if lockstep:  # an update for each sample
-        timed["update_rate"] = int(given["publish_rate"] or SimulatorParameters().publish_rate)
+        timed["update_rate"] = int(
+            given["publish_rate"] or SimulatorParameters().publish_rate
+        )
     return [
-        _state_publisher(given, urdf(load(given["scene"]), topics_there, lockstep=lockstep)),
-        _node(given, "controller_manager", "ros2_control_node", parameters=[path, timed]),
+        _state_publisher(
+            given, urdf(load(given["scene"]), topics_there, lockstep=lockstep)
+        ),
+        _node(
+            given, "controller_manager", "ros2_control_node", parameters=[path, timed]
+        ),
         _node(given, "controller_manager", "spawner", ends=False, arguments=words),
     ]
 
 
 def _state_publisher(given: Given, document: str) -> Node:
     description = ParameterValue(document, value_type=str)
-    parameters = {"robot_description": description, "frame_prefix": _frame_prefix(given)}
-    parameters["ignore_timestamp"] = True  # time stands still in a pause, and /tf goes on
+    parameters = {
+        "robot_description": description,
+        "frame_prefix": _frame_prefix(given),
+    }
+    # time stands still in a pause, and /tf goes on
+    parameters["ignore_timestamp"] = True
     return _node(given, "robot_state_publisher", parameters=[parameters])
 
 
@@ -267,20 +339,26 @@ def _exit_handler(
 ) -> Callable[[ProcessExited, LaunchContext], list[Action] | None]:
     """Return what is done when a process exits: it ends its partners, also those that yet start.
 
-    If it has failed, the launch goes on with what else it includes, and its status will be 1.
+    If it has failed, the launch goes on with what else it includes, and its status will
+    be 1.
     """
 
     def handle(event: ProcessExited, context: LaunchContext) -> list[Action] | None:
         over = given.ending or context.is_shutdown
         failed = event.returncode and not (over and event.returncode == -signal.SIGINT)
         if failed:
-            # launch takes its status from this handler, or from an exception, which ends all
+            # launch takes its status from this handler, or from an exception, which
+            # ends all
             text = f"{name} failed with exit status {event.returncode}"
             context.asyncio_loop.call_exception_handler({"message": text})
         if over or not (failed or ends):
             return None
         given.ending = True
         partners = [one for one in given.partners if one is not event.action]
-        return [EmitEvent(event=ShutdownProcess(process_matcher=lambda one: one in partners))]
+        return [
+            EmitEvent(
+                event=ShutdownProcess(process_matcher=lambda one: one in partners)
+            )
+        ]
 
     return handle

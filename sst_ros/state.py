@@ -28,7 +28,20 @@ TimesLike: TypeAlias = ArrayLike
 """Times [s], as numbers or as durations of NumPy, pandas or `datetime`."""
 
 SI_UNITS = frozenset(
-    ("", "1", "dimensionless", "s", "rad", "rad/s", "rad/s^2", "N m", "J", "kg", "m", "kg m^2")
+    (
+        "",
+        "1",
+        "dimensionless",
+        "s",
+        "rad",
+        "rad/s",
+        "rad/s^2",
+        "N m",
+        "J",
+        "kg",
+        "m",
+        "kg m^2",
+    )
 )
 """Units that an array may carry, as those of `to_xarray` do: its numbers are taken as they are."""
 
@@ -47,9 +60,9 @@ class LostMeaning(NotNumbers):
 def real_numbers(value: Any, *, seconds: bool = False) -> Array:
     """Return real numbers, in whatever form they are given, as an array of doubles.
 
-    It is the given array itself where that is one already. A mask, an imaginary part, a unit, a
-    date, text and truth values are refused rather than dropped. With `seconds`, durations are
-    converted to seconds.
+    It is the given array itself where that is one already. A mask, an imaginary part, a
+    unit, a date, text and truth values are refused rather than dropped. With `seconds`,
+    durations are converted to seconds.
 
     Raises:
         NotNumbers: names what is allowed, and what would be lost.
@@ -116,7 +129,10 @@ def _read_objects(objects: NDArray[Any], seconds: bool) -> Array:
 
 
 def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> str:
-    """Say what a conversion to doubles would drop, "" if nothing; `seconds` keeps durations."""
+    """Say what a conversion to doubles would drop, "" if nothing.
+
+    `seconds` keeps durations.
+    """
     if type(value) in (float, int):
         return ""
     if isinstance(value, (list, tuple)):
@@ -137,9 +153,14 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
     if kind == "c" or isinstance(value, complex):
         return "must be real numbers, not complex ones"
     if kind == "m":
-        is_measured = np.datetime_data(np.asarray(value).dtype)[0] not in ("generic", "Y", "M")
+        is_measured = np.datetime_data(np.asarray(value).dtype)[0] not in (
+            "generic",
+            "Y",
+            "M",
+        )
         return "" if seconds and is_measured else "must be numbers, no durations"
-    if kind == "M" or isinstance(value, date):  # a datetime and a pandas Timestamp are dates
+    # a datetime and a pandas Timestamp are dates
+    if kind == "M" or isinstance(value, date):
         return "must be numbers, no dates: give seconds since the start"
     unit = getattr(value, "units", None) or getattr(value, "unit", None)
     if unit is not None and not callable(unit) and str(unit) not in SI_UNITS:
@@ -148,7 +169,10 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
 
 
 def _is_masked(value: Any) -> bool:
-    """Return whether a masked array has a masked number; `numpy.ma` need not be imported."""
+    """Return whether a masked array has a masked number.
+
+    `numpy.ma` need not be imported.
+    """
     if not isinstance(value, np.ndarray) or value.dtype.names is not None:
         return False
     return bool(np.any(getattr(value, "mask", False)))
@@ -175,7 +199,8 @@ def finite_vector(value: Any) -> Vector3 | None:
         return None
     try:
         first, second, third = value
-        floats = type(first) is type(second) is type(third) is float  # as in each step of a run
+        # as in each step of a run
+        floats = type(first) is type(second) is type(third) is float
         plain = floats or (type(value) is np.ndarray and value.dtype.kind in "fiu")
         if not plain and find_lost_meaning([value, first, second, third]):
             return None
@@ -213,7 +238,9 @@ def _say(value: object) -> str:
         return f"{value:.6g}"
     if isinstance(value, (tuple, list, np.ndarray)):
         texts = [_say(each) for each in value]
-        return f"({', '.join(texts)})" if isinstance(value[0], float) else ", ".join(texts)
+        return (
+            f"({', '.join(texts)})" if isinstance(value[0], float) else ", ".join(texts)
+        )
     return textwrap.shorten(str(value), 200, placeholder=" ...")
 
 
@@ -232,13 +259,10 @@ class Joints(NamedTuple):
 class State(Explained):
     """The manipulator at one instant.
 
-    Attributes:
-        time_ns: simulated time since the start [ns].
-        quaternion: orientation of {E} in {B}, (x, y, z, w).
-        body_rate: angular velocity of the star in {E} [rad/s].
-        joints: angles and rates of all nine joints.
-        torque: torques that the actuators give at this instant [N m]; zero before the first step.
-
+    Attributes: time_ns: simulated time since the start [ns]. quaternion: orientation of
+        {E} in {B}, (x, y, z, w). body_rate: angular velocity of the star in {E}
+        [rad/s]. joints: angles and rates of all nine joints. torque: torques that the
+        actuators give at this instant [N m]; zero before the first step.
     """
 
     time_ns: int
@@ -254,14 +278,19 @@ class State(Explained):
         """Collect a state: quaternion and body rate begin y, 18 angles and rates are the joints."""
         j: Any = joints if type(joints) is tuple else tuple(joints)
         by_kind = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])
-        return cls(time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), by_kind, torque)
+        return cls(
+            time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), by_kind, torque
+        )
 
     def _facts(self) -> dict[str, object]:
         return {
             "time [s]": self.time_ns / NANOSECONDS,
             "quaternion": self.quaternion,
             "body_rate [rad/s]": self.body_rate,
-            **{f"{kind} [rad]": getattr(self.joints, kind) for kind in ("gamma", "mu", "beta")},
+            **{
+                f"{kind} [rad]": getattr(self.joints, kind)
+                for kind in ("gamma", "mu", "beta")
+            },
             "gamma_dot [rad/s]": self.joints.gamma_dot,
             "torque [N m]": self.torque,
         }
@@ -273,13 +302,11 @@ class Assembly:
 
     Arrays are read-only.
 
-    Attributes:
-        rotation: R of {E} in {B}, shape (3, 3).
-        mu: angles of the passive revolute joints in (-pi, pi] [rad], shape (3,).
-        beta: angles of the passive curved prismatic joints in (-pi, pi] [rad], shape (3,).
-        det_j2: determinant of J2, zero at a parallel singularity.
-        admissible: E lies on the base triangle (Eq. 4) with 0 < beta_k <= beta_max for all legs.
-
+    Attributes: rotation: R of {E} in {B}, shape (3, 3). mu: angles of the passive
+        revolute joints in (-pi, pi] [rad], shape (3,). beta: angles of the passive
+        curved prismatic joints in (-pi, pi] [rad], shape (3,). det_j2: determinant of
+        J2, zero at a parallel singularity. admissible: E lies on the base triangle (Eq.
+        4) with 0 < beta_k <= beta_max for all legs.
     """
 
     rotation: NDArray[np.float64]
@@ -315,7 +342,8 @@ UNITS["energy"] = "J"
 
 
 BASE_FRAME = "base_link"  # root of the robot (REP 105): frame {B} of the paper
-IDLE_FRAME_ID = "idle"  # of joint_states that show a state before the run, in a pause or in a fault
+# of joint_states that show a state before the run, in a pause or in a fault
+IDLE_FRAME_ID = "idle"
 
 
 def is_idle(stamp_ns: int, frame_id: str) -> bool:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Grids of runs behind pages of docs/, each by `python -m studies.NAME`; not installed."""
+"""Grids of runs behind pages of docs/, each by `python -m studies.NAME`.
+
+Not installed.
+"""
 
 from __future__ import annotations
 
@@ -33,15 +36,21 @@ def run(
 ) -> int:
     """Run a study from the command line; return the exit status.
 
-    The study gets the options, with the folder `out`, and says whether its results are as they
-    should be. A careful one does not overwrite earlier results without `--force`. Further `options`
-    are what `add_argument` takes, by name.
+    The study gets the options, with the folder `out`, and says whether its results are
+    as they should be. A careful one does not overwrite earlier results without
+    `--force`. Further `options` are what `add_argument` takes, by name.
     """
     about = (sys.modules[study.__module__].__doc__ or "").partition("\n")[0]
-    parser = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=about)
-    parser.add_argument("--out", type=Path, default=out, help=f"folder of the results; {out}")
+    parser = argparse.ArgumentParser(
+        prog=f"python -m studies.{name}", description=about
+    )
+    parser.add_argument(
+        "--out", type=Path, default=out, help=f"folder of the results; {out}"
+    )
     if careful:
-        parser.add_argument("--force", action="store_true", help="overwrite earlier results")
+        parser.add_argument(
+            "--force", action="store_true", help="overwrite earlier results"
+        )
     for option, given in options.items():
         parser.add_argument(f"--{option}", **given)
     found = parser.parse_args(words)
@@ -55,15 +64,22 @@ def run(
 
 
 def run_jobs(
-    function: Callable[[Job], Result], jobs: Sequence[Job], label: str = "", workers: int = 0
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    label: str = "",
+    workers: int = 0,
 ) -> list[Result]:
-    """Call a function of a module for each job; return the results in the order of the jobs.
+    """Call a function of a module for each job.
 
-    They are called in processes of this machine, by default one a core, or in this one for 1
-    worker; a bar with the label is drawn. A result may depend on its job only: then all bits are
-    the same for any number of workers.
+    Return the results in the order of the jobs.
+
+    They are called in processes of this machine, by default one a core, or in this one
+    for 1 worker; a bar with the label is drawn. A result may depend on its job only:
+    then all bits are the same for any number of workers.
     """
-    client = None if workers == 1 else _processes(workers or len(os.sched_getaffinity(0)))
+    client = (
+        None if workers == 1 else _processes(workers or len(os.sched_getaffinity(0)))
+    )
     found = dict(run_many(function, jobs, client=client, label=label))
     return [found[number] for number in range(len(jobs))]
 

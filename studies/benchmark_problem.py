@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The manipulator as a benchmark problem of multibody dynamics: statement, reference, solutions.
 
-Two methods that share no equation of motion find the reference: the body rates of the star in
-extended precision by fixed steps, and the paper's virtual work in the actuator angles, with the
-assembly solved at each evaluation, by SciPy with an error control of its own.
+Two methods that share no equation of motion find the reference: the body rates of the
+star in extended precision by fixed steps, and the paper's virtual work in the actuator
+angles, with the assembly solved at each evaluation, by SciPy with an error control of
+its own.
 """
 
 from __future__ import annotations
@@ -44,7 +45,13 @@ COLUMNS = (
     "t [s]", "gamma_1 [rad]", "gamma_2 [rad]", "gamma_3 [rad]",
     "q_x", "q_y", "q_z", "q_w", "omega_x [rad/s]", "omega_y [rad/s]", "omega_z [rad/s]",
 )  # fmt: skip
-SETTINGS = (("auto", 1e-6), ("auto", 1e-9), ("dop853", 1e-12), ("dopri5", 1e-6), ("rk4", 1e-6))
+SETTINGS = (
+    ("auto", 1e-6),
+    ("auto", 1e-9),
+    ("dop853", 1e-12),
+    ("dopri5", 1e-6),
+    ("rk4", 1e-6),
+)
 """Method and tolerance [rad] of each solution by this package."""
 
 ROUNDS = 9
@@ -58,7 +65,9 @@ class Agreement(NamedTuple):
     gamma_dot: float
 
 
-def solve_apart(scene: Scene, times: Array, tolerance: float = 1e-13) -> tuple[Array, Array]:
+def solve_apart(
+    scene: Scene, times: Array, tolerance: float = 1e-13
+) -> tuple[Array, Array]:
     """Solve the paper's equations by SciPy: (gamma, gamma_dot) (m, 6), quaternions (m, 4)."""
     if scene.torque is None:
         raise InputError(scene.name, [Problem("torque", None, "must be given")])
@@ -68,7 +77,10 @@ def solve_apart(scene: Scene, times: Array, tolerance: float = 1e-13) -> tuple[A
     def slope(t: float, x: Array) -> Array:
         at = virtual_work.posture(geometry, x[:3])
         return np.concatenate(
-            [x[3:], virtual_work.direct_dynamics(mechanism, at, x[3:], np.array(torque(t)))]
+            [
+                x[3:],
+                virtual_work.direct_dynamics(mechanism, at, x[3:], np.array(torque(t))),
+            ]
         )
 
     start = np.array([*scene.initial.gamma, 0.0, 0.0, 0.0])
@@ -76,7 +88,9 @@ def solve_apart(scene: Scene, times: Array, tolerance: float = 1e-13) -> tuple[A
     # Samples end steps: a step's polynomial has less accuracy than the step.
     rows = [start]
     for begin, end in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
-        rows.append(solve_ivp(slope, (begin, end), rows[-1], "DOP853", **given).y[:, -1])
+        rows.append(
+            solve_ivp(slope, (begin, end), rows[-1], "DOP853", **given).y[:, -1]
+        )
     turned = [kinematics.admissible(geometry, row[:3]).rotation for row in rows]
     return np.array(rows), np.array([quaternion_of(one) for one in turned])
 
@@ -98,9 +112,15 @@ def data_file(problem: InitialValueProblem, reference: ReferenceSolution) -> str
     angles = problem.joints(reference.states)[0].T
     columns = problem.times[:, None], angles, reference.states[:, :7]
     rows = np.hstack([np.asarray(one, dtype=float) for one in columns])
-    rows[:, 4:8] *= np.where(rows[:, 7:8] < 0.0, -1.0, 1.0)  # q and -q are one orientation
-    lines = [",".join([f"{row[0]:.2f}", *(f"{x:.{DIGITS}f}" for x in row[1:])]) for row in rows]
-    return "\n".join([",".join(COLUMNS), *lines, ""]).replace(f"-{0:.{DIGITS}f}", f"{0:.{DIGITS}f}")
+    # q and -q are one orientation
+    rows[:, 4:8] *= np.where(rows[:, 7:8] < 0.0, -1.0, 1.0)
+    lines = [
+        ",".join([f"{row[0]:.2f}", *(f"{x:.{DIGITS}f}" for x in row[1:])])
+        for row in rows
+    ]
+    return "\n".join([",".join(COLUMNS), *lines, ""]).replace(
+        f"-{0:.{DIGITS}f}", f"{0:.{DIGITS}f}"
+    )
 
 
 def solve_by_package(problem: InitialValueProblem, truth: Array) -> DataFrame:
@@ -131,7 +151,10 @@ def solve_by_package(problem: InitialValueProblem, truth: Array) -> DataFrame:
 
 
 def report(options: argparse.Namespace) -> bool:
-    """Write the page, its data file and the solutions; true where both methods agree."""
+    """Write the page, its data file and the solutions.
+
+    True where both methods agree.
+    """
     problem = InitialValueProblem(scenes.load(NAME), INTERVAL_NS)
     reference = solve_reference(problem)
     agreement = compare(problem, reference)
@@ -152,8 +175,15 @@ def page(
     solutions: DataFrame | None = None,
 ) -> str:
     """Write the problem as a Markdown page; without results the statement alone."""
-    given = {"scene": scene, "reference": reference, "agreement": agreement, "columns": COLUMNS}
-    return render(PAGES / "benchmark_problem.md", solutions=solutions, digits=DIGITS, **given)
+    given = {
+        "scene": scene,
+        "reference": reference,
+        "agreement": agreement,
+        "columns": COLUMNS,
+    }
+    return render(
+        PAGES / "benchmark_problem.md", solutions=solutions, digits=DIGITS, **given
+    )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tick loop of the node without ROS; a control loop in it, its errors, and how fast it may be.
+"""The tick loop of the node without ROS.
 
-A controller has a model of the plant, which may be wrong, and a channel to it, with encoders, noise
-and a delay of commands. The largest stable bandwidth of computed torque is found by bisection,
-beside the theory of `sampled_data`.
+A control loop in it, its errors, and how fast it may be.
+
+A controller has a model of the plant, which may be wrong, and a channel to it, with
+encoders, noise and a delay of commands. The largest stable bandwidth of computed torque
+is found by bisection, beside the theory of `sampled_data`.
 """
 
 from __future__ import annotations
@@ -20,7 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control.actuator_space import Reference, ReferenceMotion
-from sst_ros.control.controller import ChannelState, Controller, ControlStopped, Track, track_of
+from sst_ros.control.controller import (
+    ChannelState,
+    Controller,
+    ControlStopped,
+    Track,
+    track_of,
+)
 from sst_ros.errors import RunStopped
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime, TickLoop
@@ -49,7 +57,8 @@ class ModelError:
 
     name: str
     change: Callable[[Scene], Scene] | None = None
-    channel: Mapping[str, Any] = field(default_factory=dict)  # fields of a `ControlChannel`
+    # fields of a `ControlChannel`
+    channel: Mapping[str, Any] = field(default_factory=dict)
 
     def model(self, plant: Scene) -> Scene:
         """Return the controller's model of a plant."""
@@ -66,7 +75,8 @@ BODIES = ("star", "actuated_links", "intermediate_links", "payload", "actuators"
 def make_heavier(scene: Scene, factor: float, kinds: Sequence[str] = BODIES) -> Scene:
     """Return a scene whose bodies have `factor` times the mass and inertia, in the same places.
 
-    With all kinds of bodies every torque of inertia and of weight is `factor` times as large.
+    With all kinds of bodies every torque of inertia and of weight is `factor` times as
+    large.
     """
     document = plain(scene)
     for found in filter(None, map(document.get, kinds)):
@@ -97,11 +107,17 @@ TorqueOf = Callable[[Simulation], Any]
 
 
 def run_in_loop(
-    simulation: Simulation, torque: TorqueOf, period_ns: int, ticks: int, *, warm: bool = False
+    simulation: Simulation,
+    torque: TorqueOf,
+    period_ns: int,
+    ticks: int,
+    *,
+    warm: bool = False,
 ) -> tuple[list[State], list[float]]:
     """Run a simulation from its start for some ticks, with a sample at each.
 
-    With `warm` the code of all methods is loaded before, so that all ticks take equally long.
+    With `warm` the code of all methods is loaded before, so that all ticks take equally
+    long.
 
     Returns:
         The states of all samples, and the processor time of the thread at each [s].
@@ -119,7 +135,8 @@ def run_in_loop(
 
     def nothing(*_: Any, **__: Any) -> None: ...
 
-    # Input and output of a run without messages: no torque gets old, and nobody listens.
+    # Input and output of a run without messages: no torque gets old, and nobody
+    # listens.
     ends: Any = SimpleNamespace(
         torque=lambda simulation, _: simulation.acting(torque(simulation)),
         constant=lambda _: False,
@@ -129,7 +146,10 @@ def run_in_loop(
         moment=ZERO,
         unread=False,
     )
-    settings, pacer = RunSettings(period_ns, last_tick=ticks), Pacer(period_ns, 0.0, SteadyTime())
+    settings, pacer = (
+        RunSettings(period_ns, last_tick=ticks),
+        Pacer(period_ns, 0.0, SteadyTime()),
+    )
     loop = TickLoop(simulation, RunParts(settings, ends, pacer, ends))
     if warm:
         loop.warm_up()
@@ -162,10 +182,9 @@ class ControlLoop:
 def run_loop(loop: ControlLoop) -> tuple[Track, NDArray[np.bool_], str]:
     """Run a loop to its end.
 
-    Returns:
-        The track, with the errors of the true state, not of the measured one; by sample, whether
-        the controller limited a torque; why the loop ended early, empty where it did not.
-
+    Returns: The track, with the errors of the true state, not of the measured one; by
+        sample, whether the controller limited a torque; why the loop ended early, empty
+        where it did not.
     """
     period = loop.period_ns / NANOSECONDS
     plant = at_start(loop.plant, loop.motion, loop.offset)
@@ -176,7 +195,9 @@ def run_loop(loop: ControlLoop) -> tuple[Track, NDArray[np.bool_], str]:
 
     def torque(simulation: Simulation) -> Vector3:
         joints, now = simulation.state.joints, simulation.time_ns / NANOSECONDS
-        command = controller.command(now, channel.measure(joints.gamma, joints.gamma_dot))
+        command = controller.command(
+            now, channel.measure(joints.gamma, joints.gamma_dot)
+        )
         acting, desired = channel.transmit(command.torque), command.desired
         error = axpy(1.0, desired.gamma, -1.0, joints.gamma)
         torques = *command.feedforward, *command.feedback, *acting
@@ -199,7 +220,9 @@ def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scen
     """Return the plant at the start of a motion, its gamma off by `offset` [rad]."""
     start = motion.at(0.0)
     a, b, c = (angle + offset for angle in start.gamma)
-    initial = Initial(gamma=(a, b, c), gamma_dot=start.gamma_dot, orientation=start.quaternion)
+    initial = Initial(
+        gamma=(a, b, c), gamma_dot=start.gamma_dot, orientation=start.quaternion
+    )
     return replace(plant, initial=initial)
 
 
@@ -221,7 +244,9 @@ def bandwidth_in_theory(loop: ControlLoop) -> float:
 def bandwidth_limit(loop: ControlLoop) -> float:
     """Find the largest bandwidth [rad/s] at which computed torque holds the start of the motion."""
     first = 0.5 * bandwidth_in_theory(loop)
-    return largest_stable(lambda bandwidth: is_stable(loop, bandwidth), first, 1.15, 2e-3)
+    return largest_stable(
+        lambda bandwidth: is_stable(loop, bandwidth), first, 1.15, 2e-3
+    )
 
 
 def is_stable(loop: ControlLoop, bandwidth: float) -> bool:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error against processor time of the run loop: control rate, method, and how torques are held.
 
-Each point is a run of the tick loop of the simulator node, compared with the reference of the
-continuous motion; `sampled_data` derives the orders of the hold.
+Each point is a run of the tick loop of the simulator node, compared with the reference
+of the continuous motion; `sampled_data` derives the orders of the hold.
 """
 
 from __future__ import annotations
@@ -63,11 +63,14 @@ COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad", "es
 
 
 Run = tuple[NDArray[np.int64], Array, float, float]
-"""Times of the samples (n,) [ns], quaternions and body rates (n, 7), error estimate at the end
-[rad], median processor time of a tick [s]."""
+"""Times of the samples (n,) [ns], quaternions and body rates (n, 7), error estimate at
+the end [rad], median processor time of a tick [s].
+"""
 
 
-def run_controlled(scene: Scene, seconds: float, rate: int, method: str, hold: str) -> Run:
+def run_controlled(
+    scene: Scene, seconds: float, rate: int, method: str, hold: str
+) -> Run:
     """Run a scene with torques at a control rate [Hz], a divisor of 1e9, with a sample a tick.
 
     Raises:
@@ -102,17 +105,26 @@ class ControlStudy:
 
     @cached_property
     def least_rates(self) -> dict[str, float]:
-        """Least rate [Hz] from which on the error is that of the hold, by method; or infinite.
+        """Least rate [Hz] from which on the error is that of the hold, by method.
 
-        From there on the method's own error, that with the exact profile, is below a part OWN_ERROR
-        of that with held torques. Below, errors of either sign may cancel.
+        Or infinite.
+
+        From there on the method's own error, that with the exact profile, is below a
+        part OWN_ERROR of that with held torques. Below, errors of either sign may
+        cancel.
         """
         found = {}
         for method, runs in self.rows.groupby("method", sort=False):
-            errors = runs.pivot(index="rate_Hz", columns="hold", values="largest_rad").sort_index()
-            resolved = errors[EXACT] <= OWN_ERROR * errors.drop(columns=EXACT).min(axis=1)
+            errors = runs.pivot(
+                index="rate_Hz", columns="hold", values="largest_rad"
+            ).sort_index()
+            resolved = errors[EXACT] <= OWN_ERROR * errors.drop(columns=EXACT).min(
+                axis=1
+            )
             from_here_on = resolved[::-1].cummin()
-            found[str(method)] = float(min(errors.index[from_here_on[::-1]], default=math.inf))
+            found[str(method)] = float(
+                min(errors.index[from_here_on[::-1]], default=math.inf)
+            )
         return found
 
     def resolved(self, hold: str) -> DataFrame:
@@ -140,7 +152,8 @@ def control_study(
 ) -> ControlStudy:
     """Run the grid, one point after another: processor times are those of a core that is free.
 
-    Errors are taken at every tick, so that the rates [Hz], divisors of 1e9, have a common tick.
+    Errors are taken at every tick, so that the rates [Hz], divisors of 1e9, have a
+    common tick.
 
     Raises:
         InputError: the scene has no torques of its own, or cannot start.
@@ -163,7 +176,9 @@ def control_study(
         times_ns, states, estimate, tick = found
         final, largest = problem.errors(states, reference.states[times_ns // tick_ns])
         errors = final.orientation, largest.orientation
-        rows.append((scene.name, rate, method, hold, *errors, estimate, 1e6 * tick, tick * rate))
+        rows.append(
+            (scene.name, rate, method, hold, *errors, estimate, 1e6 * tick, tick * rate)
+        )
     return ControlStudy(
         scene.name,
         problem.seconds,
@@ -184,12 +199,14 @@ def advice(study: ControlStudy) -> str:
     late = "; ".join(
         f"{name}, below {rate:g} Hz," for name, rate in rates.items() if rate > RATES[0]
     )
-    other, own_errors = ("other ", f"; {late} has errors of its own") if late else ("", "")
+    other, own_errors = (
+        ("other ", f"; {late} has errors of its own") if late else ("", "")
+    )
     return (
-        "raise the rate or command the torque of the middle of the hold; do not change the method: "
-        f"at the same rate all {other}methods have the same error, to {100 * (spread - 1):.1g} %, "
-        f"and at {least:g} Hz the middle gives {start / middle:.0f} times less than the "
-        f"start{own_errors}"
+        "raise the rate or command the torque of the middle of the hold; do not change"
+        f" the method: at the same rate all {other}methods have the same error, to"
+        f" {100 * (spread - 1):.1g} %, and at {least:g} Hz the middle gives"
+        f" {start / middle:.0f} times less than the start{own_errors}"
     )
 
 
@@ -201,7 +218,10 @@ SCENES = ("example2", "friction")
 
 
 def report(options: argparse.Namespace) -> bool:
-    """Study scenes; print the page, and write control_rate.csv, .json, .md and figures."""
+    """Study scenes.
+
+    Print the page, and write control_rate.csv, .json, .md and figures.
+    """
     studies: list[ControlStudy] = []
     for name in options.scene:
         studies.append(control_study(scenes.load(name), shown=True))
@@ -237,8 +257,13 @@ def findings(study: ControlStudy) -> Iterator[str]:
     """Yield orders and advice, a sentence each."""
     for hold, power in ORDERS.items():
         found = study.order(hold)
-        doubt = "" if abs(found - power) < WRONG_ORDER else "WARNING, not as in theory: "
-        yield f"{doubt}torque at the {hold} of the hold: order {found:.3f}, theory {power}."
+        doubt = (
+            "" if abs(found - power) < WRONG_ORDER else "WARNING, not as in theory: "
+        )
+        yield (
+            f"{doubt}torque at the {hold} of the hold: order {found:.3f}, theory"
+            f" {power}."
+        )
     yield f"Advice: {advice(study)}."
     own = study.reference.own.orientation
     yield f"Reference: {study.reference.how}; its own error: {own:.0e} rad."
@@ -275,14 +300,22 @@ def figure(study: ControlStudy) -> Figure:
         left.annotate(found, (period[k], line[k]), (8, -14), textcoords="offset points",
                       color=colour, fontsize=9)  # fmt: skip
     log = {"xscale": "log", "yscale": "log"}
-    left.set(xlabel="control period [ms]", ylabel="largest error of the orientation [rad]", **log)
+    left.set(
+        xlabel="control period [ms]",
+        ylabel="largest error of the orientation [rad]",
+        **log,
+    )
     right.set(xlabel="processor time of the run loop, share of a core [%]", **log)
-    handles = [Line2D([], [], color=colour, label=name) for colour, name in HOLD_NAMES.values()]
+    handles = [
+        Line2D([], [], color=colour, label=name) for colour, name in HOLD_NAMES.values()
+    ]
     handles += [
         Line2D([], [], color=INK, marker=MARKERS[method][1], linestyle="", label=method,
                markerfacecolor="none") for method in loop.method.unique()
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False
+    )
     found = advice(study).partition(": ")[0]  # the page gives the reasons
     figure.suptitle(f"{study.scene} over {study.seconds:g} s: {found}", fontsize=12)
     return figure

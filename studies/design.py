@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A design study: arcs, star angles and size against workspace, dexterity, torque and accuracy.
 
-What no other design betters in workspace, torque and accuracy at once is the Pareto front.
+What no other design betters in workspace, torque and accuracy at once is the Pareto
+front.
 """
 
 from __future__ import annotations
@@ -36,13 +37,16 @@ HIGH = (110.0, 110.0, 110.0, 140.0, 140.0, 1.4)
 """Arcs [deg], the first two star angles [deg], and the size over that of the shipped scene."""
 DIVISIONS, TURNS = 14, 48  # of the map of a workspace
 SAMPLES = 201  # of the motion
-STAR_DENSITY = 2.6 / (3 * 0.4 * np.pi / 2)  # kg/m: the printed mass on three arcs of 90 deg
+# kg/m: the printed mass on three arcs of 90 deg
+STAR_DENSITY = 2.6 / (3 * 0.4 * np.pi / 2)
 LINK_DENSITY = 0.3 / (0.35 * np.pi / 2)
 SLIDER, PAYLOAD = 0.06, 0.8  # kg
 MOTION = {"spiral": {"phi": 0.25, "theta": 6.0, "psi": 0.2, "duration": 1.0}}  # rad, s
-PART_ERROR = 5e-5  # standard deviation of places on the spheres, of parts and assembly [m]
+# standard deviation of places on the spheres, of parts and assembly [m]
+PART_ERROR = 5e-5
 ENCODER_ERROR = np.radians(0.005)  # standard deviation [rad]
-PERCENTILE = 95.0  # of torques at rest: in the corners of the workspace they grow without bound
+# of torques at rest: in the corners of the workspace they grow without bound
+PERCENTILE = 95.0
 
 
 @dataclass(frozen=True)
@@ -62,14 +66,18 @@ class Design:
         turns = np.radians([0.0, self.alpha_1, self.alpha_1 + self.alpha_2])
         ends = np.stack([np.cos(turns), np.sin(turns), np.zeros(3)], axis=1)
         mass = STAR_DENSITY * star * np.pi / 2
-        tensor = np.sum([arc_inertia(mass, star, [0, 0, 1], end).matrix for end in ends], axis=0)
+        tensor = np.sum(
+            [arc_inertia(mass, star, [0, 0, 1], end).matrix for end in ends], axis=0
+        )
         middle = np.add(ends, [0.0, 0.0, 1.0]).mean(axis=0) * 2.0 * star / np.pi
         link = LINK_DENSITY * base * np.pi / 2
         centre = 2.0 * base / np.pi
         slider, own = SLIDER * star**2, 9e-6 * self.size**2
         arcs = [self.arc_12, self.arc_23, self.arc_31]
         alpha = [self.alpha_1, self.alpha_2, 360.0 - self.alpha_1 - self.alpha_2]
-        shape = load("gravity_payload").with_values({"base": {"arcs_deg": arcs, "radius": base}})
+        shape = load("gravity_payload").with_values(
+            {"base": {"arcs_deg": arcs, "radius": base}}
+        )
         middle_of_base = Geometry.of(shape).v.sum(axis=0)
         down = -9.80665 * middle_of_base / np.linalg.norm(middle_of_base)
         return shape.with_values(
@@ -109,14 +117,30 @@ class Indices:
 
 
 def _inertia(tensor: Array) -> dict[str, float]:
-    places = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
-    return {name: float(tensor[place]) for name, place in places.items() if name in Inertia.SPECS}
+    places = {
+        "xx": (0, 0),
+        "yy": (1, 1),
+        "zz": (2, 2),
+        "xy": (0, 1),
+        "xz": (0, 2),
+        "yz": (1, 2),
+    }
+    return {
+        name: float(tensor[place])
+        for name, place in places.items()
+        if name in Inertia.SPECS
+    }
 
 
 def draw_designs(count: int = COUNT) -> list[Design]:
     """Draw designs: first the isotropic one, then Sobol points of the range."""
-    points = qmc.scale(qmc.Sobol(6, seed=np.random.default_rng(1)).random(count), LOW, HIGH)
-    return [Design(90.0, 90.0, 90.0, 120.0, 120.0, 1.0), *(Design(*row) for row in points.tolist())]
+    points = qmc.scale(
+        qmc.Sobol(6, seed=np.random.default_rng(1)).random(count), LOW, HIGH
+    )
+    return [
+        Design(90.0, 90.0, 90.0, 120.0, 120.0, 1.0),
+        *(Design(*row) for row in points.tolist()),
+    ]
 
 
 def evaluate(design: Design) -> Indices | None:
@@ -165,7 +189,9 @@ def follow(scene: Scene, geometry: Geometry) -> tuple[float, float]:
     if not measured.admissible.all():
         raise SstError("the motion leaves the workspace")
     model = kernel.model_of(scene)
-    rows, _ = kernel.actuator_torque(model, tuple(q.T), tuple(rate.T), tuple(acceleration.T))
+    rows, _ = kernel.actuator_torque(
+        model, tuple(q.T), tuple(rate.T), tuple(acceleration.T)
+    )
     torque = np.stack(rows, axis=1)
     found = reactions_of(scene, t, q, rate, torque)
     return float(np.abs(torque).max()), float(found.prismatic.bending_moment.max())
@@ -174,7 +200,10 @@ def follow(scene: Scene, geometry: Geometry) -> tuple[float, float]:
 def orientation_error(design: Design, geometry: Geometry, poses: Array) -> Array:
     """Return the standard deviation of orientations (n, 3, 3) by tolerances [rad], shape (n,)."""
     by = rates.orientation_sensitivity(geometry, poses)
-    on_base, on_star = PART_ERROR / (0.35 * design.size), PART_ERROR / (0.4 * design.size)
+    on_base, on_star = (
+        PART_ERROR / (0.35 * design.size),
+        PART_ERROR / (0.4 * design.size),
+    )
     variance = ENCODER_ERROR**2 * np.sum(by.gamma**2, axis=(1, 2))
     # v moves across itself: what is along it changes no direction.
     variance += on_base**2 * np.sum(by.v**2, axis=(1, 2, 3))
@@ -196,7 +225,9 @@ def isotropy() -> list[tuple[float, float]]:
         geometry = Geometry.of(Design(arc, arc, arc, 120.0, 120.0, 1.0).scene())
         gamma = geometry.arc / 2.0
         rotation = kinematics.admissible(geometry, gamma).rotation
-        found.append((arc, 1.0 / float(workspace.measures(geometry, gamma, rotation).cond_j)))
+        found.append(
+            (arc, 1.0 / float(workspace.measures(geometry, gamma, rotation).cond_j))
+        )
     return found
 
 
@@ -204,7 +235,10 @@ def isotropy() -> list[tuple[float, float]]:
 def draw(table: DataFrame, front: Array) -> Figure:
     """Draw error and workspace of the designs over the peak torque, the first and front marked."""
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
-    labels = {"error": "orientation error (RMS) [mrad]", "workspace": "orientations reached [%]"}
+    labels = {
+        "error": "orientation error (RMS) [mrad]",
+        "workspace": "orientations reached [%]",
+    }
     looks = (("design", ".", GREY, 4), ("on the front", "o", BLUE, 4),
              ("isotropic, shipped size", "*", VERMILION, 14))  # fmt: skip
     rows = np.arange(len(table)) >= 0, front, np.arange(len(table)) == 0
@@ -231,15 +265,22 @@ def page(frame: DataFrame, designs: int, symmetric: list[tuple[float, float]]) -
 
 
 def report(options: argparse.Namespace) -> bool:
-    """Write the page, its table and picture; true where the front and isotropy are found."""
+    """Write the page, its table and picture.
+
+    True where the front and isotropy are found.
+    """
     designs = draw_designs()
     results = [evaluate(one) for one in designs]
     kept = [(one, found) for one, found in zip(designs, results, strict=True) if found]
     frame = data_frame(asdict(one) | asdict(found) for one, found in kept)
-    costs = np.stack([-frame["workspace"], frame["peak_torque"], frame["error"]], axis=1)
+    costs = np.stack(
+        [-frame["workspace"], frame["peak_torque"], frame["error"]], axis=1
+    )
     frame["front"] = front = find_front(costs)
     text = page(frame, len(designs), symmetric := isotropy())
-    publish(options.out, "design", {".csv": frame, ".md": text, ".png": draw(frame, front)})
+    publish(
+        options.out, "design", {".csv": frame, ".md": text, ".png": draw(frame, front)}
+    )
     print(text)
     return bool(front.any()) and max(symmetric, key=lambda row: row[1])[0] == 90.0
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration of the error estimate of `simulate`: estimate over true error in random scenes.
 
-Random scenes of each class, from a seed and from one that was not used while building, each by a
-random method and tolerance, are compared with two solutions whose tolerance is a thousandth. Where
-these two do not agree to a tenth of the error, or it is within rounding, a run is only counted.
+Random scenes of each class, from a seed and from one that was not used while building,
+each by a random method and tolerance, are compared with two solutions whose tolerance
+is a thousandth. Where these two do not agree to a tenth of the error, or it is within
+rounding, a run is only counted.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ class Case(NamedTuple):
     memoryless: bool = False  # said of a function whose torques are held
 
 
-def _torques(rng: np.random.Generator, size: float, fastest: float = 20.0) -> SineTorque:
+def _torques(
+    rng: np.random.Generator, size: float, fastest: float = 20.0
+) -> SineTorque:
     rates = rng.uniform(0.1 * fastest, fastest, 3)
     rows = (rng.uniform(-size, size, 3), rates, rng.uniform(0.0, 6.28, 3))
     amplitude, frequency, phase = (tuple(row.tolist()) for row in rows)
@@ -64,7 +67,11 @@ def _scene(rng: np.random.Generator, **values: Any) -> Scene:
     gamma = tuple(rng.uniform(0.65, 0.95, 3).tolist())
     rates = tuple(rng.uniform(-1.0, 1.0, 3).tolist())
     free = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore"}
-    start = {"initial.gamma": gamma, "initial.gamma_dot": rates, "initial.orientation": None}
+    start = {
+        "initial.gamma": gamma,
+        "initial.gamma_dot": rates,
+        "initial.orientation": None,
+    }
     return load_scene(str(name)).with_values({**free, **start, **values})
 
 
@@ -96,7 +103,11 @@ def torque_clamp(rng: np.random.Generator) -> Case:
 
 def jump(rng: np.random.Generator) -> Case:
     """Draw a function of time that jumps, which nobody says beforehand."""
-    at, before, after = rng.uniform(0.1, 0.3), rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3)
+    at, before, after = (
+        rng.uniform(0.1, 0.3),
+        rng.uniform(-1, 1, 3),
+        rng.uniform(-1, 1, 3),
+    )
     first, second = tuple(before.tolist()), tuple(after.tolist())
     return Case(_scene(rng), lambda t: first if t < at else second, None, 0.4)
 
@@ -167,11 +178,20 @@ CLASSES: dict[str, Callable[[np.random.Generator], Case]] = {
 
 
 def measure(job: tuple[str, int, int]) -> dict[str, Any]:
-    """Run one case; the row has its estimate and, where it can be resolved, its true error."""
+    """Run one case.
+
+    The row has its estimate and, where it can be resolved, its true error.
+    """
     name, seed, number = job
     rng = np.random.default_rng([seed, number, *name.encode()])
     method, tolerance = str(rng.choice(INTEGRATORS)), _log(rng, 1e-11, 1e-4)
-    row = {"class": name, "seed": seed, "number": number, "method": method, "tolerance": tolerance}
+    row = {
+        "class": name,
+        "seed": seed,
+        "number": number,
+        "method": method,
+        "tolerance": tolerance,
+    }
     try:
         case = CLASSES[name](rng)
 
@@ -205,16 +225,27 @@ def compare_bounds(job: tuple[int, int]) -> dict[str, Any]:
     """Run a smooth case: true error by 60 digits, estimate, and proven bound of the error [rad]."""
     seed, number = job
     rng = np.random.default_rng([seed, number, *b"proof"])
-    method, tolerance, case = str(rng.choice(INTEGRATORS)), _log(rng, 1e-11, 1e-4), smooth(rng)
+    method, tolerance, case = (
+        str(rng.choice(INTEGRATORS)),
+        _log(rng, 1e-11, 1e-4),
+        smooth(rng),
+    )
     given: dict[str, Any] = {"method": method, "tolerance": tolerance}
     at_end = [case.duration]
     proven = certify(case.scene, case.torque, case.duration, t_eval=at_end, **given)
     found = {"seed": seed, "number": number, **given}
     if proven.reason:
         return found | {"reason": proven.reason}
-    state, reached = Motion(case.scene, case.torque).at(case.duration), proven.trajectory
+    state, reached = (
+        Motion(case.scene, case.torque).at(case.duration),
+        proven.trajectory,
+    )
     found["error"] = float(angle(state[:4], reached.quaternion[-1]))
-    return found | {"estimate": reached.error_estimate, "bound": proven.error, "reason": ""}
+    return found | {
+        "estimate": reached.error_estimate,
+        "bound": proven.error,
+        "reason": "",
+    }
 
 
 def summarise_bounds(rows: DataFrame) -> DataFrame:
@@ -258,8 +289,14 @@ def draw(rows: DataFrame, seeds: Sequence[int]) -> Figure:
     panels = figure.subplots(2, 5, sharex=True, sharey=True)
     for axes, name in zip(panels.flat, CLASSES, strict=True):
         axes.axvspan(1.0, 30.0, color="0.93")
-        for seed, colour, line in zip(seeds, (BLUE, VERMILION), ("-", "--"), strict=True):
-            chosen = (rows["class"] == name) & (rows.seed == seed) & (rows.state == "resolved")
+        for seed, colour, line in zip(
+            seeds, (BLUE, VERMILION), ("-", "--"), strict=True
+        ):
+            chosen = (
+                (rows["class"] == name)
+                & (rows.seed == seed)
+                & (rows.state == "resolved")
+            )
             ratios = np.sort(rows[chosen].estimate / rows[chosen].error)
             share = np.linspace(0.0, 1.0, len(ratios))
             axes.plot(ratios, share, line, color=colour, label=f"seed {seed}")
@@ -273,17 +310,28 @@ def draw(rows: DataFrame, seeds: Sequence[int]) -> Figure:
     return figure
 
 
-def write_page(rows: DataFrame, bounds: DataFrame, seeds: Sequence[int], **given: Any) -> str:
+def write_page(
+    rows: DataFrame, bounds: DataFrame, seeds: Sequence[int], **given: Any
+) -> str:
     """Return the page in Markdown."""
     tables = [summarise(rows[rows.seed == seed]) for seed in seeds]
-    given |= {"tables": tables, "bounds": summarise_bounds(bounds), "methods": INTEGRATORS}
+    given |= {
+        "tables": tables,
+        "bounds": summarise_bounds(bounds),
+        "methods": INTEGRATORS,
+    }
     return render(PAGES / "estimate.md", **given)
 
 
 def report(options: argparse.Namespace) -> bool:
     """Run the cases; write docs/estimate.md, its table and its picture."""
     seeds = (options.seed, options.fresh)
-    jobs = [(name, seed, k) for k in range(options.count) for name in CLASSES for seed in seeds]
+    jobs = [
+        (name, seed, k)
+        for k in range(options.count)
+        for name in CLASSES
+        for seed in seeds
+    ]
     rows = data_frame(run_jobs(measure, jobs, "estimate        "))
     smooth_cases = [(options.fresh, k) for k in range(options.proofs)]
     bounds = data_frame(run_jobs(compare_bounds, smooth_cases, "proven bounds   "))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of stability: runs of extreme cases and what they have to agree with, and regions.
 
-A method multiplies the solution of y' = lambda y by its stability function R(h lambda) a step; it
-is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and IV.3).
+A method multiplies the solution of y' = lambda y by its stability function R(h lambda)
+a step; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2
+and IV.3).
 """
 
 from __future__ import annotations
@@ -21,7 +22,16 @@ from numpy.typing import NDArray
 from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, ORANGE, PURPLE, VERMILION, styled
+from sst_ros.host.figures import (
+    BLUE,
+    GREEN,
+    INK,
+    MARKERS,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    styled,
+)
 from sst_ros.integration.methods import METHODS, Method, Rosenbrock
 from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET
 from sst_ros.programs.llvm import llvmlite_version
@@ -43,8 +53,10 @@ FACTOR = 10.0
 """The error estimate must lie within this factor of the true error."""
 
 ROUNDING = 1e-12
-"""True errors below this [rad], or 100 times the estimate of the run at the default tolerance, are
-not resolved: then the estimate must not be above FACTOR times that either."""
+"""True errors below this [rad], or 100 times the estimate of the run at the default
+tolerance, are not resolved: then the estimate must not be above FACTOR times that
+either.
+"""
 
 
 LONGEST_PROOF = 1000
@@ -69,7 +81,10 @@ class CaseRun(NamedTuple):
 
 
 class EstimateCheck(NamedTuple):
-    """True error and estimate at a loose tolerance [rad], None without such a run; a verdict."""
+    """True error and estimate at a loose tolerance [rad], None without such a run.
+
+    A verdict.
+    """
 
     true: float | None
     estimate: float | None
@@ -98,16 +113,21 @@ class CaseResult:
     compiled_s: float | None = None  # time of the run, compilation included [s]
     same_bits: bool | None = None  # plain Python ended in the same bits, or error
     run_loop: bool | None = None  # so did that through the loop of the node
-    proven: str = ""  # what the error of `simulate` is proven to be below, or why it is not
+    # what the error of `simulate` is proven to be below, or why it is not
+    proven: str = ""
     correct: bool = False  # the result is the truth, and the error estimate holds
 
     @property
     def passed(self) -> bool:
         """The result is correct, and no run differs from the interpreted one."""
-        return self.correct and self.same_bits is not False and self.run_loop is not False
+        return (
+            self.correct and self.same_bits is not False and self.run_loop is not False
+        )
 
 
-def run_case(case: Case, *, tolerance: float | None = None, looped: bool = False) -> CaseRun:
+def run_case(
+    case: Case, *, tolerance: float | None = None, looped: bool = False
+) -> CaseRun:
     """Run a case, also through the tick loop of the node; refusals are results.
 
     A given tolerance allows steps of any length.
@@ -203,26 +223,41 @@ def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
         resolved = max(ROUNDING, 100.0 * accurate.simulation.error_estimate)
         if true >= resolved:
             holds = true / FACTOR <= estimate <= FACTOR * true
-            words = f"{estimate / true:.2g} of the true error at a tolerance of {tolerance:g}"
+            words = (
+                f"{estimate / true:.2g} of the true error at a tolerance of"
+                f" {tolerance:g}"
+            )
             words += f"; {case.estimate}" if case.estimate else ""
             return EstimateCheck(true, estimate, words, holds)
         if true == 0.0 == estimate:
             return EstimateCheck(0.0, 0.0, "both are zero: it rests")
-        words = f"true error below {resolved:.0e} rad, which is not resolved; so is the estimate"
+        words = (
+            f"true error below {resolved:.0e} rad, which is not resolved; so is the"
+            " estimate"
+        )
         holds = estimate <= FACTOR * resolved
         unresolved = unresolved or EstimateCheck(true, estimate, words, holds)
-    return unresolved or EstimateCheck(None, None, "there is no run at a loose tolerance", False)
+    return unresolved or EstimateCheck(
+        None, None, "there is no run at a loose tolerance", False
+    )
 
 
 def report(out: Path, *, long: bool = False) -> bool:
-    """Run all cases, with `long` those of minutes, too; write the page; whether all passed."""
+    """Run all cases, with `long` those of minutes, too; write the page.
+
+    Whether all passed.
+    """
     jobs = [number for number, case in enumerate(catalogue()) if long or not case.long]
     cases = run_jobs(_evaluate, jobs[::-1], "extreme cases   ")[::-1]
     print(page(cases))
     table = data_frame(asdict(case) | {"passed": case.passed} for case in cases)
     drawn = {"stability_regions.png": draw_regions(scene_points())}
     document = {"cases": records(table)}
-    publish(out, "stability", {".csv": table, ".json": document, ".md": page(cases), **drawn})
+    publish(
+        out,
+        "stability",
+        {".csv": table, ".json": document, ".md": page(cases), **drawn},
+    )
     return all(case.passed for case in cases)
 
 
@@ -244,7 +279,12 @@ def prove_case(case: Case) -> str:
     duration_ns = case.steps * case.period_ns
     times = [round(k * duration_ns / 20) / NANOSECONDS for k in range(1, 21)]
     return proven_error(
-        case.scene(), torque, times[-1], t_eval=times, tolerance=1e-10, max_steps=LONGEST_PROOF
+        case.scene(),
+        torque,
+        times[-1],
+        t_eval=times,
+        tolerance=1e-10,
+        max_steps=LONGEST_PROOF,
     )
 
 
@@ -291,9 +331,9 @@ def limits_of_theory() -> Iterator[str]:
             on_axis = _growth(method, 1j * np.geomspace(1e-3, 1e9, 100_000)).max()
             far = _growth(method, np.array([FAR]))[0]
             yield (
-                f"{name}: A-stable and L-stable; abs(R) is at most {on_axis:.15g} on the imaginary "
-                f"axis, all poles lie at z = {1.0 / method.gamma:.4g}, and abs(R({FAR:g})) = "
-                f"{far:.0e}"
+                f"{name}: A-stable and L-stable; abs(R) is at most {on_axis:.15g} on"
+                f" the imaginary axis, all poles lie at z = {1.0 / method.gamma:.4g},"
+                f" and abs(R({FAR:g})) = {far:.0e}"
             )
             continue
         line = np.linspace(0.0, 10.0, 100_001)
@@ -302,8 +342,8 @@ def limits_of_theory() -> Iterator[str]:
             for axis in (-1.0, 1j)
         )
         yield (
-            f"{name}: stable for h lambda from -{real:.3f} to 0, and up to {imaginary:.3f} i on "
-            "the imaginary axis"
+            f"{name}: stable for h lambda from -{real:.3f} to 0, and up to"
+            f" {imaginary:.3f} i on the imaginary axis"
         )
 
 
@@ -361,7 +401,13 @@ def draw_regions(points: Mapping[str, NDArray[np.complex128]]) -> Figure:
 def main(words: Sequence[str] | None = None) -> int:
     """Run the catalogue from the command line."""
     long = {"action": "store_true", "help": "the cases that take minutes, too"}
-    return run(lambda given: report(given.out, long=given.long), "extreme", DOCS, words, long=long)
+    return run(
+        lambda given: report(given.out, long=given.long),
+        "extreme",
+        DOCS,
+        words,
+        long=long,
+    )
 
 
 if __name__ == "__main__":

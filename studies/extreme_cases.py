@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The catalogue of stiff and extreme cases, as data: a scene, what acts on it, and the truth.
 
-Truths are scaling laws, closed forms, energy, rest, refusals by name, or the motion at the tightest
-tolerance:
+Truths are scaling laws, closed forms, energy, rest, refusals by name, or the motion at
+the tightest tolerance:
 
-- Without friction and springs a motion under torques tau from rates v takes place s times slower
-  under tau / s^2 from v / s, and is the same for inertias and torques times a. Gravity is absent.
-- At a parallel singularity (det J2 = 0) gamma does not determine the pose, but the motion is
-  regular in orientation and body rate: the energy residual shows whether it is passed correctly.
+- Without friction and springs a motion under torques tau from rates v takes place s
+  times slower under tau / s^2 from v / s, and is the same for inertias and torques
+  times a. Gravity is absent.
+- At a parallel singularity (det J2 = 0) gamma does not determine the pose, but the
+  motion is regular in orientation and body rate: the energy residual shows whether it
+  is passed correctly.
 """
 
 from __future__ import annotations
@@ -25,7 +27,16 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3
 from studies import extreme_scenes as make
-from studies.extreme_scenes import FREE, MS, PUSH, QUARTER, REST, RIGHT, Changes, changed
+from studies.extreme_scenes import (
+    FREE,
+    MS,
+    PUSH,
+    QUARTER,
+    REST,
+    RIGHT,
+    Changes,
+    changed,
+)
 
 Torque = Vector3 | Callable[[int, Any], Vector3]
 
@@ -38,16 +49,19 @@ class Case:
     """One case: a scene, what acts on it, and what must come out."""
 
     name: str
-    changes: Changes | Callable[[], Changes]  # of `base` by key, or a function that finds them
+    # of `base` by key, or a function that finds them
+    changes: Changes | Callable[[], Changes]
     torque: Torque  # [N m]: constant, or a function of period and simulation
     steps: int  # control periods
     period_ns: int
     expected: str = ""  # the truth and its reason, in words
-    deviation: Callable[[Case, Simulation], float] | None = None  # of the end from the truth
+    # of the end from the truth
+    deviation: Callable[[Case, Simulation], float] | None = None
     bound: float = 0.0  # largest deviation that passes
     difficulty: str = ""  # why it is hard; empty for what its group says
     refusal: str = ""  # name of the error that must end the run; empty where none may
-    stop_time: Callable[[], float] | None = None  # when it must come [s]; None if not known
+    # when it must come [s]; None if not known
+    stop_time: Callable[[], float] | None = None
     group: str = ""  # heading on the page
     base: str = "example2_heavy"
     integrator: str = "auto"
@@ -58,7 +72,9 @@ class Case:
 
     def scene(self) -> Scene:
         """Make the scene."""
-        return changed(self.changes() if callable(self.changes) else self.changes, self.base)
+        return changed(
+            self.changes() if callable(self.changes) else self.changes, self.base
+        )
 
     def torque_at(self, simulation: Simulation) -> Vector3:
         """Return the torques of the control period that begins now [N m]."""
@@ -100,12 +116,16 @@ def from_end(other: Case, _: Case, simulation: Simulation) -> float:
 
 def from_stiffer_bounce(case: Case, simulation: Simulation) -> float:
     """Energy lost, or a thousandth of the angle from the bounce off stiffer stops."""
-    return max(apart(simulation, tight_end(STIFFER)) / 1e3, energy_drift(case, simulation))
+    return max(
+        apart(simulation, tight_end(STIFFER)) / 1e3, energy_drift(case, simulation)
+    )
 
 
 def energy_drift(_: Case, simulation: Simulation) -> float:
     """Energy residual relative to the energy."""
-    return abs(simulation.energy_residual) / simulation.dynamics.total_energy(simulation.sample[0])
+    return abs(simulation.energy_residual) / simulation.dynamics.total_energy(
+        simulation.sample[0]
+    )
 
 
 def residuals(_: Case, simulation: Simulation) -> float:
@@ -147,7 +167,9 @@ def from_creep(_: Case, simulation: Simulation) -> float:
     t, friction = simulation.time_ns * 1e-9, simulation.scene.friction
     assert friction is not None and friction.gamma is not None
     v = friction.gamma.smoothing
-    path = [QUARTER + v * math.atanh(tau / make.BREAKAWAY) * t for tau in make.CREEP_PUSH]
+    path = [
+        QUARTER + v * math.atanh(tau / make.BREAKAWAY) * t for tau in make.CREEP_PUSH
+    ]
     return math.dist(simulation.state.joints.gamma, path) / (v * t)
 
 
@@ -186,8 +208,9 @@ from_reference, from_turned = partial(from_end, REFERENCE), partial(from_end, TU
 TIGHT = ("the motion at a tolerance of 1e-14", from_tight)
 
 UNSTABLE = (
-    "three joints that bounce together are an unstable motion, in which 1e-14 rad at the start "
-    "become 5e-3 rad after forty contacts: the error is that of rounding at any tolerance"
+    "three joints that bounce together are an unstable motion, in which 1e-14 rad at"
+    " the start become 5e-3 rad after forty contacts: the error is that of rounding at"
+    " any tolerance"
 )
 ONE_RUN = "one run of ten million fixed steps or more"
 

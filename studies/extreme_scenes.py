@@ -48,7 +48,11 @@ def start(
 ) -> Changes:
     """Start at angles [rad] and rates [rad/s], in an assembly near an orientation."""
     initial: dict[str, Any] = {"gamma": gamma, "gamma_dot": gamma_dot}
-    return {"initial": initial if orientation is None else {**initial, "orientation": orientation}}
+    return {
+        "initial": initial
+        if orientation is None
+        else {**initial, "orientation": orientation}
+    }
 
 
 def spun(rate: float) -> Changes:
@@ -77,7 +81,9 @@ def inertias(star: float, links: float) -> Changes:
         "intermediate_links": (scene.intermediate_links[0], links),
     }
     return {
-        f"{name}.inertia": {key: factor * value for key, value in asdict(body.inertia).items()}
+        f"{name}.inertia": {
+            key: factor * value for key, value in asdict(body.inertia).items()
+        }
         for name, (body, factor) in bodies.items()
         if body.inertia is not None
     }
@@ -103,7 +109,9 @@ def sprung(stiffness: float, damping: float) -> Changes:
 def singular_pose() -> Array:
     """Return a rotation R with det J2 = 0 of the scene SINGULAR, shape (3, 3)."""
     geometry = Geometry.of(changed(SINGULAR))
-    chart = workspace.over_orientations(geometry, workspace.triangle_directions(geometry, 12)[0])
+    chart = workspace.over_orientations(
+        geometry, workspace.triangle_directions(geometry, 12)[0]
+    )
     poses = workspace.parallel_singularities(chart)
     return np.asarray(poses.rotation[len(poses) // 2])
 
@@ -120,7 +128,9 @@ def near_singularity(angle: float, spin: float) -> Changes:
     gamma, _, _ = kinematics.inverse(Geometry.of(scene), rotation)
     quaternion = quaternion_of(rotation)
     x, y, z, w = quaternion.tolist()
-    rates = kernel.joints(kernel.model_of(scene), (x, y, z, w, 0.0, 0.0, spin)).gamma_dot
+    rates = kernel.joints(
+        kernel.model_of(scene), (x, y, z, w, 0.0, 0.0, spin)
+    ).gamma_dot
     a, b, c = gamma.tolist()
     p, q, r = (float(rate) for rate in rates)
     return {**SINGULAR, **start((a, b, c), (p, q, r), quaternion)}
@@ -134,7 +144,9 @@ def at_edge(beta: float) -> Changes:
 
     def gamma_beta(height: float) -> tuple[Array, float]:
         s = np.array([1.0, 0.9, height])
-        rotation = workspace.orientations(s[None] / np.linalg.norm(s), np.array([psi]))[0]
+        rotation = workspace.orientations(s[None] / np.linalg.norm(s), np.array([psi]))[
+            0
+        ]
         gamma, _, found = kinematics.inverse(geometry, rotation)
         return gamma, float(found[0])
 
@@ -169,12 +181,17 @@ def small_triangle(spread: float) -> Changes:
     centre, v = np.full(3, math.sqrt(1.0 / 3.0)), []
     for corner in np.eye(3):
         away = corner - centre * (centre @ corner)
-        v.append(centre * math.cos(spread) + away / np.linalg.norm(away) * math.sin(spread))
+        v.append(
+            centre * math.cos(spread) + away / np.linalg.norm(away) * math.sin(spread)
+        )
     return in_triangle(v)
 
 
 def short_arc(degrees: float) -> Changes:
-    """Return a base of whose three arcs one is that short; the others are a right angle."""
+    """Return a base of whose three arcs one is that short.
+
+    The others are a right angle.
+    """
     angle = math.radians(degrees)
     v = ((1.0, 0.0, 0.0), (math.cos(angle), math.sin(angle), 0.0), (0.0, 0.0, 1.0))
     return in_triangle(v)
@@ -189,7 +206,11 @@ def pushed(scale: float) -> Vector3:
 def noise(k: int, _: Any) -> Vector3:
     """Return reproducible noise of 1 N m for period k."""
     generator = random.Random(k)
-    return (generator.gauss(0.0, 1.0), generator.gauss(0.0, 1.0), generator.gauss(0.0, 1.0))
+    return (
+        generator.gauss(0.0, 1.0),
+        generator.gauss(0.0, 1.0),
+        generator.gauss(0.0, 1.0),
+    )
 
 
 def square_wave(k: int, _: Any) -> Vector3:
@@ -208,12 +229,16 @@ OFF_POSE: Changes = {**FREE, **start((0.7 + 1e-7, 0.8 - 1e-7, 0.75 + 2e-7))}
 class SampledPd:
     """PD control with bandwidth x period = `product` [rad], held over each period.
 
-    Its gains are the mass matrix at the pose times bandwidth^2 and 2 x bandwidth, so that theory is
-    the sampled double integrator: errors grow by `sampled_data.pole` a period.
+    Its gains are the mass matrix at the pose times bandwidth^2 and 2 x bandwidth, so
+    that theory is the sampled double integrator: errors grow by `sampled_data.pole` a
+    period.
     """
 
     def __init__(self, product: float) -> None:
-        self.pole, self.period_ns = pole(product, 1.0, 0), round(product / PD_RATE * 1e9)
+        self.pole, self.period_ns = (
+            pole(product, 1.0, 0),
+            round(product / PD_RATE * 1e9),
+        )
         self._inertia = mass_matrix(changed(OFF_POSE))
         self._sizes: list[float] = []
 

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good feedforward is: every control mode with every model error, as a grid.
 
-**Theory.** With an exact model the error of feedforward alone is that of the hold, and falls with
-the period as `sampled_data` derives. With equal gains, the error of gamma obeys one linear equation
-as long as it is small, driven by the torque that the feedforward lacks: all of it for pd, the share
-s of a model whose bodies weigh 1 +- s times too much for feedforward_pd. So
+**Theory.** With an exact model the error of feedforward alone is that of the hold, and
+falls with the period as `sampled_data` derives. With equal gains, the error of gamma
+obeys one linear equation as long as it is small, driven by the torque that the
+feedforward lacks: all of it for pd, the share s of a model whose bodies weigh 1 +- s
+times too much for feedforward_pd. So
 
     RMS(pd) / RMS(feedforward_pd) -> 1 / s = 5 for s = 20 %,
 
-and, as the hold adds the error of an exact model, it is by the triangle inequality no less than
-1 / (s + RMS(feedforward_pd, exact model) / RMS(pd)). Friction, which the model has right, and the
-curvature of the mechanism change it by some per cent. Computed torque is stable up to the bandwidth
-of `sampled_data.stability_limit`.
+and, as the hold adds the error of an exact model, it is by the triangle inequality no
+less than 1 / (s + RMS(feedforward_pd, exact model) / RMS(pd)). Friction, which the
+model has right, and the curvature of the mechanism change it by some per cent. Computed
+torque is stable up to the bandwidth of `sampled_data.stability_limit`.
 """
 
 from __future__ import annotations
@@ -74,22 +75,21 @@ class FeedforwardPlan:
     seed: int = 8  # of all noise; every loop draws the same numbers
     errors: tuple[ModelError, ...] = tuple(model_errors())
     multiples: tuple[int, ...] = (1, 2, 4, 8)  # periods for the order of the hold
-    delays: tuple[int, ...] = (0, 1, 2, 3, 4, 5)  # samples, for the limits of the bandwidth
+    # samples, for the limits of the bandwidth
+    delays: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
 
 
 @dataclass(frozen=True)
 class FeedforwardStudy:
     """Result of a study.
 
-    Attributes:
-        plan, seconds: its grid, and the length of the motion [s].
-        loops: a row for each error, mode and bandwidth, columns as in COLUMNS.
-        holds: feedforward alone, exact model: instant `at` of the torque that is held, period_s,
-            largest error of gamma [rad].
-        unheld: the same with torques as a function of time: error, and its estimate [rad].
-        limits: largest stable bandwidths of computed torque [rad/s] by delay in samples: theory,
-            ideal (the plant of the theory), real (the plant as it is).
-
+    Attributes: plan, seconds: its grid, and the length of the motion [s]. loops: a row
+        for each error, mode and bandwidth, columns as in COLUMNS. holds: feedforward
+        alone, exact model: instant `at` of the torque that is held, period_s, largest
+        error of gamma [rad]. unheld: the same with torques as a function of time:
+        error, and its estimate [rad]. limits: largest stable bandwidths of computed
+        torque [rad/s] by delay in samples: theory, ideal (the plant of the theory),
+        real (the plant as it is).
     """
 
     plan: FeedforwardPlan
@@ -100,15 +100,23 @@ class FeedforwardStudy:
     limits: DataFrame
 
     def rms(self, error: str, mode: str, bandwidth: float) -> float:
-        """Root of the mean square error of all gamma [rad]; nan where the loop failed."""
+        """Root of the mean square error of all gamma [rad].
+
+        Nan where the loop failed.
+        """
         rows = self.loops[(self.loops.error == error) & (self.loops["mode"] == mode)]
         if mode != OPEN_LOOP:
             rows = rows[rows.bandwidth_rad_per_s == bandwidth]
         return float(rows.rms_rad.iloc[0]) if len(rows) else math.nan
 
     def benefit(self, error: str, bandwidth: float) -> float:
-        """RMS(pd) / RMS(feedforward_pd) at equal gains; nan where one of them failed."""
-        return self.rms(error, "pd", bandwidth) / self.rms(error, "feedforward_pd", bandwidth)
+        """RMS(pd) / RMS(feedforward_pd) at equal gains.
+
+        Nan where one of them failed.
+        """
+        return self.rms(error, "pd", bandwidth) / self.rms(
+            error, "feedforward_pd", bandwidth
+        )
 
     def least_benefit(self, error: str, bandwidth: float) -> float:
         """Return the bound of linear theory on the benefit where bodies weigh SHARE too much."""
@@ -131,7 +139,8 @@ def feedforward_study(
 ) -> FeedforwardStudy:
     """Run the grid on all cores; the same bits for any number of workers.
 
-    Errors that the plant cannot have, as unknown friction where there is none, are left out.
+    Errors that the plant cannot have, as unknown friction where there is none, are left
+    out.
 
     Raises:
         InputError: the scene has no reference motion, or one that cannot be made.
@@ -139,7 +148,11 @@ def feedforward_study(
 
     """
     scene, motion = plan.scene, _motion(plan.scene)
-    errors = [error for error in plan.errors if error.name == "nominal" or error.changes(scene)]
+    errors = [
+        error
+        for error in plan.errors
+        if error.name == "nominal" or error.changes(scene)
+    ]
     basic = SampledControl(period=plan.period_ns / NANOSECONDS)
     shown_as = f"{scene.name:<16}" if shown else ""
     limits = [replace(basic, delay=delay) for delay in plan.delays]
@@ -149,7 +162,12 @@ def feedforward_study(
         for bandwidth in ((basic.bandwidth,) if mode == OPEN_LOOP else plan.bandwidths)
     ]
     holds = [
-        replace(basic, mode=OPEN_LOOP, feedforward_at=at, period=plan.period_ns * n / NANOSECONDS)
+        replace(
+            basic,
+            mode=OPEN_LOOP,
+            feedforward_at=at,
+            period=plan.period_ns * n / NANOSECONDS,
+        )
         for at in INSTANTS
         for n in plan.multiples
     ]
@@ -157,7 +175,9 @@ def feedforward_study(
     return FeedforwardStudy(
         plan,
         motion.duration,
-        data_frame(run_jobs(partial(_track, plan), tracked, shown_as, workers), COLUMNS),
+        data_frame(
+            run_jobs(partial(_track, plan), tracked, shown_as, workers), COLUMNS
+        ),
         data_frame(run_jobs(partial(_held, scene), holds, shown_as, workers)),
         _unheld(scene),
         data_frame(
@@ -167,7 +187,9 @@ def feedforward_study(
     )
 
 
-def _track(plan: FeedforwardPlan, job: tuple[ModelError, SampledControl]) -> dict[str, Any]:
+def _track(
+    plan: FeedforwardPlan, job: tuple[ModelError, SampledControl]
+) -> dict[str, Any]:
     """Run a loop with a model error: its row of the table."""
     error, settings = job
     motion, open_loop = _motion(plan.scene), settings.mode == OPEN_LOOP
@@ -183,7 +205,10 @@ def _track(plan: FeedforwardPlan, job: tuple[ModelError, SampledControl]) -> dic
         return named | {"failure": failure}
     found = TrackingMetrics(track, int(limited.sum()))
     late = track.time >= motion.duration + 0.5 * REST_S
-    swing, saturated = float(np.ptp(track.error[late], axis=0).max()), limited[late].any()
+    swing, saturated = (
+        float(np.ptp(track.error[late], axis=0).max()),
+        limited[late].any(),
+    )
     if not open_loop and (saturated or not swing <= found.band):
         cause = ", torques at their limit" if saturated else ""
         return named | {"failure": f"{RESTLESS}: swings by {swing:.1g} rad{cause}"}
@@ -213,7 +238,10 @@ def _limit(plant: Scene, settings: SampledControl) -> dict[str, Any]:
 
 
 def _held(plant: Scene, settings: SampledControl) -> dict[str, Any]:
-    """Find the largest error of gamma under feedforward alone; nan where the loop fails."""
+    """Find the largest error of gamma under feedforward alone.
+
+    Nan where the loop fails.
+    """
     track, _, failure = run_loop(ControlLoop(plant, _motion(plant), settings, plant))
     error = math.nan if failure else float(np.abs(track.error).max())
     return {"at": settings.feedforward_at, "period_s": settings.period, "error": error}
@@ -239,17 +267,31 @@ def report(options: argparse.Namespace) -> bool:
     study = feedforward_study(FeedforwardPlan(load(options.scene)), shown=True)
     print(page(study), flush=True)
     drawn = draw_study(study, title(study))
-    files = {".csv": study.loops, ".json": document(study), ".md": page(study), ".png": drawn}
+    files = {
+        ".csv": study.loops,
+        ".json": document(study),
+        ".md": page(study),
+        ".png": drawn,
+    }
     publish(options.out, "feedforward", files)
     return True
 
 
 def rms_table(study: FeedforwardStudy) -> DataFrame:
     """Return RMS errors as texts by model error, bandwidth and mode, and pd / feedforward_pd."""
-    failed = study.failed[["error", "mode", "bandwidth_rad_per_s"]].fillna(0.0).to_numpy().tolist()
-    footnotes = {tuple(key): f"[{number}]" for number, key in enumerate(failed, start=1)}
+    failed = (
+        study.failed[["error", "mode", "bandwidth_rad_per_s"]]
+        .fillna(0.0)
+        .to_numpy()
+        .tolist()
+    )
+    footnotes = {
+        tuple(key): f"[{number}]" for number, key in enumerate(failed, start=1)
+    }
     rows = []
-    for error, bandwidth in itertools.product(study.loops.error.unique(), study.plan.bandwidths):
+    for error, bandwidth in itertools.product(
+        study.loops.error.unique(), study.plan.bandwidths
+    ):
         row = {"error": error, "rad/s": f"{bandwidth:g}"}
         for mode in MODES:
             key = error, mode, 0.0 if mode == OPEN_LOOP else bandwidth
@@ -275,23 +317,30 @@ def findings(study: FeedforwardStudy) -> Iterator[str]:
         cells = ", ".join(f"{hold.error:.2e} rad at {1e3 * hold.period_s:g} ms"
                           for hold in study.holds.itertuples() if hold.at == at)  # fmt: skip
         yield (
-            f"Exact model, feedforward alone, torque at the {at} of the hold: {cells}; order "
-            f"{order:.3f}, theory {ORDERS[at]}"
+            f"Exact model, feedforward alone, torque at the {at} of the hold: {cells};"
+            f" order {order:.3f}, theory {ORDERS[at]}"
         )
     yield (
-        f"Torque as a function of time, nothing held: {study.unheld[0]:.1e} rad; error estimate "
-        f"of the integrator {study.unheld[1]:.1e} rad"
+        f"Torque as a function of time, nothing held: {study.unheld[0]:.1e} rad; error"
+        f" estimate of the integrator {study.unheld[1]:.1e} rad"
     )
     for sign in "+-":
         error = f"inertia {sign}{SHARE:.0%}"
         for bandwidth in study.plan.bandwidths:
-            benefit, bound = study.benefit(error, bandwidth), study.least_benefit(error, bandwidth)
+            benefit, bound = (
+                study.benefit(error, bandwidth),
+                study.least_benefit(error, bandwidth),
+            )
             if not math.isnan(benefit + bound):
                 yield (
-                    f"{error}, {bandwidth:g} rad/s: the error of feedforward_pd is {benefit:.2f} "
-                    f"times smaller than that of pd with equal gains; theory: at least {bound:.2f}"
+                    f"{error}, {bandwidth:g} rad/s: the error of feedforward_pd is"
+                    f" {benefit:.2f} times smaller than that of pd with equal gains;"
+                    f" theory: at least {bound:.2f}"
                 )
-    yield "Largest stable bandwidth of computed_torque [rad/s]: theory; without friction; as it is"
+    yield (
+        "Largest stable bandwidth of computed_torque [rad/s]: theory; without friction;"
+        " as it is"
+    )
     for row in study.limits.itertuples():
         yield (
             f"  delay {row.delay}: {row.theory:8.1f} {row.ideal:9.1f} "
@@ -305,7 +354,11 @@ def page(study: FeedforwardStudy) -> str:
     for number, row in enumerate(study.failed.itertuples(), start=1):
         at = "" if row.mode == OPEN_LOOP else f" at {row.bandwidth_rad_per_s:g} rad/s"
         failures.append(f"[{number}] {row.error}, {row.mode}{at}: {row.failure}")
-    given = {"about": title(study), "findings": findings(study), "table": rms_table(study)}
+    given = {
+        "about": title(study),
+        "findings": findings(study),
+        "table": rms_table(study),
+    }
     return render(PAGES / "feedforward.md", failures=failures, **given)
 
 
@@ -324,7 +377,9 @@ def draw_study(study: FeedforwardStudy, title: str) -> Figure:
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.6, 1.0))
     upper, lower = halves
     bandwidths = study.plan.bandwidths
-    panels = upper.subplots(1, len(bandwidths), sharex=True, sharey=True, squeeze=False)[0]
+    panels = upper.subplots(
+        1, len(bandwidths), sharex=True, sharey=True, squeeze=False
+    )[0]
     for axes, bandwidth in zip(panels, bandwidths, strict=True):
         _errors(axes, study.loops, bandwidth)
     holds, limits = lower.subplots(1, 2)
@@ -335,7 +390,9 @@ def draw_study(study: FeedforwardStudy, title: str) -> Figure:
         Line2D([], [], color=colour, marker=marker, linestyle="", label=name)
         for name, colour, marker in marks
     ]
-    upper.legend(handles=handles, loc="outside upper center", ncols=7, fontsize=9, frameon=False)
+    upper.legend(
+        handles=handles, loc="outside upper center", ncols=7, fontsize=9, frameon=False
+    )
     return figure
 
 
@@ -350,7 +407,15 @@ def _errors(axes: Axes, loops: DataFrame, bandwidth: float) -> None:
         y = names.index(loop.error) + (place - 2) * _SPREAD
         if loop.failure:
             x = high * _FAILED ** ((place + 0.5) / len(MODES))
-            axes.plot(x, y, marker, color=colour, markerfacecolor="white", markersize=5.5, zorder=3)
+            axes.plot(
+                x,
+                y,
+                marker,
+                color=colour,
+                markerfacecolor="white",
+                markersize=5.5,
+                zorder=3,
+            )
             axes.plot(x, y, "x", color=INK, markersize=4, zorder=4)
         else:
             axes.plot(loop.rms_rad, y, marker, color=colour, markersize=5.5, zorder=3)
@@ -376,7 +441,9 @@ def _holds(axes: Axes, study: FeedforwardStudy) -> None:
         axes.plot(x, y, marker, color=colour, markersize=7,
                   label=f"torque at the {at} of the hold: order {order:.3f} "
                         f"(line: {theory})")  # fmt: skip
-    axes.axhline(unheld, color=GREEN, linewidth=2.0, label=f"nothing held: {unheld:.0e} rad")
+    axes.axhline(
+        unheld, color=GREEN, linewidth=2.0, label=f"nothing held: {unheld:.0e} rad"
+    )
     periods = 1e3 * np.unique(holds.period_s.to_numpy())
     axes.set_xscale("log", base=2)
     axes.set(yscale="log", ylim=(0.2 * unheld, 10.0 * holds.error.max()))
@@ -389,10 +456,15 @@ def _holds(axes: Axes, study: FeedforwardStudy) -> None:
 def _limits(axes: Axes, limits: DataFrame) -> None:
     """Largest stable bandwidth over delay: theory as a line, simulations as markers."""
     axes.set_title("computed_torque, exact model: stable below")
-    axes.set(xlabel="delay of the command [samples]", ylabel="largest stable bandwidth [rad/s]")
+    axes.set(
+        xlabel="delay of the command [samples]",
+        ylabel="largest stable bandwidth [rad/s]",
+    )
     if limits.empty:
         return
-    axes.fill_between(limits.delay, 1.0, limits.theory, color=GREEN, alpha=0.12, linewidth=0.0)
+    axes.fill_between(
+        limits.delay, 1.0, limits.theory, color=GREEN, alpha=0.12, linewidth=0.0
+    )
     axes.plot(limits.delay, limits.theory, color=GREEN,
               label="poles of the sampled double integrator")  # fmt: skip
     axes.plot(limits.delay, limits.ideal, "^", color=GREEN, markersize=8,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo of identification: a wrong model, an exciting motion, and the identified model.
 
-The nodes follow a designed motion with a model that is wrong, and record it. From the recording, as
-encoders and torque sensors would give it, the model is identified; then the nodes follow another
-motion with either model.
+The nodes follow a designed motion with a model that is wrong, and record it. From the
+recording, as encoders and torque sensors would give it, the model is identified; then
+the nodes follow another motion with either model.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ MODE = "feedforward_pd"
 def identification(out: Path, name: str = FOLLOWED) -> bool:
     """Identify a plant with wrong inertias and friction, and follow a motion before and after.
 
-    Results lie in `out`: the scenes plant, model, exciting and identified, three bags, the table
-    and the picture.
+    Results lie in `out`: the scenes plant, model, exciting and identified, three bags,
+    the table and the picture.
 
     Raises:
         SstError: a node failed or a motion is refused; names it.
@@ -50,12 +50,21 @@ def identification(out: Path, name: str = FOLLOWED) -> bool:
     """
     out.mkdir(parents=True, exist_ok=True)
     given = load(name)
-    model = dataclasses.replace(given.with_values({"friction": GUESS}), name=f"{name}_model")
+    model = dataclasses.replace(
+        given.with_values({"friction": GUESS}), name=f"{name}_model"
+    )
     plant = unknown(given)
     designed = design(model, UNKNOWN)
-    for key, scene in {"plant": plant, "model": model, "exciting": designed.scene}.items():
+    for key, scene in {
+        "plant": plant,
+        "model": model,
+        "exciting": designed.scene,
+    }.items():
         (out / f"{key}.yaml").write_text(dump(scene), encoding="utf-8")
-    print(f"{name}: bodies of the plant differ by {SHARE:.0%}, friction is not known", flush=True)
+    print(
+        f"{name}: bodies of the plant differ by {SHARE:.0%}, friction is not known",
+        flush=True,
+    )
     _follow(out, "exciting")
     found = identify(measured(out / "exciting" / "bag"), model, UNKNOWN)
     identified = dataclasses.replace(found.scene, name=f"{name}_identified")
@@ -88,16 +97,24 @@ def measured(bag: Path, seed: int = 0) -> dict[str, object]:
 
 @styled
 def compare(out: Path, identified: str) -> str:
-    """Write the table and the picture of the tracking errors before and after; return the table."""
+    """Write the table and the picture of the tracking errors before and after.
+
+    Return the table.
+    """
     lines, rms = [f"{'tracking error of gamma [rad]':32}{'RMS':>12}{'largest':>12}"], []
     figure, (axes,) = stack(["largest error of γ [rad]"], 2.6)
-    for kind, folder, colour in (("wrong", "model", VERMILION), ("identified", "identified", BLUE)):
+    for kind, folder, colour in (
+        ("wrong", "model", VERMILION),
+        ("identified", "identified", BLUE),
+    ):
         followed = tracking.read_tracking(out / folder / "bag")
         found, label = followed.metrics, f"with the {kind} model"
         rms.append(float(np.sqrt(np.mean(found.rms**2))))
         lines.append(f"{label:32}{rms[-1]:12.3e}{found.largest.max():12.3e}")
         error = hide_zeros(np.abs(followed.track.error).max(axis=1))
-        axes.semilogy(followed.track.time, error, color=colour, linewidth=1.6, label=label)
+        axes.semilogy(
+            followed.track.time, error, color=colour, linewidth=1.6, label=label
+        )
     text = "\n".join([*lines, f"{'ratio':32}{rms[0] / rms[1]:12.1f}"])
     named = f"Tracking error, {MODE.replace('_', ' + ')}"
     axes.set_title(f"{named}: RMS {rms[0]:.1e} to {rms[1]:.1e} rad", pad=22)
@@ -115,7 +132,13 @@ def _follow(out: Path, model: str) -> None:
 def main(words: Sequence[str] | None = None) -> int:
     """Run the demo from the command line."""
     out = Path("demo_out/identify")
-    return run(lambda given: identification(given.out), "identification", out, words, careful=True)
+    return run(
+        lambda given: identification(given.out),
+        "identification",
+        out,
+        words,
+        careful=True,
+    )
 
 
 if __name__ == "__main__":

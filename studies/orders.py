@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Orders of the methods, and errors of samples, events and energy, each over what controls it.
 
-`python -m studies.orders` writes the page. Every truth is a run by DOP853 at the tightest tolerance
-that is sensible; the distance from one by Dormand-Prince 5 says how far it is known.
+`python -m studies.orders` writes the page. Every truth is a run by DOP853 at the
+tightest tolerance that is sensible; the distance from one by Dormand-Prince 5 says how
+far it is known.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ if TYPE_CHECKING:
 
 ALL = tuple(METHODS)
 ORDER = {name: method.order for name, method in METHODS.items()}
-SINE = SineTorque(amplitude=(2.0, 1.5, 1.0), frequency=(5.0, 7.0, 9.0), phase=(0.0, 1.0, 2.0))
+SINE = SineTorque(
+    amplitude=(2.0, 1.5, 1.0), frequency=(5.0, 7.0, 9.0), phase=(0.0, 1.0, 2.0)
+)
 LIMIT = 1.0
 """Limit of the actuators in the scene with a clamp [N m]."""
 
@@ -98,7 +101,8 @@ TIGHTEST = 1e-13
 STEPS = tuple(dict.fromkeys(round(2 ** (k / 2)) for k in range(21)))
 """Numbers of steps of a whole motion."""
 TOLERANCES = tuple(10.0**-k for k in range(3, 12))
-PERIOD_NS, UNIT = 5_000_000, 0.1  # of the energy's run [ns]; step of error constants [s]
+# of the energy's run [ns]; step of error constants [s]
+PERIOD_NS, UNIT = 5_000_000, 0.1
 
 
 @cache
@@ -107,7 +111,9 @@ def truth(name: str, instants: int = 0) -> tuple[Trajectory, float]:
     motion = MOTIONS[MOTIONS[name].truth or name]
     times = np.array([motion.duration])
     if instants:  # whole nanoseconds
-        drawn = np.random.default_rng(32).integers(1, round(1e9 * motion.duration), instants)
+        drawn = np.random.default_rng(32).integers(
+            1, round(1e9 * motion.duration), instants
+        )
         times = np.unique(drawn) / 1e9
     one, other = (motion.run(m, TIGHTEST, t_eval=times) for m in ("dop853", "dopri5"))
     return one, max(_largest(one, other), 1e-15)
@@ -144,8 +150,13 @@ def measure_tolerance(job: tuple[str, str, float]) -> list[Row]:
         samples, known = truth(name, 300)
         sampled = motion.run(method, tolerance, t_eval=samples.t)
         between = motion.run(method, tolerance, t_eval=None).at(samples.t)
-        found |= {"t_eval": _largest(sampled, samples), "at": _largest(between, samples)}
-    return [Row(of, name, method, tolerance, error, known) for of, error in found.items()]
+        found |= {
+            "t_eval": _largest(sampled, samples),
+            "at": _largest(between, samples),
+        }
+    return [
+        Row(of, name, method, tolerance, error, known) for of, error in found.items()
+    ]
 
 
 @cache
@@ -164,19 +175,28 @@ def measure_energy(job: tuple[str, float]) -> list[Row]:
     method, seconds = job
     simulation = Simulation("swing", method, step_budget=WHOLE_MOTION_BUDGET)
     rows, done = [], 0
-    for count in np.unique(np.geomspace(10, 1e9 * seconds / PERIOD_NS, 90).astype(int)).tolist():
+    for count in np.unique(
+        np.geomspace(10, 1e9 * seconds / PERIOD_NS, 90).astype(int)
+    ).tolist():
         simulation.steps((0.0, 0.0, 0.0), PERIOD_NS, count - done)
         done, residual = count, abs(simulation.energy_residual)
-        rows.append(Row("energy", "swing", method, 1e-9 * count * PERIOD_NS, residual, 1e-16))
+        rows.append(
+            Row("energy", "swing", method, 1e-9 * count * PERIOD_NS, residual, 1e-16)
+        )
     return rows
 
 
 def order_table(rows: DataFrame) -> DataFrame:
     """Return the orders found over the shortest steps and over all, and the error constant."""
     found = []
-    for (name, method), each in rows[rows.of == "step"].groupby(["scene", "method"], sort=False):
-        resolved = each[(each.error > 30.0 * each.known) & (each.error < 1e-3)].sort_values("x")
-        resolved = resolved.drop_duplicates("error")  # steps longer than a piece are the piece
+    for (name, method), each in rows[rows.of == "step"].groupby(
+        ["scene", "method"], sort=False
+    ):
+        resolved = each[
+            (each.error > 30.0 * each.known) & (each.error < 1e-3)
+        ].sort_values("x")
+        # steps longer than a piece are the piece
+        resolved = resolved.drop_duplicates("error")
         if len(resolved) < 3:
             continue
         short = resolved[:7]
@@ -195,16 +215,30 @@ def order_table(rows: DataFrame) -> DataFrame:
 def ratio_table(rows: DataFrame) -> DataFrame:
     """Return the largest error over the tolerance, of errors that are resolved, by method."""
     chosen = rows[~rows.of.isin(["step", "energy"]) & (rows.error > 10.0 * rows.known)]
-    ratios = (chosen.error / chosen.x).groupby([chosen.of, chosen.scene, chosen.method]).max()
-    table = ratios.unstack().reindex(columns=list(ALL)).map("{:.2g}".format).replace("nan", "-")
+    ratios = (
+        (chosen.error / chosen.x)
+        .groupby([chosen.of, chosen.scene, chosen.method])
+        .max()
+    )
+    table = (
+        ratios.unstack()
+        .reindex(columns=list(ALL))
+        .map("{:.2g}".format)
+        .replace("nan", "-")
+    )
     return (
-        table.rename(LABELS, level=0).rename(TITLES, level=1).reset_index(names=["error", "motion"])
+        table.rename(LABELS, level=0)
+        .rename(TITLES, level=1)
+        .reset_index(names=["error", "motion"])
     )
 
 
 @styled
 def draw(
-    rows: DataFrame, panels: Sequence[tuple[str, str]], xlabel: str, guide: Guide | None = None
+    rows: DataFrame,
+    panels: Sequence[tuple[str, str]],
+    xlabel: str,
+    guide: Guide | None = None,
 ) -> Figure:
     """Draw panels of (kind of error, scene), a line a method, and how far the truth is known."""
     down, across = -(-len(panels) // 2), min(len(panels), 2)
@@ -214,14 +248,25 @@ def draw(
         chosen = rows[(rows.of == of) & (rows.scene == name) & (rows.error < 0.05)]
         known, ends = chosen.known.max(), np.array([chosen.x.min(), chosen.x.max()])
         for method in ALL:
-            mine, look = chosen[chosen.method == method].sort_values("x"), MARKERS[method]
+            mine, look = (
+                chosen[chosen.method == method].sort_values("x"),
+                MARKERS[method],
+            )
             if len(mine):
                 axes.plot(mine.x, np.maximum(mine.error, known), color=look[0], marker=look[1],
                           label=method, markersize=4, linewidth=1.2)  # fmt: skip
         axes.axhline(known, color=GREY, linestyle=":", label="truth known to")
         if guide:
-            axes.plot(ends, guide[1](ends), "--", color=INK, linewidth=0.9, label=guide[0])
-        axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=LABELS[of], title=TITLES[name])
+            axes.plot(
+                ends, guide[1](ends), "--", color=INK, linewidth=0.9, label=guide[0]
+            )
+        axes.set(
+            xscale="log",
+            yscale="log",
+            xlabel=xlabel,
+            ylabel=LABELS[of],
+            title=TITLES[name],
+        )
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
                   fontsize=9, frameon=False)  # fmt: skip
     return figure
@@ -230,7 +275,9 @@ def draw(
 def report(options: argparse.Namespace) -> bool:
     """Measure all; write orders.csv, .json, .md and the pictures."""
     steps = list(product(SHOWN, ALL))
-    toleranced = list(product(("smooth", "friction", "stop", "contact"), ALL, TOLERANCES))
+    toleranced = list(
+        product(("smooth", "friction", "stop", "contact"), ALL, TOLERANCES)
+    )
     energies = [(method, options.seconds) for method in list(METHODS)[::-1]]
     parts = [
         *run_jobs(measure_energy, energies, "energy          "),
@@ -240,13 +287,21 @@ def report(options: argparse.Namespace) -> bool:
     rows = data_frame(row._asdict() for part in parts for row in part)
     samples = [(of, name) for name in ("smooth", "friction") for of in ("t_eval", "at")]
     swing = Simulation("swing")
-    given = {"energy": swing.dynamics.total_energy(swing.sample[0]), "seconds": options.seconds}
-    page = render(PAGES / "orders.md", orders=order_table(rows), ratios=ratio_table(rows), **given)
+    given = {
+        "energy": swing.dynamics.total_energy(swing.sample[0]),
+        "seconds": options.seconds,
+    }
+    page = render(
+        PAGES / "orders.md", orders=order_table(rows), ratios=ratio_table(rows), **given
+    )
     figures = {
         ".png": draw(rows, [("step", name) for name in SHOWN], "step [s]"),
         "orders_samples.png": draw(rows, samples, "tolerance [rad]", TOLERANCE),
         "orders_events.png": draw(
-            rows, [("stop", "stop"), ("contact", "contact")], "tolerance [rad]", TOLERANCE
+            rows,
+            [("stop", "stop"), ("contact", "contact")],
+            "tolerance [rad]",
+            TOLERANCE,
         ),
         "orders_energy.png": draw(rows, [("energy", "swing")], "time [s]", ROUNDING),
     }

@@ -29,7 +29,12 @@ from sst_ros.host.figures import (
 )
 from sst_ros.host.output import write_into
 from sst_ros.mechanism import virtual_work
-from sst_ros.mechanism.geometry import Array, angle_between, quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import (
+    Array,
+    angle_between,
+    quaternion_of,
+    rotation_matrix,
+)
 from sst_ros.plot.pictures import (
     ASSUMPTION,
     LEAST_ANGLE_DEG,
@@ -85,9 +90,8 @@ class LargestDifference(NamedTuple):
 def paper(out: Path) -> list[LargestDifference]:
     """Run both examples, draw the figures into `out` and write an index page.
 
-    Returns:
-        The largest differences between the solutions; `within` of each is true if all is well.
-
+    Returns: The largest differences between the solutions; `within` of each is true if
+        all is well.
     """
     found: list[LargestDifference] = []
     paths: list[Path] = []
@@ -96,7 +100,9 @@ def paper(out: Path) -> list[LargestDifference]:
         for name in demo.EXAMPLES:
             scene = load(name)
             print(f"{name}: {scene.description}", flush=True)
-            times, solutions, differences, note = _solve(scene, demo.record(name, out / name))
+            times, solutions, differences, note = _solve(
+                scene, demo.record(name, out / name)
+            )
             found += differences
             notes += note
             paths += _draw(scene, times, solutions, out)
@@ -105,10 +111,16 @@ def paper(out: Path) -> list[LargestDifference]:
         paths.insert(2, path)
         lines = [*map(str, found), *dict.fromkeys(notes)]
         page = render(
-            PAGES / "paper.html", lines=lines, paths=paths, assumption=ASSUMPTION.capitalize()
+            PAGES / "paper.html",
+            lines=lines,
+            paths=paths,
+            assumption=ASSUMPTION.capitalize(),
         )
         publish(out, "paper", {"index.html": page})
-    print("\n".join([*lines, f"Files: {out}: index.html, {len(paths)} pictures"]), flush=True)
+    print(
+        "\n".join([*lines, f"Files: {out}: index.html, {len(paths)} pictures"]),
+        flush=True,
+    )
     return found
 
 
@@ -120,25 +132,30 @@ def _solve(
     times = run.seconds
     motion = simulate(scene, duration=float(times[-1]), t_eval=times, tolerance=1e-12)
     solutions = {"continuous": motion.quaternion, "nodes, 500 Hz": run.quaternion}
-    differences = [_difference(scene, "nodes", motion, run.quaternion, run.gamma, NODES_LIMIT)]
+    differences = [
+        _difference(scene, "nodes", motion, run.quaternion, run.gamma, NODES_LIMIT)
+    ]
     try:
         quaternion, gamma = integrate_by_pinocchio(scene, times)
     except MissingDependency as error:
         return times, solutions, differences, [f"no independent engine: {error}"]
     solutions["Pinocchio"] = quaternion
-    differences.append(_difference(scene, "Pinocchio", motion, quaternion, gamma, ENGINE_LIMIT))
+    differences.append(
+        _difference(scene, "Pinocchio", motion, quaternion, gamma, ENGINE_LIMIT)
+    )
     return times, solutions, differences, []
 
 
 def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
     """Integrate a scene by Pinocchio, whose equations share nothing with those of this package.
 
-    The seven links are a tree, base -> actuated -> intermediate link of each leg with the star on
-    leg 1; a point of the axis t_k on legs 2 and 3 is tied to the star. SciPy's DOP853 integrates
-    Pinocchio's accelerations in the angles of the seven joints of the tree.
+    The seven links are a tree, base -> actuated -> intermediate link of each leg with
+    the star on leg 1; a point of the axis t_k on legs 2 and 3 is tied to the star.
+    SciPy's DOP853 integrates Pinocchio's accelerations in the angles of the seven
+    joints of the tree.
 
-    Returns:
-        Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3), at the times [s].
+    Returns: Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3), at
+        the times [s].
 
     Raises:
         MissingDependency: Pinocchio is not installed.
@@ -160,14 +177,21 @@ def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
         return np.append(state[size:], acceleration)
 
     span = (0.0, float(times[-1]))
-    run = solve_ivp(derivative, span, start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-12)
+    run = solve_ivp(
+        derivative, span, start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-12
+    )
     poses = [model.pose(state) for state in run.y.T]
     rotations = np.array([pose.rotation for pose in poses])
     return quaternion_of(rotations), np.array([pose.gamma for pose in poses])
 
 
 def _difference(
-    scene: Scene, who: str, motion: Trajectory, quaternion: Array, gamma: Array, limit: float
+    scene: Scene,
+    who: str,
+    motion: Trajectory,
+    quaternion: Array,
+    gamma: Array,
+    limit: float,
 ) -> LargestDifference:
     """Return the largest difference of the actuator angles and of the orientation."""
     apart = float(np.abs(gamma - motion.gamma).max())
@@ -185,12 +209,16 @@ def _draw(scene: Scene, times: Array, solutions: Solutions, out: Path) -> list[P
             figure = draw_path(scene, solutions)
         elif name == "position_of_E":
             values = [position_of_e(scene, each) for each in solutions.values()]
-            figure = _compare(times, [*solutions], values, "xyz", POSITION, LEAST_POSITION_M)
+            figure = _compare(
+                times, [*solutions], values, "xyz", POSITION, LEAST_POSITION_M
+            )
         else:
             which = ("theta", "phi", "psi").index(name)
             values = [zyz_degrees(each, which) for each in solutions.values()]
             label = f"{ZYZ[which]} [deg]"
-            figure = _compare(times, [*solutions], values, ZYZ[which], label, LEAST_ANGLE_DEG)
+            figure = _compare(
+                times, [*solutions], values, ZYZ[which], label, LEAST_ANGLE_DEG
+            )
         paths += save(figure, title, out, stem, ["png"])
     return paths
 
@@ -205,7 +233,9 @@ def _compare(
 ) -> Figure:
     """Draw columns of several solutions over time, and below how far they are from the first."""
     unit = label.split("[")[1].rstrip("]")
-    figure, (above, below) = stack([label, f"difference from\n{names[0]} [{unit}]"], 2.7)
+    figure, (above, below) = stack(
+        [label, f"difference from\n{names[0]} [{unit}]"], 2.7
+    )
     for name, columns, looks in zip(names, values, LINES, strict=False):
         above.plot(seconds, columns, **looks)[0].set_label(name)
         if columns is not values[0]:
@@ -213,8 +243,13 @@ def _compare(
             largest = f"{name}: at most {np.nanmax(apart):.1e} {unit}"
             below.plot(seconds, hide_zeros(apart), label=largest, **looks)
     widen(above, values[0], least)
-    if len(letters) > 1:  # beside the last value, those that lie there together on one line
-        beside: Looks = {"textcoords": "offset points", "va": "center", "annotation_clip": False}
+    # beside the last value, those that lie there together on one line
+    if len(letters) > 1:
+        beside: Looks = {
+            "textcoords": "offset points",
+            "va": "center",
+            "annotation_clip": False,
+        }
         last, apart = values[0][-1], 0.06 * np.ptp(above.get_ylim())
         order = np.argsort(last, kind="stable")
         for near in np.split(order, np.flatnonzero(np.diff(last[order]) > apart) + 1):
@@ -229,7 +264,8 @@ def _compare(
 def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]:
     """Check Example 1 as the paper does: inverse dynamics of the motion gives the torques back.
 
-    Accelerations are those of a spline through the rates, so that no direct dynamics enters.
+    Accelerations are those of a spline through the rates, so that no direct dynamics
+    enters.
     """
     assert scene.torque is not None and scene.duration is not None
     times = np.arange(0.0, scene.duration, STEP)
@@ -254,10 +290,14 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
     above.legend(fontsize=9)
     below.plot(times, hide_zeros(apart), color=VERMILION)
     below.set_yscale("log")
-    title = f"Inverse dynamics of Example 1, the check in the paper's text\n{ASSUMPTION}"
+    title = (
+        f"Inverse dynamics of Example 1, the check in the paper's text\n{ASSUMPTION}"
+    )
     path = save(figure, title, out, "fig09_inverse_dynamics", ["png"])[0]
     what = "torques by inverse dynamics against 1.13 sin 12t"
-    return path, LargestDifference(scene.name, what, float(apart.max()), TORQUE_LIMIT, "N m")
+    return path, LargestDifference(
+        scene.name, what, float(apart.max()), TORQUE_LIMIT, "N m"
+    )
 
 
 def main(words: Sequence[str] | None = None) -> int:

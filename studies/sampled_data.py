@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sampled-data theory of a control loop: the largest stable bandwidth, and the error of a hold.
 
-**Bandwidth.** Exact computed torque leaves a double integrator for each axis, x'' = u, and asks for
-u = -(omega^2 x + 2 zeta omega x'). The state is sampled every T, u acts d samples later and is held
-for T. With v = T x', u in units of 1 / T^2 and w = omega T, one period is exactly
+**Bandwidth.** Exact computed torque leaves a double integrator for each axis, x'' = u,
+and asks for u = -(omega^2 x + 2 zeta omega x'). The state is sampled every T, u acts d
+samples later and is held for T. With v = T x', u in units of 1 / T^2 and w = omega T,
+one period is exactly
 
     x+ = x + v + u / 2,   v+ = v + u,   u = -(w^2 x + 2 zeta w v), d samples old,
 
@@ -11,14 +12,15 @@ so the loop's poles are the roots of
 
     z^d (z - 1)^2 + w^2 (z + 1) / 2 + 2 zeta w (z - 1) = 0
 
-and it is stable while all of them lie inside the unit circle. Without delay, Jury's conditions give
-w < min(4 zeta, 1 / zeta); with delay, the limit is found in the roots.
+and it is stable while all of them lie inside the unit circle. Without delay, Jury's
+conditions give w < min(4 zeta, 1 / zeta); with delay, the limit is found in the roots.
 
-**Hold.** Torques are held while the motion wants them to change. A torque tau(t_k + a T) held from
-t_k for T lacks, on average over the hold, (1/2 - a) T tau'(t_k): with a = 0, the start of the hold,
-the plant sees the torque late by T / 2, and the error falls as T^1. With a = 1/2 that vanishes;
-what is left is tau'' T^2 / 24 on average, and the hold's first moment, which moves the plant by
-T^3 / 12 times tau' in each of 1 / T periods: the error falls as T^2.
+**Hold.** Torques are held while the motion wants them to change. A torque tau(t_k + a
+T) held from t_k for T lacks, on average over the hold, (1/2 - a) T tau'(t_k): with a =
+0, the start of the hold, the plant sees the torque late by T / 2, and the error falls
+as T^1. With a = 1/2 that vanishes; what is left is tau'' T^2 / 24 on average, and the
+hold's first moment, which moves the plant by T^3 / 12 times tau' in each of 1 / T
+periods: the error falls as T^2.
 """
 
 from __future__ import annotations
@@ -35,7 +37,10 @@ _FINEST = 1e-4
 
 
 def pole(product: float, damping: float, delay: int) -> float:
-    """Modulus of the outermost pole; `product` is bandwidth x period [rad], delay in samples."""
+    """Modulus of the outermost pole.
+
+    `product` is bandwidth x period [rad], delay in samples.
+    """
     polynomial = np.zeros(delay + 3)
     polynomial[:3] = (1.0, -2.0, 1.0)
     rate, angle = 2.0 * damping * product, 0.5 * product**2
@@ -45,7 +50,9 @@ def pole(product: float, damping: float, delay: int) -> float:
 
 def stability_limit(damping: float, delay: int) -> float:
     """Largest bandwidth times period [rad] below which every loop is stable."""
-    return largest_stable(lambda product: pole(product, damping, delay) < 1.0, _FINEST, 1.02)
+    return largest_stable(
+        lambda product: pole(product, damping, delay) < 1.0, _FINEST, 1.02
+    )
 
 
 def largest_stable(
@@ -70,7 +77,10 @@ def largest_stable(
 
 
 def slope(periods: Sequence[float], errors: Sequence[float]) -> float:
-    """Power of the period with which errors fall, by least squares; nan for a single one."""
+    """Power of the period with which errors fall, by least squares.
+
+    Nan for a single one.
+    """
     if len(periods) < 2:
         return math.nan
     return float(np.polyfit(np.log(periods), np.log(errors), 1)[0])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions to some 30 of 60 digits, by no code of the proof: mpmath and extrapolation.
 
-The start comes from the closure of the loops, r_k . R e_k = 0. The constants of the equations are
-made from a scene's numbers in mpmath, too.
+The start comes from the closure of the loops, r_k . R e_k = 0. The constants of the
+equations are made from a scene's numbers in mpmath, too.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def unit(a: Any) -> Any:
 
 def solve(matrix: Any, right: Any) -> Any:
     """Solve linear equations."""
-    return np.array(list(mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(right.tolist()))))
+    return np.array(
+        list(mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(right.tolist())))
+    )
 
 
 class Motion:
@@ -41,12 +43,21 @@ class Motion:
     def __init__(self, scene: Scene, torque: Any = None) -> None:
         with mp.workdps(DIGITS):
             self.v = np.array([unit(row) for row in exact(np.array(scene.base.v))])
-            self.w = np.array([unit(cross(self.v[k], self.v[(k + 1) % 3])) for k in range(3)])
+            self.w = np.array(
+                [unit(cross(self.v[k], self.v[(k + 1) % 3])) for k in range(3)]
+            )
             first, second, _ = (mpf(x) * mp.pi / 180 for x in scene.star.alpha_deg)
             angles = (mpf(0), first, first + second)
             self.e = np.array([[-mp.sin(x), mp.cos(x), mpf(0)] for x in angles])
-            numbers = {p: mpf(x) for p, x in leaves(scene).items() if x and p[0] != "torque"}
-            arrays: dict[str, Any] = {"v": self.v, "w": self.w, "e": self.e, "arc": [mp.pi / 2] * 3}
+            numbers = {
+                p: mpf(x) for p, x in leaves(scene).items() if x and p[0] != "torque"
+            }
+            arrays: dict[str, Any] = {
+                "v": self.v,
+                "w": self.w,
+                "e": self.e,
+                "arc": [mp.pi / 2] * 3,
+            }
             geometry: Any = SimpleNamespace(of_leg=lambda name, k: arrays[name][k])
             self.model = kernel.model_of(rebuild(scene, numbers), geometry)
             self.torque = scene.torque if torque is None else torque
@@ -56,7 +67,10 @@ class Motion:
     def start(self, scene: Scene) -> Any:
         """Return quaternion and body rate, by Newton's method on the closure of the loops."""
         initial = scene.initial
-        gamma, gamma_dot = exact(np.array(initial.gamma)), exact(np.array(initial.gamma_dot))
+        gamma, gamma_dot = (
+            exact(np.array(initial.gamma)),
+            exact(np.array(initial.gamma_dot)),
+        )
         r = np.array([
             v * mp.cos(x) + cross(w, v) * mp.sin(x)
             for v, w, x in zip(self.v, self.w, gamma, strict=True)
@@ -65,7 +79,9 @@ class Motion:
         for _ in range(8):  # Newton: a small turn d adds d . (e x R^T r) to r . R e
             x, y, z, w = q
             near = np.array(rotation_rows((x, y, z, w)), dtype=object)
-            rows = np.array([cross(e, near.T @ one) for e, one in zip(self.e, r, strict=True)])
+            rows = np.array(
+                [cross(e, near.T @ one) for e, one in zip(self.e, r, strict=True)]
+            )
             off = np.array([one @ near @ e for e, one in zip(self.e, r, strict=True)])
             d = -solve(rows, off)
             q = q + np.array(quaternion_rate(tuple(q), tuple(d)))
@@ -82,7 +98,9 @@ class Motion:
             torque = [mpf(a) * mp.sin(mpf(f) * t + mpf(p)) for a, f, p in rows]
         elif callable(torque):
             torque = torque(t)
-        return np.array(kernel.derivative(self.model, tuple(y), tuple(map(mpf, torque))))
+        return np.array(
+            kernel.derivative(self.model, tuple(y), tuple(map(mpf, torque)))
+        )
 
     def at(self, end: float) -> Any:
         """Return the state at a time [s], to about 1e-29."""
@@ -97,7 +115,10 @@ class Motion:
                     small, before = h / n, y
                     here = y + small * first
                     for k in range(1, n):
-                        before, here = here, before + 2 * small * self.slope(t + k * small, here)
+                        before, here = (
+                            here,
+                            before + 2 * small * self.slope(t + k * small, here),
+                        )
                     row = [(here + before + small * self.slope(t + h, here)) / 2]
                     for k, old in enumerate(rows[-1] if rows else [], start=1):
                         ratio = (mpf(n) / (n - 2 * k)) ** 2
@@ -107,7 +128,10 @@ class Motion:
                 if error <= LOCAL:
                     t, y = t + h, rows[-1][-1]
                 h *= min(
-                    mpf(2), max(mpf("0.3"), (LOCAL / error) ** (mpf(1) / (2 * STAGES - 1)) * 0.9)
+                    mpf(2),
+                    max(
+                        mpf("0.3"), (LOCAL / error) ** (mpf(1) / (2 * STAGES - 1)) * 0.9
+                    ),
                 )
             self.known[end] = y
             return y

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams of trajectories beside a run that keeps real time: tracking error, missed periods.
 
-Each message has one point, one second ahead on a slow path around the start, as jogging tools send
-them. `python -m studies.streams --seconds 60` prints a row a rate; docs/nodes.md has the figures.
+Each message has one point, one second ahead on a slow path around the start, as jogging
+tools send them. `python -m studies.streams --seconds 60` prints a row a rate;
+docs/nodes.md has the figures.
 """
 
 from __future__ import annotations
@@ -33,18 +34,24 @@ WAIT_S = 300.0  # a busy machine needs a minute to start them
 def main(words: Sequence[str] | None = None) -> None:
     """Print a row for each rate."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rates", type=float, nargs="+", default=[3.0, 10.0, 50.0], metavar="HZ")
+    parser.add_argument(
+        "--rates", type=float, nargs="+", default=[3.0, 10.0, 50.0], metavar="HZ"
+    )
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--scene", default="reach")
     parser.add_argument("--mode", default="computed_torque")
     parser.add_argument(
-        "--realtime", action="store_true", help="SCHED_FIFO for the nodes, beside other work"
+        "--realtime",
+        action="store_true",
+        help="SCHED_FIFO for the nodes, beside other work",
     )
     given = parser.parse_args(words)
     keep_domain()
     rclpy.init()
     columns = "{:>6} {:>6} {:>9} {:>12} {:>12} {:>11} {:>10}"
-    print(columns.format("rate", "sent", "refused", "periods", "missed", "error", "ticks"))
+    print(
+        columns.format("rate", "sent", "refused", "periods", "missed", "error", "ticks")
+    )
     print(columns.format("[Hz]", "", "", "", "", "[rad]", "missed"))
     for rate in given.rates:
         print(columns.format(f"{rate:g}", *stream(given, rate)), flush=True)
@@ -54,11 +61,15 @@ def main(words: Sequence[str] | None = None) -> None:
 def stream(given: argparse.Namespace, rate: float) -> tuple[str, ...]:
     """Stream at a rate [Hz]; return what the nodes counted."""
     node, said = rclpy.create_node("jogger"), dict[str, dict[str, str]]()
-    publisher = node.create_publisher(JointTrajectory, "sst_inverse_dynamics/joint_trajectory", 10)
+    publisher = node.create_publisher(
+        JointTrajectory, "sst_inverse_dynamics/joint_trajectory", 10
+    )
 
     def hear(message: DiagnosticArray) -> None:
         for status in message.status:
-            said[status.name.rpartition(" ")[2]] = {one.key: one.value for one in status.values}
+            said[status.name.rpartition(" ")[2]] = {
+                one.key: one.value for one in status.values
+            }
 
     node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
     run = {"scene": given.scene, "duration": 0.0, "wait_for_command": True}
@@ -77,7 +88,9 @@ def stream(given: argparse.Namespace, rate: float) -> tuple[str, ...]:
         begin, sent = time.monotonic(), 0
         while (passed := time.monotonic() - begin) < given.seconds:
             if sent <= passed * rate:
-                publisher.publish(_message(scene.load(given.scene).initial.gamma, passed))
+                publisher.publish(
+                    _message(scene.load(given.scene).initial.gamma, passed)
+                )
                 sent += 1
             rclpy.spin_once(node, timeout_sec=0.5 / rate)
         assert controller.poll() is None, "the controller has ended"
@@ -92,7 +105,10 @@ def _schedule(process: int) -> None:
     """Give a process a priority below that of the simulator, and a lower one to its children."""
     tasks = [int(task.name) for task in Path(f"/proc/{process}/task").iterdir()]
     children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    for number, priority in [*((task, 9) for task in tasks), *((int(one), 5) for one in children)]:
+    for number, priority in [
+        *((task, 9) for task in tasks),
+        *((int(one), 5) for one in children),
+    ]:
         os.sched_setscheduler(number, os.SCHED_FIFO, os.sched_param(priority))
 
 

@@ -31,7 +31,10 @@ JOINTS = "/joint_states"
 ORIENTATION, EULER = "/sst_simulator/orientation", "/sst_simulator/euler_zyz"
 APPLIED, SCENE = "/sst_simulator/applied_torques", "/sst_simulator/scene"
 DIAGNOSTICS, COMMANDS = "/diagnostics", "/sst_simulator/commands"
-DESIRED, ERROR = "/sst_inverse_dynamics/reference", "/sst_inverse_dynamics/tracking_error"
+DESIRED, ERROR = (
+    "/sst_inverse_dynamics/reference",
+    "/sst_inverse_dynamics/tracking_error",
+)
 STAMPED = "/sst_simulator/commands_stamped"
 KINDS = {
     **dict.fromkeys((JOINTS, STAMPED, DESIRED, ERROR), "sensor_msgs/msg/JointState"),
@@ -45,7 +48,9 @@ KINDS = {
 
 
 def make(kind: str, **fields: Any) -> Any:
-    return STORE.types[kind if "/msg/" in kind else kind.replace("/", "/msg/")](**fields)
+    return STORE.types[kind if "/msg/" in kind else kind.replace("/", "/msg/")](
+        **fields
+    )
 
 
 def time(ns: int, kind: str = "Time") -> Any:
@@ -58,7 +63,10 @@ def header(stamp_ns: int) -> Any:
 
 @dataclass
 class Entry:
-    """A message of a topic; `sample` is the index of the sample it belongs to, -1 for none."""
+    """A message of a topic.
+
+    `sample` is the index of the sample it belongs to, -1 for none.
+    """
 
     topic: str
     received_ns: int
@@ -68,7 +76,11 @@ class Entry:
 
 def joint_state(stamp_ns: int, position: Any, velocity: Any, torque: Any) -> Any:
     """Numbers of the first joints; the torques are those of the actuators."""
-    parts = {"position": position, "velocity": velocity, "effort": np.zeros(len(position))}
+    parts = {
+        "position": position,
+        "velocity": velocity,
+        "effort": np.zeros(len(position)),
+    }
     parts["effort"][:3] = torque
     names = NAMES[: len(position)]
     return make("sensor_msgs/JointState", header=header(stamp_ns), name=names, **parts)
@@ -81,17 +93,27 @@ def state_entries(state, stamp_ns: int, received_ns: int, sample: int) -> list[E
     turn = make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
     theta, phi, psi = zyz_angles(rotation_matrix(state.quaternion)).tolist()
     angles = make("geometry_msgs/Vector3", x=theta, y=phi, z=psi)
-    orientation = make("geometry_msgs/QuaternionStamped", header=header(stamp_ns), quaternion=turn)
+    orientation = make(
+        "geometry_msgs/QuaternionStamped", header=header(stamp_ns), quaternion=turn
+    )
     euler = make("geometry_msgs/Vector3Stamped", header=header(stamp_ns), vector=angles)
     contents = {JOINTS: joints, ORIENTATION: orientation, EULER: euler}
-    return [Entry(topic, received_ns, content, sample) for topic, content in contents.items()]
+    return [
+        Entry(topic, received_ns, content, sample)
+        for topic, content in contents.items()
+    ]
 
 
 def torque_entry(torques: list, start_ns: int, received_ns: int, sample: int) -> Entry:
     unused = dict.fromkeys(("positions", "velocities", "accelerations"), np.empty(0))
     ends = [time(i * TICK_NS, "Duration") for i in range(1, len(torques) + 1)]
     points = [
-        make(f"{KINDS[APPLIED]}Point", **unused, effort=np.array(torque), time_from_start=end)
+        make(
+            f"{KINDS[APPLIED]}Point",
+            **unused,
+            effort=np.array(torque),
+            time_from_start=end,
+        )
         for torque, end in zip(torques, ends, strict=True)
     ]
     parts = {"header": header(start_ns), "joint_names": NAMES[:3], "points": points}
@@ -105,15 +127,27 @@ def command_entry(received_ns: int, torque: Any) -> Entry:
 
 
 def diagnostics_entry(received_ns: int, **values: object) -> Entry:
-    pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(v)) for key, v in values.items()]
-    texts = {"level": 0, "name": "/sst_simulator: run", "message": "", "hardware_id": ""}
+    pairs = [
+        make("diagnostic_msgs/KeyValue", key=key, value=str(v))
+        for key, v in values.items()
+    ]
+    texts = {
+        "level": 0,
+        "name": "/sst_simulator: run",
+        "message": "",
+        "hardware_id": "",
+    }
     status = make("diagnostic_msgs/DiagnosticStatus", **texts, values=pairs)
-    content = make("diagnostic_msgs/DiagnosticArray", header=header(received_ns), status=[status])
+    content = make(
+        "diagnostic_msgs/DiagnosticArray", header=header(received_ns), status=[status]
+    )
     return Entry(DIAGNOSTICS, received_ns, content)
 
 
 def simulated(scene, seconds: float) -> list[Entry]:
-    """Messages of a run with the scene's sines held over each tick, as the nodes send them."""
+    """Messages of a run with the scene's sines held over each tick, as the nodes send
+    them.
+    """
     simulation, profile = Simulation(scene), scene.torque.at
     begun = START_NS - 300_000_000
     text = make("std_msgs/String", data=yaml_document.dump(scene))
@@ -166,13 +200,18 @@ def simulated(scene, seconds: float) -> list[Entry]:
 
 
 def tracked(entries: list[Entry], desired) -> list[Entry]:
-    """Add what a controller publishes; `desired` gives angles and rates at t [s], shape (2, 3)."""
+    """Add what a controller publishes.
+
+    `desired` gives angles and rates at t [s], shape (2, 3).
+    """
     more = []
     for entry in entries:
         if entry.topic == JOINTS and entry.sample >= 0:
             stamp = nanoseconds(entry.content.header.stamp)
             wanted = np.array(desired((stamp - START_NS) / 1e9))
-            measured = np.array([entry.content.position[:3], entry.content.velocity[:3]])
+            measured = np.array(
+                [entry.content.position[:3], entry.content.velocity[:3]]
+            )
             effort = entry.content.effort[:3]
             for topic, (position, velocity), torque in (
                 (DESIRED, wanted, 0.75 * effort),
@@ -187,7 +226,9 @@ def write(
     path: Path, entries: list[Entry], *, sqlite: bool = False, namespace: str = "",
     mode: CompressionMode | None = None, chunks: Any = None,
 ) -> Path:  # fmt: skip
-    """Write messages by rosbags, compressed as rosbag2 does it, or in chunks of some other kind."""
+    """Write messages by rosbags, compressed as rosbag2 does it, or in chunks of some
+    other kind.
+    """
     plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
     writer = Writer(path, version=9, storage_plugin=plugin)
     if mode is not None:
@@ -206,7 +247,10 @@ def write(
 
 
 def record(path: Path, entries: list[Entry], flush_every: int = 0) -> Path:
-    """Write messages as the recorder does; with `flush_every`, a chunk for so many messages."""
+    """Write messages as the recorder does.
+
+    With `flush_every`, a chunk for so many messages.
+    """
     writer = BagWriter(path)
     for number, message in enumerate(_serialize(entries, writer.connect), 1):
         writer.write(*message)
@@ -232,7 +276,10 @@ def without(entries: list[Entry], *topics: str) -> list[Entry]:
 
 
 def edited(entries: list[Entry], topic: str, sample: int | None, change) -> list[Entry]:
-    """Copy the messages; `change` gets the content of one, or of all of a topic, and returns it."""
+    """Copy the messages.
+
+    `change` gets the content of one, or of all of a topic, and returns it.
+    """
     return [
         dataclasses.replace(entry, content=change(entry.content))
         if entry.topic == topic and sample in (None, entry.sample)
@@ -257,7 +304,9 @@ def with_moment(entries: list[Entry], moment: Sequence[float]) -> list[Entry]:
 
 def same(one: Recording, other: Recording) -> None:
     """Check that two recorded runs have the same numbers."""
-    arrays = {name: mine for name, mine in vars(one).items() if isinstance(mine, np.ndarray)}
+    arrays = {
+        name: mine for name, mine in vars(one).items() if isinstance(mine, np.ndarray)
+    }
     assert len(arrays) == 11
     for name, mine in arrays.items():
         assert np.array_equal(mine, getattr(other, name), equal_nan=True), name

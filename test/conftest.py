@@ -3,7 +3,8 @@
 
 import os
 
-# Before NumPy is imported: OpenBLAS's threads wait for each other where workers share the cores.
+# Before NumPy is imported: OpenBLAS's threads wait for each other where workers share
+# the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import itertools
@@ -14,7 +15,8 @@ import pytest
 from sst_ros.dynamics import kernel, traced_dynamics
 from sst_ros.scene import scene
 
-# By its default an example of 0.2 s is a failure: on a loaded machine any may take that long.
+# By its default an example of 0.2 s is a failure: on a loaded machine any may take that
+# long.
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
@@ -22,13 +24,17 @@ pytest_plugins = ["pytester", "missing_packages", "unexpected_skips", "repeat_fa
 
 
 def pytest_configure(config):
-    """Leave out slow tests, unless tests are chosen by `-m` or by name: colcon chooses none."""
+    """Leave out slow tests, unless tests are chosen by `-m` or by name: colcon chooses
+    none.
+    """
     if not config.option.markexpr and not any("::" in word for word in config.args):
         config.option.markexpr = "not slow"
 
 
 def pytest_pycollect_makemodule(module_path, parent):
-    """Import a module when it is collected; launch_testing's plugin does it while it looks.
+    """Import a module when it is collected.
+
+    launch_testing's plugin does it while it looks.
 
     A module that skips itself then skips its whole folder.
     """
@@ -80,7 +86,9 @@ def read(written):
 def written(bags, tmp_path):
     """Write messages into a new folder and return its path."""
     names = (f"bag{number or ''}" for number in itertools.count())
-    return lambda entries, **options: bags.write(tmp_path / next(names), entries, **options)
+    return lambda entries, **options: bags.write(
+        tmp_path / next(names), entries, **options
+    )
 
 
 @pytest.fixture
@@ -93,7 +101,9 @@ def undrawn(monkeypatch):
 
 @pytest.fixture
 def wrong_kernel(monkeypatch):
-    """Falsify what the kernel's derivative gives, and what has been traced from it or will be."""
+    """Falsify what the kernel's derivative gives, and what has been traced from it or
+    will be.
+    """
     right = kernel.derivative
 
     def put(wrong):

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An independent truth to 80 digits: loop closure, differences and Lagrange's equations alone.
+"""An independent truth to 80 digits: loop closure, differences and Lagrange's equations
+alone.
 
-No formula of the paper is used. Positions solve r_k . R e_k = 0 by Newton's method, the frames of
-all seven links are built by geometry, every rate, acceleration and slope is a central difference,
-and loads come from heights, stretches and rates. Arrays hold mpmath numbers; rows belong to legs.
+No formula of the paper is used. Positions solve r_k . R e_k = 0 by Newton's method, the
+frames of all seven links are built by geometry, every rate, acceleration and slope is a
+central difference, and loads come from heights, stretches and rates. Arrays hold mpmath
+numbers; rows belong to legs.
 """
 
 from __future__ import annotations
@@ -14,7 +16,9 @@ from numpy import cross
 
 DIGITS = 80
 STEP = mpf(10) ** -13
-"""Step of all differences: their truncation is 1e-26, three of them lose 39 of the 80 digits."""
+"""Step of all differences: their truncation is 1e-26, three of them lose 39 of the 80
+digits.
+"""
 
 EYE = np.eye(3, dtype=object)
 exact = np.frompyfunc(mpf, 1, 1)
@@ -52,7 +56,9 @@ def partials(function, at):
 
 
 class Positions:
-    """Vectors, frames (star, {11} {12} {13}, {21} {22} {23}) and joint angles at one gamma."""
+    """Vectors, frames (star, {11} {12} {13}, {21} {22} {23}) and joint angles at one
+    gamma.
+    """
 
     def __init__(self, truth, gamma):
         self.r = truth.carriages(gamma)
@@ -69,7 +75,9 @@ class Positions:
 
     def own(self, vectors):
         """Seven vectors in {B} as the seven frames see them."""
-        return np.array([frame.T @ x for frame, x in zip(self.frames, vectors, strict=True)])
+        return np.array(
+            [frame.T @ x for frame, x in zip(self.frames, vectors, strict=True)]
+        )
 
 
 class Lagrange:
@@ -79,10 +87,15 @@ class Lagrange:
         mp.dps = DIGITS
         self.scene = scene
         self.v = np.array([unit(row) for row in exact(np.array(scene.base.v))])
-        self.w = np.array([unit(cross(self.v[k], self.v[(k + 1) % 3])) for k in range(3)])
+        self.w = np.array(
+            [unit(cross(self.v[k], self.v[(k + 1) % 3])) for k in range(3)]
+        )
         alpha = exact(np.array(scene.star.alpha_deg)) * mp.pi / 180
         self.e = np.array(
-            [[-mp.sin(x), mp.cos(x), mpf(0)] for x in (mpf(0), alpha[0], alpha[0] + alpha[1])]
+            [
+                [-mp.sin(x), mp.cos(x), mpf(0)]
+                for x in (mpf(0), alpha[0], alpha[0] + alpha[1])
+            ]
         )
         links = [scene.star, *scene.actuated_links, *scene.intermediate_links]
         self.inertias = [exact(link.inertia.matrix) for link in links]
@@ -91,7 +104,9 @@ class Lagrange:
             c = exact(np.array(carried.centre))
             self.weights[0] = self.weights[0] + c * carried.mass
             shifted = (EYE * (c @ c) - np.outer(c, c)) * carried.mass
-            self.inertias[0] = self.inertias[0] + exact(carried.inertia.matrix) + shifted
+            self.inertias[0] = (
+                self.inertias[0] + exact(carried.inertia.matrix) + shifted
+            )
         if drive := scene.actuators:
             for actuated in self.inertias[1:4]:
                 actuated[2, 2] += mpf(drive.rotor_inertia) * mpf(drive.gear_ratio) ** 2
@@ -102,7 +117,9 @@ class Lagrange:
         self._known = {}
 
     def carriages(self, gamma):
-        return np.array([turn(w * g) @ v for w, g, v in zip(self.w, gamma, self.v, strict=True)])
+        return np.array(
+            [turn(w * g) @ v for w, g, v in zip(self.w, gamma, self.v, strict=True)]
+        )
 
     def orientation(self, r):
         """R by Newton's method on r_k . R e_k = 0; the residual ends below 1e-77."""
@@ -131,24 +148,35 @@ class Lagrange:
 
     def lever(self, gamma):
         """Angular velocity of the star per actuator rate, columns by actuator."""
-        return np.stack([self.spins(lambda x, d=d: gamma + x * d)[0] for d in EYE], axis=1)
+        return np.stack(
+            [self.spins(lambda x, d=d: gamma + x * d)[0] for d in EYE], axis=1
+        )
 
     def inertia_matrix(self, gamma):
-        """Second derivatives of the kinetic energy by the rates; it is a quadratic form of them."""
+        """Second derivatives of the kinetic energy by the rates.
+
+        It is a quadratic form of them.
+        """
         lines = [lambda x, d=d: gamma + x * d for d in EYE]
         spins = np.array([self.at(gamma).own(self.spins(line)) for line in lines])
         return sum(spins[:, i] @ m @ spins[:, i].T for i, m in enumerate(self.inertias))
 
     def resistance(self, gamma, rate, moment):
-        """d/dt dT/dgamma_dot - dT/dgamma at gamma_ddot = 0, less the external moment's part."""
+        """d/dt dT/dgamma_dot - dT/dgamma at gamma_ddot = 0, less the external moment's
+        part.
+        """
         slopes = partials(self.inertia_matrix, gamma)
         turning = np.tensordot(rate, slopes, 1) @ rate
         return turning - (slopes @ rate) @ rate / 2 - self.lever(gamma).T @ moment
 
     def acceleration(self, gamma, rate, torque, moment=(0.0, 0.0, 0.0)):
         """gamma_ddot of torques and of a moment on the star in {B}."""
-        gamma, rate, torque, moment = map(exact, map(np.asarray, (gamma, rate, torque, moment)))
-        return solve(self.inertia_matrix(gamma), torque - self.resistance(gamma, rate, moment))
+        gamma, rate, torque, moment = map(
+            exact, map(np.asarray, (gamma, rate, torque, moment))
+        )
+        return solve(
+            self.inertia_matrix(gamma), torque - self.resistance(gamma, rate, moment)
+        )
 
     def potential(self, gamma):
         """Weight by height of the centres of mass, springs by stretch."""
@@ -168,7 +196,9 @@ class Lagrange:
         by_joint = partials(lambda x: self.at(x).angles, gamma)  # (actuator, kind, leg)
         for kind, name in enumerate(("gamma", "mu", "beta")):
             if friction := getattr(self.scene.friction, name):
-                rub = np.array([friction_torque(friction, v) for v in rate @ by_joint[:, kind]])
+                rub = np.array(
+                    [friction_torque(friction, v) for v in rate @ by_joint[:, kind]]
+                )
                 force = force - by_joint[:, kind] @ rub
         return force.astype(float)
 
@@ -183,13 +213,13 @@ def friction_torque(friction, v):
 
 
 class Motion:
-    """gamma(t) = gamma + rate t + acceleration t^2 / 2, and what differences say of it at t = 0.
+    """gamma(t) = gamma + rate t + acceleration t^2 / 2, and what differences say of it
+    at t = 0.
 
     Attributes:
         here: positions.
         rates, accelerations: of the joints gamma, mu, beta by leg, shape (3, 3).
         omega, omega_dot: of the star and all links, in {B}, shape (7, 3).
-
     """
 
     def __init__(self, truth, gamma, rate, acceleration):
@@ -201,7 +231,9 @@ class Motion:
         self.truth, self.path, self.gamma = truth, path, gamma
         self.here = truth.at(gamma)
         self.rates = self.slope(lambda here: here.angles)
-        self.accelerations = slope(lambda t: slope(lambda x: truth.at(path(x)).angles, t))
+        self.accelerations = slope(
+            lambda t: slope(lambda x: truth.at(path(x)).angles, t)
+        )
         self.omega = truth.spins(path)
         self.omega_dot = slope(lambda t: truth.spins(path, t))
 

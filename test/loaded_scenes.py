@@ -50,8 +50,13 @@ def start_of(scene: Scene, size: int = 7) -> list[float]:
     return [*state.quaternion, *state.body_rate, *(0.0,) * (size - 7)]
 
 
-def run(simulation: Simulation, seconds: float, period: float, torque=REST) -> Simulation:
-    """Step through a time; `torque` may be three numbers or a function, held over each period."""
+def run(
+    simulation: Simulation, seconds: float, period: float, torque=REST
+) -> Simulation:
+    """Step through a time.
+
+    `torque` may be three numbers or a function, held over each period.
+    """
     count = round(seconds / period)
     for k in range(count):
         now = torque((k + 0.5) * period) if callable(torque) else torque

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A test whose import needs an optional package that is not installed is skipped, not failed.
+"""A test whose import needs an optional package that is not installed is skipped, not
+failed.
 
-`colcon test` runs with the packages of rosdep, which has no keys for mcap, rosbags and others.
-With CI=true such a skip fails the session: see unexpected_skips.py.
+`colcon test` runs with the packages of rosdep, which has no keys for mcap, rosbags and
+others. With CI=true such a skip fails the session: see unexpected_skips.py.
 """
 
 import pytest

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random manipulators and states for the tests, from plain numbers in [-1, 1].
 
-Hypothesis and seeded generators draw the same 64 numbers; all zeros is the isotropic design at
-home with plain inertias, so counterexamples shrink towards it.
+Hypothesis and seeded generators draw the same 64 numbers; all zeros is the isotropic
+design at home with plain inertias, so counterexamples shrink towards it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,9 @@ def scene_of(v, alpha_deg, star, actuated, intermediate, **rest) -> Scene:
         base=Base(v=v, radius=0.35),
         star=Star(alpha_deg=alpha_deg, radius=0.4, inertia=inertia_of(star)),
         actuated_links=tuple(Link(inertia=inertia_of(matrix)) for matrix in actuated),
-        intermediate_links=tuple(Link(inertia=inertia_of(matrix)) for matrix in intermediate),
+        intermediate_links=tuple(
+            Link(inertia=inertia_of(matrix)) for matrix in intermediate
+        ),
         **rest,
     )
 
@@ -96,7 +98,9 @@ def inertia_of(matrix) -> Inertia:
 
 
 def rigid_body(numbers, size: float) -> np.ndarray:
-    """Inertia of a body with positive second moments of mass: positive definite, triangle kept."""
+    """Inertia of a body with positive second moments of mass: positive definite,
+    triangle kept.
+    """
     x, y, z = size * (1.1 + np.asarray(numbers[:3]))
     turn = Rotation.from_rotvec(2.0 * np.asarray(numbers[3:])).as_matrix()
     tensor = turn @ np.diag([y + z, x + z, x + y]) @ turn.T
@@ -106,12 +110,17 @@ def rigid_body(numbers, size: float) -> np.ndarray:
 def assembly_of(geometry: Geometry, gamma, rotation) -> Assembly:
     """Describe the assembly R at actuator angles gamma; R closes the loops."""
     r = kinematics.carriage_directions(geometry, gamma)
-    mu, beta, det_j2, admissible = kinematics.describe_assemblies(geometry, r, np.asarray(rotation))
+    mu, beta, det_j2, admissible = kinematics.describe_assemblies(
+        geometry, r, np.asarray(rotation)
+    )
     return Assembly(rotation, mu, beta, float(det_j2), bool(admissible))
 
 
 def star_orientation(geometry: Geometry, numbers) -> np.ndarray:
-    """R with E inside the base triangle; at zeros E is at the centre and mu_1 = 90 deg."""
+    """R with E inside the base triangle.
+
+    At zeros E is at the centre and mu_1 = 90 deg.
+    """
     s = (1.2 + np.asarray(numbers[:3])) @ geometry.v
     s /= np.linalg.norm(s)
     t = np.cross(geometry.w[0], s)
@@ -122,7 +131,10 @@ def star_orientation(geometry: Geometry, numbers) -> np.ndarray:
 
 
 def sample_of(numbers, isotropic: bool = False) -> Sample | None:
-    """Turn 64 numbers in [-1, 1] into a sample; None where the state is near a singularity."""
+    """Turn 64 numbers in [-1, 1] into a sample.
+
+    None where the state is near a singularity.
+    """
     x = np.asarray(numbers, dtype=float)
     v, alpha = np.eye(3), np.full(3, 120.0)
     if not isotropic:
@@ -138,10 +150,14 @@ def sample_of(numbers, isotropic: bool = False) -> Sample | None:
     rotation = star_orientation(geometry, x[53:57])
     gamma, mu, beta = kinematics.inverse(geometry, rotation)
     assembly = assembly_of(geometry, gamma, rotation)
-    regular = np.sin(mu).min() > 0.2 and abs(assembly.det_j2) > 0.05 and beta.max() < 1.5
+    regular = (
+        np.sin(mu).min() > 0.2 and abs(assembly.det_j2) > 0.05 and beta.max() < 1.5
+    )
     if not (regular and assembly.admissible):
         return None
-    return Sample(scene, geometry, rotation, gamma, 4 * x[57:60], 5 * x[58:61], 2 * x[61:64])
+    return Sample(
+        scene, geometry, rotation, gamma, 4 * x[57:60], 5 * x[58:61], 2 * x[61:64]
+    )
 
 
 def seeded_samples(seed: int, count: int, isotropic: bool = False) -> list[Sample]:
@@ -171,7 +187,9 @@ def samples(draw) -> Sample:
 
 
 def folding_star() -> tuple[Scene, np.ndarray]:
-    """Example 1 with a star that folds, and R at its parallel singularities, shape (n, 3, 3)."""
+    """Example 1 with a star that folds, and R at its parallel singularities, shape (n,
+    3, 3).
+    """
     scene = load("example1")
     scene = replace(scene, star=replace(scene.star, alpha_deg=(210.0, 75.0, 75.0)))
     geometry = Geometry.of(scene)

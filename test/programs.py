@@ -23,7 +23,10 @@ sys.meta_path.insert(0, Hider())
 
 
 def python(*words, env=None, status=0, **options):
-    """Run Python with these words, a program by default; return what it has printed and said."""
+    """Run Python with these words, a program by default.
+
+    Return what it has printed and said.
+    """
     if len(words) == 1:
         words = ("-c", *words)
     environment = {**os.environ, **(env or {})}
@@ -35,7 +38,9 @@ def python(*words, env=None, status=0, **options):
 
 @contextmanager
 def own_domain():
-    """Have nodes use a ROS domain that nothing else on this machine has, without the network."""
+    """Have nodes use a ROS domain that nothing else on this machine has, without the
+    network.
+    """
     number, lock = processes.lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The symmetric motion of the isotropic manipulator: one degree of freedom, as in Example 1.
+"""The symmetric motion of the isotropic manipulator: one degree of freedom, as in
+Example 1.
 
-Where the base triangle has right angles, the arcs are 120 degrees apart, all legs are alike and all
-torques are equal, all gamma_k stay equal and E stays at the centre. The angle of the star about s
-obeys tan psi = sqrt(3) tan x with x = gamma_k - pi/4, and Lagrange's equation of x is
+Where the base triangle has right angles, the arcs are 120 degrees apart, all legs are
+alike and all torques are equal, all gamma_k stay equal and E stays at the centre. The
+angle of the star about s obeys tan psi = sqrt(3) tan x with x = gamma_k - pi/4, and
+Lagrange's equation of x is
 
     M1(x) x_ddot + M1'(x) x_dot^2 / 2 = tau(t),
     M1(x) = I_zz / d^2 + Ia_zz + Ip_yy + 2 Ip_xx cos^2 x / d^2,  d = 2 - cos 2x,
@@ -36,18 +38,26 @@ def inertia(scene: Scene, x: Any) -> Any:
 
 
 def inertia_slope(scene: Scene, x: float) -> float:
-    """M1'(x) [kg m^2/rad], to rounding: a step into the complex plane subtracts nothing."""
+    """M1'(x) [kg m^2/rad], to rounding: a step into the complex plane subtracts
+    nothing.
+    """
     return float(inertia(scene, x + 1e-100j).imag / 1e-100)
 
 
 def drift_free_rate(scene: Scene) -> float:
-    """Find the initial rate [rad/s] at gamma_k = pi/4 with which gamma returns after one period.
+    """Find the initial rate [rad/s] at gamma_k = pi/4 with which gamma returns after
+    one period.
 
-    The paper's rate for Example 1 is lost; this is the one that makes its motion periodic, whatever
-    the inertias are. The scene is symmetric, with the same sine torque at all legs.
+    The paper's rate for Example 1 is lost; this is the one that makes its motion
+    periodic, whatever the inertias are. The scene is symmetric, with the same sine
+    torque at all legs.
     """
     torque = scene.torque
-    amplitude, frequency, phase = torque.amplitude[0], torque.frequency[0], torque.phase[0]
+    amplitude, frequency, phase = (
+        torque.amplitude[0],
+        torque.frequency[0],
+        torque.phase[0],
+    )
     period = 2.0 * math.pi / frequency
 
     def rates(t: float, y: tuple[float, float]) -> tuple[float, float]:
@@ -56,7 +66,8 @@ def drift_free_rate(scene: Scene) -> float:
         return y[1], push / inertia(scene, y[0])
 
     def drift(rate: float) -> float:
-        # SciPy's tightest; the steps are shorter than it asks for, so that only rounding is left.
+        # SciPy's tightest; the steps are shorter than it asks for, so that only
+        # rounding is left.
         run = solve_ivp(
             rates,
             (0.0, period),
@@ -70,4 +81,5 @@ def drift_free_rate(scene: Scene) -> float:
 
     # For a constant inertia the rate is -amplitude cos(phase) / (frequency M1).
     near = -amplitude * math.cos(phase) / (frequency * inertia(scene, 0.0))
-    return float(newton(drift, near, x1=0.9 * near, tol=1e-13))  # the secant's last step
+    # the secant's last step
+    return float(newton(drift, near, x1=0.9 * near, tol=1e-13))

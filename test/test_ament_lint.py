@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The linters of a ROS installation, as `colcon test` runs them; exceptions with their reasons.
+"""The linters of a ROS installation, as `colcon test` runs them.
+
+Exceptions with their reasons.
 
 `make lint` checks the same and more with ruff, on any machine.
 """
@@ -33,12 +35,16 @@ LINTERS = {
 @pytest.mark.parametrize("name", LINTERS)
 def test_nothing_is_found(name, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    linter = pytest.importorskip(f"{name}.main", reason=f"needs {name} of a ROS installation")
+    linter = pytest.importorskip(
+        f"{name}.main", reason=f"needs {name} of a ROS installation"
+    )
     assert linter.main(argv=[*LINTERS[name]]) == 0, capsys.readouterr()
 
 
 def test_copyright():
-    """Sources have an SPDX line each, which ament_copyright does not know: it checks LICENSE."""
+    """Sources have an SPDX line each, which ament_copyright does not know: it checks
+    LICENSE.
+    """
     reason = "needs ament_copyright of a ROS installation"
     found = pytest.importorskip("ament_copyright.parser", reason=reason).parse_file(
         ROOT / "LICENSE"

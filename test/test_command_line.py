@@ -53,7 +53,9 @@ sys.exit(main())
 
 
 def test_an_interrupt_while_modules_are_imported_ends_in_silence():
-    told = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    told = {
+        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)
+    }
     done = python(INTERRUPTED, status=-signal.SIGINT, **told)
     assert done.stdout == done.stderr == ""
 
@@ -106,7 +108,10 @@ def test_words_that_are_none_of_the_command_are_refused(words, said, capsys):
 
 
 def error_of(words, capsys):
-    """Run a command that fails; return its one line. Skip where it needs what is not installed."""
+    """Run a command that fails; return its one line.
+
+    Skip where it needs what is not installed.
+    """
     assert main(words) == 1
     said = capsys.readouterr().err
     if " is not installed: " in said:
@@ -127,12 +132,21 @@ def error_of(words, capsys):
         (["report", "accuracy", "nowhere"], "must be a readable .yaml file or one of"),
         (["plan", "check", "spiral", "--csv", "{here}"], "--csv"),
         (["plan", "check", "spiral", "--force", "--csv", "{here}"], "Is a directory"),
-        (["plan", "check", "spiral", "--csv", "/proc/torques.csv"], "/proc/torques.csv"),
+        (
+            ["plan", "check", "spiral", "--csv", "/proc/torques.csv"],
+            "/proc/torques.csv",
+        ),
         (["demo", "--out", "/etc/passwd"], "exists already"),
         (["demo", "--force", "--out", "/etc/passwd"], "Not a directory"),
         (["demo", "feedforward", "--scene", "example2"], "has no desired motion"),
-        (["workspace", "example2", "--out", "picture"], "must end in .png or .pdf or .svg"),
-        (["simulate", "example2", "--out", "table.txt"], "must end in .parquet or .csv"),
+        (
+            ["workspace", "example2", "--out", "picture"],
+            "must end in .png or .pdf or .svg",
+        ),
+        (
+            ["simulate", "example2", "--out", "table.txt"],
+            "must end in .parquet or .csv",
+        ),
         (["scene", "show", "{here}/latin.yaml"], "latin.yaml"),
         (["view", "no_such_bag"], "does not exist"),
         (["view", "--scene", "no_such_scene"], "must be a readable .yaml file"),
@@ -153,7 +167,11 @@ BUG = "internal error, please report it with the output of --debug: "
 @pytest.mark.parametrize(
     ("error", "status", "said"),
     [
-        (ValueError("a bug\nwith two lines"), 3, f"{BUG}ValueError: a bug with two lines"),
+        (
+            ValueError("a bug\nwith two lines"),
+            3,
+            f"{BUG}ValueError: a bug with two lines",
+        ),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
@@ -176,7 +194,9 @@ def test_what_goes_wrong_is_one_line_and_a_traceback_only_on_demand(
 )
 def test_output_that_is_not_taken_is_no_traceback(reader, said):
     """A full disk is one line; a reader that leaves is no error of ours."""
-    ours, theirs = os.pipe() if reader == "gone" else (None, os.open("/dev/full", os.O_WRONLY))
+    ours, theirs = (
+        os.pipe() if reader == "gone" else (None, os.open("/dev/full", os.O_WRONLY))
+    )
     if ours is not None:
         os.close(ours)
     pipes = {"stdout": theirs, "stderr": subprocess.PIPE, "capture_output": False}
@@ -186,14 +206,27 @@ def test_output_that_is_not_taken_is_no_traceback(reader, said):
 
 
 def test_a_stdout_that_was_closed_before_the_start_is_no_error():
-    closed = {"preexec_fn": lambda: os.close(1), "stdout": None, "capture_output": False}
-    assert python("-m", "sst_ros", "scene", "list", stderr=subprocess.PIPE, **closed).stderr == ""
+    closed = {
+        "preexec_fn": lambda: os.close(1),
+        "stdout": None,
+        "capture_output": False,
+    }
+    assert (
+        python(
+            "-m", "sst_ros", "scene", "list", stderr=subprocess.PIPE, **closed
+        ).stderr
+        == ""
+    )
 
 
 BAGS = "mcap|rosbags|zstandard"
 NEEDED = {
     "rclpy": [*NODES, "demo", "demo feedforward"],
-    "rosbags|mcap|zstandard": ["export bag", "export bag --format parquet", "recover bag"],
+    "rosbags|mcap|zstandard": [
+        "export bag",
+        "export bag --format parquet",
+        "recover bag",
+    ],
     "rosbags|mcap|zstandard|matplotlib": [
         "report run bag",
         "report accuracy",
@@ -207,15 +240,19 @@ NEEDED = {
 
 
 @pytest.mark.parametrize(
-    ("line", "modules"), [(line, name) for name, lines in NEEDED.items() for line in lines]
+    ("line", "modules"),
+    [(line, name) for name, lines in NEEDED.items() for line in lines],
 )
 def test_what_needs_an_extra_says_which(line, modules, tmp_path):
-    """After a plain installation, every path ends in the line that says what to install."""
+    """After a plain installation, every path ends in the line that says what to
+    install.
+    """
     program = BLOCKED.format(names=OPTIONAL, commands=[line.split()])
     said = python(program, status=1, cwd=tmp_path).stderr
     assert said.count("\n") == 1, said
     assert any(
-        f"{name} is not installed: " in said and f"sst_ros[{EXTRAS.get(name, 'ros')}]'" in said
+        f"{name} is not installed: " in said
+        and f"sst_ros[{EXTRAS.get(name, 'ros')}]'" in said
         for name in modules.split("|")
     ), said
     assert not list(tmp_path.iterdir())
@@ -224,8 +261,14 @@ def test_what_needs_an_extra_says_which(line, modules, tmp_path):
 @pytest.mark.parametrize(
     ("line", "how"),
     [
-        ("recover bag", "rosbags is not installed: pip install mcap rosbags, or pip install 'sst_"),
-        ("simulate example2 --plot", "matplotlib is not installed: apt install python3-matplotlib"),
+        (
+            "recover bag",
+            "rosbags is not installed: pip install mcap rosbags, or pip install 'sst_",
+        ),
+        (
+            "simulate example2 --plot",
+            "matplotlib is not installed: apt install python3-matplotlib",
+        ),
         ("view bag", "viser is not installed: pip install viser"),
         ("recorder", "rclpy is not installed: source a ROS 2 installation"),
     ],
@@ -269,7 +312,15 @@ def test_every_command_names_itself_and_a_function_that_exists(capsys):
 def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     pytest.importorskip("pyarrow", reason="needs pyarrow: pip install .[record]")
-    words = ["simulate", "example2", "--duration", "0.05", "--out", "run.parquet", "--plot"]
+    words = [
+        "simulate",
+        "example2",
+        "--duration",
+        "0.05",
+        "--out",
+        "run.parquet",
+        "--plot",
+    ]
     assert main(words) == 0
     assert "example2: reached the end\n" in capsys.readouterr().out
     trajectory = Trajectory.load("run.parquet")

@@ -52,7 +52,9 @@ def test_a_copied_simulation_goes_on_to_the_bit(make_copy, scene, torque, option
     simulation = Simulation(scene, **options)
     simulation.steps(torque, TICK, 20)
     other = make_copy(simulation)
-    assert other.state == simulation.state and other.evaluations == simulation.evaluations
+    assert (
+        other.state == simulation.state and other.evaluations == simulation.evaluations
+    )
     assert other.within(19_500_000) == simulation.within(19_500_000)
     for each in (simulation, other):
         each.steps(torque, TICK, 20)
@@ -67,8 +69,16 @@ def test_a_copied_simulation_goes_on_to_the_bit(make_copy, scene, torque, option
 @copied
 def test_a_copied_batch_and_its_results_have_the_same_bits(make_copy):
     pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
-    batch = Batch("example2", parameters={"star.mass": [1.0, 1.1], "star.inertia.zz": [0.26, 0.27]})
-    start = {"gamma": (0.785, 0.785, 0.785), "gamma_dot": REST, "step": 1e-3, "count": 8}
+    batch = Batch(
+        "example2",
+        parameters={"star.mass": [1.0, 1.1], "star.inertia.zz": [0.26, 0.27]},
+    )
+    start = {
+        "gamma": (0.785, 0.785, 0.785),
+        "gamma_dot": REST,
+        "step": 1e-3,
+        "count": 8,
+    }
     result = batch.run(**start, keep_every=4)
     again, other = make_copy(batch).run(**start, keep_every=4), make_copy(result)
     for each in (again, other):
@@ -119,7 +129,9 @@ def test_a_copied_proof_has_the_same_bounds(make_copy):
 
 def results(folder):
     """What public names return, or hold, with arrays."""
-    run = simulate("example2", (0.1, 0.0, 0.0), 0.3, samples=60, sensitivities=["star.mass"])
+    run = simulate(
+        "example2", (0.1, 0.0, 0.0), 0.3, samples=60, sensitivities=["star.mass"]
+    )
     recorded.write(folder / "bag", recorded.simulated(load_scene("example2"), 0.02))
     geometry = Geometry.of(load_scene("example2"))
     batch = Batch("example2", parameters={"star.mass": [1.0, 1.1]})
@@ -148,7 +160,9 @@ def results(folder):
 
 
 def held_arrays(result):
-    """Arrays that an object keeps: those it computes anew at each call are the caller's."""
+    """Arrays that an object keeps: those it computes anew at each call are the
+    caller's.
+    """
     names = [name for name in dir(result) if not name.startswith("_")]
     values = result if isinstance(result, dict) else {}
     if not values:
@@ -159,7 +173,9 @@ def held_arrays(result):
             yield name, value
 
 
-@pytest.mark.parametrize("make_copy", [lambda x: x, *COPIES.values()], ids=["itself", *COPIES])
+@pytest.mark.parametrize(
+    "make_copy", [lambda x: x, *COPIES.values()], ids=["itself", *COPIES]
+)
 def test_no_array_of_a_result_can_be_written_to(tmp_path, make_copy):
     pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     frozen = (
@@ -190,7 +206,9 @@ def test_what_was_given_cannot_change_a_motion():
     for array in (table.torques, table.times):
         with pytest.raises(ValueError, match="read-only"):
             array[:] = 5.0
-    with pytest.raises(AttributeError, match="torques is read-only: make another TorqueTable"):
+    with pytest.raises(
+        AttributeError, match="torques is read-only: make another TorqueTable"
+    ):
         table.torques = torques
     polynomial = PolynomialTorque(np.ones((2, 1, 3)), [0, 1])
     with pytest.raises(ValueError, match="read-only"):
@@ -214,7 +232,9 @@ def test_a_second_thread_is_refused_by_name_and_loses_no_step():
     other.start()
     assert inside.wait(30.0)
     for call in (lambda: simulation.step(REST, TICK), simulation.reset):
-        with pytest.raises(InputError, match=r"MainThread.*holder advances the simulation"):
+        with pytest.raises(
+            InputError, match=r"MainThread.*holder advances the simulation"
+        ):
             call()
     leave.set()
     other.join(30.0)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error estimate of simulate() where a motion is not smooth, against far finer solutions."""
+"""The error estimate of simulate() where a motion is not smooth, against far finer
+solutions.
+"""
 
 import functools
 
@@ -13,7 +15,9 @@ from sst_ros.mechanism.geometry import angle_between
 from sst_ros.scene.torque_profile import PolynomialTorque, SineTorque
 
 EXAMPLE2 = load_scene("example2_heavy")
-SINE = SineTorque(amplitude=(4.0, 5.0, 3.0), frequency=(9.0, 7.0, 8.0), phase=(0.1, 0.7, 2.0))
+SINE = SineTorque(
+    amplitude=(4.0, 5.0, 3.0), frequency=(9.0, 7.0, 8.0), phase=(0.1, 0.7, 2.0)
+)
 STEPPED = ("rk4", "dopri5", "dop853", "rodas5p")
 HALVES = np.arange(100) / 2000
 
@@ -28,7 +32,9 @@ def square(t):
 
 
 PIECES = PolynomialTorque([[[30.0, 9.0, -20.0]], [[-4.0, 2.0, 3.0]]], [0.0, 0.2])
-SATURATED = EXAMPLE2.with_values({"actuators.torque_limit": 2.5, "stroke.at_end": "ignore"})
+SATURATED = EXAMPLE2.with_values(
+    {"actuators.torque_limit": 2.5, "stroke.at_end": "ignore"}
+)
 FREE = EXAMPLE2.with_values({"stroke.at_end": "ignore", "workspace.at_edge": "ignore"})
 WEAK = EXAMPLE2.with_values({"actuators.torque_limit": 0.5})
 RUNS = {
@@ -59,7 +65,9 @@ def run_case(name, **options):
 
 @functools.cache
 def truth_of(name):
-    return run_case(name, **{"method": "dop853", "tolerance": 1e-12} | TRUTHS.get(name, {}))
+    return run_case(
+        name, **{"method": "dop853", "tolerance": 1e-12} | TRUTHS.get(name, {})
+    )
 
 
 @pytest.mark.parametrize(
@@ -90,17 +98,26 @@ def test_a_run_meets_its_tolerance_and_its_estimate_holds_and_is_not_far_too_lar
 
 
 def test_breakpoints_of_a_table_are_not_rounded_to_nanoseconds():
-    """A torque of 1 N m that acts for 1e-10 s longer turns the star by 1e-10 of a radian."""
+    """A torque of 1 N m that acts for 1e-10 s longer turns the star by 1e-10 of a
+    radian.
+    """
     times = np.array([0.0, 0.1 + 3.3e-10, 0.2 + 4.4e-10])
     torques = [[5.0, 0.0, 0.0], [-5.0, 4.0, 0.0], [0.0, -4.0, 5.0]]
-    arguments = {"scene": EXAMPLE2, "duration": 0.4, "t_eval": [0.4], "tolerance": 1e-12}
+    arguments = {
+        "scene": EXAMPLE2,
+        "duration": 0.4,
+        "t_eval": [0.4],
+        "tolerance": 1e-12,
+    }
     found = simulate(torque=TorqueTable(times, torques), method="dop853", **arguments)
 
     def same(t):
         return torques[int(np.searchsorted(times, t, side="right")) - 1]
 
     other = simulate(torque=same, breaks=times[1:], method="dopri5", **arguments)
-    rounded = simulate(torque=TorqueTable(times.round(9), torques), method="dop853", **arguments)
+    rounded = simulate(
+        torque=TorqueTable(times.round(9), torques), method="dop853", **arguments
+    )
     assert angle_between(found.quaternion[-1], other.quaternion[-1]) < 1e-12
     assert angle_between(found.quaternion[-1], rounded.quaternion[-1]) > 1e-10
 
@@ -112,16 +129,31 @@ def law(t, state):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_answer_of_a_held_controller_to_the_error_is_in_the_estimate(seed):
-    """Held for so long that the loop is unstable: the error grows, and the torques with it."""
+    """Held for so long that the loop is unstable: the error grows, and the torques with
+    it.
+    """
     rng = np.random.default_rng(seed)
-    period, tolerance = round(float(rng.uniform(0.1, 0.25)), 3), 10.0 ** rng.uniform(-9.0, -5.0)
-    arguments = {"torque": law, "duration": 0.9, "control_period": period, "t_eval": [0.9]}
-    truth = simulate(FREE, method="dop853", tolerance=1e-13, memoryless=True, **arguments)
+    period, tolerance = (
+        round(float(rng.uniform(0.1, 0.25)), 3),
+        10.0 ** rng.uniform(-9.0, -5.0),
+    )
+    arguments = {
+        "torque": law,
+        "duration": 0.9,
+        "control_period": period,
+        "t_eval": [0.9],
+    }
+    truth = simulate(
+        FREE, method="dop853", tolerance=1e-13, memoryless=True, **arguments
+    )
     for method in STEPPED:
-        run = functools.partial(simulate, FREE, method=method, tolerance=tolerance, **arguments)
+        run = functools.partial(
+            simulate, FREE, method=method, tolerance=tolerance, **arguments
+        )
         found, other = run(memoryless=True), run()
         error, unseen = (
-            angle_between(x.quaternion[-1], truth.quaternion[-1]) for x in (found, other)
+            angle_between(x.quaternion[-1], truth.quaternion[-1])
+            for x in (found, other)
         )
         assert found.success and error <= found.error_estimate <= 4.0 * error + 1e-13
         assert unseen <= 3.0 * other.error_estimate
@@ -142,13 +174,18 @@ def test_samples_do_not_change_the_motion(method):
     for one in ends:
         assert one.quaternion[-1].tobytes() == ends[0].quaternion[-1].tobytes()
         assert one.error_estimate == ends[0].error_estimate
-    few, finer = ends[3], simulate(EXAMPLE2, jumping, 0.4, t_eval=ends[3].t, tolerance=1e-11)
+    few, finer = (
+        ends[3],
+        simulate(EXAMPLE2, jumping, 0.4, t_eval=ends[3].t, tolerance=1e-11),
+    )
     assert max(map(angle_between, few.quaternion, finer.quaternion)) < 1e-7
 
 
 def test_nine_samples_cost_little_more_than_none():
     counts = [
-        simulate("example2_heavy", method="dop853", t_eval=times, tolerance=1e-8).evaluations
+        simulate(
+            "example2_heavy", method="dop853", t_eval=times, tolerance=1e-8
+        ).evaluations
         for times in ([1.0], np.linspace(0.0, 1.0, 9))
     ]
     assert counts[1] <= counts[0] + 9 * 12  # a step for each, which is counted
@@ -157,7 +194,12 @@ def test_nine_samples_cost_little_more_than_none():
 @pytest.mark.parametrize("method", STEPPED)
 def test_many_samples_are_as_good_as_the_end_and_cost_a_step_each(method):
     many, finer = (
-        simulate(EXAMPLE2, method=how, t_eval=np.linspace(0.0, 1.0, 4001), tolerance=tolerance)
+        simulate(
+            EXAMPLE2,
+            method=how,
+            t_eval=np.linspace(0.0, 1.0, 4001),
+            tolerance=tolerance,
+        )
         for how, tolerance in ((method, 1e-7), ("dop853", 1e-12))
     )
     assert max(map(angle_between, many.quaternion, finer.quaternion)) < 1e-7
@@ -173,7 +215,15 @@ def test_the_longest_step_is_obeyed():
         seen.append(t)
         return (0.0, 0.0, 0.0)
 
-    simulate(EXAMPLE2, torque, 1.0, max_step=0.01, tolerance=1e-3, method="dopri5", t_eval=[1.0])
+    simulate(
+        EXAMPLE2,
+        torque,
+        1.0,
+        max_step=0.01,
+        tolerance=1e-3,
+        method="dopri5",
+        t_eval=[1.0],
+    )
     assert np.diff(np.unique(seen)).max() <= 0.01
 
 
@@ -194,13 +244,17 @@ def test_auto_is_implicit_under_a_stiff_feedback():
     scene = load_scene("example1")
     found = simulate(scene, damped, 0.5, tolerance=1e-6, t_eval=[0.5])
     assert "rodas5p" in found.method
-    explicit = simulate(scene, damped, 0.5, tolerance=1e-6, t_eval=[0.5], method="dopri5")
+    explicit = simulate(
+        scene, damped, 0.5, tolerance=1e-6, t_eval=[0.5], method="dopri5"
+    )
     assert found.evaluations < 0.5 * explicit.evaluations
     assert angle_between(found.quaternion[-1], explicit.quaternion[-1]) < 2e-6
 
 
 @pytest.mark.parametrize(
-    "torque", [None, jumping, lambda t, state: jumping(t)], ids=["sine", "f(t)", "f(t, x)"]
+    "torque",
+    [None, jumping, lambda t, state: jumping(t)],
+    ids=["sine", "f(t)", "f(t, x)"],
 )
 def test_rodas5p_is_what_runs_when_it_is_asked_for(torque):
     found, other = (

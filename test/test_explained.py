@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Objects say what they are: in ten lines of text, as a table in a notebook, by tab completion."""
+"""Objects say what they are: in ten lines of text, as a table in a notebook, by tab
+completion.
+"""
 
 import re
 from xml.etree import ElementTree
@@ -31,7 +33,12 @@ def made(bag):
     batch = Batch(scene, parameters={"star.mass": [1.0, 2.0]})
     recording = read_bag(bag)
     start = np.full((2, 3), 0.7)
-    yield from (scene, Simulation(scene), Simulation(scene).state, InverseDynamics(scene))
+    yield from (
+        scene,
+        Simulation(scene),
+        Simulation(scene).state,
+        InverseDynamics(scene),
+    )
     yield from (reference_motion(load_scene("reach")), recording)
     yield from (
         batch,
@@ -47,14 +54,20 @@ def made(bag):
 def test_each_object_says_in_ten_lines_what_its_table_says(example2_bag):
     pytest.importorskip("flint")
     objects = list(made(example2_bag))
-    explained = {*Explained.__subclasses__(), *MotionTable.__subclasses__()} - {MotionTable}
+    explained = {*Explained.__subclasses__(), *MotionTable.__subclasses__()} - {
+        MotionTable
+    }
     assert {type(one) for one in objects} == explained
     for one in objects:
         head, *lines = repr(one).splitlines()
         assert head == type(one).__name__ and 2 <= len(lines) <= 9
         rows = re.search("<table>.*?</table>", one._repr_html_(), re.S)[0]
-        cells = ["".join(row.itertext()) for row in ElementTree.fromstring(rows).iter("tr")]
-        assert ["".join(line.split()) for line in lines] == ["".join(c.split()) for c in cells]
+        cells = [
+            "".join(row.itertext()) for row in ElementTree.fromstring(rows).iter("tr")
+        ]
+        assert ["".join(line.split()) for line in lines] == [
+            "".join(c.split()) for c in cells
+        ]
         assert all(len(line) <= 230 for line in lines)
 
 

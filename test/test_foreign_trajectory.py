@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a trajectory that others have made, with a valid checksum, are checked as any input."""
+"""Files of a trajectory that others have made, with a valid checksum, are checked as
+any input.
+"""
 
 import json
 
@@ -86,7 +88,9 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".parquet"])
-@pytest.mark.parametrize(("change", "said"), (METADATA | NUMBERS).values(), ids=METADATA | NUMBERS)
+@pytest.mark.parametrize(
+    ("change", "said"), (METADATA | NUMBERS).values(), ids=METADATA | NUMBERS
+)
 def test_a_foreign_file_is_refused(saved, tmp_path, suffix, change, said):
     path = crafted(saved, tmp_path, suffix, change)
     with pytest.raises(InputError, match=said) as caught:
@@ -96,7 +100,9 @@ def test_a_foreign_file_is_refused(saved, tmp_path, suffix, change, said):
 
 
 def test_columns_of_unequal_length_are_refused(saved, tmp_path):
-    with pytest.raises(InputError, match=r"gamma_1 = \(5,\): must have the shape \(6,\)"):
+    with pytest.raises(
+        InputError, match=r"gamma_1 = \(5,\): must have the shape \(6,\)"
+    ):
         Trajectory.load(crafted(saved, tmp_path, ".npz", cut))
 
 
@@ -109,7 +115,9 @@ def test_a_device_is_refused_at_once(tmp_path):
 
 
 def test_an_unchanged_copy_is_read(saved, tmp_path):
-    again = Trajectory.load(crafted(saved, tmp_path, ".npz", lambda columns, about: None))
+    again = Trajectory.load(
+        crafted(saved, tmp_path, ".npz", lambda columns, about: None)
+    )
     assert np.array_equal(again.gamma, Trajectory.load(saved).gamma)
 
 

@@ -24,7 +24,9 @@ STEPS = {"fast_spin": 200_000, "stiff": 20_000_000}
 
 @cache
 def run(name):
-    """A scene at every step of its whole duration: the simulation, its states, what ended it."""
+    """A scene at every step of its whole duration: the simulation, its states, what
+    ended it.
+    """
     scene = load(name)
     simulation = Simulation(scene)
     torque = scene.torque.at if scene.torque else REST
@@ -55,22 +57,34 @@ def test_a_scene_is_small_commented_and_can_start(name):
     assert source.startswith("# ")
     assert source.count("\n") < 70 and max(map(len, source.splitlines())) <= 110
     numbers = [line for line in source.splitlines() if re.search(r"[:,[] *-?\d", line)]
-    told = [line for line in numbers if "#" in line or "printed" in line or "chosen" in line]
+    told = [
+        line for line in numbers if "#" in line or "printed" in line or "chosen" in line
+    ]
     assert len(told) > len(numbers) / 2
     assert check(name).name == name
 
 
 def test_example2_passes_the_ends_that_it_ignores():
-    """With every printed number: gamma_1 from 0.9125 s, beta_2 from 0.9326 s to the end at 1 s."""
-    gamma, beta = np.degrees(of("example2", "gamma")), np.degrees(of("example2", "beta"))
+    """With every printed number: gamma_1 from 0.9125 s, beta_2 from 0.9326 s to the end
+    at 1 s.
+    """
+    gamma, beta = (
+        np.degrees(of("example2", "gamma")),
+        np.degrees(of("example2", "beta")),
+    )
     assert run("example2")[1][-1].time_ns == 1_000_000_000
-    assert gamma[-1, 0] == gamma.max() == pytest.approx(93.986, abs=1e-3) and gamma.min() > 0.0
+    assert (
+        gamma[-1, 0] == gamma.max() == pytest.approx(93.986, abs=1e-3)
+        and gamma.min() > 0.0
+    )
     assert np.flatnonzero(gamma[:, 0] > 90.0)[0] * STEP_NS == 914_000_000
     assert beta[-1, 1] == beta.min() == pytest.approx(-5.157, abs=1e-3)
     assert np.flatnonzero(beta[:, 1] < 0.0)[0] * STEP_NS == 934_000_000
 
 
-@pytest.mark.parametrize(("name", "bound"), [("gravity_payload", 1e-8), ("fast_spin", 1e-6)])
+@pytest.mark.parametrize(
+    ("name", "bound"), [("gravity_payload", 1e-8), ("fast_spin", 1e-6)]
+)
 def test_energy_is_conserved_while_it_moves(name, bound):
     assert np.ptp(of(name, "gamma")) > 0.1
     simulation, states, _ = run(name)
@@ -81,7 +95,10 @@ def test_energy_is_conserved_while_it_moves(name, bound):
 
 def test_friction_keeps_the_kinetic_energy_below_that_of_the_frictionless_scene():
     simulation, states, _ = run("friction")
-    free, torque = Simulation(replace(simulation.scene, friction=None)), simulation.scene.torque
+    free, torque = (
+        Simulation(replace(simulation.scene, friction=None)),
+        simulation.scene.torque,
+    )
     freely = [free.step(torque.at, STEP_NS) for _ in range(450)]
     rubbed, unrubbed = (
         np.mean([sum(energies(simulation, state)) for state in some])
@@ -92,7 +109,10 @@ def test_friction_keeps_the_kinetic_energy_below_that_of_the_frictionless_scene(
 
 
 def test_elastic_stops_catch_the_actuator_and_throw_it_back():
-    gamma, rate = of("elastic_stops", "gamma")[:, 0], of("elastic_stops", "gamma_dot")[:, 0]
+    gamma, rate = (
+        of("elastic_stops", "gamma")[:, 0],
+        of("elastic_stops", "gamma_dot")[:, 0],
+    )
     beyond = np.flatnonzero(gamma > np.pi / 2)
     assert len(beyond) and gamma.max() < np.pi / 2 + 0.1
     assert rate[beyond[0]] > 0.0 and gamma[beyond[-1] + 1 :].min() < np.pi / 2 - 0.01
@@ -104,7 +124,9 @@ def test_impacts_bounce_at_upper_and_lower_stops():
     bounces = []
     for leg in range(3):
         beyond = (gamma[:, leg] < 0.0) | (gamma[:, leg] > np.pi / 2)
-        first, last = (np.flatnonzero(np.diff(beyond.astype(int)) == way) for way in (1, -1))
+        first, last = (
+            np.flatnonzero(np.diff(beyond.astype(int)) == way) for way in (1, -1)
+        )
         for i, j in zip(first, last, strict=True):
             bounces.append((leg, rate[i, leg] > 0.0))
             assert 0.2 < -rate[j + 1, leg] / rate[i, leg] < 0.9
@@ -121,7 +143,9 @@ def test_general_is_general_and_moves():
 
 
 def test_stiff_creeps_to_the_rest_of_its_springs():
-    """1000 rate = -500 (gamma - rest) once inertia has died: off by 500 / 1000^2 of the way."""
+    """1000 rate = -500 (gamma - rest) once inertia has died: off by 500 / 1000^2 of the
+    way.
+    """
     scene, gamma = load("stiff"), of("stiff", "gamma")
     start, rest = np.array(scene.initial.gamma), np.array([0.9, 0.7, 0.8])
     seconds = np.array([state.time_ns for state in run("stiff")[1]]) / 1e9

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Structure of the package: rooms in order, no import cycle, short paths, names defined once."""
+"""Structure of the package: rooms in order, no import cycle, short paths, names defined
+once.
+"""
 
 import ast
 import importlib.util
@@ -35,19 +37,26 @@ FLOORS = (
     {"__main__"},
     {"sst_ros"},
 )
-"""Rooms from the lowest to the highest; a file imports from its own floor and from those below.
+"""Rooms from the lowest to the highest.
 
-The face of the package imports every room, and no file imports it."""
+A file imports from its own floor and from those below.
+
+The face of the package imports every room, and no file imports it.
+"""
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 FILES = {
-    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(
+        ".__init__"
+    ): path
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 ROS = ("rclpy", "rcl_interfaces", "builtin_interfaces")
 
 
 def imports(name):
-    """Every module that a file names in an import, in functions and under TYPE_CHECKING too."""
+    """Every module that a file names in an import, in functions and under TYPE_CHECKING
+    too.
+    """
     path = FILES[name]
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -57,13 +66,18 @@ def imports(name):
             base = node.module or ""
             if node.level:
                 parts = package.split(".")
-                base = ".".join([*parts[: len(parts) - node.level + 1], *filter(None, [base])])
+                base = ".".join(
+                    [*parts[: len(parts) - node.level + 1], *filter(None, [base])]
+                )
             for alias in node.names:
                 full = f"{base}.{alias.name}"
                 yield full if full in FILES else base
 
 
-GRAPH = {name: {one for one in imports(name) if one in FILES and one != name} for name in FILES}
+GRAPH = {
+    name: {one for one in imports(name) if one in FILES and one != name}
+    for name in FILES
+}
 
 
 def room(name):
@@ -99,7 +113,8 @@ def test_every_class_name_has_one_definition():
 
 
 def test_every_test_file_has_a_name_of_its_own():
-    # launch_testing's collector, which every ROS installation loads, refuses equal names.
+    # launch_testing's collector, which every ROS installation loads, refuses equal
+    # names.
     names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
     assert sorted(names) == sorted(set(names))
 
@@ -198,8 +213,9 @@ MOST_FILES = {
     "bag": 9,  # with the one reader of YAML documents, for metadata.yaml
     "report": 26,  # from a bag, with that reader, too, to the table of `report run`
 }
-"""Files with a function that a call passes, not to grow. The loop and its steps are files, where
-they were generated text before."""
+"""Files with a function that a call passes, not to grow. The loop and its steps are
+files, where they were generated text before.
+"""
 
 
 @pytest.mark.timeout(320)  # where nothing is compiled yet
@@ -211,10 +227,16 @@ def test_calls_pass_few_files_and_those_that_contributing_names(tmp_path):
     lines = [line.split() for line in done.stdout.splitlines()]
     found = {name: set(files) for name, *files in lines}
     counts = {name: len(found[name]) for name in MOST_FILES if ros or name != "answer"}
-    assert {name: count for name, count in counts.items() if count > MOST_FILES[name]} == {}
+    assert {
+        name: count for name, count in counts.items() if count > MOST_FILES[name]
+    } == {}
     text = (here.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    told = text[text.index("## Data paths") : text.index("## Where to add")].split("```")[1::2]
+    told = text[text.index("## Data paths") : text.index("## Where to add")].split(
+        "```"
+    )[1::2]
     passed = found["made"] | found["compiled"]
-    for files, block in zip((found.get("answer"), passed, found["report"]), told, strict=True):
+    for files, block in zip(
+        (found.get("answer"), passed, found["report"]), told, strict=True
+    ):
         modules = set(re.findall(r"^\w+\.\w+", block, re.MULTILINE))
         assert modules and modules <= (files or modules)

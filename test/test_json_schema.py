@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The JSON schema accepts what `read` accepts and refuses what it can; the key reference is new."""
+"""The JSON schema accepts what `read` accepts and refuses what it can.
+
+The key reference is new.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,11 @@ LINK = {"inertia": {"xx": 1.0, "yy": 1.0, "zz": 1.0}}
         ("stroke", {"at_end": "bounce"}, ["stroke", "at_end"]),
         ("stroke", {"at_end": "elastic", "restitution": 2}, ["stroke", "restitution"]),
         ("moment", {"topic": "yes"}, ["moment", "topic"]),
-        ("springs", [{"joint": "mu_1", "stiffness": 0, "rest": 0}], ["springs", 0, "stiffness"]),
+        (
+            "springs",
+            [{"joint": "mu_1", "stiffness": 0, "rest": 0}],
+            ["springs", 0, "stiffness"],
+        ),
         ("friction", {"gamma_1": {}}, ["friction"]),
         ("provenance", {"base": 3}, ["provenance", "base"]),
     ],

@@ -4,9 +4,30 @@
 import pytest
 from programs import python
 
-HEAVY = {"scipy", "matplotlib", "llvmlite", "numba", "rclpy", "pandas", "rosbags", "dask"}
-DOCUMENTS = {"cli", "description", "dynamics", "host", "mechanism", "nodes", "programs", "scene"}
-"""Rooms that a command needs which prints documents; of `nodes` the handler of signals."""
+HEAVY = {
+    "scipy",
+    "matplotlib",
+    "llvmlite",
+    "numba",
+    "rclpy",
+    "pandas",
+    "rosbags",
+    "dask",
+}
+DOCUMENTS = {
+    "cli",
+    "description",
+    "dynamics",
+    "host",
+    "mechanism",
+    "nodes",
+    "programs",
+    "scene",
+}
+"""Rooms that a command needs which prints documents.
+
+Of `nodes` the handler of signals.
+"""
 COMMAND = "from sst_ros.__main__ import main; main({!r})"
 RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_000_000)"
 
@@ -16,18 +37,26 @@ RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_0
     [
         pytest.param("import sst_ros", set(), HEAVY | {"numpy", "yaml"}, id="package"),
         pytest.param(RUN, None, HEAVY - {"llvmlite"}, id="a run"),
-        pytest.param(COMMAND.format(["scene", "list"]), DOCUMENTS, HEAVY, id="scene list"),
-        pytest.param(COMMAND.format(["scene", "schema"]), DOCUMENTS, HEAVY, id="scene schema"),
+        pytest.param(
+            COMMAND.format(["scene", "list"]), DOCUMENTS, HEAVY, id="scene list"
+        ),
+        pytest.param(
+            COMMAND.format(["scene", "schema"]), DOCUMENTS, HEAVY, id="scene schema"
+        ),
         pytest.param(COMMAND.format(["describe"]), DOCUMENTS, HEAVY, id="describe"),
     ],
 )
 def test_what_is_loaded(program, rooms, excluded):
-    """A command takes little more time than the import of NumPy: it loads what it needs."""
+    """A command takes little more time than the import of NumPy: it loads what it
+    needs.
+    """
     done = python(f"{program}\nimport sys\nprint(*sys.modules)")
     names = [name.split(".") for name in done.stdout.splitlines()[-1].split()]
     assert ["sst_ros"] in names and not {first for first, *_ in names} & excluded
     if rooms is not None:
-        assert {name[1] for name in names if name[0] == "sst_ros" and len(name) > 2} <= rooms
+        assert {
+            name[1] for name in names if name[0] == "sst_ros" and len(name) > 2
+        } <= rooms
         assert ["sst_ros", "dynamics", "kernel"] not in names
 
 
@@ -47,7 +76,9 @@ print(*sorted(set(sys.modules) - before))
 """
 
 
-@pytest.mark.parametrize(("scene", "torque"), [("example2_heavy", 50.0), ("elastic_stops", 1.0)])
+@pytest.mark.parametrize(
+    ("scene", "torque"), [("example2_heavy", 50.0), ("elastic_stops", 1.0)]
+)
 def test_steps_import_nothing_after_the_code_is_loaded(scene, torque):
     """A limit or a stop that a run in real time meets costs no import: it takes 0.4 s."""
     done = python(STEPS.format(scene=scene, torque=torque))

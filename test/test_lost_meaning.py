@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a number means beyond its value is refused at every public name, never dropped.
 
-A mask, an imaginary part, a duration, a date, a unit, text and truth values: NumPy turns each of
-them into plain doubles without a word. Times may be given as durations; numbers of a document may
-be text, as in a YAML file.
+A mask, an imaginary part, a duration, a date, a unit, text and truth values: NumPy
+turns each of them into plain doubles without a word. Times may be given as durations;
+numbers of a document may be text, as in a YAML file.
 """
 
 import datetime
@@ -16,7 +16,15 @@ import pytest
 from test_wrong_arguments import REST, SCENE, STUDY, TASK, calls  # noqa: F401
 
 import sst_ros
-from sst_ros import Batch, InputError, Simulation, SstError, TorqueTable, Trajectory, simulate
+from sst_ros import (
+    Batch,
+    InputError,
+    Simulation,
+    SstError,
+    TorqueTable,
+    Trajectory,
+    simulate,
+)
 from sst_ros.state import NotNumbers, real_numbers
 
 TIMES = {"t", "t_eval", "breaks", "times", "breakpoints"}
@@ -50,7 +58,9 @@ KINDS = {
     "nanoseconds": lambda x: in_milliseconds(x).astype("m8[ns]"),
     "timedelta": lambda x: in_milliseconds(x).astype(object),
     "dates": lambda x: np.datetime64("2026-01-01", "ms") + in_milliseconds(x),
-    "datetime": lambda x: (np.datetime64("2026-01-01", "ms") + in_milliseconds(x)).astype(object),
+    "datetime": lambda x: (
+        np.datetime64("2026-01-01", "ms") + in_milliseconds(x)
+    ).astype(object),
     "degrees": lambda x: x.view(Quantity),
 }
 DURATIONS = ("durations", "nanoseconds", "timedelta")
@@ -69,7 +79,9 @@ def cases(public):
         "period": 1e-3,
     }
     for function, right in public:
-        filled = {name: extra.get(name) if x is None else x for name, x in right.items()}
+        filled = {
+            name: extra.get(name) if x is None else x for name, x in right.items()
+        }
         for name, value in filled.items():
             try:
                 array = np.array(real_numbers(value))
@@ -77,10 +89,16 @@ def cases(public):
                 continue
             if array.size and not isinstance(value, (bool, np.bool_)):
                 yield function, right, name, array
-    motion = {name: getattr(run, name) for name in ("t", "gamma", "torque", "gamma_dot")}
+    motion = {
+        name: getattr(run, name) for name in ("t", "gamma", "torque", "gamma_dot")
+    }
     for name, array in motion.items():
         yield identify_arrays, motion, name, array
-    for key, value in {"star.mass": 1.0, "base.v": np.eye(3), "initial.gamma": REST}.items():
+    for key, value in {
+        "star.mass": 1.0,
+        "base.v": np.eye(3),
+        "initial.gamma": REST,
+    }.items():
         yield partial(change_scene, key), {}, "value", np.array(value)
     for form in FORMS:
         yield partial(vary, FORMS[form]), {}, "zz", np.array([0.26, 0.27])
@@ -115,7 +133,9 @@ FORMS = {
     "list": lambda zz: sweep(list(zz)),
     "uniform": lambda zz: sweep(("uniform", *zz)),
     "mapping": lambda zz: sweep({"grid": zz}),
-    "table": lambda zz: sst_ros.sweep(**STUDY | {"vary": {}, "table": {"star.inertia.zz": zz}}),
+    "table": lambda zz: sst_ros.sweep(
+        **STUDY | {"vary": {}, "table": {"star.inertia.zz": zz}}
+    ),
 }
 """Ways in which numbers that vary are given."""
 
@@ -125,7 +145,9 @@ def test_what_numbers_mean_is_not_dropped(calls, kind, tmp_path, monkeypatch):  
     monkeypatch.chdir(tmp_path)
     taken = []
     for function, right, name, array in cases(calls):
-        if (kind in DURATIONS and name in TIMES) or (kind == "degrees" and not array.ndim):
+        if (kind in DURATIONS and name in TIMES) or (
+            kind == "degrees" and not array.ndim
+        ):
             continue
         given, where = KINDS[kind](array), f"{describe(function)}({name})"
         if isinstance(given, np.ndarray) and given.ndim == 0:
@@ -180,7 +202,12 @@ def test_dates_are_refused_with_what_to_give():
 
 
 def test_functions_give_plain_torques():
-    for torque in (masked(np.ones(3)), np.ones(3) + 1j, in_milliseconds(np.ones(3)), ["1"] * 3):
+    for torque in (
+        masked(np.ones(3)),
+        np.ones(3) + 1j,
+        in_milliseconds(np.ones(3)),
+        ["1"] * 3,
+    ):
         with pytest.raises(SstError), warnings.catch_warnings():
             warnings.simplefilter("error")
             simulate("example2", lambda t, torque=torque: torque, 0.01)
@@ -203,11 +230,15 @@ def test_arrays_of_text_and_of_truth_values_are_refused(convert):
         lambda: TorqueTable([0.0], changed(1, 3)),
         lambda: TorqueTable(changed(1), [REST]),
         lambda: sst_ros.PolynomialTorque(changed(1, 1, 3), [0.0, 1.0]),
-        lambda: Trajectory(SCENE, run.t, run.quaternion, run.body_rate, changed(len(run), 3)),
+        lambda: Trajectory(
+            SCENE, run.t, run.quaternion, run.body_rate, changed(len(run), 3)
+        ),
         lambda: sst_ros.Geometry.build(np.eye(3), changed(3)),
         lambda: simulate(**TASK | {"t_eval": changed(1)}),
         lambda: Batch(SCENE, parameters={"star.mass": changed(2)}),
-        lambda: sst_ros.sweep(SCENE, {}, table={"star.mass": changed(2)}, duration=0.01),
+        lambda: sst_ros.sweep(
+            SCENE, {}, table={"star.mass": changed(2)}, duration=0.01
+        ),
     ):
         with pytest.raises(InputError):
             call()
@@ -217,18 +248,25 @@ def test_own_arrays_with_units_are_taken():
     pytest.importorskip("xarray")
     run = simulate(**TASK)
     data = run.to_xarray()
-    again = Trajectory(run.scene, data.time, data.quaternion, data.body_rate, data.torque)
+    again = Trajectory(
+        run.scene, data.time, data.quaternion, data.body_rate, data.torque
+    )
     assert np.array_equal(again.gamma, run.gamma)
     with pytest.raises(InputError, match="in deg"):
         run.at(data.time.assign_attrs(units="deg"))
 
 
 def test_every_parameter_that_takes_arrays_is_declared():
-    """A parameter whose annotation says nothing of arrays is not checked by its annotation."""
+    """A parameter whose annotation says nothing of arrays is not checked by its
+    annotation.
+    """
     for name in sst_ros.__all__:
         value = getattr(sst_ros, name)
         if callable(value) and not isinstance(value, type):
-            assert all(p.annotation is not p.empty for p in signature(value).parameters.values())
+            assert all(
+                p.annotation is not p.empty
+                for p in signature(value).parameters.values()
+            )
 
 
 def test_a_duration_is_no_number_of_nanoseconds():

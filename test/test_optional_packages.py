@@ -59,7 +59,9 @@ def find_importers():
         if path.name == "launch_parts.py":  # its `require` names packages of ROS
             continue
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-        for name, by_statement in imported_names(ast.parse(path.read_text(encoding="utf-8"))):
+        for name, by_statement in imported_names(
+            ast.parse(path.read_text(encoding="utf-8"))
+        ):
             importers = found[name.partition(".")[0]]
             if by_statement:
                 importers.append(".".join(parts).removesuffix(".__init__"))
@@ -78,14 +80,19 @@ def test_each_optional_import_has_an_extra():
     unexplained = [
         name
         for name in IMPORTERS
-        if explanation(ModuleNotFoundError(f"No module named {name!r}", name=name)) is None
+        if explanation(ModuleNotFoundError(f"No module named {name!r}", name=name))
+        is None
     ]
     assert unexplained == []
 
 
-@pytest.mark.parametrize("hidden", sorted(name for name in IMPORTERS if IMPORTERS[name]))
+@pytest.mark.parametrize(
+    "hidden", sorted(name for name in IMPORTERS if IMPORTERS[name])
+)
 def test_a_hidden_package_is_explained(hidden):
-    done = python(HIDDEN.format(names=[hidden]) + IMPORTS.format(modules=IMPORTERS[hidden]))
+    done = python(
+        HIDDEN.format(names=[hidden]) + IMPORTS.format(modules=IMPORTERS[hidden])
+    )
     for line in done.stdout.splitlines():
         message = line.partition(" ")[2]
         missing = re.match(r"(\w+) is not installed: ", message)
@@ -101,7 +108,9 @@ def test_the_page_names_the_extra_that_it_needs(hidden, words):
     pytest.importorskip("viser", reason="needs viser: pip install .[view]")
     program = HIDDEN.format(names=[hidden]) + COMMAND.format(words=words)
     said = python(program, status=1).stderr
-    assert re.fullmatch(rf"sst-ros: {hidden} is not installed: .*sst_ros\[view\].*\n", said), said
+    assert re.fullmatch(
+        rf"sst-ros: {hidden} is not installed: .*sst_ros\[view\].*\n", said
+    ), said
 
 
 def test_beside_ros_the_package_of_pip_that_brings_a_module_is_named(monkeypatch):

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a release consists of: version, extras, package.xml, changelogs, wheel, source archive."""
+"""What a release consists of: version, extras, package.xml, changelogs, wheel, source
+archive.
+"""
 
 import os
 import re
@@ -24,21 +26,39 @@ ROOT = Path(__file__).parents[1]
 MARKDOWN = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 RST = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
 _SAME = "argcomplete hypothesis jinja2 jsonschema matplotlib numpy pandas pytest scipy"
-PYTHON_KEYS = {name: f"python3-{name}" for name in (*_SAME.split(), "pytest-timeout")} | {
+PYTHON_KEYS = {
+    name: f"python3-{name}" for name in (*_SAME.split(), "pytest-timeout")
+} | {
     "llvmlite": "python3-numba",  # which needs llvmlite, that has no key
     "mpmath": "python3-sympy",  # which needs mpmath
     "PyYAML": "python3-yaml",
 }
-"""Keys of rosdep, which are packages of apt as bloom needs them: it refuses keys of pip."""
+"""Keys of rosdep, which are packages of apt as bloom needs them: it refuses keys of
+pip.
+"""
 
-WITHOUT_KEY = {"control", "dask", "mcap", "pyarrow", "python-flint", "rosbags", "viser", "xarray"}
-"""Python packages of setup.py that have none, or one of pip: `pip install sst_ros[all]`."""
+WITHOUT_KEY = {
+    "control",
+    "dask",
+    "mcap",
+    "pyarrow",
+    "python-flint",
+    "rosbags",
+    "viser",
+    "xarray",
+}
+"""Python packages of setup.py that have none, or one of pip: `pip install
+sst_ros[all]`.
+"""
 
 KEYS = yaml.safe_load((ROOT / "test/rosdep_keys.yaml").read_text(encoding="utf-8"))
 """What each key is in each distribution, on a date: python -m tools.rosdep_keys."""
 
 RELEASED_FOR = ("debian", "ubuntu")
-"""Systems for which bloom makes packages; docs/release.md says why RHEL and Fedora are left out."""
+"""Systems for which bloom makes packages.
+
+docs/release.md says why RHEL and Fedora are left out.
+"""
 
 BRINGS = {
     "distributed": "dask[distributed]",
@@ -53,7 +73,9 @@ BRINGS = {
 
 
 def test_version_and_metadata_are_those_of_package_xml():
-    texts = {name: (ROOT / name).read_text(encoding="utf-8") for name in metadata.written()}
+    texts = {
+        name: (ROOT / name).read_text(encoding="utf-8") for name in metadata.written()
+    }
     assert texts == metadata.written(), "run python -m tools.metadata"
     assert sst_ros.__version__ == metadata.version()
     assert f'VERSION = "{metadata.version()}"' in texts["sst_ros/version.py"]
@@ -62,7 +84,9 @@ def test_version_and_metadata_are_those_of_package_xml():
 def test_what_a_person_fills_in_is_in_one_file():
     """Addresses that exist nowhere stand in package.xml and its copy, and nothing else."""
     assert len(metadata.placeholders()) == 3
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True
+    )
     if listed.returncode:
         pytest.skip("needs a clone by git")
     files = {ROOT / name for name in listed.stdout.splitlines()} - {Path(__file__)}
@@ -177,13 +201,25 @@ def test_the_changelogs_agree():
 
 
 def test_the_parser_of_bloom_reads_every_release():
-    changelog = pytest.importorskip("catkin_pkg.changelog").get_changelog_from_path(ROOT, "sst_ros")
-    read = {version: (date, content) for version, date, content in changelog.foreach_version()}
+    changelog = pytest.importorskip("catkin_pkg.changelog").get_changelog_from_path(
+        ROOT, "sst_ros"
+    )
+    read = {
+        version: (date, content)
+        for version, date, content in changelog.foreach_version()
+    }
     assert list(read)[::-1] == re.findall(r"^## \[(\d\S+)\] - ", MARKDOWN, re.M)
     date, content = read[sst_ros.__version__]
     assert f"## [{sst_ros.__version__}] - {date.date()}" in MARKDOWN
-    released = MARKDOWN.partition(f"## [{sst_ros.__version__}]")[2].partition("\n## ")[0]
-    items = [item for bullets in content if hasattr(bullets, "bullets") for item in bullets.bullets]
+    released = MARKDOWN.partition(f"## [{sst_ros.__version__}]")[2].partition("\n## ")[
+        0
+    ]
+    items = [
+        item
+        for bullets in content
+        if hasattr(bullets, "bullets")
+        for item in bullets.bullets
+    ]
     assert len(items) == len(re.findall(r"^- ", released, re.M)) > 10
 
 
@@ -198,18 +234,32 @@ def test_package_xml_is_valid():
     parsed = package.parse_package(ROOT, warnings=warnings)
     parsed.validate(warnings)
     assert warnings == []
-    assert (parsed.version, parsed.get_build_type()) == (sst_ros.__version__, "ament_python")
+    assert (parsed.version, parsed.get_build_type()) == (
+        sst_ros.__version__,
+        "ament_python",
+    )
 
 
 def data_of(package):
-    """Return the files of a package that are no code: templates, profiles, the mark of types."""
+    """Return the files of a package that are no code: templates, profiles, the mark of
+    types.
+    """
     files = (path for path in package.rglob("*") if path.is_file())
-    return {path.relative_to(package) for path in files if path.suffix not in (".py", ".pyc")}
+    return {
+        path.relative_to(package)
+        for path in files
+        if path.suffix not in (".py", ".pyc")
+    }
 
 
 def check_installed(python, folder):
-    """Try what an installation without any extra offers, from a folder that is not the source."""
-    environment = {**os.environ, "PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
+    """Try what an installation without any extra offers, from a folder that is not the
+    source.
+    """
+    environment = {
+        **os.environ,
+        "PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}",
+    }
     environment.pop("PYTHONPATH", None)
 
     def run(*words):
@@ -220,14 +270,22 @@ def check_installed(python, folder):
     assert not {path.name for path in python.parent.iterdir()} & {*NODES}
     assert run(command, "--version").stdout == f"sst-ros {sst_ros.__version__}\n"
     assert "example2" in run(command, "scene", "list").stdout
-    done = run(command, "simulate", "example2", "--duration", "0.01", "--method", "dopri5")
+    done = run(
+        command, "simulate", "example2", "--duration", "0.01", "--method", "dopri5"
+    )
     assert done.returncode == 0, done.stderr
     assert "reached the end" in done.stdout
     nodes = python.parents[1] / "lib" / "sst_ros"
-    for words in ([command, "plot", "bag"], [command, "demo"], *([nodes / name] for name in NODES)):
+    for words in (
+        [command, "plot", "bag"],
+        [command, "demo"],
+        *([nodes / name] for name in NODES),
+    ):
         done = run(*words)
         assert done.returncode == 1, words
-        assert re.fullmatch(r"sst-ros: \w+ is not installed: .*\n", done.stderr), done.stderr
+        assert re.fullmatch(r"sst-ros: \w+ is not installed: .*\n", done.stderr), (
+            done.stderr
+        )
     where = run(python, "-c", "import sst_ros; print(*sst_ros.__path__)")
     installed = Path(where.stdout.strip())
     assert installed.is_relative_to(python.parents[1]), where.stderr
@@ -241,16 +299,35 @@ def test_an_installation_without_extras_works(kind, tmp_path):
     for needed in ("build", "twine"):
         pytest.importorskip(needed, reason=f"needs {needed}: pip install .[test]")
     source = tmp_path / "source"
-    ignored = shutil.ignore_patterns(".*", "*_out", "__pycache__", "*.egg-info", "build", "site")
+    ignored = shutil.ignore_patterns(
+        ".*", "*_out", "__pycache__", "*.egg-info", "build", "site"
+    )
     shutil.copytree(ROOT, source, ignore=ignored)
-    build = [sys.executable, "-m", "build", f"--{kind}", "--outdir", tmp_path / "dist", source]
+    build = [
+        sys.executable,
+        "-m",
+        "build",
+        f"--{kind}",
+        "--outdir",
+        tmp_path / "dist",
+        source,
+    ]
     subprocess.run(build, check=True, capture_output=True, timeout=300)
     (built,) = (tmp_path / "dist").iterdir()
-    check = [sys.executable, "-m", "twine", "check", "--strict", built]  # the description renders
+    # the description renders
+    check = [sys.executable, "-m", "twine", "check", "--strict", built]
     checked = subprocess.run(check, capture_output=True, text=True)
     assert checked.returncode == 0, checked.stdout + checked.stderr
     venv.create(tmp_path / "fresh", with_pip=True)
     python = tmp_path / "fresh" / "bin" / "python"
-    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", built]
+    install = [
+        python,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        built,
+    ]
     subprocess.run(install, check=True, timeout=300)
     check_installed(python, tmp_path)

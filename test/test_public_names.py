@@ -56,7 +56,9 @@ def test_each_name_has_a_docstring_and_one_entry_in_the_reference(name):
 )
 def test_a_scene_is_its_name_its_document_or_a_scene(make):
     scene = sst_ros.load_scene("reach")
-    said = [repr(make(given)) for given in ("reach", yaml.safe_load(dump(scene)), scene)]
+    said = [
+        repr(make(given)) for given in ("reach", yaml.safe_load(dump(scene)), scene)
+    ]
     assert said == [said[0]] * 3
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/release.md, step by step, in a clone; the conda recipe and pixi.toml beside setup.py."""
+"""docs/release.md, step by step, in a clone.
+
+The conda recipe and pixi.toml beside setup.py.
+"""
 
 import importlib
 import os
@@ -15,22 +18,32 @@ import yaml
 
 import sst_ros
 
-tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "pip._vendor.tomli")
+tomllib = importlib.import_module(
+    "tomllib" if sys.version_info >= (3, 11) else "pip._vendor.tomli"
+)
 
 ROOT = Path(__file__).parents[1]
 STEPS = re.findall(
-    r"^ *```bash\n(.*?)^ *```$", (ROOT / "docs/release.md").read_text(encoding="utf-8"), re.M | re.S
+    r"^ *```bash\n(.*?)^ *```$",
+    (ROOT / "docs/release.md").read_text(encoding="utf-8"),
+    re.M | re.S,
 )
 PUBLISHES = ("git push", "git -C", "twine upload", "bloom-release", "rattler-build")
 """Commands that are not run here, nor part of the extra `test`."""
 
 
 def dry(command):
-    """What stands for a command that takes hours, in the test; "" for one that publishes."""
+    """What stands for a command that takes hours, in the test.
+
+    "" for one that publishes.
+    """
     if command.startswith(PUBLISHES):
         return ""
     if command.startswith("make "):
-        return f"make --dry-run PYTHON={sys.executable} {command.removeprefix('make ')} > /dev/null"
+        return (
+            f"make --dry-run PYTHON={sys.executable} {command.removeprefix('make ')} >"
+            " /dev/null"
+        )
     if command.endswith("--filled"):  # what only a person fills in is refused
         return f"! {command} 2> /dev/null"
     if module := re.match(r"python -m benchmark\.\w+", command):
@@ -42,7 +55,9 @@ def dry(command):
 @pytest.mark.timeout(900)
 def test_the_page_of_the_release_in_a_clone(tmp_path):
     source = tmp_path / "source"
-    ignored = shutil.ignore_patterns(".*", "*_out", "__pycache__", "*.egg-info", "build", "site")
+    ignored = shutil.ignore_patterns(
+        ".*", "*_out", "__pycache__", "*.egg-info", "build", "site"
+    )
     shutil.copytree(ROOT, source, ignore=ignored)
     commands = [line.strip() for step in STEPS for line in step.splitlines()]
     assert len(commands) == 29 and sum(not dry(command) for command in commands) == 8
@@ -56,20 +71,28 @@ def test_the_page_of_the_release_in_a_clone(tmp_path):
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     author = {"GIT_AUTHOR_NAME": "A", "GIT_AUTHOR_EMAIL": "a@b"}
     author |= {"GIT_COMMITTER_NAME": "A", "GIT_COMMITTER_EMAIL": "a@b"}
-    kept = {k: v for k, v in os.environ.items() if k != "PYTHONPATH" and not k.startswith("PYTEST")}
+    kept = {
+        k: v
+        for k, v in os.environ.items()
+        if k != "PYTHONPATH" and not k.startswith("PYTEST")
+    }
     done = subprocess.run(
         ["bash", "-c", script], cwd=source, env={**kept, **author, "PATH": path},
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert "reached the end" in done.stdout
-    tags = subprocess.run(["git", "tag"], cwd=source, capture_output=True, text=True).stdout
+    tags = subprocess.run(
+        ["git", "tag"], cwd=source, capture_output=True, text=True
+    ).stdout
     assert tags == "v0.2.0\n"
     assert {path.name for path in (source / "dist").iterdir()} == {
         "sst_ros-0.2.0-py3-none-any.whl", "sst_ros-0.2.0.tar.gz",
     }  # fmt: skip
     hardware = (tmp_path / "sst_ros_hardware", "tag")
-    tags = subprocess.run(["git", "-C", *hardware], capture_output=True, text=True).stdout
+    tags = subprocess.run(
+        ["git", "-C", *hardware], capture_output=True, text=True
+    ).stdout
     assert tags == "0.2.0\n"
     assert "\n0.2.0 (20" in (source / "CHANGELOG.rst").read_text(encoding="utf-8")
 
@@ -89,9 +112,17 @@ def test_conda_and_pixi_ask_for_what_setup_py_asks_for(monkeypatch):
         for name, text in pixi["dependencies"].items()
     }
     assert bounds == needed
-    assert recipe["context"]["version"] == pixi["workspace"]["version"] == sst_ros.__version__
+    assert (
+        recipe["context"]["version"]
+        == pixi["workspace"]["version"]
+        == sst_ros.__version__
+    )
     scripts = given["entry_points"]["console_scripts"]
     assert recipe["build"]["python"]["entry_points"] == scripts
     features = [pixi, *pixi["feature"].values()]
-    extras = {extra for one in features for extra in one["pypi-dependencies"]["sst_ros"]["extras"]}
+    extras = {
+        extra
+        for one in features
+        for extra in one["pypi-dependencies"]["sst_ros"]["extras"]
+    }
     assert extras <= set(given["extras_require"])

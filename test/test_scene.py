@@ -57,13 +57,19 @@ def test_every_number_says_where_it_comes_from(name):
         assert prefixes & set(told), f"{leaf} has no provenance"
     for key, said in told.items():
         # The inertias of the paper are lost.
-        kinds = "derived|assumed|chosen" if "inertia" in key else "printed|derived|assumed|chosen"
+        kinds = (
+            "derived|assumed|chosen"
+            if "inertia" in key
+            else "printed|derived|assumed|chosen"
+        )
         assert re.match(rf"({kinds})\b", said), key
 
 
 def test_inertia_matrix_is_symmetric_with_the_tensors_entries():
     matrix = Inertia(xx=3.0, yy=4.0, zz=5.0, xy=0.1, xz=-0.2, yz=0.3).matrix
-    np.testing.assert_array_equal(matrix, [[3, 0.1, -0.2], [0.1, 4, 0.3], [-0.2, 0.3, 5]])
+    np.testing.assert_array_equal(
+        matrix, [[3, 0.1, -0.2], [0.1, 4, 0.3], [-0.2, 0.3, 5]]
+    )
 
 
 @pytest.mark.parametrize(
@@ -83,7 +89,9 @@ def test_what_is_no_scene_is_refused(name, message, tmp_path, monkeypatch):
 
 
 def test_an_installation_without_scenes_is_told(monkeypatch, tmp_path):
-    monkeypatch.setattr("sst_ros.scene.scene.__file__", str(tmp_path / "a" / "scene.py"))
+    monkeypatch.setattr(
+        "sst_ros.scene.scene.__file__", str(tmp_path / "a" / "scene.py")
+    )
     with pytest.raises(InputError, match=r"config/scenes = .*: was not installed"):
         scenes.share_directory()
 
@@ -112,9 +120,15 @@ def test_numbers_lists_sections_and_choices():
     links = [link.inertia for link in other.actuated_links]
     assert (other.star.inertia.zz, EXAMPLE2.star.inertia.zz) == (0.3, 0.26)
     assert other.base.v[0] == (1.01, 0.01, 0.01)
-    assert [(i.xx, i.zz) for i in links] == [(0.02, 0.018375), (0.02, 0.021), (0.02, 0.018375)]
+    assert [(i.xx, i.zz) for i in links] == [
+        (0.02, 0.018375),
+        (0.02, 0.021),
+        (0.02, 0.018375),
+    ]
     assert other.gravity.acceleration == (0.0, 0.0, -9.81)
-    assert other.initial == Initial(gamma=(first, 0.25, third), gamma_dot=(0.5, 0.5, 0.5))
+    assert other.initial == Initial(
+        gamma=(first, 0.25, third), gamma_dot=(0.5, 0.5, 0.5)
+    )
     assert (other.stroke.at_end, other.torque) == ("ignore", None)
     assert EXAMPLE2.with_values({}) == EXAMPLE2
 
@@ -139,7 +153,10 @@ def test_arcs_define_the_directions_of_the_base():
         ({"initial.gamma[-1]": None}, "names nothing"),
         ({"star.": None}, "names nothing"),
         ({"star.inertia.zz": {1, 2}}, "star.inertia.zz"),
-        ({"star.inertia.zz": object()}, "star.inertia.zz = .*: must be a finite number"),
+        (
+            {"star.inertia.zz": object()},
+            "star.inertia.zz = .*: must be a finite number",
+        ),
     ],
 )
 def test_what_makes_no_scene_is_refused(values, said):
@@ -163,9 +180,10 @@ def test_a_star_too_heavy_for_its_mass_is_warned_of(tmp_path, capsys):
     assert main(["scene", "check", str(path)]) == 0
     valid, warning = capsys.readouterr().out.splitlines()
     assert valid == f"{path}: valid, with warnings"
-    assert warning == (
-        f"{path}: warning: star.inertia: its trace is 1.04 kg m^2; a body of star.mass = 2.6 kg "
-        "within star.radius = 0.4 m has at most 2 m r^2 = 0.832 kg m^2"
+    assert (
+        warning == f"{path}: warning: star.inertia: its trace is 1.04 kg m^2; a body of"
+        " star.mass = 2.6 kg within star.radius = 0.4 m has at most 2 m r^2 = 0.832"
+        " kg m^2"
     )
 
 

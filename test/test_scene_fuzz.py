@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gallery documents with other values in them: a scene, or a refusal that says where; no traceback.
+"""Gallery documents with other values in them: a scene, or a refusal that says where.
+
+No traceback.
 
 What is taken is assembled, traced, differentiated and described as well.
 """
@@ -52,12 +54,19 @@ SECTIONS = {
 }
 SECTIONS |= {
     "moment": {"topic": True},
-    "actuators": {"rotor_inertia": 1e-4, "gear_ratio": 9, "torque_limit": 1, "time_constant": 0.1},
+    "actuators": {
+        "rotor_inertia": 1e-4,
+        "gear_ratio": 9,
+        "torque_limit": 1,
+        "time_constant": 0.1,
+    },
 }
 numbers = (
     st.floats()
     | st.integers()
-    | st.sampled_from([0, -1, 1e-320, 1e-12, 1e-9, 1e9, 1e308, 10**400, 1.5707963267948966])
+    | st.sampled_from(
+        [0, -1, 1e-320, 1e-12, 1e-9, 1e9, 1e308, 10**400, 1.5707963267948966]
+    )
 )
 values = (
     numbers
@@ -66,7 +75,9 @@ values = (
     | st.text(max_size=5)
     | st.recursive(
         st.none() | numbers | st.text(max_size=8),
-        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner),
+        lambda inner: (
+            st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner)
+        ),
         max_leaves=6,
     )
     | st.sampled_from([{}, [], [[]], {"xx": 1}, [{}], "gamma_1", "impact", "elastic"])
@@ -110,7 +121,8 @@ def written(tree):
 
 
 @FUZZ
-@example(("gravity_payload", ("intermediate_links", 0, "centre", 0)), 2e154)  # its square is inf
+# its square is inf
+@example(("gravity_payload", ("intermediate_links", 0, "centre", 0)), 2e154)
 @given(st.sampled_from(PLACES), values)
 def test_another_value_in_one_place(path, place, value):
     judged(changed(place, value), path)
@@ -125,7 +137,9 @@ def test_another_number_in_a_scene_that_is_described(path, place, value):
 @FUZZ
 @given(
     st.sampled_from(sorted(TREES)),
-    st.dictionaries(st.sampled_from(sorted(SECTIONS)), st.sampled_from(sorted(SECTIONS))),
+    st.dictionaries(
+        st.sampled_from(sorted(SECTIONS)), st.sampled_from(sorted(SECTIONS))
+    ),
     st.lists(st.sampled_from(sorted(SECTIONS)), max_size=3),
 )
 def test_sections_exchanged_added_and_left_out(path, name, mixed, dropped):

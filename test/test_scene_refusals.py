@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every way to get a scene wrong has its own words, with key, value, what is allowed and line."""
+"""Every way to get a scene wrong has its own words, with key, value, what is allowed
+and line.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +107,8 @@ def test_refused(old, new, message):
     error = refusal(changed(old, new))
     assert re.search(message, str(error)), str(error)
     assert str(error).startswith("origin: line ")
-    # A missing key is told at the head of its section, broken YAML where it stops making sense.
+    # A missing key is told at the head of its section, broken YAML where it stops
+    # making sense.
     near = 1 + SOURCE[: SOURCE.index(old)].count("\n")
     assert any(abs(problem.line - near) <= 2 for problem in error.problems)
 
@@ -113,7 +116,10 @@ def test_refused(old, new, message):
 NO_MAPPING = {
     "empty": ("", "origin: document = None: must be a mapping"),
     "comment": ("# nothing\n", "origin: document = None: must be a mapping"),
-    "list": ("- 1\n- 2\n", r"origin: line 1: document = \['1', '2'\]: must be a mapping"),
+    "list": (
+        "- 1\n- 2\n",
+        r"origin: line 1: document = \['1', '2'\]: must be a mapping",
+    ),
     "word": ("scene", "origin: line 1: document = 'scene': must be a mapping"),
     "two documents": ("a: 1\n---\nb: 2\n", "but found another document.*must be YAML"),
     "control character": ("name: \x00", "must be YAML"),
@@ -134,19 +140,25 @@ BODIES = SOURCE[: SOURCE.index("provenance:")]
     ("section", "key", "line"),
     [
         (
-            "springs:\n- {joint: mu_1, stiffness: 4, rest: 0}\n- {joint: mu_2, rest: 0}",
+            (
+                "springs:\n- {joint: mu_1, stiffness: 4, rest: 0}\n- {joint: mu_2,"
+                " rest: 0}"
+            ),
             "springs[1].stiffness",
             3,
         ),
         ("provenance:\n  ' star-mass ': guessed", "provenance.star-mass", 1),
     ],
 )
-def test_a_key_that_no_line_has_is_told_with_the_line_of_the_deepest_part_of_it(section, key, line):
+def test_a_key_that_no_line_has_is_told_with_the_line_of_the_deepest_part_of_it(
+    section, key, line
+):
     (problem,) = refusal(BODIES + section).problems
     assert (problem.key, problem.line) == (key, len(BODIES.splitlines()) + line)
 
 
-# One more section at the end of example 2, and what must be said of it after "origin: line N: ".
+# One more section at the end of example 2, and what must be said of it after "origin:
+# line N: ".
 SECTIONS_REFUSED = [
     ("gravity: {acceleration: [0, 0, 0]}", r"gravity = None: has no effect without acc.*: leave"),
     ("gravity: {acceleration: [0, 0, -9.8]}", r"gravity = .*: acts on nothing: no body has a m"),
@@ -204,9 +216,13 @@ def test_a_section_is_refused(section, message):
 
 
 def test_a_fault_in_one_place_hides_none_in_another_and_lines_rise():
-    source = BODIES.replace("radius: 0.35 ", "radius: wide ").replace("duration: 1 ", "time: 1 ")
+    source = BODIES.replace("radius: 0.35 ", "radius: wide ").replace(
+        "duration: 1 ", "time: 1 "
+    )
     source = source.replace("[120, 120, 120]", "[120, 120, 119]")
-    source += "gravity: {acceleration: [0, 0, -9.8]}\nstroke: {at_end: no, restitution: 2}\n"
+    source += (
+        "gravity: {acceleration: [0, 0, -9.8]}\nstroke: {at_end: no, restitution: 2}\n"
+    )
     source += "springs: [{joint: mu_1, stiffness: 1e11, rest: 0}, {joint: mu_1}]\n"
     source += "provenance: {durations: printed}\n"
     problems = refusal(source).problems
@@ -234,7 +250,10 @@ def test_what_contradicts_itself_across_sections_is_checked_once_each_of_them_is
     ("gamma", "message"),
     [
         ("[0.05, 0.05, 1.5]", "cannot start here: no admissible assembly at gamma"),
-        ("[2, 2, 2]", r"must lie in the stroke, 0 to \(1\.570796, 1\.570796, 1\.570796\) rad"),
+        (
+            "[2, 2, 2]",
+            r"must lie in the stroke, 0 to \(1\.570796, 1\.570796, 1\.570796\) rad",
+        ),
         ("[0.78, 0.78, -0.1]", "must lie in the stroke"),
     ],
 )

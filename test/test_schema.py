@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arbitrary and hostile documents give an object or one InputError at once, and nothing else."""
+"""Arbitrary and hostile documents give an object or one InputError at once, and nothing
+else.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +43,18 @@ def test_arbitrary_text_is_a_scene_or_refused(source):
 
 
 @FAST
-@given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6), st.text(min_size=1, max_size=30))
+@given(
+    st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6),
+    st.text(min_size=1, max_size=30),
+)
 def test_numbers_and_text_survive_a_dump_bit_by_bit(rates, description):
     initial = Initial(gamma=np.divide(rates[:3], 200.0), gamma_dot=rates[3:])
     try:
         scene = replace(EXAMPLE2, description=description, initial=initial)
     except InputError:
-        assert not description.strip() or any(unicodedata.category(c) == "Cc" for c in description)
+        assert not description.strip() or any(
+            unicodedata.category(c) == "Cc" for c in description
+        )
         return
     assert read(Scene, dump(scene), "dump") == scene
 
@@ -66,17 +73,47 @@ INERTIA = Inertia(xx=1.0, yy=1.0, zz=1.0)
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Base(v=np.ones(2), radius=0.35), r"base: v = .*: must be 3 x 3 finite numbers"),
-        (lambda: Base(v=np.array(3.0), radius=0.35), r"base: v = .*: must be 3 x 3 finite"),
+        (
+            lambda: Base(v=np.ones(2), radius=0.35),
+            r"base: v = .*: must be 3 x 3 finite numbers",
+        ),
+        (
+            lambda: Base(v=np.array(3.0), radius=0.35),
+            r"base: v = .*: must be 3 x 3 finite",
+        ),
         (lambda: Base(v="abc", radius=0.35), r"base: v = 'abc': must be 3 x 3"),
-        (lambda: Base(v=np.eye(3), radius=True), r"base: radius = True: must be a finite number"),
-        (lambda: Base(v=np.eye(3), radius=None), r"base: radius = None: must be a finite number"),
-        (lambda: Base(v=np.eye(3), radius=10**400), r"base: radius = 1000.*: must be a finite"),
-        (lambda: Base(v=np.eye(3), radius=1j), r"base: radius = 1j: must be a finite number"),
-        (lambda: Star(alpha_deg=[120] * 3, radius=1.0, inertia=None), r"star: inertia = None"),
-        (lambda: Star(alpha_deg=[120] * 3, radius=1.0, inertia=Link), r"star: inertia = .*mapping"),
-        (lambda: Stroke(at_end=None), r"stroke: at_end = None: must be one of stop, ignore"),
-        (lambda: Workspace(beta_max_deg=np.nan), r"workspace: beta_max_deg = nan: must be"),
+        (
+            lambda: Base(v=np.eye(3), radius=True),
+            r"base: radius = True: must be a finite number",
+        ),
+        (
+            lambda: Base(v=np.eye(3), radius=None),
+            r"base: radius = None: must be a finite number",
+        ),
+        (
+            lambda: Base(v=np.eye(3), radius=10**400),
+            r"base: radius = 1000.*: must be a finite",
+        ),
+        (
+            lambda: Base(v=np.eye(3), radius=1j),
+            r"base: radius = 1j: must be a finite number",
+        ),
+        (
+            lambda: Star(alpha_deg=[120] * 3, radius=1.0, inertia=None),
+            r"star: inertia = None",
+        ),
+        (
+            lambda: Star(alpha_deg=[120] * 3, radius=1.0, inertia=Link),
+            r"star: inertia = .*mapping",
+        ),
+        (
+            lambda: Stroke(at_end=None),
+            r"stroke: at_end = None: must be one of stop, ignore",
+        ),
+        (
+            lambda: Workspace(beta_max_deg=np.nan),
+            r"workspace: beta_max_deg = nan: must be",
+        ),
     ],
 )
 def test_sections_built_in_python_are_held_to_the_same_rules(build, message):
@@ -86,7 +123,12 @@ def test_sections_built_in_python_are_held_to_the_same_rules(build, message):
 
 def test_what_has_no_effect_and_what_contradicts_itself_are_told_at_once():
     with pytest.raises(InputError) as caught:
-        Star(alpha_deg=[120, 120, 121], radius=1.0, inertia=INERTIA, centre=(0.0, 0.0, 1.0))
+        Star(
+            alpha_deg=[120, 120, 121],
+            radius=1.0,
+            inertia=INERTIA,
+            centre=(0.0, 0.0, 1.0),
+        )
     assert [problem.key for problem in caught.value.problems] == ["centre", "alpha_deg"]
 
 
@@ -121,7 +163,10 @@ def test_flags_whole_numbers_and_words_are_read(source, expected):
     [
         ("on: 1", r"line 1: on = '1': must be true or false"),
         ("on: yes", r"line 1: on = 'yes': must be true or false"),
-        ("count: 2.5", r"line 1: count = '2\.5': must be a whole number from 1 to 9 \[1\]"),
+        (
+            "count: 2.5",
+            r"line 1: count = '2\.5': must be a whole number from 1 to 9 \[1\]",
+        ),
         ("count: 10", r"line 1: count = '10': must be a whole number from 1 to 9"),
         ("count: 0x3", r"line 1: count = '0x3': must be a whole number"),
         ("count: true", r"line 1: count = 'true': must be a whole number"),
@@ -182,13 +227,18 @@ def test_a_name_is_text_that_can_be_printed(name):
     str(error).encode("utf-8")
 
 
-@pytest.mark.parametrize("text", ["3_5", "1_000.0", "0x10", "0o17", "0b1", "1:30", "１２", "1e5 x"])
+@pytest.mark.parametrize(
+    "text", ["3_5", "1_000.0", "0x10", "0o17", "0b1", "1:30", "１２", "1e5 x"]
+)
 def test_a_number_is_written_as_yaml_1_2_and_json_write_it(text):
-    assert "duration = " in str(refusal(SOURCE.replace("duration: 1 ", f"duration: {text} ")))
+    assert "duration = " in str(
+        refusal(SOURCE.replace("duration: 1 ", f"duration: {text} "))
+    )
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("010", 10.0), ("+1.5e1", 15.0), (".5", 0.5), ("5.", 5.0), ("1E-1", 0.1)]
+    ("text", "value"),
+    [("010", 10.0), ("+1.5e1", 15.0), (".5", 0.5), ("5.", 5.0), ("1E-1", 0.1)],
 )
 def test_numbers_of_yaml_1_2_are_read_as_it_reads_them(text, value):
     changed = SOURCE.replace("duration: 1 ", f"duration: {text} ")

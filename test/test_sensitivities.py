@@ -23,10 +23,15 @@ TORQUES = {
     "constant": (CONSTANT, lambda x: tuple(x)),
     "sine": (
         SINE,
-        lambda x: SineTorque(**dict(zip(SineTorque.SPECS, x.reshape(3, 3).tolist(), strict=True))),
+        lambda x: SineTorque(
+            **dict(zip(SineTorque.SPECS, x.reshape(3, 3).tolist(), strict=True))
+        ),
     ),
     "table": (TABLE[1], lambda x: TorqueTable(TABLE[0], x.reshape(3, 3))),
-    "polynomial": (PIECES, lambda x: PolynomialTorque(x.reshape(2, 2, 3), (0.0, 0.04, 0.06))),
+    "polynomial": (
+        PIECES,
+        lambda x: PolynomialTorque(x.reshape(2, 2, 3), (0.0, 0.04, 0.06)),
+    ),
 }
 TERMS = (
     "star.inertia.zz", "star.centre[2]", "payload.mass", "actuated_links[0].inertia.zz",
@@ -34,11 +39,18 @@ TERMS = (
     "friction.gamma.coulomb", "springs[0].stiffness", "springs[0].rest", "actuators.time_constant",
     "actuators.rotor_inertia", "initial.gamma[0]", "initial.gamma_dot[1]",
 )  # fmt: skip
-STOPS = ("stroke.stiffness", "stroke.damping", "star.inertia.xx", "initial.gamma_dot[0]")
+STOPS = (
+    "stroke.stiffness",
+    "stroke.damping",
+    "star.inertia.xx",
+    "initial.gamma_dot[0]",
+)
 
 
 def bouncing():
-    """Actuator 1 meets the lower end of its stroke at 20 ms, and leaves it some 16 ms later."""
+    """Actuator 1 meets the lower end of its stroke at 20 ms, and leaves it some 16 ms
+    later.
+    """
     return load_scene("impacts").with_values(
         {
             "stroke": {"at_end": "elastic", "stiffness": 2e4, "damping": 0.3},
@@ -66,7 +78,9 @@ def slow(*case):
     ],
 )
 def test_sensitivities_are_the_limit_of_differences(kind, at_stops):
-    """Along a random direction in all parameters at once, and in all numbers of the torques."""
+    """Along a random direction in all parameters at once, and in all numbers of the
+    torques.
+    """
     rng = np.random.default_rng([len(kind), at_stops])
     scene, terms, span = bouncing(), STOPS, [0.02, 0.03, 0.05]
     if not at_stops:
@@ -81,19 +95,31 @@ def test_sensitivities_are_the_limit_of_differences(kind, at_stops):
     def run(step):
         changed = {name: x + step * along[name] for name, x in values.items()}
         torque = build(given + step * push)
-        return simulate(scene.with_values(changed), torque, span[-1], t_eval=span, tolerance=1e-13)
+        return simulate(
+            scene.with_values(changed), torque, span[-1], t_eval=span, tolerance=1e-13
+        )
 
-    motion = simulate(scene, build(given), span[-1], t_eval=span, sensitivities=[*terms, "torque"])
+    motion = simulate(
+        scene, build(given), span[-1], t_eval=span, sensitivities=[*terms, "torque"]
+    )
     steps = np.array([-2.0, -1.0, 1.0, 2.0]) * 1e-3
-    runs, weights = [run(step) for step in steps], np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
+    runs, weights = (
+        [run(step) for step in steps],
+        np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3,
+    )
     here = Rotation.from_quat(motion.quaternion).inv()
     turns = [(here * Rotation.from_quat(one.quaternion)).as_rotvec() for one in runs]
     found = motion.sensitivities
     for name in ("gamma", "gamma_dot", "body_rate", "rotation"):
         rows = turns if name == "rotation" else [getattr(one, name) for one in runs]
         change = getattr(found["torque"], name) @ push
-        change = change + sum(getattr(found[key], name)[..., 0] * along[key] for key in terms)
-        assert np.abs(change - np.tensordot(weights, rows, 1)).max() < 1e-7 * np.abs(change).max()
+        change = change + sum(
+            getattr(found[key], name)[..., 0] * along[key] for key in terms
+        )
+        assert (
+            np.abs(change - np.tensordot(weights, rows, 1)).max()
+            < 1e-7 * np.abs(change).max()
+        )
 
 
 def test_a_key_of_several_numbers_means_each_of_them():
@@ -104,7 +130,9 @@ def test_a_key_of_several_numbers_means_each_of_them():
     found = motion.at([0.0, 0.05]).sensitivities
     assert np.all(found[several[0]].gamma_dot[0] == pytest.approx(np.eye(3)))
     together = np.concatenate([found[name].gamma for name in several], axis=2)
-    assert np.all(together == np.concatenate([found[name].gamma for name in each], axis=2))
+    assert np.all(
+        together == np.concatenate([found[name].gamma for name in each], axis=2)
+    )
     assert simulate("example2").sensitivities == {}
 
 
@@ -125,22 +153,32 @@ def test_what_has_no_sensitivity_is_refused(torque, name, message):
 
 
 def turned_by(scene, direction, size):
-    """Return the scene with other directions and angles of its star, that sum to 360 degrees."""
+    """Return the scene with other directions and angles of its star, that sum to 360
+    degrees.
+    """
     moved = np.array(scene.base.v) + size * direction[:9].reshape(3, 3)
-    alpha = np.array(scene.star.alpha_deg) + size * np.append(direction[9:], -direction[9:].sum())
-    return scene.with_values({"base.v": moved.tolist(), "star.alpha_deg": alpha.tolist()})
+    alpha = np.array(scene.star.alpha_deg) + size * np.append(
+        direction[9:], -direction[9:].sum()
+    )
+    return scene.with_values(
+        {"base.v": moved.tolist(), "star.alpha_deg": alpha.tolist()}
+    )
 
 
 @pytest.mark.parametrize("at_stops", [False, True])
 def test_sensitivities_by_the_geometry_are_the_limit_of_differences(at_stops):
-    """At fixed initial angles and rates, so that the start moves, and the stops with the arcs."""
+    """At fixed initial angles and rates, so that the start moves, and the stops with
+    the arcs.
+    """
     scene, span = (bouncing() if at_stops else load_scene("general")), [0.0, 0.03, 0.05]
     direction = np.random.default_rng(7).normal(size=11) * np.repeat([0.1, 5.0], [9, 2])
     keys = ["base.v", "star.alpha_deg"]
     motion = simulate(scene, CONSTANT, span[-1], t_eval=span, sensitivities=keys)
     steps = np.array([-2.0, -1.0, 1.0, 2.0]) * 1e-3
     given = [turned_by(scene, direction, step) for step in steps]
-    runs = [simulate(one, CONSTANT, span[-1], t_eval=span, tolerance=1e-13) for one in given]
+    runs = [
+        simulate(one, CONSTANT, span[-1], t_eval=span, tolerance=1e-13) for one in given
+    ]
     weights = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
     here = Rotation.from_quat(motion.quaternion).inv()
     turns = [(here * Rotation.from_quat(one.quaternion)).as_rotvec() for one in runs]
@@ -155,13 +193,20 @@ def test_sensitivities_by_the_geometry_are_the_limit_of_differences(at_stops):
 
 
 def test_the_orientation_at_given_angles_by_the_geometry():
-    """Two derivations: closed loops in vectors, and the traced joint angles of the dynamics."""
+    """Two derivations: closed loops in vectors, and the traced joint angles of the
+    dynamics.
+    """
     scene = load_scene("general")
     geometry = Geometry.of(scene)
     motion = simulate(
-        scene, CONSTANT, 1e-3, sensitivities=["base.v", "star.alpha_deg", "initial.gamma"]
+        scene,
+        CONSTANT,
+        1e-3,
+        sensitivities=["base.v", "star.alpha_deg", "initial.gamma"],
     )
-    found = rates.orientation_sensitivity(geometry, rotation_matrix(motion.quaternion[0]))
+    found = rates.orientation_sensitivity(
+        geometry, rotation_matrix(motion.quaternion[0])
+    )
     traced = motion.sensitivities
     assert found.gamma == pytest.approx(traced["initial.gamma"].rotation[0], abs=1e-12)
     lengths = np.linalg.norm(scene.base.v, axis=1)
@@ -169,19 +214,27 @@ def test_the_orientation_at_given_angles_by_the_geometry():
     assert of_v.reshape(3, 9) == pytest.approx(traced["base.v"].rotation[0], abs=1e-12)
     of_alpha = np.radians(found.alpha)
     assert of_alpha == pytest.approx(traced["star.alpha_deg"].rotation[0], abs=1e-13)
-    many = rates.orientation_sensitivity(geometry, rotation_matrix(motion.quaternion[:5]))
+    many = rates.orientation_sensitivity(
+        geometry, rotation_matrix(motion.quaternion[:5])
+    )
     assert many.v.shape == (5, 3, 3, 3) and np.all(many.v[0] == found.v)
 
 
 def test_an_inertia_means_its_six_numbers():
     parts = [f"star.inertia.{part}" for part in ("xx", "yy", "zz", "xy", "xz", "yz")]
-    motion = simulate("example2", CONSTANT, 0.05, sensitivities=["star.inertia", *parts])
+    motion = simulate(
+        "example2", CONSTANT, 0.05, sensitivities=["star.inertia", *parts]
+    )
     found = motion.sensitivities
     assert found["star.inertia"].gamma.shape == (len(motion), 3, 6)
     for number, part in enumerate(parts):
-        assert np.array_equal(found["star.inertia"].gamma[..., number], found[part].gamma[..., 0])
+        assert np.array_equal(
+            found["star.inertia"].gamma[..., number], found[part].gamma[..., 0]
+        )
 
 
 def test_a_refusal_names_the_argument():
-    with pytest.raises(InputError, match=r"^simulate: sensitivities = 'star\.wool': must be"):
+    with pytest.raises(
+        InputError, match=r"^simulate: sensitivities = 'star\.wool': must be"
+    ):
         simulate("example2", CONSTANT, 0.05, sensitivities=["star.wool"])

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shipped scenes against a closed form, another integrator and the inverse dynamics."""
+"""The shipped scenes against a closed form, another integrator and the inverse
+dynamics.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,11 @@ from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
 
 MILLISECOND = 1_000_000
-EXAMPLE1, EXAMPLE2, THIN = load("example1"), load("example2_heavy"), load("example2_stroke")
+EXAMPLE1, EXAMPLE2, THIN = (
+    load("example1"),
+    load("example2_heavy"),
+    load("example2_stroke"),
+)
 
 
 def swing(t_end):
@@ -43,7 +49,10 @@ def swung(simulation, home):
 
 
 def test_example_1_follows_its_closed_form():
-    """Both integrators err below 1e-12 in 0.3 s; E is off the centre by rounding only."""
+    """Both integrators err below 1e-12 in 0.3 s.
+
+    E is off the centre by rounding only.
+    """
     simulation, torque = Simulation(EXAMPLE1), EXAMPLE1.torque.at
     home = simulation.state.quaternion
     for k in range(1, 301):
@@ -52,8 +61,12 @@ def test_example_1_follows_its_closed_form():
         assert np.abs(centre - 3.0**-0.5).max() < 1e-12
         if k % 100 == 0:
             x, rate = swing(k / 1000.0)
-            np.testing.assert_allclose(simulation.state.joints.gamma, x + np.pi / 4, atol=1e-11)
-            np.testing.assert_allclose(simulation.state.joints.gamma_dot, rate, atol=1e-10)
+            np.testing.assert_allclose(
+                simulation.state.joints.gamma, x + np.pi / 4, atol=1e-11
+            )
+            np.testing.assert_allclose(
+                simulation.state.joints.gamma_dot, rate, atol=1e-10
+            )
             psi = np.arctan(np.sqrt(3.0) * np.tan(x))
             assert swung(simulation, home) == pytest.approx(psi, abs=1e-11)
 
@@ -68,7 +81,14 @@ def by_scipy(scene, end, events=None):
         return kernel.derivative(model, tuple(y), torque(t))
 
     return solve_ivp(
-        rates, (0.0, end), start, "DOP853", rtol=2.3e-14, atol=1e-15, max_step=0.01, events=events
+        rates,
+        (0.0, end),
+        start,
+        "DOP853",
+        rtol=2.3e-14,
+        atol=1e-15,
+        max_step=0.01,
+        events=events,
     )
 
 
@@ -111,9 +131,10 @@ def test_thin_example_2_stops_at_the_end_of_the_first_stroke():
 
 
 def test_torques_of_the_inverse_dynamics_bring_the_motion_back():
-    """The paper's own check, 1 s. Nothing is held: torques are functions of time within a step.
-    The method's error is below rounding, and some 1000 steps of rounding at 1e-16 add up to less
-    than 1e-12 rad; 1e-8 is what the paper shows."""
+    """The paper's own check, 1 s. Nothing is held: torques are functions of time within
+    a step. The method's error is below rounding, and some 1000 steps of rounding at
+    1e-16 add up to less than 1e-12 rad; 1e-8 is what the paper shows.
+    """
     scene = replace(EXAMPLE2, motion=load("reach").motion)
     motion, mechanism = reference_motion(scene), virtual_work.Mechanism.of(scene)
 

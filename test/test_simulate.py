@@ -63,7 +63,12 @@ def test_the_run_of_simulate_with_a_control_period_is_that_of_simulation():
         assert tuple(found.torque[k]) == state.torque
         simulation.step(tuple(controller(0.0, state)), 1_000_000)
     between = simulate(
-        EXAMPLE2, controller, 0.1, control_period=0.001, tolerance=1e-10, t_eval=[0.02, 0.0305]
+        EXAMPLE2,
+        controller,
+        0.1,
+        control_period=0.001,
+        tolerance=1e-10,
+        t_eval=[0.02, 0.0305],
     )
     assert between.quaternion[0].tolist() == found.quaternion[20].tolist()
     np.testing.assert_allclose(found.at(0.0305).gamma, between.gamma[1:], atol=1e-12)
@@ -75,7 +80,9 @@ def test_auto_takes_order_eight_for_a_smooth_motion_and_is_as_accurate_as_it_say
     assert found.method == "dop853"
     steps = simulate(EXAMPLE2, tolerance=1e-9, t_eval=[1.0])
     assert steps.evaluations < 2000
-    ratio = found.error_estimate / angle_between(found.quaternion[-1], truth.quaternion[-1])
+    ratio = found.error_estimate / angle_between(
+        found.quaternion[-1], truth.quaternion[-1]
+    )
     assert 1.5 < ratio < 3.0 and found.error_estimate <= 1e-9
     assert abs(found.energy_residual) < 3e-9
     times = np.linspace(0.0, 1.0, 201)
@@ -116,15 +123,21 @@ def test_equal_calls_give_equal_bits_in_arrays_of_their_own(arguments):
 
 
 @pytest.mark.parametrize("arguments", RUNS.values(), ids=RUNS)
-def test_samples_are_even_and_accurate_and_the_motion_does_not_depend_on_them(arguments):
+def test_samples_are_even_and_accurate_and_the_motion_does_not_depend_on_them(
+    arguments,
+):
     run = simulate(**arguments)
-    np.testing.assert_allclose(run.t, np.linspace(0.0, run.t[-1], 201), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        run.t, np.linspace(0.0, run.t[-1], 201), rtol=0, atol=1e-9
+    )
     few, end = simulate(**arguments, samples=4), simulate(**arguments, t_eval=run.t[-1])
     assert few.t.tolist() == run.t[::50].tolist()
     for name in ARRAYS:
         assert getattr(few, name)[-1].tobytes() == getattr(run, name)[-1].tobytes()
         assert getattr(end, name)[-1].tobytes() == getattr(run, name)[-1].tobytes()
-    assert few.error_estimate == run.error_estimate and few.evaluations <= run.evaluations
+    assert (
+        few.error_estimate == run.error_estimate and few.evaluations <= run.evaluations
+    )
     truth = simulate(**arguments, method="dop853", tolerance=1e-13)
     apart = angle_between(run.quaternion, truth.quaternion)
     assert apart.max() < 1e-9  # rad, the tolerance
@@ -133,7 +146,10 @@ def test_samples_are_even_and_accurate_and_the_motion_does_not_depend_on_them(ar
 
 def test_samples_are_even_up_to_a_limit_and_the_periods_of_a_control_unless_a_number_is_given():
     stopped = simulate(EXAMPLE2, (5.0, 0.0, 0.0), 0.4)
-    assert stopped.t[:-1].tolist() == (np.arange(len(stopped) - 1) * 0.4 / 200).round(9).tolist()
+    assert (
+        stopped.t[:-1].tolist()
+        == (np.arange(len(stopped) - 1) * 0.4 / 200).round(9).tolist()
+    )
     assert 0.0 < stopped.t[-1] - stopped.t[-2] <= 0.002
     control = {"torque": spring, "duration": 0.1, "control_period": 0.03}
     assert simulate(EXAMPLE2, **control).t.tolist() == [0.0, 0.03, 0.06, 0.09, 0.1]
@@ -147,7 +163,9 @@ def test_samples_are_even_up_to_a_limit_and_the_periods_of_a_control_unless_a_nu
 )
 def test_threads_get_their_own_motions(arguments):
     one = simulate(**arguments)
-    times = [np.sort(np.random.default_rng(k).uniform(0.0, one.t[-1], 20)) for k in range(8)]
+    times = [
+        np.sort(np.random.default_rng(k).uniform(0.0, one.t[-1], 20)) for k in range(8)
+    ]
     expected = [one.at(t).quaternion for t in times]
     with ThreadPoolExecutor(8) as pool:
         for _ in range(3):
@@ -167,7 +185,9 @@ def test_threads_get_their_own_motions(arguments):
         ("example2_heavy", jerk, "dop853"),
     ],
 )
-def test_auto_begins_with_order_eight_and_changes_where_the_motion_is_stiff(scene, torque, first):
+def test_auto_begins_with_order_eight_and_changes_where_the_motion_is_stiff(
+    scene, torque, first
+):
     found = simulate(scene, torque, 0.1)
     assert found.success and found.method.startswith(first)
     rough = simulate(scene, torque, 0.1, tolerance=1e-5)
@@ -178,9 +198,13 @@ def test_auto_begins_with_order_eight_and_changes_where_the_motion_is_stiff(scen
     ("duration", "method", "letters", "within"),
     [(0.4, "dop853", 27, 1e-8), (3.0, "dop853", 25, 1e-7)],
 )
-def test_a_limit_ends_the_motion_and_keeps_what_is_valid(duration, method, letters, within):
+def test_a_limit_ends_the_motion_and_keeps_what_is_valid(
+    duration, method, letters, within
+):
     found = simulate(EXAMPLE2, (5.0, 0.0, 0.0), duration)
-    truth = simulate(EXAMPLE2, (5.0, 0.0, 0.0), duration, method="dop853", tolerance=1e-12)
+    truth = simulate(
+        EXAMPLE2, (5.0, 0.0, 0.0), duration, method="dop853", tolerance=1e-12
+    )
     assert method in found.method
     assert (found.status, truth.status, found.success) == (1, 1, False)
     assert "gamma_1 > 1.570796" in found.message
@@ -195,7 +219,11 @@ def test_a_limit_ends_the_motion_and_keeps_what_is_valid(duration, method, lette
 
 def test_another_start():
     gamma = [0.5, 0.6, 0.7]
-    for initial in ((gamma, np.zeros(3)), {"gamma": gamma}, {"gamma": gamma, "orientation": None}):
+    for initial in (
+        (gamma, np.zeros(3)),
+        {"gamma": gamma},
+        {"gamma": gamma, "orientation": None},
+    ):
         found = simulate(EXAMPLE2, duration=0.01, initial=initial)
         np.testing.assert_allclose(found.gamma[0], gamma, atol=1e-14)
 
@@ -204,7 +232,10 @@ def test_another_start():
     ("arguments", "said"),
     [
         ({"scene": "swin"}, "one of [^(]*did you mean 'swing'"),
-        ({"scene": "nowhere/swing.yaml"}, "(?s)swing.yaml': .*[(]No such file or directory[)]"),
+        (
+            {"scene": "nowhere/swing.yaml"},
+            "(?s)swing.yaml': .*[(]No such file or directory[)]",
+        ),
         ({"scene": 3}, "must be a Scene"),
         ({"torque": 1.0}, "three finite numbers"),
         ({"torque": (1.0, float("nan"), 0.0)}, "three finite numbers"),
@@ -216,21 +247,42 @@ def test_another_start():
         ({"t_eval": [0.2, 0.1]}, "ascending"),
         ({"t_eval": [0.1, 3.0]}, "ascending"),
         ({"samples": 0}, "samples = 0: must be a whole number from 1 to 10000000"),
-        ({"samples": 10**5000}, "samples(.|\n)*an integer of 5001 digits: must be a whole number"),
+        (
+            {"samples": 10**5000},
+            "samples(.|\n)*an integer of 5001 digits: must be a whole number",
+        ),
         ({"samples": True}, "samples = True: must be a whole number"),
         ({"samples": 3, "t_eval": [0.1]}, "samples = 3: must be None where t_eval"),
         ({"method": "euler"}, "must be one of auto, rk4, dopri5, dop853, rodas5p"),
         ({"method": "gauss"}, "has left: auto and dop853 are as accurate"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"control_period": 0.001}, "control_period(.|\n)*is for a function"),
-        ({"initial": {"gama": 1}}, r"gama = 1: unknown key(.|\n)*gamma = None: is missing"),
-        ({"torque": lambda t, state: None, "duration": 0.1}, r"torque\(0\) = None: must be three"),
+        (
+            {"initial": {"gama": 1}},
+            r"gama = 1: unknown key(.|\n)*gamma = None: is missing",
+        ),
+        (
+            {"torque": lambda t, state: None, "duration": 0.1},
+            r"torque\(0\) = None: must be three",
+        ),
         ({"duration": None}, r"duration(.|\n)*must be given"),
-        ({"torque": jerk, "control_period": 1e-9}, "period = 1e-09: must be at least .* s"),
+        (
+            {"torque": jerk, "control_period": 1e-9},
+            "period = 1e-09: must be at least .* s",
+        ),
         ({"breaks": [0.2, 0.1]}, "breaks(.|\n)*ascending"),
-        ({"initial": {"gamma": [0.8] * 3, "orientation": [0, 0, 0, 0]}}, "not all zero"),
-        ({"initial": {"orientation": [0, 0, 0, 0]}}, "gamma(.|\n)*is missing(.|\n)*not all zero"),
-        ({"initial": {"gamma": [0.8] * 3, "orientation": [1e-200] * 4}}, "not all zero"),
+        (
+            {"initial": {"gamma": [0.8] * 3, "orientation": [0, 0, 0, 0]}},
+            "not all zero",
+        ),
+        (
+            {"initial": {"orientation": [0, 0, 0, 0]}},
+            "gamma(.|\n)*is missing(.|\n)*not all zero",
+        ),
+        (
+            {"initial": {"gamma": [0.8] * 3, "orientation": [1e-200] * 4}},
+            "not all zero",
+        ),
         ({"torque": lambda state, t: (0.0, 0.0, 0.0)}, "f.t, state., in this order"),
         ({"breaks": "x"}, "breaks = 'x': must be numbers"),
         ({"max_step": 0.0}, "max_step(.|\n)*> 0"),
@@ -240,7 +292,9 @@ def test_another_start():
 )
 def test_bad_input_is_refused(arguments, said):
     with pytest.raises(InputError, match=said):
-        simulate(**{"scene": replace(EXAMPLE2, duration=None), "duration": 0.01, **arguments})
+        simulate(
+            **{"scene": replace(EXAMPLE2, duration=None), "duration": 0.01, **arguments}
+        )
 
 
 @pytest.mark.parametrize("method", ["auto", "dopri5", "dop853", "rodas5p"])
@@ -255,8 +309,12 @@ def test_a_state_feedback_is_part_of_the_differential_equation(method):
         return dynamics.derivative(*y, *torque)
 
     y = [*start.quaternion, *start.body_rate]
-    expected = solve_ivp(slope, (0.0, 0.3), y, "DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
-    found = simulate(EXAMPLE2, spring, 0.3, method=method, t_eval=[0.0, 0.3], tolerance=1e-10)
+    expected = solve_ivp(slope, (0.0, 0.3), y, "DOP853", rtol=1e-13, atol=1e-14).y[
+        :, -1
+    ]
+    found = simulate(
+        EXAMPLE2, spring, 0.3, method=method, t_eval=[0.0, 0.3], tolerance=1e-10
+    )
     assert found.success, found.message
     assert np.abs(found.quaternion[-1] - expected[:4]).max() < 1e-10
     assert np.abs(found.body_rate[-1] - expected[4:]).max() < 1e-9
@@ -265,7 +323,9 @@ def test_a_state_feedback_is_part_of_the_differential_equation(method):
     assert found.evaluations > 10
     for k in range(2):
         seen = SimpleNamespace(gamma=found.gamma[k], gamma_dot=found.gamma_dot[k])
-        assert found.torque[k].tolist() == spring(found.t[k], SimpleNamespace(joints=seen))
+        assert found.torque[k].tolist() == spring(
+            found.t[k], SimpleNamespace(joints=seen)
+        )
     np.testing.assert_allclose(
         found.at(0.15).gamma[0],
         simulate(EXAMPLE2, spring, 0.15, tolerance=1e-11).gamma[-1],
@@ -276,7 +336,9 @@ def test_a_state_feedback_is_part_of_the_differential_equation(method):
 def test_a_held_feedback_tends_to_the_continuous_one_in_proportion_to_the_period():
     continuous = simulate(EXAMPLE2, spring, 0.2).gamma[-1]
     apart = [
-        np.abs(simulate(EXAMPLE2, spring, 0.2, control_period=h).gamma[-1] - continuous).max()
+        np.abs(
+            simulate(EXAMPLE2, spring, 0.2, control_period=h).gamma[-1] - continuous
+        ).max()
         for h in (4e-3, 2e-3, 1e-3)
     ]
     assert apart[2] > 1e-6
@@ -289,9 +351,13 @@ def test_a_feedback_has_the_limit_and_the_lag_of_the_actuators():
     assert np.abs(simulate(limited, spring, 0.2).torque).max() == 0.125
     lagging = EXAMPLE2.with_values({"actuators.time_constant": 0.01})
     seen = []
-    found = simulate(lagging, lambda t, state: seen.append(state.torque) or (1.0, 0.0, 0.0), 0.1)
+    found = simulate(
+        lagging, lambda t, state: seen.append(state.torque) or (1.0, 0.0, 0.0), 0.1
+    )
     assert found.torque[0].tolist() == [0.0] * 3
-    np.testing.assert_allclose(found.torque[-1], [1.0 - np.exp(-10.0), 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        found.torque[-1], [1.0 - np.exp(-10.0), 0.0, 0.0], atol=1e-9
+    )
     assert max(torque[0] for torque in seen) > 0.9
 
 
@@ -317,7 +383,9 @@ def test_machine_code_gives_the_bits_of_plain_python(scene, method, torque):
     assert found.quaternion.tobytes() == plain.quaternion.tobytes()
     assert found.gamma_dot.tobytes() == plain.gamma_dot.tobytes()
     told = ("error_estimate", "evaluations", "method", "energy_residual", "step")
-    assert [getattr(found, name) for name in told] == [getattr(plain, name) for name in told]
+    assert [getattr(found, name) for name in told] == [
+        getattr(plain, name) for name in told
+    ]
 
 
 def test_a_motion_that_its_budget_will_not_finish_is_said_early():

@@ -41,7 +41,10 @@ def energy(simulation):
 
 
 def end_of(scene, torque):
-    """Step by milliseconds; return the error that ends the run at the last valid state."""
+    """Step by milliseconds.
+
+    Return the error that ends the run at the last valid state.
+    """
     simulation = Simulation(scene)
     with pytest.raises(RunStopped) as caught:
         for _ in range(1000):
@@ -55,7 +58,10 @@ def end_of(scene, torque):
 @pytest.mark.parametrize("driven", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_energy_grows_by_the_work_of_constant_torques(seed, driven):
-    """The work is tau . (gamma - gamma_0), exactly; DOP853 at 1 ms errs below rounding."""
+    """The work is tau . (gamma - gamma_0), exactly.
+
+    DOP853 at 1 ms errs below rounding.
+    """
     (sample,) = seeded_samples(seed + 60, 1)
     torque = tuple((sample.torque / 10.0).tolist()) if driven else REST
     initial = Initial(gamma=sample.gamma, gamma_dot=sample.gamma_dot / 2.0)
@@ -67,10 +73,14 @@ def test_energy_grows_by_the_work_of_constant_torques(seed, driven):
     assert np.abs(np.subtract(after.quaternion, before.quaternion)).max() > 0.01
     work = np.dot(torque, np.subtract(after.joints.gamma, before.joints.gamma))
     assert abs(work) > 1e-4 if driven else work == 0.0
-    assert energy(simulation) - start == pytest.approx(work, abs=1e-13 * (start + driven))
+    assert energy(simulation) - start == pytest.approx(
+        work, abs=1e-13 * (start + driven)
+    )
 
 
-@pytest.mark.parametrize(("gamma", "ends"), [((0.7, 0.8, 0.9), {}), ((1.3, 1.4, 1.58), IGNORE)])
+@pytest.mark.parametrize(
+    ("gamma", "ends"), [((0.7, 0.8, 0.9), {}), ((1.3, 1.4, 1.58), IGNORE)]
+)
 def test_the_start_is_the_one_of_the_scene_outside_an_ignored_stroke_too(gamma, ends):
     initial = Initial(gamma=gamma, gamma_dot=(0.1, -0.2, 0.3))
     state = Simulation(replace(EXAMPLE2, initial=initial, **ends)).state
@@ -109,7 +119,9 @@ def test_a_torque_that_is_a_function_of_time_is_asked_at_simulated_times():
     assert max(asked) == pytest.approx(0.003, abs=1e-15)
 
 
-@pytest.mark.parametrize(("leg", "sign"), [(0, -1.0), (1, -1.0), (2, -1.0), (1, 1.0), (2, 1.0)])
+@pytest.mark.parametrize(
+    ("leg", "sign"), [(0, -1.0), (1, -1.0), (2, -1.0), (1, 1.0), (2, 1.0)]
+)
 def test_each_end_of_each_stroke_stops_the_run(leg, sign):
     torque = tuple(5.0 * sign * (k == leg) for k in range(3))
     error = end_of(replace(EXAMPLE2, workspace=Workspace(at_edge="ignore")), torque)
@@ -118,7 +130,9 @@ def test_each_end_of_each_stroke_stops_the_run(leg, sign):
 
 
 def test_the_largest_beta_stops_the_run():
-    error = end_of(replace(EXAMPLE2, workspace=Workspace(beta_max_deg=40.0)), EXAMPLE2.torque.at)
+    error = end_of(
+        replace(EXAMPLE2, workspace=Workspace(beta_max_deg=40.0)), EXAMPLE2.torque.at
+    )
     assert isinstance(error, WorkspaceLeft)
     assert error.reason.startswith("beta_") and error.reason.endswith("> 0.698132 rad")
     assert max(error.state.joints.beta) < np.radians(40.0)
@@ -129,7 +143,9 @@ def test_a_motion_that_no_step_resolves_is_refused_and_nothing_of_it_is_kept(pus
     simulation, other = Simulation(EXAMPLE2), Simulation(EXAMPLE2)
     simulation.step(REST, MILLISECOND)
     before, estimate = simulation.state, simulation.error_estimate
-    with pytest.raises(Diverged, match=r"do not resolve it \(sin_mu = 1, det_j2 = -1\)") as caught:
+    with pytest.raises(
+        Diverged, match=r"do not resolve it \(sin_mu = 1, det_j2 = -1\)"
+    ) as caught:
         simulation.step((push, 0.0, push), MILLISECOND)
     assert simulation.state is before is caught.value.state
     assert simulation.error_estimate == estimate
@@ -141,9 +157,15 @@ def test_a_motion_that_no_step_resolves_is_refused_and_nothing_of_it_is_kept(pus
 
 THREE, WHOLE = "must be three finite numbers", "whole nanoseconds"
 REFUSED = [
-    *(((torque,), f"torque = .*: {THREE}") for torque in (1.0, None, "abc", (1.0, 2.0))),
+    *(
+        ((torque,), f"torque = .*: {THREE}")
+        for torque in (1.0, None, "abc", (1.0, 2.0))
+    ),
     *((((0.0, bad, 0.0),), f"torque = .*: {THREE}") for bad in (math.nan, math.inf)),
-    *(((REST, dt), f"dt_ns = .*{WHOLE}") for dt in (1e-3, math.nan, True, "1", None, 0, -5)),
+    *(
+        ((REST, dt), f"dt_ns = .*{WHOLE}")
+        for dt in (1e-3, math.nan, True, "1", None, 0, -5)
+    ),
     *(((REST, 1, n), "count = .*a whole number") for n in (-1, 0, math.nan, 1.5, True)),
     ((REST, 1, 1, (0.0, math.nan, 0.0)), f"moment = .*: {THREE}"),
 ]
@@ -208,7 +230,8 @@ def test_no_torque_gives_a_warning_and_a_wrong_one_is_refused():
         warnings.simplefilter("error")
         simulation.steps(EXAMPLE2.torque, 10 * MILLISECOND, 50)
         simulation.step(lambda t: (t, 0.0, 1.0), MILLISECOND)
-    with pytest.raises(InputError, match="must return three torques"):  # and not Diverged
+    # and not Diverged
+    with pytest.raises(InputError, match="must return three torques"):
         simulation.step(lambda t: (t, t), MILLISECOND)
 
 
@@ -227,13 +250,18 @@ def test_a_torque_moves_as_its_function_does(scene, torque, within):
     one.steps(torque, 10 * MILLISECOND, 50)
     other.steps(getattr(torque, "at", lambda t: torque), 10 * MILLISECOND, 50)
     assert one.state.torque == pytest.approx(other.state.torque, abs=1e-13)
-    assert one.state.quaternion == pytest.approx(other.state.quaternion, abs=within, rel=0.0)
-    assert one.error_estimate < (1e-7 if scene is LIMITED else 1e-8)  # it has kinks inside steps
+    assert one.state.quaternion == pytest.approx(
+        other.state.quaternion, abs=within, rel=0.0
+    )
+    # it has kinks inside steps
+    assert one.error_estimate < (1e-7 if scene is LIMITED else 1e-8)
     if within == 0.0:
         assert one.state == other.state
     middle = one.time_ns - 4 * MILLISECOND
     expected = other.within(middle).quaternion
-    assert one.within(middle).quaternion == pytest.approx(expected, abs=within or 1e-12, rel=0.0)
+    assert one.within(middle).quaternion == pytest.approx(
+        expected, abs=within or 1e-12, rel=0.0
+    )
 
 
 BITS = """
@@ -252,10 +280,15 @@ print(json.dumps(found))
 
 @pytest.mark.slow
 def test_bits_depend_on_the_c_library_only_as_the_page_on_lockstep_says():
-    """glibc chooses sin, cos and atan2 by FMA and AVX2; LLVM's target changes nothing."""
+    """glibc chooses sin, cos and atan2 by FMA and AVX2.
+
+    LLVM's target changes nothing.
+    """
     pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     without = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
-    plain, other = (json.loads(python(BITS % True, env=env).stdout) for env in ({}, without))
+    plain, other = (
+        json.loads(python(BITS % True, env=env).stdout) for env in ({}, without)
+    )
     assert json.loads(python(BITS % False, env={}).stdout) == plain
     for name, row in plain.items():
         np.testing.assert_allclose(other[name], row, rtol=1e-11, atol=1e-13)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory: derived quantities against the states of Simulation, files to the bit, at(t)."""
+"""Trajectory: derived quantities against the states of Simulation, files to the bit,
+at(t).
+"""
 
 import copy
 import pickle
@@ -39,7 +41,9 @@ def path(request, tmp_path):
 def test_angles_and_rates_are_those_of_the_states(run):
     bare = Trajectory(run.scene, run.t, run.quaternion, run.body_rate, run.torque)
     for name in ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot"):
-        np.testing.assert_allclose(getattr(bare, name), getattr(run, name), rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(
+            getattr(bare, name), getattr(run, name), rtol=1e-13, atol=1e-14
+        )
 
 
 def test_energy_and_closure(run):
@@ -71,7 +75,9 @@ def test_a_file_keeps_every_bit_the_scene_and_the_figures(run, path):
     assert again.scene == run.scene
     for name in ("status", "message", "method", "error_estimate", "energy_residual"):
         assert getattr(again, name) == getattr(run, name)
-    np.testing.assert_allclose(again.at(0.1234).gamma, run.at(0.1234).gamma, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        again.at(0.1234).gamma, run.at(0.1234).gamma, rtol=0, atol=1e-12
+    )
     with pytest.raises(InputError, match=r"exists"):
         run.save(path)
     run.save(path, overwrite=True)
@@ -83,7 +89,9 @@ def test_a_copy_and_another_process_get_every_bit_of_the_samples():
         for name in ARRAYS:
             assert getattr(again, name).tobytes() == getattr(run, name).tobytes(), name
         assert again.energy_residual == run.energy_residual and repr(again) == repr(run)
-        np.testing.assert_allclose(again.at(0.1234).gamma, run.at(0.1234).gamma, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            again.at(0.1234).gamma, run.at(0.1234).gamma, rtol=0, atol=1e-9
+        )
 
 
 def test_a_csv_is_the_table_and_other_suffixes_are_refused(run, tmp_path):
@@ -123,8 +131,12 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(run, path):
         except InputError:
             refused += 1
             continue
-        same = all(np.array_equal(getattr(again, name), getattr(run, name)) for name in ARRAYS)
-        assert same and again.scene == run.scene and repr(again) == repr(run), f"byte {at}"
+        same = all(
+            np.array_equal(getattr(again, name), getattr(run, name)) for name in ARRAYS
+        )
+        assert same and again.scene == run.scene and repr(again) == repr(run), (
+            f"byte {at}"
+        )
     assert refused > 400
 
 
@@ -132,7 +144,9 @@ def test_parallel_saves_to_one_path_never_break_a_reader(run, path):
     motions = run, run.at(run.t[::2])
     run.save(path)
     writers = [
-        threading.Thread(target=lambda m=m: [m.save(path, overwrite=True) for _ in range(20)])
+        threading.Thread(
+            target=lambda m=m: [m.save(path, overwrite=True) for _ in range(20)]
+        )
         for m in motions * 2
     ]
     for writer in writers:
@@ -148,14 +162,19 @@ PROFILES = {
     "sine": None,
     "numbers": (0.5, -0.2, 0.3),
     "table": TorqueTable([0.0, 0.03, 0.11], [[1, 0, 0], [0, 1, 0], [0.2, 0, 1]]),
-    "pieces": PolynomialTorque([[[20, 0, 9], [-4, 1, 0]], [[1, 2, 3], [3, 2, 1]]], [0.0, 0.1, 0.3]),
+    "pieces": PolynomialTorque(
+        [[[20, 0, 9], [-4, 1, 0]], [[1, 2, 3], [3, 2, 1]]], [0.0, 0.1, 0.3]
+    ),
     "function": lambda t: (np.cos(9.0 * t), t, -t),
 }
 
 
 LIMITED = replace(EXAMPLE2, actuators=Actuators(torque_limit=0.5))
 CASES = {name: (EXAMPLE2, torque) for name, torque in PROFILES.items()}
-CASES["clamped"] = (LIMITED, TorqueTable([0.0, 0.03], [[2.0, 0.0, 0.0], [-2.0, 1.0, 0.0]]))
+CASES["clamped"] = (
+    LIMITED,
+    TorqueTable([0.0, 0.03], [[2.0, 0.0, 0.0], [-2.0, 1.0, 0.0]]),
+)
 
 
 @pytest.mark.parametrize(("scene", "torque"), CASES.values(), ids=CASES)
@@ -176,10 +195,20 @@ def test_between_samples_it_is_as_accurate_as_at_them(scene, torque):
 @pytest.mark.parametrize("rows", [slice(None, 5), slice(2, None, 3), slice(-4, -1)])
 def test_a_slice_has_its_samples_and_goes_on_between_them(run, rows):
     part = run[rows]
-    for name in ("t", "quaternion", "body_rate", "torque", "gamma", "beta_dot", "energy"):
+    for name in (
+        "t",
+        "quaternion",
+        "body_rate",
+        "torque",
+        "gamma",
+        "beta_dot",
+        "energy",
+    ):
         assert np.array_equal(getattr(part, name), getattr(run, name)[rows])
     middle = 0.5 * (part.t[0] + part.t[-1])
-    np.testing.assert_allclose(part.at(middle).gamma, run.at(middle).gamma, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        part.at(middle).gamma, run.at(middle).gamma, rtol=0, atol=1e-11
+    )
     for wrong in (3, slice(5, 5), slice(None, None, -1)):
         with pytest.raises(InputError, match=r"trajectory: (rows|t) = "):
             run[wrong]
@@ -189,10 +218,14 @@ def test_samples_under_held_torques_need_nothing_else():
     """As those of a recording: each torque is that of the interval that ends there."""
     times, torques = np.arange(11) / 100, [(0.1 * k, 0.5, -0.3) for k in range(10)]
     run, wanted = (
-        simulate(EXAMPLE2, TorqueTable(times[:10], torques), 0.1, t_eval=t, tolerance=1e-12)
+        simulate(
+            EXAMPLE2, TorqueTable(times[:10], torques), 0.1, t_eval=t, tolerance=1e-12
+        )
         for t in (times, [0.034567])
     )
-    found = Trajectory(EXAMPLE2, run.t, run.quaternion, run.body_rate, run.torque).at(0.034567)
+    found = Trajectory(EXAMPLE2, run.t, run.quaternion, run.body_rate, run.torque).at(
+        0.034567
+    )
     np.testing.assert_allclose(found.quaternion, wanted.quaternion, atol=1e-12)
     assert found.torque[0].tolist() == list(torques[3])
 
@@ -233,8 +266,12 @@ def test_misfits_are_refused(times, n, said):
         at_rest(times, n)
 
 
-@pytest.mark.parametrize("torque", [lambda t: (t, 0.0, 0.1), lambda t, state: (t, 0.0, 0.1)])
-def test_a_loaded_run_under_a_function_has_no_motion_between_its_samples(torque, tmp_path):
+@pytest.mark.parametrize(
+    "torque", [lambda t: (t, 0.0, 0.1), lambda t, state: (t, 0.0, 0.1)]
+)
+def test_a_loaded_run_under_a_function_has_no_motion_between_its_samples(
+    torque, tmp_path
+):
     pytest.importorskip("pyarrow", reason="files need pyarrow")
     run = simulate("example2", torque, 0.2, t_eval=[0.0, 0.1, 0.2])
     run.save(tmp_path / "run.parquet")

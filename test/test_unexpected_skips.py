@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A skip that nobody expects fails where CI=true; a failure names the command that repeats it."""
+"""A skip that nobody expects fails where CI=true.
+
+A failure names the command that repeats it.
+"""
 
 import re
 import shlex
@@ -24,7 +27,12 @@ MODULE = "import pytest\npytest.importorskip('no_such_module')\n"
 @pytest.mark.parametrize(
     ("source", "ci", "workers", "status"),
     [
-        (TEST.format(reason="no chromium with chromedriver on the PATH"), "true", (), 0),
+        (
+            TEST.format(reason="no chromium with chromedriver on the PATH"),
+            "true",
+            (),
+            0,
+        ),
         (TEST.format(reason="llvmlite is missing"), "true", (), 1),
         (TEST.format(reason="llvmlite is missing"), "true", ("-n", "1"), 1),
         (TEST.format(reason="llvmlite is missing"), "false", (), 0),
@@ -54,7 +62,11 @@ def test_a_failure_names_the_command_that_repeats_it_alone(pytester, workers):
     done = pytester.runpytest_inprocess("-q", "-p", "repeat_failures", *workers)
     (line,) = [line for line in done.stdout.lines if line.startswith("repeat: ")]
     again = subprocess.run(
-        line.removeprefix("repeat: "), shell=True, capture_output=True, text=True, timeout=60
+        line.removeprefix("repeat: "),
+        shell=True,
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     assert again.returncode == 1 and "1 failed in" in again.stdout, again.stdout
     assert shlex.split(line)[-1] == "test_it.py::test_fails[it's]"

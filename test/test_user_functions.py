@@ -46,7 +46,10 @@ RAISED = {
 
 
 def function_of(action, late, feedback):
-    """Torques that are smooth, until `action` is done at a time; with or without the state."""
+    """Torques that are smooth, until `action` is done at a time.
+
+    With or without the state.
+    """
 
     def torque(t, state=None):
         if t > late:
@@ -97,11 +100,15 @@ def test_one_exception_of_a_step_comes_out_and_the_state_stays():
     with pytest.raises(ZeroDivisionError, match="once"):
         run.step(torque, 1_000_000)
     assert run.state == before
-    assert run.step(torque, 1_000_000) == other.step(lambda t: (0.1, 0.0, 0.0), 1_000_000)
+    assert run.step(torque, 1_000_000) == other.step(
+        lambda t: (0.1, 0.0, 0.0), 1_000_000
+    )
 
 
 def test_a_result_that_is_not_finite_is_refused_or_rejects_the_step():
-    with pytest.raises(InputError, match=r"torque\(0\) = \(nan, 0, 0\): must be three finite"):
+    with pytest.raises(
+        InputError, match=r"torque\(0\) = \(nan, 0, 0\): must be three finite"
+    ):
         simulate(SWING, lambda t: (math.nan, 0, 0), 0.1)
 
 
@@ -117,12 +124,17 @@ def test_torques_that_switch_with_the_state_end_with_advice():
     """Each second of them had no end: the steps shrink at every crossing."""
     motion = simulate(SWING, switch, 0.3, tolerance=1e-10)
     assert motion.status == -1 and motion.evaluations <= 1_000_000
-    assert "give control_period" in motion.message and "smooth the switch" in motion.message
+    assert (
+        "give control_period" in motion.message
+        and "smooth the switch" in motion.message
+    )
     assert np.isfinite(motion.quaternion).all()
 
 
 def test_a_looser_tolerance_costs_less():
-    costs = [simulate(SWING, switch, 0.02, tolerance=tol).evaluations for tol in (1e-3, 1e-7)]
+    costs = [
+        simulate(SWING, switch, 0.02, tolerance=tol).evaluations for tol in (1e-3, 1e-7)
+    ]
     assert costs[0] < 0.5 * costs[1]
     assert costs[0] < 100_000
 
@@ -157,6 +169,10 @@ def test_the_first_use_may_be_in_threads_of_a_new_process(attempt):
 
 @pytest.mark.parametrize("name", ["plain", "no HOME", "read-only HOME"])
 def test_a_new_process_needs_no_home(name, tmp_path):
-    environments = {"plain": {}, "no HOME": {"HOME": ""}, "read-only HOME": {"HOME": "/proc"}}
+    environments = {
+        "plain": {},
+        "no HOME": {"HOME": ""},
+        "read-only HOME": {"HOME": "/proc"},
+    }
     code = "import sst_ros; print(sst_ros.simulate('swing', duration=0.1).status)"
     assert python(code, env=environments[name]).stdout.strip() == "0"

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values of wrong types and ranges at every public name: refused by an SstError, in a bounded time.
+"""Values of wrong types and ranges at every public name: refused by an SstError, in a
+bounded time.
 
 Functions that are thrown return wrong values; what they raise themselves is theirs.
 """
@@ -24,7 +25,24 @@ DICT["star"] = DICT
 NAN, INF = float("nan"), float("inf")
 SCENE, MOVING, REST = load_scene("example2"), load_scene("spiral"), (0.0, 0.0, 0.0)
 WRONG = [
-    *(NAN, INF, -INF, 1e308, 10**400, 10**5001, 2**64, True, 0, -1, 1, 2, 7, 1.5, -0.0, 0.1),
+    *(
+        NAN,
+        INF,
+        -INF,
+        1e308,
+        10**400,
+        10**5001,
+        2**64,
+        True,
+        0,
+        -1,
+        1,
+        2,
+        7,
+        1.5,
+        -0.0,
+        0.1,
+    ),
     *(
         1e-320,
         1e9,
@@ -35,16 +53,75 @@ WRONG = [
         np.uint64(2**63),
         np.bool_(1),
     ),
-    *((), [], [[]], [None], ["a"], [1, 2], [1, 2, 3], (0, 0, 0, 0), [0, 0, 0, "a"], [10**400] * 3),
-    *([1e-300] * 3, [[1, 2], [3]], [NAN] * 3, np.eye(3), np.zeros((0, 3)), np.zeros((2, 2, 3))),
-    *(np.array("1"), np.array([None, 1]), np.datetime64("2026-01-01"), range(3), slice(1)),
-    *("", "1", "x", "\0", "\ud800", b"1", "a/b.yaml", Path("/"), Path("x.npz"), "example2"),
+    *(
+        (),
+        [],
+        [[]],
+        [None],
+        ["a"],
+        [1, 2],
+        [1, 2, 3],
+        (0, 0, 0, 0),
+        [0, 0, 0, "a"],
+        [10**400] * 3,
+    ),
+    *(
+        [1e-300] * 3,
+        [[1, 2], [3]],
+        [NAN] * 3,
+        np.eye(3),
+        np.zeros((0, 3)),
+        np.zeros((2, 2, 3)),
+    ),
+    *(
+        np.array("1"),
+        np.array([None, 1]),
+        np.datetime64("2026-01-01"),
+        range(3),
+        slice(1),
+    ),
+    *(
+        "",
+        "1",
+        "x",
+        "\0",
+        "\ud800",
+        b"1",
+        "a/b.yaml",
+        Path("/"),
+        Path("x.npz"),
+        "example2",
+    ),
     *(lambda: 0, lambda t: 0, lambda t: "abc", lambda t: (1, 2), lambda state, t: 0),
-    *(["1", "2", "3"], [1, 2, 3, 4, 5, 6, 7], bytearray(b"12"), type(SCENE), pytest, "a" * 5000),
-    *(None, object(), Ellipsis, set(), {}, {"star": {}}, {1: 2}, {"a": [1]}, LIST, DICT),
+    *(
+        ["1", "2", "3"],
+        [1, 2, 3, 4, 5, 6, 7],
+        bytearray(b"12"),
+        type(SCENE),
+        pytest,
+        "a" * 5000,
+    ),
+    *(
+        None,
+        object(),
+        Ellipsis,
+        set(),
+        {},
+        {"star": {}},
+        {1: 2},
+        {"a": [1]},
+        LIST,
+        DICT,
+    ),
     *(10**18, range(10**12), [range(10**12)] * 3, {"gamma": range(10**12)}, dict, list),
 ]
-TASK = {"scene": SCENE, "torque": REST, "duration": 0.01, "initial": None, "t_eval": None}
+TASK = {
+    "scene": SCENE,
+    "torque": REST,
+    "duration": 0.01,
+    "initial": None,
+    "t_eval": None,
+}
 TASK |= {
     "samples": None,
     "method": "auto",
@@ -53,10 +130,24 @@ TASK |= {
     "breaks": (),
     "max_step": None,
 }
-PROOF = {name: TASK[name] for name in ("scene", "torque", "duration", "initial", "t_eval")}
+PROOF = {
+    name: TASK[name] for name in ("scene", "torque", "duration", "initial", "t_eval")
+}
 PROOF |= {"bound": 1e-9, "ranges": None, "progress": False}
-STUDY = {"scene": SCENE, "vary": {"star.inertia.zz": [0.26, 0.27]}, "duration": 0.01, "n": 2}
-STUDY |= {"seed": 0, "out": None, "client": None, "workers": 1, "resume": False, "progress": False}
+STUDY = {
+    "scene": SCENE,
+    "vary": {"star.inertia.zz": [0.26, 0.27]},
+    "duration": 0.01,
+    "n": 2,
+}
+STUDY |= {
+    "seed": 0,
+    "out": None,
+    "client": None,
+    "workers": 1,
+    "resume": False,
+    "progress": False,
+}
 
 
 def push_back(state):
@@ -75,9 +166,13 @@ def calls():
     run, motion = simulate(**TASK), sst_ros.reference_motion(MOVING)
     inverse, batch = sst_ros.InverseDynamics(SCENE), Batch(SCENE)
     controller = sst_ros.Controller(MOVING, motion, settings, 1e-3)
-    rows = {name: getattr(run, name) for name in ("t", "quaternion", "body_rate", "torque")}
+    rows = {
+        name: getattr(run, name) for name in ("t", "quaternion", "body_rate", "torque")
+    }
     data = {name: getattr(run, name) for name in ("t", "gamma", "torque", "gamma_dot")}
-    fit = of(method="inverse_dynamics", scene=SCENE, parameters=None, cutoff=None, noise=None)
+    fit = of(
+        method="inverse_dynamics", scene=SCENE, parameters=None, cutoff=None, noise=None
+    )
     start = of(gamma=run.gamma[:3], gamma_dot=REST, torque=REST, step=1e-3, count=2)
     push = of(torque=REST, dt_ns=1000, moment=REST)
     measured = Measurement(MOVING.initial.gamma, REST)
@@ -160,7 +255,9 @@ def test_nothing_but_an_sst_error_comes_out(calls, seed, tmp_path, monkeypatch):
     try:
         for number in range(2000):
             function, right = calls[number % len(calls)]
-            names = chosen.sample(sorted(right), min(len(right), chosen.choice([1, 1, 1, 2])))
+            names = chosen.sample(
+                sorted(right), min(len(right), chosen.choice([1, 1, 1, 2]))
+            )
             given = right | {name: chosen.choice(WRONG) for name in names}
             signal.alarm(60)
             try:
@@ -169,7 +266,10 @@ def test_nothing_but_an_sst_error_comes_out(calls, seed, tmp_path, monkeypatch):
                 assert str(error)
             except Exception as error:
                 wrong = {name: Problem(name, given[name], "") for name in names}
-                pytest.fail(f"{function}: {type(error).__name__} of {[*map(str, wrong.values())]}")
+                pytest.fail(
+                    f"{function}: {type(error).__name__} of"
+                    f" {[*map(str, wrong.values())]}"
+                )
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
@@ -214,7 +314,9 @@ def test_what_is_given_stands_in_the_message():
 def test_each_public_name_is_thrown_at(calls):
     thrown = [function for function, _ in calls]
     others = {name for name in sst_ros.__all__ if getattr(sst_ros, name) not in thrown}
-    errors = {name for name in others if name.endswith(("Error", "Stopped", "Configuration"))}
+    errors = {
+        name for name in others if name.endswith(("Error", "Stopped", "Configuration"))
+    }
     # A version, what gives others by methods above, and what only results have.
     results = {
         "Equations",

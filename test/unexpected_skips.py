@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""With CI=true, a test that is skipped for a reason that is not listed here fails the session."""
+"""With CI=true, a test that is skipped for a reason that is not listed here fails the
+session.
+"""
 
 import os
 
@@ -17,14 +19,20 @@ ALLOWED = (
 
 
 class UnexpectedSkips:
-    """Collects skipped tests and modules, and fails the session if one of them should run."""
+    """Collects skipped tests and modules, and fails the session if one of them should
+    run.
+    """
 
     def __init__(self):
         self.found = []
 
     def pytest_runtest_logreport(self, report):
         if report.skipped and not hasattr(report, "wasxfail"):
-            reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
+            reason = (
+                report.longrepr[2]
+                if isinstance(report.longrepr, tuple)
+                else report.longrepr
+            )
             if not any(allowed in str(reason) for allowed in ALLOWED):
                 self.found.append(f"{report.nodeid}: {reason}")
 

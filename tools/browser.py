@@ -14,9 +14,9 @@ from typing import Any
 from sst_ros.errors import SstError
 
 _FLAGS = (
-    "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--disable-background-networking --disable-component-update --disable-sync --no-first-run "
-    "--hide-scrollbars"
+    "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader"
+    " --disable-background-networking --disable-component-update --disable-sync"
+    " --no-first-run --hide-scrollbars"
 )
 _TIMEOUT_S = 120.0
 """Bound of every wait: without a graphics card a busy machine draws a frame in seconds."""
@@ -39,14 +39,19 @@ class Browser:
         self._driver.get("about:blank")
         self._driver.set_window_size(*size)
         # The window has borders; what counts is the page.
-        inner = self._driver.execute_script("return [window.innerWidth, window.innerHeight]")
+        inner = self._driver.execute_script(
+            "return [window.innerWidth, window.innerHeight]"
+        )
         self._driver.set_window_size(2 * size[0] - inner[0], 2 * size[1] - inner[1])
         self.complaints()
         self._driver.get(url)
 
     def text(self, selector: str) -> str:
         """Text of the element that a CSS selector finds; empty where there is none."""
-        script = "const e = document.querySelector(arguments[0]); return e ? e.textContent : ''"
+        script = (
+            "const e = document.querySelector(arguments[0]); return e ? e.textContent"
+            " : ''"
+        )
         return str(self._driver.execute_script(script, selector))
 
     def title(self) -> str:
@@ -94,7 +99,9 @@ class Browser:
         )
         self._driver.execute_async_script(script)
 
-    def until(self, holds: Callable[[], bool], what: str, timeout: float = _TIMEOUT_S) -> None:
+    def until(
+        self, holds: Callable[[], bool], what: str, timeout: float = _TIMEOUT_S
+    ) -> None:
         """Wait for a condition.
 
         Raises:
@@ -115,7 +122,8 @@ class Browser:
 
         def succeeded() -> bool:
             nonlocal taken
-            with suppress(TimeoutException):  # the driver waits 10 s, a busy machine may need more
+            # the driver waits 10 s, a busy machine may need more
+            with suppress(TimeoutException):
                 taken = bytes(self._driver.get_screenshot_as_png())
             return bool(taken)
 
@@ -128,7 +136,11 @@ class Browser:
     def complaints(self) -> list[str]:
         """Return the errors on the browser's console since the last call."""
         entries = self._driver.get_log("browser")
-        return [entry["message"] for entry in entries if entry["level"] in ("SEVERE", "ERROR")]
+        return [
+            entry["message"]
+            for entry in entries
+            if entry["level"] in ("SEVERE", "ERROR")
+        ]
 
 
 @contextmanager
@@ -144,7 +156,9 @@ def browse() -> Iterator[Browser]:
 
     found = chromium()
     if found is None:
-        raise SstError("no chromium with chromedriver on the PATH: apt install chromium-driver")
+        raise SstError(
+            "no chromium with chromedriver on the PATH: apt install chromium-driver"
+        )
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         options = webdriver.ChromeOptions()
         options.binary_location = found[0]

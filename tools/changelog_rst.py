@@ -14,7 +14,10 @@ _RELEASE = re.compile(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", re.M)
 
 
 def text(markdown: str) -> str:
-    """Convert the released sections of a changelog after Keep a Changelog; others stay out."""
+    """Convert the released sections of a changelog after Keep a Changelog.
+
+    Others stay out.
+    """
     title = "Changelog for package sst_ros"
     parts = [f"{'^' * len(title)}\n{title}\n{'^' * len(title)}\n"]
     found = _RELEASE.split(markdown)
@@ -29,7 +32,9 @@ def _body(markdown: str) -> str:
     """Headings become bold paragraphs: catkin_pkg leaves nested sections out."""
     out = re.sub(r"^### (.*)$", r"**\1**", markdown, flags=re.M)
     out = re.sub(r"\[([^\]]+)\]\((http[^)]+)\)", r"`\1 <\2>`__", out)
-    return re.sub(r"(?<!`)`([^`<]+)`(?!_)", lambda code: f"``{' '.join(code[1].split())}``", out)
+    return re.sub(
+        r"(?<!`)`([^`<]+)`(?!_)", lambda code: f"``{' '.join(code[1].split())}``", out
+    )
 
 
 def main() -> None:

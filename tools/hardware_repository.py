@@ -3,8 +3,9 @@
 
     python -m tools.hardware_repository ../sst_ros_hardware
 
-It has the package at its root, its licence, and one commit with the tag of its version. In a folder
-that is such a repository already, the commit of the new version follows the earlier ones.
+It has the package at its root, its licence, and one commit with the tag of its version.
+In a folder that is such a repository already, the commit of the new version follows the
+earlier ones.
 """
 
 from __future__ import annotations
@@ -30,13 +31,17 @@ def make(folder: Path) -> str:
     version = ET.parse(SOURCE / "package.xml").findtext("version")
 
     def git(*words: str) -> str:
-        done = subprocess.run(["git", "-C", folder, *words], stdout=subprocess.PIPE, check=True)
+        done = subprocess.run(
+            ["git", "-C", folder, *words], stdout=subprocess.PIPE, check=True
+        )
         return done.stdout.decode()
 
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / ".git").exists():
         if any(folder.iterdir()):
-            raise SystemExit(f"{folder}: must be a new folder or a repository of {name}")
+            raise SystemExit(
+                f"{folder}: must be a new folder or a repository of {name}"
+            )
         git("init", "--quiet", "--initial-branch", "main")
     if f"{version}\n" in git("tag"):
         raise SystemExit(f"{folder}: version {version} is there already")

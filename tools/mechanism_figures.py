@@ -3,7 +3,8 @@
 
     python -m tools.mechanism_figures [FOLDER]
 
-All directions come from the kinematics of one pose of the paper's isotropic manipulator.
+All directions come from the kinematics of one pose of the paper's isotropic
+manipulator.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ VIEW = (1.0, 0.72, 0.42)
 HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
 
 
-def great_circle(start: Array, end: Array, share: float = 1.0, points: int = 60) -> Array:
+def great_circle(
+    start: Array, end: Array, share: float = 1.0, points: int = 60
+) -> Array:
     """Points of the great circle from one unit vector towards another, shape (points, 3)."""
     angle = np.arccos(np.clip(start @ end, -1.0, 1.0))
     across = end - (start @ end) * start
@@ -67,7 +70,13 @@ class SphereDrawing:
               width: float = 1.4) -> None:  # fmt: skip
         """Draw a vector with its name beside its tip."""
         a, b = self.flat(start), self.flat(end)
-        style = {"arrowstyle": "-|>", "color": colour, "lw": width, "shrinkA": 0, "shrinkB": 0}
+        style = {
+            "arrowstyle": "-|>",
+            "color": colour,
+            "lw": width,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
         self.axes.annotate("", (b[0], b[1]), (a[0], a[1]), arrowprops=style)
         self.text(end, label, shift, colour)
 
@@ -82,7 +91,9 @@ class SphereDrawing:
         """Explain lines below the drawing: colour, width, style, text of each."""
         for colour, width, style, label in entries:
             self.axes.plot([], [], color=colour, lw=width, ls=style, label=label)
-        self.axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.02), frameon=False, fontsize=10)
+        self.axes.legend(
+            loc="upper center", bbox_to_anchor=(0.5, 0.02), frameon=False, fontsize=10
+        )
 
     def outward(self, at: Array, length: float) -> Array:
         """Return the projected direction from the centre to a point, scaled to a length."""
@@ -136,14 +147,22 @@ def geometry_picture() -> Figure:
     sheet.arrow(origin, r[0], INK, "$\\mathbf{r}_1$", (-0.28, 0.13))
     sheet.arrow(origin, 0.55 * geometry.w[0], BLUE, "$\\mathbf{w}_1$", (0.08, 0.02))
     sheet.arrow(origin, 0.55 * t[0], VERMILION, "$\\mathbf{t}_1$", (0.06, -0.045))
-    sheet.text(great_circle(geometry.v[0], r[0])[34], "$\\gamma_1$", (-0.02, -0.085), BLUE, 15)
+    sheet.text(
+        great_circle(geometry.v[0], r[0])[34], "$\\gamma_1$", (-0.02, -0.085), BLUE, 15
+    )
     sheet.text(great_circle(s, r[0])[28], "$\\beta_1$", (0.085, -0.05), VERMILION, 15)
     for k, label in ((1, "$\\gamma_2$"), (2, "$\\gamma_3$")):
         middle = great_circle(geometry.v[k], r[k])[30]
         sheet.text(middle, label, sheet.outward(middle, 0.1), BLUE, 15)
     _angle(sheet, s, r[0], r[1], 0.13, "$\\alpha_1$", 0.24, (0.02, 0.0))
     _angle(sheet, r[0], geometry.v[0], s, 0.13, "$\\mu_1$", 0.13, (-0.16, -0.015))
-    shifts = ((0.03, 0.08), (0.085, -0.06), (0.11, -0.01), (-0.07, 0.085), (-0.06, -0.06))
+    shifts = (
+        (0.03, 0.08),
+        (0.085, -0.06),
+        (0.11, -0.01),
+        (-0.07, 0.085),
+        (-0.06, -0.06),
+    )
     for at, name, shift in zip(
         (s, *r, origin), ("E", "R_1", "R_2", "R_3", "O"), shifts, strict=True
     ):
@@ -162,7 +181,9 @@ def frames_picture() -> Figure:
     figure = Figure(figsize=(7.0, 6.4), layout="constrained")
     sheet = SphereDrawing(figure.subplots(), VIEW)
     _mechanism(sheet, labels=False)
-    base = np.stack([geometry.v[0], np.cross(geometry.w[0], geometry.v[0]), geometry.w[0]])
+    base = np.stack(
+        [geometry.v[0], np.cross(geometry.w[0], geometry.v[0]), geometry.w[0]]
+    )
     for end, colour, name, shift in (
         (1.12 * base[0], BLUE, "$x$ along $v_1$", (-0.05, -0.07)),
         (1.12 * base[1], BLUE, "$y$", (0.08, -0.02)),
@@ -194,10 +215,14 @@ def leg_frames_picture() -> Figure:
         ("{2k}, intermediate link: {1k} turned by $-\\mu_k$ about x", second[0], VERMILION,
          ("$r_k$", "$t_k \\times r_k$", "$t_k$")),
     )  # fmt: skip
-    for axes, (title, frame, colour, names) in zip(figure.subplots(1, 3), frames, strict=True):
+    for axes, (title, frame, colour, names) in zip(
+        figure.subplots(1, 3), frames, strict=True
+    ):
         sheet = SphereDrawing(axes, [0.9, 0.95, 0.55], outline=False)
         sheet.curve(great_circle(geometry.v[0], geometry.v[1]), color="#bbbbbb", lw=2.0)
-        sheet.curve(great_circle(at.rotation[:, 2], at.r[0], 1.3), color="#f0b890", lw=2.0)
+        sheet.curve(
+            great_circle(at.rotation[:, 2], at.r[0], 1.3), color="#f0b890", lw=2.0
+        )
         sheet.axes.plot(*sheet.flat(at.r[0]), "s", color=INK, ms=6)
         sheet.text(at.r[0], "$R_k$", (0.2, 0.03), INK, 12)
         for axis, letter, name in zip(frame.T, "xyz", names, strict=True):
@@ -225,7 +250,9 @@ def planes_picture() -> Figure:
         sheet.axes.plot(flat[:, 0], flat[:, 1], ".", color="#cfe3f0", ms=2.5, zorder=0)
         for k in range(3):
             v, after = geometry.v[k], geometry.v[(k + 1) % 3]
-            sheet.curve(great_circle(v, after), color=BLUE if k < count else "#bbbbbb", lw=2.4)
+            sheet.curve(
+                great_circle(v, after), color=BLUE if k < count else "#bbbbbb", lw=2.4
+            )
             sheet.curve([v, np.zeros(3)], color=GREY, lw=0.8, ls=":")
             sheet.text(v, f"$P_{k + 1}$", sheet.outward(v, 0.13), INK, 11)
         sheet.axes.plot(*sheet.flat(s), "o", color=VERMILION, ms=7)
@@ -244,14 +271,22 @@ def _grid(count: int = 9000) -> Array:
 
 
 STEPS = (
-    ("torques, initial $\\dot\\gamma$, initial $\\gamma$", "scene, Simulation.step", ""),
+    (
+        "torques, initial $\\dot\\gamma$, initial $\\gamma$",
+        "scene, Simulation.step",
+        "",
+    ),
     ("direct kinematics", "kinematics.direct", "up to 8 orientations"),
     ("admissible solution", "kinematics.admissible", "Eq. 4"),
     ("direct velocity analysis", "virtual_work.posture", "Eqs. 9 to 23"),
     ("direct acceleration analysis", "virtual_work.bias", "Eqs. 24 to 49"),
     ("direct link Jacobian matrices", "virtual_work.link_jacobians", "Eqs. 50 to 62"),
     ("dynamics equations", "virtual_work.equation_of_motion", "Eqs. 63 to 92"),
-    ("$\\ddot\\gamma$, integrated to the motion", "virtual_work.direct_dynamics", "Eq. 90"),
+    (
+        "$\\ddot\\gamma$, integrated to the motion",
+        "virtual_work.direct_dynamics",
+        "Eq. 90",
+    ),
 )
 """The steps of Fig. 7, the functions that take them, and their equations."""
 
@@ -268,7 +303,9 @@ def flow_chart() -> Figure:
                            facecolor="#eaf2f8", edgecolor=BLUE)
         )  # fmt: skip
         axes.text(1.8, y, step, ha="center", va="center", fontsize=11)
-        axes.text(3.85, y + 0.1, function, va="center", fontsize=9.5, family="monospace")
+        axes.text(
+            3.85, y + 0.1, function, va="center", fontsize=9.5, family="monospace"
+        )
         axes.text(3.85, y - 0.15, equations, va="center", fontsize=9, color=GREY)
         if row:
             axes.annotate("", (1.8, y + 0.33), (1.8, y + 0.67), arrowprops=arrow)

@@ -54,7 +54,9 @@ def hardware_package(text: str) -> str:
     lines = {name: re.findall(rf"^  <{name}\b.*\n", package(), re.M) for name in SHARED}
     for name in SHARED:
         text = re.sub(rf"^  <{name}\b.*\n", "", text, flags=re.M)
-    above, description, below = re.split(r"^(  <description>.*\n)", text, maxsplit=1, flags=re.M)
+    above, description, below = re.split(
+        r"^(  <description>.*\n)", text, maxsplit=1, flags=re.M
+    )
     after = "".join(line for name in SHARED[1:] for line in lines[name])
     return above + "".join(lines["version"]) + description + after + below
 
@@ -77,8 +79,12 @@ def placeholders() -> list[str]:
 
 def main() -> int:
     """Write the files, or tell what is not filled in; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m tools.metadata", description=__doc__)
-    parser.add_argument("--filled", action="store_true", help="fail where package.xml has marks")
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.metadata", description=__doc__
+    )
+    parser.add_argument(
+        "--filled", action="store_true", help="fail where package.xml has marks"
+    )
     if parser.parse_args().filled:
         for line in placeholders():
             print(f"package.xml: {line}: must be filled in", file=sys.stderr)

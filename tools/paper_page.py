@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the places in the code into docs/paper.md: `python -m tools.paper_page`.
 
-They are read from the equation numbers in comments and docstrings of `sst_ros/mechanism`, so a
-renamed function changes the page and a missing number stops it. A row of the table:
+They are read from the equation numbers in comments and docstrings of
+`sst_ros/mechanism`, so a renamed function changes the page and a missing number stops
+it. A row of the table:
 
     | 4 | $w_k^T s > 0$ | As printed. | `kinematics.direct` |
 """
@@ -35,13 +36,20 @@ def places() -> dict[int, str]:
     for path in sorted((ROOT / "sst_ros" / "mechanism").glob("*.py")):
         source = path.read_text(encoding="utf-8")
         tree = ast.parse(source)
-        owners = [node for node in tree.body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+        owners = [
+            node
+            for node in tree.body
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+        ]
         for line, text in enumerate(source.splitlines(), 1):
-            owner = next((o for o in owners if o.lineno <= line <= (o.end_lineno or 0)), None)
+            owner = next(
+                (o for o in owners if o.lineno <= line <= (o.end_lineno or 0)), None
+            )
             if owner is None:
                 continue
             for number, width in numbers(text):
-                # Among equal widths the paper's own file wins over the helpers around it.
+                # Among equal widths the paper's own file wins over the helpers around
+                # it.
                 rank = width if path.stem == "virtual_work" else 2 * width
                 if number not in found or rank < found[number][0]:
                     found[number] = rank, f"`{path.stem}.{owner.name}`"

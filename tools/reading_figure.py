@@ -38,8 +38,18 @@ INERTIAS = {
 ZYZ = "theta", "phi", "psi"
 RATE = {"initial.gamma_dot": r"\dot{\gamma}"}
 PANELS = (
-    ("Fig. 9: ψ of Example 1; the initial rate is lost as well", "example1", ("psi",), True),
-    ("Figs. 12 to 14: θ, φ, ψ of Example 2", "example2", ("theta", "phi", "psi"), False),
+    (
+        "Fig. 9: ψ of Example 1; the initial rate is lost as well",
+        "example1",
+        ("psi",),
+        True,
+    ),
+    (
+        "Figs. 12 to 14: θ, φ, ψ of Example 2",
+        "example2",
+        ("theta", "phi", "psi"),
+        False,
+    ),
     ("Figs. 10, 11: position of E in Example 2", "example2", ("x", "y", "z"), False),
 )
 LEAST, MOST = 1e-3, 1e2
@@ -49,8 +59,8 @@ LEAST, MOST = 1e-3, 1e2
 def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str], Array]:
     """Return the combinations of an example's lost numbers, and their relative deviations.
 
-    Readings are of ZYZ angles, or of coordinates of E, whose error is that of an angle by the
-    radius.
+    Readings are of ZYZ angles, or of coordinates of E, whose error is that of an angle
+    by the radius.
     """
     scene = load(name)
     words = INERTIAS | (RATE if rate else {})
@@ -58,7 +68,8 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
     motion = simulate(scene, t_eval=t, sensitivities=[*words])
     rotation = rotation_matrix(motion.quaternion)
     if read == ("x", "y", "z"):
-        by_turn = rotation @ np.cross(np.eye(3), [0.0, 0.0, 1.0]).T  # of R z by turns in {E}
+        # of R z by turns in {E}
+        by_turn = rotation @ np.cross(np.eye(3), [0.0, 0.0, 1.0]).T
     else:
         h = 1e-5  # of central differences [rad]: rounding and truncation are below 1e-9
         turns = Rotation.from_rotvec(h * np.vstack([np.eye(3), -np.eye(3)])).as_matrix()
@@ -67,10 +78,15 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
         by_turn = angles[:, [ZYZ.index(key) for key in read]]
     # All legs alike: derivatives add up.
     slopes = np.stack(
-        [find_number(scene, key) * motion.sensitivities[key].rotation.sum(axis=2) for key in words],
+        [
+            find_number(scene, key) * motion.sensitivities[key].rotation.sum(axis=2)
+            for key in words
+        ],
         axis=2,
     )
-    _, singular, rows = np.linalg.svd((by_turn @ slopes).reshape(-1, len(words)) / ERROR)
+    _, singular, rows = np.linalg.svd(
+        (by_turn @ slopes).reshape(-1, len(words)) / ERROR
+    )
     relative = 1.0 / np.maximum(singular, 1e-9)
     labels = (describe_combination(row, tuple(words.values())) for row in rows)
     powers = [re.sub(r"(\S+)\^([+-][\d.]+)", r"$\1^{\2}$", label) for label in labels]
@@ -81,19 +97,23 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
 def draw_determined(panels: Sequence[tuple[str, Sequence[str], Array]]) -> Figure:
     """Draw how well readings determine combinations of parameters, a panel for each figure read.
 
-    A panel has a title, labels of the combinations and their relative standard deviations, rising;
-    those beyond MOST are counted below the others.
+    A panel has a title, labels of the combinations and their relative standard
+    deviations, rising; those beyond MOST are counted below the others.
     """
     known = [int(np.sum(deviations < MOST)) for _, _, deviations in panels]
     both = zip(known, panels, strict=True)
     rows = [count + (count < len(labels)) for count, (_, labels, _) in both]
     figure = Figure(figsize=(8.2, 1.2 + 0.3 * sum(rows) + 0.45 * len(rows)))
-    grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=rows)[:, 0]
+    grid = figure.subplots(
+        len(panels), 1, sharex=True, squeeze=False, height_ratios=rows
+    )[:, 0]
     every = zip(grid, known, rows, panels, strict=True)
     for axes, count, size, (name, labels, deviations) in every:
         places, shown = np.arange(count), deviations[:count]
         colours = [BLUE if value < 1.0 else GREY for value in shown]
-        axes.barh(places, shown - LEAST, left=LEAST, height=0.62, log=True, color=colours)
+        axes.barh(
+            places, shown - LEAST, left=LEAST, height=0.62, log=True, color=colours
+        )
         for place, value in zip(places.tolist(), shown.tolist(), strict=True):
             text = f"{value:.1%}" if value < 1.0 else "open"
             white = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of reference pages and the SROS2 policies, from the declarations that the program runs by.
 
-`python -m tools.reference_pages` writes them, the tables between the marks of each page, as in
+`python -m tools.reference_pages` writes them, the tables between the marks of each
+page, as in
 
     <!-- begin recorder parameters -->
     | parameter | default | allowed | set at run time | what |
@@ -24,7 +25,14 @@ from pandas import DataFrame
 from benchmark import measure
 from sst_ros.cli import commands
 from sst_ros.nodes import inverse_dynamics, simulation_interfaces, topics
-from sst_ros.nodes.topics import CALLS, EXECUTES, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
+from sst_ros.nodes.topics import (
+    CALLS,
+    EXECUTES,
+    PUBLISHES,
+    SERVES,
+    SUBSCRIBES,
+    Endpoint,
+)
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
 from sst_ros.report.results import markdown
 from sst_ros.runtime import run_loop, settings
@@ -36,8 +44,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SIMULATOR = "sst_simulator"
 LOG_AND_EVENTS = ("/rosout", "/parameter_events")
 PARAMETER_SERVICES = (
-    "describe_parameters get_parameter_types get_parameters get_type_description list_parameters "
-    "set_parameters set_parameters_atomically"
+    "describe_parameters get_parameter_types get_parameters get_type_description"
+    " list_parameters set_parameters set_parameters_atomically"
 )
 SIMULATION_INTERFACES = simulation_interfaces.SERVICES
 
@@ -52,7 +60,9 @@ class Described(NamedTuple):
 
 
 NODES = tuple(
-    Described(command, f"sst_{command}", parameters, tuple(topics.NODES[command].values()))
+    Described(
+        command, f"sst_{command}", parameters, tuple(topics.NODES[command].values())
+    )
     for command, (_, parameters) in settings.COMMANDS.items()
 )
 
@@ -64,7 +74,9 @@ def commands_tables() -> Iterator[tuple[str, str]]:
     for name, entry in commands.COMMANDS.items():
         if not isinstance(entry, str):
             rows = [*map(_argument_row, entry.arguments)]
-            arguments_of = _table(("argument", "what"), rows) if rows else "No arguments.\n"
+            arguments_of = (
+                _table(("argument", "what"), rows) if rows else "No arguments.\n"
+            )
             text += f"## {name}\n\n{entry.what[:1].upper()}{entry.what[1:]}.\n\n{arguments_of}\n"
     yield "commands", text
 
@@ -85,7 +97,10 @@ def columns_tables() -> Iterator[tuple[str, str]]:
     """Yield the parts of docs/columns.md: name and text."""
     yield "times", _columns(TIMES)
     for name, sources in TABLES.items():
-        yield name, _columns([column for source in sources for column in source.columns])
+        yield (
+            name,
+            _columns([column for source in sources for column in source.columns]),
+        )
 
 
 def _columns(listed: Iterable[Column]) -> str:
@@ -139,14 +154,26 @@ def nodes_tables() -> Iterator[tuple[str, str]]:
         ("diagnostics", run_loop.KEYS),
         ("inverse_dynamics diagnostics", inverse_dynamics.KEYS),
     ):
-        yield name, _table(("key", "what"), ((f"`{key}`", text) for key, text in keys.items()))
+        yield (
+            name,
+            _table(("key", "what"), ((f"`{key}`", text) for key, text in keys.items())),
+        )
     heads = ("parameter", "default", "allowed", "set at run time", "what")
     for node in NODES:
-        yield f"{node.command} parameters", _table(heads, _parameter_rows(node.parameters))
+        yield (
+            f"{node.command} parameters",
+            _table(heads, _parameter_rows(node.parameters)),
+        )
         rows = [*_endpoint_rows(node.endpoints)]
         if node.command == "recorder":
-            rows = [("subscribes", f"`{topic}`", "as published", "") for topic in default_topics()]
-        yield f"{node.command} topics and services", _table(("use", "name", "type", "what"), rows)
+            rows = [
+                ("subscribes", f"`{topic}`", "as published", "")
+                for topic in default_topics()
+            ]
+        yield (
+            f"{node.command} topics and services",
+            _table(("use", "name", "type", "what"), rows),
+        )
 
 
 PAGES = {

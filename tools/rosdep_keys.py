@@ -4,7 +4,8 @@
     git clone https://github.com/ros/rosdistro
     python -m tools.rosdep_keys rosdistro
 
-A key is a package that a distribution of ROS releases, or the system's package of that name.
+A key is a package that a distribution of ROS releases, or the system's package of that
+name.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ HEAD = """\
 def keys() -> list[str]:
     """List the keys of all packages of this repository, each once."""
     texts = [path.read_text(encoding="utf-8") for path in PACKAGES]
-    found = {key for text in texts for key in re.findall(r"_?depend[^>]*>([\w-]+)</", text)}
+    found = {
+        key for text in texts for key in re.findall(r"_?depend[^>]*>([\w-]+)</", text)
+    }
     return sorted(found)
 
 
@@ -58,7 +61,9 @@ def table(folder: Path) -> dict[str, Any]:
     """Read what each key is from a copy of ros/rosdistro."""
 
     def git(*words: str) -> str:
-        done = subprocess.run(["git", "-C", folder, *words], stdout=subprocess.PIPE, check=True)
+        done = subprocess.run(
+            ["git", "-C", folder, *words], stdout=subprocess.PIPE, check=True
+        )
         return done.stdout.decode()
 
     def document(path: str) -> Any:
@@ -82,7 +87,9 @@ def table(folder: Path) -> dict[str, Any]:
             if released.get(key):
                 known[distribution] = released[key]
             elif key in rules:
-                known[distribution] = [*platforms_of(rules[key], platforms[distribution])]
+                known[distribution] = [
+                    *platforms_of(rules[key], platforms[distribution])
+                ]
     return {"commit": commit, "date": date, "platforms": platforms, "keys": found}
 
 

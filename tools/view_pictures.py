@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of the page: `python -m tools.view_pictures`, then docs/mechanism.png or docs/view.webp.
 
-The picture shows the mechanism as built. The frames of the paper have their origins at O; {1k},
-{2k} and {E} are drawn on their links, where they can be distinguished; axes are x red, y green,
-z blue. The film shows what `make view` does, of a run in slow motion, so that it is as smooth as
-the motion is, however slowly a machine without graphics draws.
+The picture shows the mechanism as built. The frames of the paper have their origins at
+O; {1k}, {2k} and {E} are drawn on their links, where they can be distinguished; axes
+are x red, y green, z blue. The film shows what `make view` does, of a run in slow
+motion, so that it is as smooth as the motion is, however slowly a machine without
+graphics draws.
 """
 
 from __future__ import annotations
@@ -52,7 +53,10 @@ def picture(path: Path) -> None:
         _build(server, scene)
         with browse() as page:
             page.open(server.url, SIZE)
-            page.hide(".mantine-Notification-root, .mantine-Paper-root, .mantine-ActionIcon-root")
+            page.hide(
+                ".mantine-Notification-root, .mantine-Paper-root,"
+                " .mantine-ActionIcon-root"
+            )
             for _ in range(10):
                 page.drawn()
             taken = Image.open(io.BytesIO(page.picture())).convert("RGB")
@@ -95,7 +99,11 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
     places = {BASE: ("{B}", np.zeros(3), 0.42), STAR: ("{E}", 1.05 * end, 0.24)}
     for k in LEGS:
         places[ACTUATED[k - 1]] = (f"{{1{k}}}", bar, 0.15)
-        places[INTERMEDIATE[k - 1]] = (f"{{2{k}}}", 1.07 * star * np.array([1.0, 0.0, 0.0]), 0.15)
+        places[INTERMEDIATE[k - 1]] = (
+            f"{{2{k}}}",
+            1.07 * star * np.array([1.0, 0.0, 0.0]),
+            0.15,
+        )
     for link, (name, position, length) in places.items():
         node = f"/manipulator/{link}/axes"
         server.scene.add_frame(
@@ -128,13 +136,19 @@ def film(path: Path) -> None:
                 raise SstError("`view` printed no address")
             with browse() as page:
                 page.open(found.group(), FILM_SIZE)
-                taken = [Image.open(io.BytesIO(png)).convert("RGB") for png in _pictures(page)]
+                taken = [
+                    Image.open(io.BytesIO(png)).convert("RGB")
+                    for png in _pictures(page)
+                ]
         finally:
             process.send_signal(signal.SIGINT)
     first, *others = (_shrink(picture, FILM_WIDTH) for picture in taken)
     first.save(path, save_all=True, append_images=others, duration=1000 // RATE, loop=0,
                quality=_QUALITY, method=6)  # fmt: skip
-    print(f"{path}: {len(taken)} frames, {path.stat().st_size / 1e6:.2f} MB, {date.today()}")
+    print(
+        f"{path}: {len(taken)} frames, {path.stat().st_size / 1e6:.2f} MB,"
+        f" {date.today()}"
+    )
 
 
 def _pictures(page: Browser) -> list[bytes]:

@@ -47,12 +47,20 @@ def run_apart(part: str, share: float, seed: int, patience: float) -> Ledger:
 
 def main() -> int:
     """Run the campaign; exit with 1 where anything was found."""
-    parser = argparse.ArgumentParser(description=__doc__, prog="python -m benchmark.campaign")
+    parser = argparse.ArgumentParser(
+        description=__doc__, prog="python -m benchmark.campaign"
+    )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--share", type=float, default=1.0, help="share of all cases, 0 to 1")
-    parser.add_argument("--seed", type=int, default=2026, help="seed of all random choices")
+    parser.add_argument(
+        "--share", type=float, default=1.0, help="share of all cases, 0 to 1"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=2026, help="seed of all random choices"
+    )
     parser.add_argument("--only", nargs="+", choices=sorted(PARTS), help="parts to run")
-    parser.add_argument("--patience", type=float, default=1.0, help="factor of bounds of time")
+    parser.add_argument(
+        "--patience", type=float, default=1.0, help="factor of bounds of time"
+    )
     parser.add_argument("--processes", type=int, default=2, help="parts at once")
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
     options = parser.parse_args()
@@ -61,9 +69,13 @@ def main() -> int:
     found: dict[str, Ledger] = {}
     with ThreadPoolExecutor(options.processes) as pool:
         # The longest first: `bits` compiles 200 scenes, then the nodes.
-        long_first = sorted(parts, key=lambda part: (part != "bits", PARTS[part][0] != "nodes"))
+        long_first = sorted(
+            parts, key=lambda part: (part != "bits", PARTS[part][0] != "nodes")
+        )
         waiting = {
-            pool.submit(run_apart, part, options.share, options.seed, options.patience): part
+            pool.submit(
+                run_apart, part, options.share, options.seed, options.patience
+            ): part
             for part in long_first
         }
         for future in as_completed(waiting):
@@ -76,12 +88,16 @@ def main() -> int:
     ledgers = [found[part] for part in parts]
     text = format_ledgers(ledgers)
     minutes = (time.monotonic() - began) / 60
-    print(f"\n{text}\n\nseed {options.seed}, share {options.share:g}, {minutes:.1f} minutes")
+    print(
+        f"\n{text}\n\nseed {options.seed}, share {options.share:g}, {minutes:.1f}"
+        " minutes"
+    )
     if options.write:
         made = (
-            f"Seed {options.seed}, share {options.share:g} of all cases, {minutes:.0f} minutes, "
-            f"bounds of time times {options.patience:g}, load {os.getloadavg()[0]:.0f} at the end, "
-            f"{platform.machine()}, Python {platform.python_version()}, {date.today()}."
+            f"Seed {options.seed}, share {options.share:g} of all cases, {minutes:.0f}"
+            f" minutes, bounds of time times {options.patience:g}, load"
+            f" {os.getloadavg()[0]:.0f} at the end, {platform.machine()}, Python"
+            f" {platform.python_version()}, {date.today()}."
         )
         fill_page(PAGE, {"results": f"{text}\n\n{made}"})
     return 0 if all(ledger.sound for ledger in ledgers) else 1

@@ -17,7 +17,10 @@ from benchmark.campaign.ledger import Ledger
 from benchmark.nodes import own_domain
 
 COMMAND_BOUND_S = 30.0
-"""A refusal takes a second; a command that does its work takes longer beside other work."""
+"""A refusal takes a second.
+
+A command that does its work takes longer beside other work.
+"""
 
 
 def sst_ros(
@@ -30,7 +33,10 @@ def sst_ros(
     fails: bool | None = None,
     user: int | None = None,
 ) -> subprocess.CompletedProcess[str] | None:
-    """Run the command line; count a hang, a traceback, a long message or a wrong exit status."""
+    """Run the command line.
+
+    Count a hang, a traceback, a long message or a wrong exit status.
+    """
     ledger.tried += 1
     name, began = " ".join(words)[:120], time.perf_counter()
     try:
@@ -117,13 +123,38 @@ def command_lines(ledger: Ledger) -> None:
         (folder / "empty.yaml").write_text("")
         (folder / "binary.yaml").write_bytes(os.urandom(300))
         count = len(ledger.numbers(150, least=4))
-        for words in WRONG if ledger.share >= 1 else rng.sample(WRONG, min(len(WRONG), count)):
+        for words in (
+            WRONG if ledger.share >= 1 else rng.sample(WRONG, min(len(WRONG), count))
+        ):
             sst_ros(ledger, words, folder=folder, fails=True)
-        words_of = ["", "-", "--", "folder", "empty.yaml", "binary.yaml", "example2", "-1", "nan"]
-        words_of += ["--out", "--force", "--scene", "\x1b[31m", "a" * 300, "../..", "~", "'"]
+        words_of = [
+            "",
+            "-",
+            "--",
+            "folder",
+            "empty.yaml",
+            "binary.yaml",
+            "example2",
+            "-1",
+            "nan",
+        ]
+        words_of += [
+            "--out",
+            "--force",
+            "--scene",
+            "\x1b[31m",
+            "a" * 300,
+            "../..",
+            "~",
+            "'",
+        ]
         for _ in range(count - ledger.tried):
             verb = rng.choice(VERBS)
-            words = [verb, "--nosuchoption", *rng.choices(words_of, k=rng.randint(0, 3))]
+            words = [
+                verb,
+                "--nosuchoption",
+                *rng.choices(words_of, k=rng.randint(0, 3)),
+            ]
             sst_ros(ledger, words, folder=folder, fails=True)
 
 
@@ -135,12 +166,20 @@ def surroundings(ledger: Ledger) -> None:
         folder.chmod(0o777)
         readonly = folder / "readonly"
         readonly.mkdir(mode=0o555)
-        show, run, full = "scene show example2", "simulate example2 --duration 0.1", "TMPDIR"
+        show, run, full = (
+            "scene show example2",
+            "simulate example2 --duration 0.1",
+            "TMPDIR",
+        )
         cases: dict[str, tuple[str, dict[str, str], int | None]] = {
             "no HOME": ("scene list", {"HOME": ""}, None),
             "HOME that is not there": (show, {"HOME": "/nonexistent"}, None),
             "read-only HOME": (run, {"HOME": str(readonly)}, nobody),
-            "TMPDIR that is not there": ("scene list", {"TMPDIR": "/nonexistent"}, None),
+            "TMPDIR that is not there": (
+                "scene list",
+                {"TMPDIR": "/nonexistent"},
+                None,
+            ),
             "plain ASCII": (show, {"LANG": "C", "LC_ALL": "C"}, None),
             "ASCII output": ("scene list", {"PYTHONIOENCODING": "ascii"}, None),
             "temporary files in a full disk": (run, {full: "/dev/full"}, None),
@@ -153,14 +192,24 @@ def surroundings(ledger: Ledger) -> None:
         for label in labels[: len(ledger.numbers(len(cases), least=4))]:
             words, env, user = cases[label]
             before = len(ledger.notes)
-            sst_ros(ledger, words.split(), folder=folder, env=env, user=user, bound=60.0)
-            ledger.notes[before:] = [f"{label}: {note}" for note in ledger.notes[before:]]
+            sst_ros(
+                ledger, words.split(), folder=folder, env=env, user=user, bound=60.0
+            )
+            ledger.notes[before:] = [
+                f"{label}: {note}" for note in ledger.notes[before:]
+            ]
         for verb in (["scene", "list"], ["scene", "show", "stiff"], ["--help"]):
             ledger.tried += 1
             with Path("/dev/full").open("w") as disk:
                 command = [sys.executable, "-m", "sst_ros", *verb]
-                pipes: dict[str, Any] = {"stdout": disk, "stderr": subprocess.PIPE, "text": True}
-                done = subprocess.run(command, cwd=folder, timeout=60.0 * ledger.patience, **pipes)
+                pipes: dict[str, Any] = {
+                    "stdout": disk,
+                    "stderr": subprocess.PIPE,
+                    "text": True,
+                }
+                done = subprocess.run(
+                    command, cwd=folder, timeout=60.0 * ledger.patience, **pipes
+                )
             if "Traceback" in done.stderr:
                 note = f"{' '.join(verb)} into a full disk: {done.stderr[-200:]}"
                 ledger.found("tracebacks", note)

@@ -84,7 +84,8 @@ class Ledger:
 
     @contextlib.contextmanager
     def case(self, name: str, bound: float) -> Iterator[None]:
-        """Try one case in this process: our own errors are answers, others are findings.
+        """Try one case in this process: our own errors are answers, others are
+        findings.
 
         Its time is that of the processor: other work on the machine does not count.
         """
@@ -126,6 +127,8 @@ def run_part(part: str, share: float, seed: int, patience: float = 1.0) -> Ledge
     try:
         getattr(importlib.import_module(f"benchmark.campaign.{room}"), part)(ledger)
     except Exception as error:
-        ledger.found("tracebacks", f"the part itself ended: {type(error).__name__}: {error}")
+        ledger.found(
+            "tracebacks", f"the part itself ended: {type(error).__name__}: {error}"
+        )
     ledger.seconds = time.monotonic() - began
     return ledger

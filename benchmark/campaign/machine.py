@@ -25,20 +25,29 @@ from benchmark.campaign.ledger import Ledger
 from sst_ros import Trajectory, simulate
 from sst_ros.recording import recording
 
-RUNS = (("example2", "auto"), ("friction", "dop853"), ("stiff", "auto"), ("elastic_stops", "auto"))
+RUNS = (
+    ("example2", "auto"),
+    ("friction", "dop853"),
+    ("stiff", "auto"),
+    ("elastic_stops", "auto"),
+)
 
 
 def run(number: int) -> bytes:
     """Return the bits of a short motion and of its states between the samples."""
     scene, method = RUNS[number % len(RUNS)]
     motion = simulate(scene, duration=0.05 + 0.01 * (number % 3), method=method)
-    return b"".join(one.to_pandas().to_numpy().tobytes() for one in (motion, motion.at([0.02])))
+    return b"".join(
+        one.to_pandas().to_numpy().tobytes() for one in (motion, motion.at([0.02]))
+    )
 
 
 def workers(ledger: Ledger) -> None:
     """Simulate in threads, forked and spawned processes: the bits are those alone."""
     alone = [run(number) for number in range(12)]
-    makers: list[Callable[[], Executor]] = [partial(ThreadPoolExecutor, n) for n in (2, 8)]
+    makers: list[Callable[[], Executor]] = [
+        partial(ThreadPoolExecutor, n) for n in (2, 8)
+    ]
     contexts = [get_context(name) for name in ("fork", "spawn")]
     makers += [partial(ProcessPoolExecutor, 2, mp_context=one) for one in contexts]
     for number in ledger.numbers(24):
@@ -48,7 +57,9 @@ def workers(ledger: Ledger) -> None:
                 found = list(pool.map(run, numbers, timeout=300.0 * ledger.patience))
             for one, bits in zip(numbers, found, strict=True):
                 if bits != alone[one]:
-                    ledger.found("silent", f"workers {number}: {RUNS[one % 4]} has other bits")
+                    ledger.found(
+                        "silent", f"workers {number}: {RUNS[one % 4]} has other bits"
+                    )
 
 
 def _save(path: Path, duration: float) -> None:
@@ -56,7 +67,9 @@ def _save(path: Path, duration: float) -> None:
 
 
 def saves(ledger: Ledger) -> None:
-    """Save different motions to one path at a time: what is there then is one of them, whole."""
+    """Save different motions to one path at a time: what is there then is one of them,
+    whole.
+    """
     for number in ledger.numbers(40):
         suffix = (".csv", ".parquet")[number % 2]
         with TemporaryDirectory() as name, ThreadPoolExecutor(4) as pool:
@@ -67,7 +80,9 @@ def saves(ledger: Ledger) -> None:
                 whole = simulate("example2", duration=float(found.t[-1]))
                 left = [*Path(name).iterdir()]
                 if not np.array_equal(found.gamma, whole.gamma) or left != [path]:
-                    ledger.found("silent", f"saves {number}: {path.name} is of several motions")
+                    ledger.found(
+                        "silent", f"saves {number}: {path.name} is of several motions"
+                    )
 
 
 def _flip(path: Path, rng: random.Random) -> None:
@@ -89,7 +104,10 @@ def damage(ledger: Ledger) -> None:
     rng = ledger.rng
     with TemporaryDirectory() as name:
         folder = Path(name)
-        bag, motion = long_bag.write(folder / "bag", 1.0), simulate("example2", duration=0.1)
+        bag, motion = (
+            long_bag.write(folder / "bag", 1.0),
+            simulate("example2", duration=0.1),
+        )
         tables = [folder / f"motion{suffix}" for suffix in (".csv", ".parquet")]
         for path in tables:
             motion.save(path)
@@ -100,25 +118,42 @@ def damage(ledger: Ledger) -> None:
             (shutil.copytree if chosen is bag else shutil.copy)(chosen, copy)
             inside = rng.choice(sorted(copy.iterdir())) if chosen is bag else copy
             _flip(inside, rng)
-            target = copy if chosen is bag else copy.rename(folder / f"changed{chosen.suffix}")
-            with ledger.case(f"damage {number} of {chosen.name}/{inside.name}", bound=20.0):
+            target = (
+                copy
+                if chosen is bag
+                else copy.rename(folder / f"changed{chosen.suffix}")
+            )
+            with ledger.case(
+                f"damage {number} of {chosen.name}/{inside.name}", bound=20.0
+            ):
                 if chosen is not bag:
                     Trajectory.load(target)
                 else:
                     found = recording.read(target)
-                    same = np.array_equal(found.trajectory.gamma, expected.trajectory.gamma)
+                    same = np.array_equal(
+                        found.trajectory.gamma, expected.trajectory.gamma
+                    )
                     if not same and not found.signals.bag.damage:
-                        ledger.found("silent", f"damage {number}: {inside.name} differs in silence")
+                        ledger.found(
+                            "silent",
+                            f"damage {number}: {inside.name} differs in silence",
+                        )
             (shutil.rmtree if target.is_dir() else Path.unlink)(target)
 
 
-COMMANDS = ("scene show stiff", "simulate example2 --out motion.csv --force", "plan check reach")
+COMMANDS = (
+    "scene show stiff",
+    "simulate example2 --out motion.csv --force",
+    "plan check reach",
+)
 
 
 def interrupts(ledger: Ledger) -> None:
-    """Interrupt commands at random moments, close their streams: a line at most, no traceback.
+    """Interrupt commands at random moments, close their streams: a line at most, no
+    traceback.
 
-    But the KeyboardInterrupt of Python's own start, before the first line of `main`, is not ours.
+    But the KeyboardInterrupt of Python's own start, before the first line of `main`, is
+    not ours.
     """
     rng = ledger.rng
     with TemporaryDirectory() as name:
@@ -127,7 +162,10 @@ def interrupts(ledger: Ledger) -> None:
             if closed := rng.choice([(), (0,), (1,), (2,), (0, 1, 2)]):
                 shut = " ".join(f"{one}>&-" for one in closed).replace("0>", "0<")
                 words = ["sh", "-c", f'exec "$@" {shut}', "sh", *words]
-            pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+            pipes: dict[str, Any] = {
+                "stdout": subprocess.PIPE,
+                "stderr": subprocess.PIPE,
+            }
             process = subprocess.Popen(words, cwd=name, text=True, **pipes)
             sent = rng.choice((signal.SIGINT, signal.SIGTERM, signal.SIGHUP, None))
             if sent is not None:
@@ -144,6 +182,8 @@ def interrupts(ledger: Ledger) -> None:
                 ledger.found("hangs", label)
                 continue
             ledger.time(time.monotonic() - began, math.inf, label)
-            early = said.rstrip().endswith("KeyboardInterrupt") and "in main" not in said
+            early = (
+                said.rstrip().endswith("KeyboardInterrupt") and "in main" not in said
+            )
             if "Traceback" in said and not early:
                 ledger.found("tracebacks", f"{label}: {said.strip().splitlines()[-1]}")

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes: hostile messages and parameters, steps that do not end, kills, starts and stops."""
+"""Nodes: hostile messages and parameters, steps that do not end, kills, starts and
+stops.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from sst_ros.recording.recording import read
 
 SAMPLE_NS = 2_000_000
 FAULT_S, REPLY_S, CLOSE_S = 1.0, 0.5, 2.0
-"""Within this time a step beyond its budget is a fault, a node answers a service, and it ends."""
+"""Within this time a step beyond its budget is a fault, a node answers a service, and
+it ends.
+"""
 
 NODE = "/sst_simulator"
 
@@ -86,23 +90,35 @@ def messages(ledger: Ledger) -> None:
     names = ["gamma_1", "gamma_2", "gamma_3", "", "mu_1", "x" * 1000, "é"]
     with running(command_timeout=0.0) as (process, client):
         plain = client.node.create_publisher(Float64MultiArray, f"{NODE}/commands", 10)
-        stamped = client.node.create_publisher(JointState, f"{NODE}/commands_stamped", 10)
-        wrench = client.node.create_publisher(WrenchStamped, f"{NODE}/external_moment", 10)
+        stamped = client.node.create_publisher(
+            JointState, f"{NODE}/commands_stamped", 10
+        )
+        wrench = client.node.create_publisher(
+            WrenchStamped, f"{NODE}/external_moment", 10
+        )
         bad: list[str] = []
 
         def check(state: Any) -> None:
-            if not all(map(math.isfinite, (*state.position, *state.velocity, *state.effort))):
+            if not all(
+                map(math.isfinite, (*state.position, *state.velocity, *state.effort))
+            ):
                 bad.append(str(state))
 
         client.node.create_subscription(JointState, "/joint_states", check, 10)
-        client.until(lambda: plain.get_subscription_count() and stamped.get_subscription_count())
+        client.until(
+            lambda: plain.get_subscription_count() and stamped.get_subscription_count()
+        )
         for number in ledger.cases(1200, least=60):
             kind = rng.randrange(3)
-            data = [rng.choice(odd) for _ in range(rng.choice((0, 1, 3, 3, 3, 9, 2000)))]
+            data = [
+                rng.choice(odd) for _ in range(rng.choice((0, 1, 3, 3, 3, 9, 2000)))
+            ]
             if kind == 0:
                 plain.publish(Float64MultiArray(data=data))
             elif kind == 1:
-                chosen = [rng.choice(names) for _ in range(rng.choice((len(data), 3, 0)))]
+                chosen = [
+                    rng.choice(names) for _ in range(rng.choice((len(data), 3, 0)))
+                ]
                 message = JointState(name=chosen, effort=data)
                 message.header.stamp.sec = rng.choice((0, -(2**31), 2**31 - 1))
                 stamped.publish(message)
@@ -111,7 +127,9 @@ def messages(ledger: Ledger) -> None:
                 message.wrench.torque.x = rng.choice(odd)
                 wrench.publish(message)
             client.executor.spin_once(timeout_sec=0.0)
-            if number % 200 == 0 and not is_alive(ledger, process, client, f"message {number}"):
+            if number % 200 == 0 and not is_alive(
+                ledger, process, client, f"message {number}"
+            ):
                 return
         is_alive(ledger, process, client, "all messages")
         if bad:
@@ -120,12 +138,26 @@ def messages(ledger: Ledger) -> None:
 
 
 def parameters(ledger: Ledger) -> None:
-    """Set parameters of a running simulator to hostile values: refused, or taken; never a fall."""
+    """Set parameters of a running simulator to hostile values: refused, or taken.
+
+    Never a fall.
+    """
     from rcl_interfaces.srv import ListParameters, SetParameters
     from rclpy.parameter import Parameter
 
     rng = ledger.rng
-    values: list[Any] = [True, 0, -1, 2**62, 0.0, -0.0, 5e-324, 1e308, math.nan, math.inf]
+    values: list[Any] = [
+        True,
+        0,
+        -1,
+        2**62,
+        0.0,
+        -0.0,
+        5e-324,
+        1e308,
+        math.nan,
+        math.inf,
+    ]
     values += ["", "x", [1.0], ["a"], []]
     with running() as (process, client):
         reply, _ = client.call(ListParameters, f"{NODE}/list_parameters")
@@ -138,25 +170,36 @@ def parameters(ledger: Ledger) -> None:
                 message = Parameter(name, value=value).to_parameter_msg()
             except (TypeError, AssertionError, OverflowError):
                 continue
-            done, took = client.call(SetParameters, f"{NODE}/set_parameters", parameters=[message])
+            done, took = client.call(
+                SetParameters, f"{NODE}/set_parameters", parameters=[message]
+            )
             ledger.time(took, math.inf, name)
             if done is None:
                 ledger.found("lost", f"no reply to {name} = {value}")
-            if number % 50 == 0 and not is_alive(ledger, process, client, f"{name} = {value}"):
+            if number % 50 == 0 and not is_alive(
+                ledger, process, client, f"{name} = {value}"
+            ):
                 return
         is_alive(ledger, process, client, "all parameters")
         stop(ledger, process)
 
 
 def node_kills(ledger: Ledger) -> None:
-    """Kill the player and the controller beside a simulator: it goes on and ends when asked."""
+    """Kill the player and the controller beside a simulator: it goes on and ends when
+    asked.
+    """
     rng = ledger.rng
     for number in ledger.cases(66, least=1):
-        with running(wait_for_command=True) as (process, client), TemporaryDirectory() as folder:
+        with (
+            running(wait_for_command=True) as (process, client),
+            TemporaryDirectory() as folder,
+        ):
             table = Path(folder) / "torques.csv"
             table.write_text("time,tau_1,tau_2,tau_3\n0,0.01,0,0\n60,0,0,0\n")
             kind = ("torque_player", "inverse_dynamics")[number % 2]
-            other = start(kind, **({"scene": "reach"} if number % 2 else {"csv": table}))
+            other = start(
+                kind, **({"scene": "reach"} if number % 2 else {"csv": table})
+            )
             client.until(lambda: client.node.count_subscribers("/joint_states"))
             # The wait is the experiment: the moment of the kill is random.
             time.sleep(rng.uniform(0.0, 1.5))
@@ -179,7 +222,9 @@ def recorder_kills(ledger: Ledger) -> None:
                     time.sleep(0.01)
                 if (size := _size(bag)) < 50_000:
                     states = f"simulator {simulator.poll()}, recorder {recorder.poll()}"
-                    ledger.found("hangs", f"kill {number}: {size} bytes in time, ends: {states}")
+                    ledger.found(
+                        "hangs", f"kill {number}: {size} bytes in time, ends: {states}"
+                    )
                     continue
                 # The wait is the experiment: the moment of the kill is random.
                 time.sleep(ledger.rng.uniform(1.5, 4.0))
@@ -188,7 +233,9 @@ def recorder_kills(ledger: Ledger) -> None:
                 recorder.wait()
                 steps = np.diff(read(bag_writer.recover(bag).bag).time_ns)
                 if not np.all(steps == SAMPLE_NS):
-                    note = f"kill {number}: gaps inside what was recovered, {size} bytes"
+                    note = (
+                        f"kill {number}: gaps inside what was recovered, {size} bytes"
+                    )
                     ledger.found("lost", note)
             except SstError as error:
                 ledger.found("lost", f"kill {number}: {error}")
@@ -235,12 +282,16 @@ def _time_fault(ledger: Ledger, client: Client) -> None:
 
 
 def starts(ledger: Ledger) -> None:
-    """Start and stop nodes at random moments: one line or none, nothing left in /dev/shm."""
+    """Start and stop nodes at random moments: one line or none, nothing left in
+    /dev/shm.
+    """
     rng = ledger.rng
     before = _shared_memory()
     for number in ledger.cases(200, least=4):
         with own_domain():
-            kind = ("simulator", "torque_player", "recorder", "inverse_dynamics")[number % 4]
+            kind = ("simulator", "torque_player", "recorder", "inverse_dynamics")[
+                number % 4
+            ]
             bag = {"output": f"/tmp/sst_campaign_{os.getpid()}_{number}"}
             process = start(kind, **(bag if kind == "recorder" else {}))
             # The wait is the experiment: the moment of the signal is random.
@@ -253,9 +304,13 @@ def starts(ledger: Ledger) -> None:
                 ledger.found("tracebacks", f"{kind}: {text[-300:]}")
     left = _shared_memory() - before
     if len(left) > 4:
-        ledger.found("lost", f"{len(left)} files left in /dev/shm: {sorted(left)[:3]}", len(left))
+        ledger.found(
+            "lost", f"{len(left)} files left in /dev/shm: {sorted(left)[:3]}", len(left)
+        )
 
 
 def _shared_memory() -> set[str]:
     folder = Path("/dev/shm")
-    return {path.name for path in folder.glob("*fastrtps*")} if folder.is_dir() else set()
+    return (
+        {path.name for path in folder.glob("*fastrtps*")} if folder.is_dir() else set()
+    )

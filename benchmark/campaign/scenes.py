@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random scenes held to their invariants. Hostile documents and extreme numbers are tests."""
+"""Random scenes held to their invariants.
+
+Hostile documents and extreme numbers are tests.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +30,18 @@ def needle() -> str:
     tree = yaml.safe_load(text_of("swing")[0])
     tree["star"]["inertia"] = {"xx": 1.0, "yy": 1.0, "zz": 1e-12}
     tree |= {"actuated_links": [{}], "intermediate_links": [{}]}
-    return yaml.dump({**tree, "stroke": {"at_end": "ignore"}, "workspace": {"at_edge": "ignore"}})
+    return yaml.dump(
+        {**tree, "stroke": {"at_end": "ignore"}, "workspace": {"at_edge": "ignore"}}
+    )
 
 
 def _finite(ledger: Ledger, name: str, state: Any) -> None:
-    numbers = (*state.quaternion, *state.body_rate, *state.joints.gamma, *state.joints.gamma_dot)
+    numbers = (
+        *state.quaternion,
+        *state.body_rate,
+        *state.joints.gamma,
+        *state.joints.gamma_dot,
+    )
     if not all(map(math.isfinite, numbers)):
         ledger.found("silent", f"{name}: a number is not finite")
 
@@ -41,7 +51,15 @@ def random_scene(rng: random.Random) -> Scene:
     tree = yaml.safe_load(text_of("general" if rng.random() < 0.3 else "swing")[0])
     tree["description"] = "campaign"
     tree["duration"] = 0.2
-    for key in ("motion", "torque", "friction", "springs", "gravity", "payload", "actuators"):
+    for key in (
+        "motion",
+        "torque",
+        "friction",
+        "springs",
+        "gravity",
+        "payload",
+        "actuators",
+    ):
         tree.pop(key, None)
     scale = 10 ** rng.uniform(-1, 1)
     x, y = (rng.uniform(0.5, 1.5) * scale for _ in range(2))
@@ -49,16 +67,24 @@ def random_scene(rng: random.Random) -> Scene:
     tree["star"]["inertia"] = {"xx": x, "yy": y, "zz": z}
     if rng.random() < 0.5:
         tree["gravity"] = {"acceleration": [rng.uniform(-9.81, 9.81) for _ in range(3)]}
-        tree["payload"] = {"mass": rng.uniform(0.1, 3), "centre": [0, 0, rng.uniform(0, 0.3)]}
+        tree["payload"] = {
+            "mass": rng.uniform(0.1, 3),
+            "centre": [0, 0, rng.uniform(0, 0.3)],
+        }
     if rng.random() < 0.5:
         kind = rng.choice(("gamma", "mu", "beta"))
         rubbing = {"viscous": rng.uniform(0, 1), "coulomb": rng.uniform(0, 0.5)}
         if rng.random() < 0.5:  # Stribeck
-            rubbing |= {"static": 2.0 * rubbing["coulomb"], "stribeck": 10 ** rng.uniform(-2, 0)}
+            rubbing |= {
+                "static": 2.0 * rubbing["coulomb"],
+                "stribeck": 10 ** rng.uniform(-2, 0),
+            }
         tree["friction"] = {kind: rubbing}
     if rng.random() < 0.4:
         joint = f"{rng.choice(('gamma', 'mu', 'beta'))}_{rng.randint(1, 3)}"
-        tree["springs"] = [{"joint": joint, "stiffness": 10 ** rng.uniform(-1, 2), "rest": 0.8}]
+        tree["springs"] = [
+            {"joint": joint, "stiffness": 10 ** rng.uniform(-1, 2), "rest": 0.8}
+        ]
     if rng.random() < 0.3:
         tree["actuators"] = {"torque_limit": rng.uniform(0.5, 5), "rotor_inertia": 1e-4}
         if rng.random() < 0.5:
@@ -87,9 +113,14 @@ def invariants(ledger: Ledger) -> None:
                 ledger.found("silent", f"{name}: closure {plain.closure_residual:.1e}")
             energy = sum(abs(x) for x in fine.state.body_rate) ** 2
             if not abs(plain.energy_residual) < 1e-7 * (1 + energy):
-                ledger.found("silent", f"{name}: energy residual {plain.energy_residual:.1e} J")
+                ledger.found(
+                    "silent", f"{name}: energy residual {plain.energy_residual:.1e} J"
+                )
             error = float(angle_between(plain.state.quaternion, fine.state.quaternion))
-            if error > 1e-12 and error > 3 * plain.error_estimate + 3 * fine.error_estimate:
+            if (
+                error > 1e-12
+                and error > 3 * plain.error_estimate + 3 * fine.error_estimate
+            ):
                 note = f"{name}: error {error:.1e}, estimate {plain.error_estimate:.1e}"
                 ledger.found("silent", note)
 
@@ -98,12 +129,17 @@ def _draw_torque(rng: random.Random) -> Torque:
     """Three numbers, or a function of time that jumps, or has a pulse."""
     one, other = ([rng.uniform(-2, 2) for _ in range(3)] for _ in range(2))
     begin, end = sorted(rng.uniform(0, 0.1) for _ in range(2))
-    functions = (lambda t: one if t < begin else other, lambda t: one if begin < t < end else other)
+    functions = (
+        lambda t: one if t < begin else other,
+        lambda t: one if begin < t < end else other,
+    )
     return rng.choice((tuple(one), *functions))
 
 
 def estimates(ledger: Ledger) -> None:
-    """Compare the error estimate with the true error, by the bounds of the page of estimates."""
+    """Compare the error estimate with the true error, by the bounds of the page of
+    estimates.
+    """
     for number in ledger.numbers(60):
         for name in CLASSES:
             with ledger.case(f"{name} {number} (seed {ledger.seed})", bound=120.0):
@@ -113,16 +149,24 @@ def estimates(ledger: Ledger) -> None:
                 error, estimate = row["error"], row["estimate"]
                 within = row["status"] == 2 or error <= 3 * row["tolerance"]
                 if error > 3 * estimate or not within:
-                    note = f"{name} {number}: error {error:.1e}, estimate {estimate:.1e}"
+                    note = (
+                        f"{name} {number}: error {error:.1e}, estimate {estimate:.1e}"
+                    )
                     ledger.found("silent", note)
 
 
 def bits(ledger: Ledger) -> None:
-    """Simulate random scenes as machine code and as plain Python: not one bit may differ."""
+    """Simulate random scenes as machine code and as plain Python: not one bit may
+    differ.
+    """
     rng = random.Random(ledger.seed + 1)
     for number in ledger.numbers(200):
         name = f"scene {number} (seed {ledger.seed + 1})"
-        method = rng.choice(("rk4", "dopri5", "dop853", "rodas5p")) if number % 10 else "auto"
+        method = (
+            rng.choice(("rk4", "dopri5", "dop853", "rodas5p"))
+            if number % 10
+            else "auto"
+        )
         with ledger.case(f"{name} {method}", bound=120.0), warnings.catch_warnings():
             warnings.simplefilter("error")
             scene = random_scene(rng)
@@ -134,5 +178,7 @@ def bits(ledger: Ledger) -> None:
                 plain_states = [run.step(torque, PERIOD_NS) for _ in range(40)]
             for plain, fast in zip(plain_states, fast_states, strict=True):
                 if plain != fast:
-                    ledger.found("silent", f"{name} {method}: bits differ at {plain.time_ns} ns")
+                    ledger.found(
+                        "silent", f"{name} {method}: bits differ at {plain.time_ns} ns"
+                    )
                     break

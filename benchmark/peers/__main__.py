@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error against processor time on one second of Example 2, for sst_ros and its peers.
 
-python -m benchmark.peers [--quick] [--rounds N] [--only ENGINE ...] [--out FOLDER] [--no-page]
+python -m benchmark.peers [--quick] [--rounds N] [--only ENGINE ...] [--out FOLDER]
+[--no-page]
 """
 
 from __future__ import annotations
@@ -31,12 +32,20 @@ MODULES = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the study; the exit status is 1 where an engine fails its gate."""
-    parser = argparse.ArgumentParser(prog="python -m benchmark.peers", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmark.peers", description=__doc__
+    )
     parser.add_argument("--quick", action="store_true", help="smaller sweep, 3 rounds")
     parser.add_argument("--rounds", type=int, help="rounds of timing (9; quick: 3)")
-    parser.add_argument("--only", nargs="+", choices=MODULES, help="these engines and ours")
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of peers.md and the rest")
-    parser.add_argument("--no-page", action="store_true", help="table on the terminal only")
+    parser.add_argument(
+        "--only", nargs="+", choices=MODULES, help="these engines and ours"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=DOCS, help="folder of peers.md and the rest"
+    )
+    parser.add_argument(
+        "--no-page", action="store_true", help="table on the terminal only"
+    )
     options = parser.parse_args(arguments)
     if llvmlite_version() is None:
         parser.error("needs llvmlite, which compiles our side: pip install llvmlite")
@@ -48,7 +57,9 @@ def main(arguments: list[str] | None = None) -> int:
     curves = run_study(task, truth, series, rounds)
     least = find_floor(task, TARGETS)
     seconds = time.monotonic() - begin
-    result = results.Results(curves, missing, truth, rounds, options.quick, seconds, least)
+    result = results.Results(
+        curves, missing, truth, rounds, options.quick, seconds, least
+    )
     print("\n\n".join(result.parts().values()))
     if not options.no_page:
         options.out.mkdir(parents=True, exist_ok=True)

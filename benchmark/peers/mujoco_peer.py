@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """MuJoCo: equality constraints; its integrators, softness and time steps swept.
 
-Torques reach it in three ways: by a callback in C (nothing of Python in the loop, exact times
-at all stages), by a Python callback (the same times), and by `rollout` with a table of torques
-held over each step (their values at its middle, which makes any integrator of order 2 at most).
+Torques reach it in three ways: by a callback in C (nothing of Python in the loop, exact
+times at all stages), by a Python callback (the same times), and by `rollout` with a
+table of torques held over each step (their values at its middle, which makes any
+integrator of order 2 at most).
 
-Its ties are soft: their softness is (1 - d)/d times the mobility it keeps in body_invweight0, with
-d at most 0.9999. Where the centres of mass are decides that mobility; here it is set outright and
-swept, so that MuJoCo gets the best compromise between too soft and too stiff for its steps.
+Its ties are soft: their softness is (1 - d)/d times the mobility it keeps in
+body_invweight0, with d at most 0.9999. Where the centres of mass are decides that
+mobility; here it is set outright and swept, so that MuJoCo gets the best compromise
+between too soft and too stiff for its steps.
 """
 
 from __future__ import annotations
@@ -46,11 +48,16 @@ void torques(const void *model, void *data) {{
 {lines}
 }}
 """
-"""MuJoCo hands no user data to a callback: it reads and writes where `t` and `force` point."""
+"""MuJoCo hands no user data to a callback: it reads and writes where `t` and `force`
+point.
+"""
 
 
 def series(task: Task, quick: bool) -> list[Series]:
-    """RK4 with three sources of torque; the other integrators with the fastest source."""
+    """RK4 with three sources of torque.
+
+    The other integrators with the fastest source.
+    """
     factor = 1.6 if quick else 1.25
     grid = [
         (mobility, settle)
@@ -97,12 +104,18 @@ class Model:
     """
 
     def __init__(
-        self, task: Task, integrator: str, mobility: float, settle: float, motors: bool = False
+        self,
+        task: Task,
+        integrator: str,
+        mobility: float,
+        settle: float,
+        motors: bool = False,
     ) -> None:
         import mujoco
 
         self.mujoco: Any = mujoco
-        # A setting that diverges is reported in our table; MuJoCo would write files about it.
+        # A setting that diverges is reported in our table; MuJoCo would write files
+        # about it.
         mujoco.set_mju_user_warning(lambda text: None)
         self.task = task
         self.model = model = mujoco.MjModel.from_xml_string(_xml(task, settle, motors))
@@ -143,9 +156,9 @@ def _xml(task: Task, settle: float, motors: bool) -> str:
     for body in list_bodies(task):
         six = body.about_centre[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         text[body.name] = (
-            f'<body name="{body.name}"><inertial pos="{_numbers(body.centre)}" mass="{body.mass}"'
-            f' fullinertia="{_numbers(six)}"/>'
-            f'<joint name="{body.joint}" type="hinge" axis="{_numbers(body.axis)}"/>'
+            f'<body name="{body.name}"><inertial pos="{_numbers(body.centre)}"'
+            f' mass="{body.mass}" fullinertia="{_numbers(six)}"/><joint'
+            f' name="{body.joint}" type="hinge" axis="{_numbers(body.axis)}"/>'
         )
         children.setdefault(body.parent, []).append(body.name)
 
@@ -153,8 +166,8 @@ def _xml(task: Task, settle: float, motors: bool) -> str:
         return text[name] + "".join(map(nested, children.get(name, []))) + "</body>"
 
     ties = "".join(
-        f'<connect body1="s" body2="{name}" anchor="{_numbers(point)}" solref="{settle} 1"'
-        ' solimp="0.9999 0.9999 0.001"/>'
+        f'<connect body1="s" body2="{name}" anchor="{_numbers(point)}" solref="{settle}'
+        ' 1" solimp="0.9999 0.9999 0.001"/>'
         for name, point in list_ties(task)
     )
     drives = "".join(f'<motor joint="g{k}"/>' for k in range(3)) if motors else ""
@@ -223,7 +236,9 @@ class _Compiled(_Steps):
         self.address = int(data.energy.ctypes.data) - 8
         data.time = 0.123456789
         if ctypes.c_double.from_address(self.address).value != 0.123456789:
-            raise RuntimeError("this MuJoCo keeps the time elsewhere: no compiled callback")
+            raise RuntimeError(
+                "this MuJoCo keeps the time elsewhere: no compiled callback"
+            )
         self.force = int(data.qfrc_applied.ctypes.data)
 
     def callback(self) -> Any:
@@ -233,11 +248,15 @@ class _Compiled(_Steps):
 
 
 @cache
-def _compile(sines: tuple[tuple[int, tuple[float, float, float]], ...]) -> tuple[Any, Any]:
+def _compile(
+    sines: tuple[tuple[int, tuple[float, float, float]], ...],
+) -> tuple[Any, Any]:
     """Return the library of the callback, and its function."""
     if not c_floor.has_gcc():
         raise Failed("there is no gcc")
-    lines = [f"force[{at}] = {a!r} * sin({f!r} * *t + {s!r});" for at, (a, f, s) in sines]
+    lines = [
+        f"force[{at}] = {a!r} * sin({f!r} * *t + {s!r});" for at, (a, f, s) in sines
+    ]
     with tempfile.TemporaryDirectory() as folder:
         text = CALLBACK.format(lines="\n".join(lines))
         library, _ = c_floor.compile_c(text, Path(folder), "torques", "-O3")
@@ -259,13 +278,19 @@ class Rollout(_Steps):
         super().__init__(task, integrator, mobility, settle, steps)
         model, data = self.model.model, self.model.data
         middles = (np.arange(steps) + 0.5) * (DURATION / steps)
-        controls = np.array([task.torque_at(t) for t in middles])[None].repeat(copies, axis=0)
+        controls = np.array([task.torque_at(t) for t in middles])[None].repeat(
+            copies, axis=0
+        )
         self.model.reset(steps)
         self.kind = self.mujoco.mjtState.mjSTATE_FULLPHYSICS
         start = np.zeros(self.mujoco.mj_stateSize(model, self.kind))
         self.mujoco.mj_getState(model, data, start, self.kind)
         self.states = np.empty((copies, steps, len(start)))
-        own = data if threads == 1 else [self.mujoco.MjData(model) for _ in range(threads)]
+        own = (
+            data
+            if threads == 1
+            else [self.mujoco.MjData(model) for _ in range(threads)]
+        )
         self.rollout = partial(
             rollout.rollout, model, own, start[None].repeat(copies, axis=0), controls, nstep=steps,
             state=self.states, sensordata=np.empty((copies, steps, 0)),

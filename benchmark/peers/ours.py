@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sst_ros: the public call with its samples, fixed steps of each method, and plain Python."""
+"""sst_ros: the public call with its samples, fixed steps of each method, and plain
+Python.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ ENGINE, PACKAGE = "sst_ros", "llvmlite"
 PUBLIC = "simulate()"
 """Name of the series of the public call, from which all ratios to other engines are."""
 
-# Ladders end where rounding begins: below 2e-14 rad the doubles of the reference are seen.
+# Ladders end where rounding begins: below 2e-14 rad the doubles of the reference are
+# seen.
 METHODS = {
     "DOP853": (DOP853, 5, 80),
     "Dormand-Prince 5": (DORMAND_PRINCE, 6, 500),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pinocchio: constrained forward dynamics in C++, the Runge-Kutta loop in Python.
 
-A point tie has three rows of rank two, so the proximal steps matter: mu 0.1 and five of them give
-the right acceleration to 1e-11 at the least cost.
+A point tie has three rows of rank two, so the proximal steps matter: mu 0.1 and five of
+them give the right acceleration to 1e-11 at the least cost.
 """
 
 from __future__ import annotations
@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 
 from benchmark.peers.study import Engine, Failed, Series, list_steps
-from benchmark.peers.task import BASE, DURATION, Moving, Pose, Task, list_bodies, list_ties
+from benchmark.peers.task import (
+    BASE,
+    DURATION,
+    Moving,
+    Pose,
+    Task,
+    list_bodies,
+    list_ties,
+)
 from sst_ros.integration.methods import DOP853, RK4, Tableau
 
 ENGINE, PACKAGE = "Pinocchio", "pin"
@@ -25,7 +33,10 @@ def series(task: Task, quick: bool) -> list[Series]:
     """RK4 and DOP853 in a Python loop."""
     model, factor = Model(task), 1.6 if quick else 1.2
     found, python = [], "the steps and the torques"
-    for name, method, first, last in (("RK4", RK4, 10, 1600), ("DOP853", DOP853, 5, 100)):
+    for name, method, first, last in (
+        ("RK4", RK4, 10, 1600),
+        ("DOP853", DOP853, 5, 100),
+    ):
         settings = list_steps(first, last, factor, partial(_Steps, model, method))
         name = f"{name} in a Python loop"
         found.append(Series(ENGINE, name, python, 1e-10, model.acceleration, settings))
@@ -51,11 +62,19 @@ class Model:
             inertia = pin.Inertia(body.mass, body.centre, body.about_centre)
             model.appendBodyToJoint(index, inertia, still)
             at_body[body.name] = self.joints[body.joint] = index
-        self.ties, self.tied = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+        self.ties, self.tied = (
+            pin.StdVec_RigidConstraintModel(),
+            pin.StdVec_RigidConstraintData(),
+        )
         for name, point in list_ties(task):
             place = pin.SE3(np.eye(3), point)
             tie = pin.RigidConstraintModel(
-                pin.ContactType.CONTACT_3D, model, at_body["s"], place, at_body[name], place
+                pin.ContactType.CONTACT_3D,
+                model,
+                at_body["s"],
+                place,
+                at_body[name],
+                place,
             )
             self.ties.append(tie)
             self.tied.append(tie.createData())
@@ -65,7 +84,9 @@ class Model:
         except TypeError:  # before Pinocchio 4
             pin.initConstraintDynamics(model, self.data, self.ties)
         self.proximal = pin.ProximalSettings(1e-16, MU, ITERATIONS)
-        self.place = {name: model.joints[index].idx_v for name, index in self.joints.items()}
+        self.place = {
+            name: model.joints[index].idx_v for name, index in self.joints.items()
+        }
         self.drives = [self.place[f"g{k}"] for k in range(3)]
 
     def acceleration(self, at: Moving) -> np.ndarray:
@@ -89,8 +110,8 @@ class Model:
 class _Steps(Engine):
     """A Runge-Kutta method, as lean as Python and NumPy allow.
 
-    Stages are rows of one array, all views are made once, a stage is one product. The state is
-    x = (q, v).
+    Stages are rows of one array, all views are made once, a stage is one product. The
+    state is x = (q, v).
     """
 
     def __init__(self, model: Model, method: Tableau, steps: int) -> None:

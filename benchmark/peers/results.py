@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the study found, as tables, in the pages that show it, as CSV, as JSON and as a picture.
+"""What the study found, as tables, in the pages that show it, as CSV, as JSON and as a
+picture.
 
-`python -m benchmark.peers.results` draws the picture and brings the README's table up to date from
-docs/peers.csv and docs/peers.json.
+`python -m benchmark.peers.results` draws the picture and brings the README's table up
+to date from docs/peers.csv and docs/peers.json.
 """
 
 from __future__ import annotations
@@ -87,11 +88,15 @@ class Results:
         for target, point in zip(TARGETS, found, strict=True):
             ratio = self.ratio(point, target)
             text = "-" if point is None else f"{1e3 * point.time:.3g}"
-            cells[_head(target)] = text + ("" if ratio is None else f" ({_round(ratio)} x)")
+            cells[_head(target)] = text + (
+                "" if ratio is None else f" ({_round(ratio)} x)"
+            )
         return cells
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        """All series, the best of each engine, and those beside the floor, by name of the part."""
+        """All series, the best of each engine, and those beside the floor, by name of
+        the part.
+        """
         series = []
         for curve in self.curves:
             one, failed = curve.series, "" if curve.passed else " FAILED"
@@ -108,13 +113,22 @@ class Results:
         return {part: pd.DataFrame(listed) for part, listed in rows.items()}
 
     def _list_floor(self) -> list[dict[str, str]]:
-        """What a program that evaluates one acceleration at a time can do at most, and peers."""
+        """What a program that evaluates one acceleration at a time can do at most, and
+        peers.
+        """
         counts, cost = self.floor.evaluations, self.floor.seconds
-        rows = [{"": "evaluations, at least", **{_head(t): str(n) for t, n in counts.items()}}]
+        rows = [
+            {
+                "": "evaluations, at least",
+                **{_head(t): str(n) for t, n in counts.items()},
+            }
+        ]
         if cost is None:
             return rows
         times = {target: count * cost for target, count in counts.items()}
-        rows.append({"": "in C [ms]", **{_head(t): f"{1e3 * x:.3g}" for t, x in times.items()}})
+        rows.append(
+            {"": "in C [ms]", **{_head(t): f"{1e3 * x:.3g}" for t, x in times.items()}}
+        )
         for engine in self.engines:
             own = {target: self.best(engine, target) for target in times}
             cells = {_head(t): "-" if p is None else f"{_round(p.time / times[t])} x"
@@ -130,7 +144,9 @@ class Results:
             for target in TARGETS:
                 point = self.best(engine, target)
                 if point is not None:
-                    method = next(c.series.name for c in self.curves if point in c.points)
+                    method = next(
+                        c.series.name for c in self.curves if point in c.points
+                    )
                     parts.append(f"{_head(target)}: {method}, {point.setting.label}")
             lines.append(f"{engine}: {'; '.join(parts) or 'none'}")
         return lines
@@ -138,16 +154,20 @@ class Results:
     def run(self) -> str:
         """How the study was run."""
         return (
-            f"{sum(len(curve.points) for curve in self.curves)} settings, {self.rounds} rounds; "
-            f"reference: {self.reference.how}, own error {self.reference.error:.0e} rad.\n"
-            f"{join_line(self.machine)}. {'A quick, smaller sweep. ' if self.quick else ''}"
-            f"The whole took {self.seconds:.0f} s."
+            f"{sum(len(curve.points) for curve in self.curves)} settings, {self.rounds}"
+            f" rounds; reference: {self.reference.how}, own error"
+            f" {self.reference.error:.0e} rad.\n{join_line(self.machine)}."
+            f" {'A quick, smaller sweep. ' if self.quick else ''}The whole took"
+            f" {self.seconds:.0f} s."
         )
 
     def parts(self) -> dict[str, str]:
         """The parts of the page by name, Markdown."""
         missing = [f"{engine}: {why}.\n" for engine, why in self.missing.items()]
-        lines = ["The settings behind the best times:\n", *(f"- {x}." for x in self.settings())]
+        lines = [
+            "The settings behind the best times:\n",
+            *(f"- {x}." for x in self.settings()),
+        ]
         return {part: markdown(rows) for part, rows in self.tables().items()} | {
             "settings": "\n".join([*missing, *lines]),
             "run": self.run(),
@@ -155,26 +175,41 @@ class Results:
 
 
 def write(results: Results, folder: Path) -> None:
-    """Write peers.md, .png, .csv, a row for each setting timed or failed, and peers.json."""
+    """Write peers.md, .png, .csv, a row for each setting timed or failed, and
+    peers.json.
+    """
     rows = [row for curve in results.curves for row in _list_points(curve)]
     pd.DataFrame(rows).to_csv(folder / "peers.csv", index=False, lineterminator="\n")
-    best = [(engine, "best of all", partial(results.best, engine)) for engine in results.engines]
-    best += [(c.series.engine, c.series.name, partial(reach, [c])) for c in results.curves]
+    best = [
+        (engine, "best of all", partial(results.best, engine))
+        for engine in results.engines
+    ]
+    best += [
+        (c.series.engine, c.series.name, partial(reach, [c])) for c in results.curves
+    ]
     reached = []
     for engine, method, find in best:
         for target in TARGETS:
             point = find(target)
-            row: dict[str, Any] = {"engine": engine, "method": method, "error_rad": target}
+            row: dict[str, Any] = {
+                "engine": engine,
+                "method": method,
+                "error_rad": target,
+            }
             row["ms"] = None if point is None else 1e3 * point.time
             row["setting"] = None if point is None else point.setting.label
             reached.append({**row, "over_ours": results.ratio(point, target)})
     document = {
         "machine": results.machine,
         "reference_error_rad": results.reference.error,
-        "gates": {f"{c.series.engine}: {c.series.name}": c.gate for c in results.curves},
+        "gates": {
+            f"{c.series.engine}: {c.series.name}": c.gate for c in results.curves
+        },
         "reached": reached,
         "floor": {
-            "evaluations": {f"{t:.0e}": n for t, n in results.floor.evaluations.items()},
+            "evaluations": {
+                f"{t:.0e}": n for t, n in results.floor.evaluations.items()
+            },
             "ns_of_one_in_c": results.floor.seconds and 1e9 * results.floor.seconds,
         },
     }
@@ -218,7 +253,8 @@ def _format(value: float) -> str:
 def draw(folder: Path) -> None:
     """Write peers.png beside peers.csv and peers.json.
 
-    A thin curve with a number is a method; thick is the best, of sst_ros the public call.
+    A thin curve with a number is a method; thick is the best, of sst_ros the public
+    call.
     """
     rows = pd.read_csv(folder / "peers.csv")
     rows = rows[rows.median_ms.notna() & rows.failed.isna()]
@@ -238,11 +274,18 @@ def draw(folder: Path) -> None:
             (times, errors), number = find_front(group), number + 1
             looks = {"linewidth": 1.0, "alpha": 0.4, "label": f"{number}  {method}"}
             axes.plot(times, errors, color=colour, **looks)
-            height = 4 - 7 * (number % 3) if errors[-1] > 1e-4 else -3  # these end together
-            beside: Looks = {"textcoords": "offset points", "fontsize": 8, "color": colour}
+            # these end together
+            height = 4 - 7 * (number % 3) if errors[-1] > 1e-4 else -3
+            beside: Looks = {
+                "textcoords": "offset points",
+                "fontsize": 8,
+                "color": colour,
+            }
             axes.annotate(str(number), (times[-1], errors[-1]), (3, height), **beside)
     for error in (1e-6, 1e-9):  # which the tables name
-        axes.axhline(error, color="#666666", linewidth=0.8, linestyle=(0, (6, 4)), zorder=1)
+        axes.axhline(
+            error, color="#666666", linewidth=0.8, linestyle=(0, (6, 4)), zorder=1
+        )
     axes.set(xscale="log", yscale="log", ylim=(0.5 * SMALLEST, LARGEST))
     axes.set_xlabel("processor time of one simulated second [ms], median")
     axes.set_ylabel("error of the orientation at t = 1 s [rad]")
@@ -253,14 +296,18 @@ def draw(folder: Path) -> None:
 
 
 def find_front(rows: pd.DataFrame) -> tuple[list[float], list[float]]:
-    """Times [ms] and errors [rad] that no faster one is as accurate as, in order of time."""
+    """Times [ms] and errors [rad] that no faster one is as accurate as, in order of
+    time.
+    """
     sorted_rows = rows.sort_values(["median_ms", "error_at_end_rad"])
     best = sorted_rows[sorted_rows.error_at_end_rad.cummin().diff().fillna(-1.0) < 0.0]
     return best.median_ms.tolist(), best.error_at_end_rad.clip(lower=SMALLEST).tolist()
 
 
 def fill_readme(text: str, results: dict[str, Any]) -> str:
-    """Return the text of the README with processor times of the best settings, over ours."""
+    """Return the text of the README with processor times of the best settings, over
+    ours.
+    """
     best = {
         (row["engine"], row["error_rad"]): row
         for row in results["reached"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error against processor time of every series that passes its gate.
 
-An engine brings series: a gate, and settings that can be run. Every setting runs once for its
-error; those that no setting with as few steps beats are then timed in rounds.
+An engine brings series: a gate, and settings that can be run. Every setting runs once
+for its error; those that no setting with as few steps beats are then timed in rounds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from typing import Any
 import numpy as np
 
 from benchmark.measure import time_in_turn
-from benchmark.peers.task import DURATION, Moving, Pose, Task, find_relative, turn_between
+from benchmark.peers.task import (
+    DURATION,
+    Moving,
+    Pose,
+    Task,
+    find_relative,
+    turn_between,
+)
 from sst_ros.host.output import slices
 from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
 
@@ -30,12 +37,13 @@ class Failed(Exception):
 
 
 class Engine:
-    """An engine with the mechanism in it at one setting; all that it needs is made beforehand.
+    """An engine with the mechanism in it at one setting.
+
+    All that it needs is made beforehand.
 
     Attributes:
         run: do the second from its start; this is timed.
         pose: where a run has ended, of what `run` returned.
-
     """
 
     run: Callable[[], Any]
@@ -81,14 +89,22 @@ class Series:
 
     def gate(self, task: Task) -> float:
         """Largest relative difference to the paper's equations at the moving states."""
-        largest = max(find_relative(self.acceleration(at), at.answer) for at in task.moving)
+        largest = max(
+            find_relative(self.acceleration(at), at.answer) for at in task.moving
+        )
         return largest if math.isfinite(largest) else math.inf
 
 
 def list_steps(
-    first: float, last: float, factor: float, make: Callable[[int], Engine], note: str = ""
+    first: float,
+    last: float,
+    factor: float,
+    make: Callable[[int], Engine],
+    note: str = "",
 ) -> list[Setting]:
-    """Return settings from the first number of steps to the last, each about `factor` finer."""
+    """Return settings from the first number of steps to the last, each about `factor`
+    finer.
+    """
     counts, now = [], float(first)
     while now <= last * 1.001:
         counts.append(round(now) if now < 40 else 20 * round(now / 20))
@@ -122,11 +138,9 @@ def solve_task(task: Task) -> Reference:
 class Point:
     """A setting and what came of it; errors are infinite where it failed.
 
-    Attributes:
-        error: of the orientation at the end [rad].
-        gamma: largest error of an actuator angle at the end [rad].
-        seconds: processor time of the whole second, one a round; empty for what was not timed.
-
+    Attributes: error: of the orientation at the end [rad]. gamma: largest error of an
+        actuator angle at the end [rad]. seconds: processor time of the whole second,
+        one a round; empty for what was not timed.
     """
 
     setting: Setting
@@ -154,8 +168,12 @@ class Curve:
         return self.gate <= self.series.tolerance
 
 
-def run_study(task: Task, reference: Reference, series: list[Series], rounds: int) -> list[Curve]:
-    """Gate all, run all settings for their errors, then time the worthwhile ones in rounds."""
+def run_study(
+    task: Task, reference: Reference, series: list[Series], rounds: int
+) -> list[Curve]:
+    """Gate all, run all settings for their errors, then time the worthwhile ones in
+    rounds.
+    """
     curves = [Curve(one, one.gate(task)) for one in series]
     passed = [curve for curve in curves if curve.passed]
     calls: dict[int, Callable[[], Any]] = {}
@@ -165,7 +183,9 @@ def run_study(task: Task, reference: Reference, series: list[Series], rounds: in
         parts = slices(len(settings), 1, label, True)
         tried = [_try(settings[part.start], reference) for part in parts]
         best = math.inf
-        for point, engine in sorted(tried, key=lambda both: (both[0].setting.steps, both[0].error)):
+        for point, engine in sorted(
+            tried, key=lambda both: (both[0].setting.steps, both[0].error)
+        ):
             if engine is not None and (not point.setting.steps or point.error < best):
                 calls[id(point)], points[id(point)] = engine.run, point
             best = min(best, point.error)
@@ -193,5 +213,7 @@ def _try(setting: Setting, reference: Reference) -> tuple[Point, Engine | None]:
 
 def reach(curves: list[Curve], target: float) -> Point | None:
     """Return the fastest setting of some curves whose error is at most the target."""
-    good = [p for curve in curves for p in curve.points if p.seconds and p.error <= target]
+    good = [
+        p for curve in curves for p in curve.points if p.seconds and p.error <= target
+    ]
     return min(good, key=lambda point: point.time, default=None)

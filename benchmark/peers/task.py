@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The work that every engine gets: seven links, three torques over time, one second from rest.
+"""The work that every engine gets: seven links, three torques over time, one second
+from rest.
 
-As rigid bodies the links are a tree with two loops to close, for engines that need one: base ->
-actuated k -> intermediate k for each leg, the star hangs on leg 1. All axes pass through O. Legs 2
-and 3 are closed by tying the point t_k of the intermediate link to that of the star. At the start
-all joint angles are 0 and all body frames are {B}.
+As rigid bodies the links are a tree with two loops to close, for engines that need one:
+base -> actuated k -> intermediate k for each leg, the star hangs on leg 1. All axes
+pass through O. Legs 2 and 3 are closed by tying the point t_k of the intermediate link
+to that of the star. At the start all joint angles are 0 and all body frames are {B}.
 """
 
 from __future__ import annotations
@@ -28,13 +29,18 @@ from sst_ros.simulation.simulation import Simulation
 
 DURATION = 1.0
 JOINTS = ("g0", "m0", "b0", "g1", "m1", "g2", "m2")
-"""Joints of the tree: gamma (g) and mu (m) of each leg; the star hangs on leg 1 by beta (b)."""
+"""Joints of the tree: gamma (g) and mu (m) of each leg.
+
+The star hangs on leg 1 by beta (b).
+"""
 
 KINDS = {"g": 0, "m": 3, "b": 6}
 
 
 class Pose(NamedTuple):
-    """Where an engine has the mechanism: R of the star in {B}, and gamma [rad] of its own."""
+    """Where an engine has the mechanism: R of the star in {B}, and gamma [rad] of its
+    own.
+    """
 
     rotation: Array
     gamma: Array
@@ -83,7 +89,10 @@ class Task:
         rotation = rotation_matrix(np.array(start.quaternion))
         across = np.cross(geometry.w, geometry.v)
         self.w, self.t = geometry.w, geometry.e @ rotation.T
-        self.r = np.cos(self.gamma)[:, None] * geometry.v + np.sin(self.gamma)[:, None] * across
+        self.r = (
+            np.cos(self.gamma)[:, None] * geometry.v
+            + np.sin(self.gamma)[:, None] * across
+        )
         self.frames = {"s": rotation}
         mechanism = virtual_work.Mechanism.of(self.scene)
         self.tensors = {"s": mechanism.star}
@@ -118,7 +127,9 @@ class Task:
         rate = np.array(self.dynamics.derivative(*y, *torque)[4:7])
         q0, q1, q2, q3, w0, w1, w2 = y[:7]
         rows, body_rate = rotation_rows((q0, q1, q2, q3)), (w0, w1, w2)
-        legs = [kernel.leg_motion(leg, rows, body_rate) for leg in self.dynamics.model.legs]
+        legs = [
+            kernel.leg_motion(leg, rows, body_rate) for leg in self.dynamics.model.legs
+        ]
         at_rest = [kernel.rest_accelerations(at, body_rate)[1] for at in legs]
         answer: Array = np.array([at.g for at in legs]) @ rate + at_rest
         return answer
@@ -131,11 +142,15 @@ class Task:
                 for time in (0.21, 0.53, 0.87)]  # fmt: skip
 
     def _moving(self, time: float, y: list[float]) -> Moving:
-        first, now = (np.array(self.dynamics.joints(*state)) for state in (self.start, y))
+        first, now = (
+            np.array(self.dynamics.joints(*state)) for state in (self.start, y)
+        )
         turn = now[:9] - first[:9]
         turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
         places = {joint: KINDS[joint[0]] + int(joint[1]) for joint in JOINTS}
-        posture = virtual_work.posture(self.geometry, now[:3], rotation_matrix(np.array(y[:4])))
+        posture = virtual_work.posture(
+            self.geometry, now[:3], rotation_matrix(np.array(y[:4]))
+        )
         mechanism = virtual_work.Mechanism.of(self.scene)
         torque = np.array(self.torque_at(time))
         answer = virtual_work.direct_dynamics(mechanism, posture, now[9:12], torque)
@@ -158,7 +173,9 @@ def turn_between(first: Array, second: Array) -> float:
 
 def find_relative(found: Array, expected: Array) -> float:
     """Length of the difference over the length of what is expected."""
-    return float(np.linalg.norm(np.asarray(found) - expected) / np.linalg.norm(expected))
+    return float(
+        np.linalg.norm(np.asarray(found) - expected) / np.linalg.norm(expected)
+    )
 
 
 BASE = "base"
@@ -204,8 +221,8 @@ def list_ties(task: Task) -> list[tuple[str, Array]]:
 def _body(task: Task, name: str, parent: str, joint: str, axis: Array) -> Body:
     """Put the centre of mass off O: engines scale the softness of a tie by where it is.
 
-    Without gravity only the inertia about O matters, so mass and centre are free: a point mass on
-    the axis of the largest moment takes from the two smaller ones only.
+    Without gravity only the inertia about O matters, so mass and centre are free: a
+    point mass on the axis of the largest moment takes from the two smaller ones only.
     """
     tensor = task.tensor(name)
     moments, axes = np.linalg.eigh(tensor)

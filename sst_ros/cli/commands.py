@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `sst-ros`: its table of commands, and how one runs; errors become an exit status.
+"""The command `sst-ros`: its table of commands, and how one runs.
 
-A function is named, not imported: its module, with the rooms and libraries that it uses, is
-imported when its command runs, so that `sst-ros --help` imports none of them.
+Errors become an exit status.
+
+A function is named, not imported: its module, with the rooms and libraries that it
+uses, is imported when its command runs, so that `sst-ros --help` imports none of them.
 """
 
 from __future__ import annotations
@@ -28,18 +30,26 @@ PROGRAM = "sst-ros"
 class Arg:
     """An argument as argparse takes it, and `module:function` of what completes it in a shell."""
 
-    def __init__(self, name: str, what: str = "", *, completer: str = "", **options: Any) -> None:
-        self.name, self.options, self.completer = name, {**options, "help": what}, completer
+    def __init__(
+        self, name: str, what: str = "", *, completer: str = "", **options: Any
+    ) -> None:
+        self.name, self.options, self.completer = (
+            name,
+            {**options, "help": what},
+            completer,
+        )
 
 
 class Subcommand:
     """A command: its line of help, what runs it as `module:function`, and its arguments.
 
-    Optional modules that it `needs` are looked for before the module that runs it is imported; its
-    page of help says `more`.
+    Optional modules that it `needs` are looked for before the module that runs it is
+    imported; its page of help says `more`.
     """
 
-    def __init__(self, what: str, run: str, *args: Arg, needs: str = "", more: str = "") -> None:
+    def __init__(
+        self, what: str, run: str, *args: Arg, needs: str = "", more: str = ""
+    ) -> None:
         self.what, self.run, self.arguments = what, run, args
         self.needs, self.more = needs.split(), more
 
@@ -51,14 +61,17 @@ def _number_of(kind: Callable[[str], Any], text: str) -> Any:
     try:
         return kind(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"invalid {kind.__name__} value: {text!r}") from None
+        raise argparse.ArgumentTypeError(
+            f"invalid {kind.__name__} value: {text!r}"
+        ) from None
 
 
 _flag = partial(Arg, action="store_true")
 _path = partial(Arg, type=Path)
 _number = partial(Arg, type=partial(_number_of, float))
 _whole = partial(Arg, type=partial(_number_of, int))
-_scene = partial(Arg, completer="scene.scene:names")  # which shells complete by argcomplete
+# which shells complete by argcomplete
+_scene = partial(Arg, completer="scene.scene:names")
 
 
 def _out(what: str, default: str) -> tuple[Arg, Arg]:
@@ -98,10 +111,15 @@ COMMANDS: dict[str, Subcommand | str] = {
         _count("--samples", 10_000_000, "even intervals in time; default: 200"),
         _path("--out", "trajectory, .parquet, .csv or .npz", metavar="FILE"),
         _flag("--plot", "draw it; beside FILE, or as SCENE.png"),
-        _flag("--reactions", "forces and moments at every joint: in FILE (.csv), as a picture"),
+        _flag(
+            "--reactions",
+            "forces and moments at every joint: in FILE (.csv), as a picture",
+        ),
         _flag("--force", "overwrite earlier results"),
-        more="Simulate a scene under its own torques. Exit status 1 if the motion ended "
-        "before the duration, at a limit of the scene for example.",
+        more=(
+            "Simulate a scene under its own torques. Exit status 1 if the motion ended "
+            "before the duration, at a limit of the scene for example."
+        ),
     ),
     "certify": Subcommand(
         "enclose the true motion of a scene: a proven bound of the error of simulate",
@@ -109,12 +127,19 @@ COMMANDS: dict[str, Subcommand | str] = {
         SCENE,
         _number("--duration", "length [s]; default: that of the scene"),
         _number("--bound", "angle to be proven [rad]; default: 1e-9", default=1e-9),
-        Arg("--digits", "keys of numbers known to their last digit", nargs="+", default=[]),
+        Arg(
+            "--digits",
+            "keys of numbers known to their last digit",
+            nargs="+",
+            default=[],
+        ),
         _path("--out", "table, .csv", metavar="FILE"),
         _flag("--force", "overwrite the file of --out"),
         needs="flint",
-        more="Enclose the true motion of a scene under its own torques, with proof. Exit status 1 "
-        "if it is not proven to its end, within the bound.",
+        more=(
+            "Enclose the true motion of a scene under its own torques, with proof. Exit"
+            " status 1 if it is not proven to its end, within the bound."
+        ),
     ),
     "workspace": Subcommand(
         "map the workspace of a scene: reach, condition, singular poses",
@@ -132,7 +157,9 @@ COMMANDS: dict[str, Subcommand | str] = {
         "cli.runs:check_files",
         _path("files", nargs="+", metavar="FILE"),
     ),
-    "scene schema": Subcommand("print the JSON schema, for editors", "cli.scenes:print_schema"),
+    "scene schema": Subcommand(
+        "print the JSON schema, for editors", "cli.scenes:print_schema"
+    ),
     "plan": "check a reference motion: torques, limits, shortest duration",
     "plan check": Subcommand(
         "check feasibility and the shortest duration; exit status 0 if feasible",
@@ -141,7 +168,9 @@ COMMANDS: dict[str, Subcommand | str] = {
         _flag("--json", "print JSON instead of a table"),
         _path("--csv", "write the torques to play", metavar="OUT"),
         _flag("--force", "overwrite the file of --csv"),
-        _number("--period", "length of a row of --csv [s]; default 0.001", default=1e-3),
+        _number(
+            "--period", "length of a row of --csv [s]; default 0.001", default=1e-3
+        ),
     ),
     "describe": Subcommand(
         "write a scene as URDF",
@@ -149,14 +178,16 @@ COMMANDS: dict[str, Subcommand | str] = {
         _scene("--scene", _OF_SCENE, default="example2", metavar="S"),
         Arg(
             "--ros2-control",
-            "with the tags by which ros2_control drives a running simulator; free by default",
+            "with the tags by which ros2_control drives a running simulator; free by"
+            " default",
             nargs="?",
             const="free",
             choices=("free", "lockstep"),
         ),
     ),
     "equations": Subcommand(
-        "write the equations of a scene for another program: C, CasADi, JAX, FMI, MuJoCo",
+        "write the equations of a scene for another program: C, CasADi, JAX, FMI,"
+        " MuJoCo",
         "cli.runs:write_equations",
         SCENE,
         Arg("--target", "what to write", choices=_TARGETS, required=True),
@@ -173,25 +204,37 @@ COMMANDS: dict[str, Subcommand | str] = {
     "demo": Subcommand(
         "run the paper's examples or a reference motion by the nodes",
         "cli.reports:run_demo",
-        Arg("kind", "default: examples", nargs="?", choices=("examples", "feedforward")),
+        Arg(
+            "kind", "default: examples", nargs="?", choices=("examples", "feedforward")
+        ),
         *_out("folder of the results", "demo_out or demo_out/feedforward"),
         _scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
         Arg("--mode", "with feedforward: control modes", nargs="+", choices=_MODES),
         needs="rclpy rosbags matplotlib",
-        more="Run the paper's examples, or have the node inverse_dynamics follow a scene's motion.",
+        more=(
+            "Run the paper's examples, or have the node inverse_dynamics follow a"
+            " scene's motion."
+        ),
     ),
     "view": Subcommand(
         "show the manipulator in a browser, live or from a bag",
         "cli.runs:view",
         _path("bag", "folder of a bag to play", nargs="?"),
         _scene("--scene", "start a simulator of this scene to look at", metavar="S"),
-        Arg("--simulator", "node of the simulator", default="sst_simulator", metavar="NAME"),
+        Arg(
+            "--simulator",
+            "node of the simulator",
+            default="sst_simulator",
+            metavar="NAME",
+        ),
         Arg("--namespace", f"namespace of its nodes; with BAG {_RUN_OF}", metavar="NS"),
         Arg("--host", "address to serve at (this machine only)", default="127.0.0.1"),
         _count("--port", 65535, "port, or the next free one", 1024, default=8080),
         _flag("--open", "open it, where there is a desktop"),
         needs="viser",
-        more="Show a running simulator, one that is started for it (--scene), or a bag.",
+        more=(
+            "Show a running simulator, one that is started for it (--scene), or a bag."
+        ),
     ),
     "report": "evaluate a recorded run or the integration methods",
     "report run": Subcommand(
@@ -210,10 +253,17 @@ COMMANDS: dict[str, Subcommand | str] = {
         *_out("folder of the results", "accuracy_out"),
     ),
     "report stability": Subcommand(
-        "stable steps along the motion of a scene; runs at its limits and with other numbers",
+        "stable steps along the motion of a scene; runs at its limits and with other"
+        " numbers",
         "cli.reports:report_stability",
         SCENE,
-        Arg("--only", "rows of the table; default: all", nargs="+", default=[], metavar="ROW"),
+        Arg(
+            "--only",
+            "rows of the table; default: all",
+            nargs="+",
+            default=[],
+            metavar="ROW",
+        ),
         *_out("folder of the results", "stability_out"),
         needs="pandas matplotlib",
     ),
@@ -225,7 +275,13 @@ COMMANDS: dict[str, Subcommand | str] = {
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
         _NAMESPACE,
         _flag("--list", "list the pictures, and draw none"),
-        _path("--compare", "deprecated: `sst-ros compare`", nargs="+", default=[], metavar="BAG"),
+        _path(
+            "--compare",
+            "deprecated: `sst-ros compare`",
+            nargs="+",
+            default=[],
+            metavar="BAG",
+        ),
     ),
     "compare": Subcommand(
         "show by joint how recorded runs differ: table, pictures",
@@ -267,28 +323,50 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("study", "study as a .yaml file; or the word plot", metavar="STUDY"),
         _path("folder", "with plot: folder of results", nargs="?", metavar="DIR"),
         _path("--out", "folder of the results; default: STUDY_sweep, or with plot DIR"),
-        Arg("--scheduler", "Dask scheduler, as tcp://host:8786; default: none", metavar="ADDRESS"),
+        Arg(
+            "--scheduler",
+            "Dask scheduler, as tcp://host:8786; default: none",
+            metavar="ADDRESS",
+        ),
         _count("--workers", 1024, "threads; default: one a core"),
         _flag("--resume", "compute only the chunks that are missing in --out"),
         more="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
     "identify": Subcommand(
-        "identify inertias, friction and more from a recorded run; design excitation motions",
+        "identify inertias, friction and more from a recorded run; design excitation"
+        " motions",
         "cli.motions:run_identification",
         Arg("bag", "folder of the bag, or the word design", metavar="BAG"),
-        _scene("designed", "after design: scene to make a motion for", nargs="?", metavar="SCENE"),
-        _scene("--scene", "known numbers, and where to start; default: as recorded", metavar="S"),
+        _scene(
+            "designed",
+            "after design: scene to make a motion for",
+            nargs="?",
+            metavar="SCENE",
+        ),
+        _scene(
+            "--scene",
+            "known numbers, and where to start; default: as recorded",
+            metavar="S",
+        ),
         Arg(
             "--parameters",
-            "unknowns by the beginning of their names, as in: star friction.gamma offset; "
-            "default: bodies, friction, springs and rotors of the scene; by simulation full names, "
-            "as in: friction.gamma.smoothing stroke.restitution",
+            "unknowns by the beginning of their names, as in: star friction.gamma"
+            " offset; default: bodies, friction, springs and rotors of the scene; by"
+            " simulation full names, as in: friction.gamma.smoothing"
+            " stroke.restitution",
             nargs="+",
             metavar="P",
         ),
         _NAMESPACE,
-        Arg("--method", "default: inverse_dynamics", choices=("inverse_dynamics", "simulation")),
-        _number("--cutoff", "of a zero-phase filter of measured angles [Hz]; default: no filter"),
+        Arg(
+            "--method",
+            "default: inverse_dynamics",
+            choices=("inverse_dynamics", "simulation"),
+        ),
+        _number(
+            "--cutoff",
+            "of a zero-phase filter of measured angles [Hz]; default: no filter",
+        ),
         _number(
             "--delay",
             "of measured angles [s]; default: estimated where angles are filtered",
@@ -298,11 +376,15 @@ COMMANDS: dict[str, Subcommand | str] = {
         _whole("--seed", "of a designed motion; default: 0"),
         _path("--out", "write the scene", metavar="SCENE.yaml"),
         _flag("--force", "overwrite the file of --out"),
-        more="`identify BAG` fits the torques of a recorded run by weighted least squares: "
-        "what the motion determines, with standard deviations, and the nearest scene whose bodies "
-        "can exist. With --method simulation the motion is integrated and fitted to the recorded "
-        "angles, by any numbers of the scene. `identify design SCENE` makes a motion that "
-        "determines the parameters well, within stroke, workspace and the limits of the actuators.",
+        more=(
+            "`identify BAG` fits the torques of a recorded run by weighted least"
+            " squares: what the motion determines, with standard deviations, and the"
+            " nearest scene whose bodies can exist. With --method simulation the motion"
+            " is integrated and fitted to the recorded angles, by any numbers of the"
+            " scene. `identify design SCENE` makes a motion that determines the"
+            " parameters well, within stroke, workspace and the limits of the"
+            " actuators."
+        ),
     ),
 }
 """A word names a group of commands."""
@@ -327,8 +409,14 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the usage, the error and the nearest name; exit with status 2."""
         more = ""
-        if wrong := re.search(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message):
-            known = [str(choice) for action in self._actions for choice in action.choices or ()]
+        if wrong := re.search(
+            r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message
+        ):
+            known = [
+                str(choice)
+                for action in self._actions
+                for choice in action.choices or ()
+            ]
             known += self._option_string_actions
             more = suggestion(wrong[1] or wrong[2].partition("=")[0], known)
         super().error(printable(message) + more)
@@ -337,23 +425,36 @@ class Parser(argparse.ArgumentParser):
 def parser() -> Parser:
     """Build the parser of all commands.
 
-    Nodes are listed but parse their arguments themselves: a node takes those of ROS, too.
+    Nodes are listed but parse their arguments themselves: a node takes those of ROS,
+    too.
     """
     result = Parser(
         prog=PROGRAM,
-        description="Simulator of the 3-RRP spherical star-triangle parallel manipulator.",
+        description=(
+            "Simulator of the 3-RRP spherical star-triangle parallel manipulator."
+        ),
         epilog=f"`{PROGRAM} COMMAND --help` describes a command or a node.",
     )
     result.add_argument("--version", action="version", version=f"{PROGRAM} {VERSION}")
-    result.add_argument("--debug", action="store_true", help="print the traceback of an error")
-    groups = {"": result.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)}
+    result.add_argument(
+        "--debug", action="store_true", help="print the traceback of an error"
+    )
+    groups = {
+        "": result.add_subparsers(
+            dest="command", metavar="COMMAND", parser_class=Parser
+        )
+    }
     for name, entry in COMMANDS.items():
         group, _, last = name.rpartition(" ")
         if isinstance(entry, str):
             below = groups[group].add_parser(last, help=entry)
-            groups[name] = below.add_subparsers(dest="kind", required=True, metavar="KIND")
+            groups[name] = below.add_subparsers(
+                dest="kind", required=True, metavar="KIND"
+            )
             continue
-        command = groups[group].add_parser(last, help=entry.what, description=entry.more or None)
+        command = groups[group].add_parser(
+            last, help=entry.what, description=entry.more or None
+        )
         command.set_defaults(entry=entry)
         for each in entry.arguments:
             action: Any = command.add_argument(each.name, **each.options)
@@ -371,18 +472,27 @@ def function(name: str) -> Any:
 
 
 def free_out(options: argparse.Namespace, default: str | Path) -> Path:
-    """Return the path of `--out`, or the default; refuse to overwrite without `--force`."""
+    """Return the path of `--out`, or the default.
+
+    Refuse to overwrite without `--force`.
+    """
     out = options.out or Path(default)
     return require_free(out, options.command, force=getattr(options, "force", False))
 
 
 def run_command(words: list[str]) -> int:
-    """Run a command or a node; return the exit status. Errors are one line on stderr."""
+    """Run a command or a node; return the exit status.
+
+    Errors are one line on stderr.
+    """
     end = words.index("--ros-args") if "--ros-args" in words else len(words)
     debug = "--debug" in words[:end]  # wherever it is before the words of ROS
     try:
-        status = _run([*(word for word in words[:end] if word != "--debug"), *words[end:]])
-        print(end="", flush=True)  # does nothing where stdout was closed before the start
+        status = _run(
+            [*(word for word in words[:end] if word != "--debug"), *words[end:]]
+        )
+        # does nothing where stdout was closed before the start
+        print(end="", flush=True)
     except (Exception, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()

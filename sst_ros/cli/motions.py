@@ -35,11 +35,15 @@ PLOT, DESIGN = "plot", "design"  # words in place of a study, and of a bag
 
 def check_plan(options: argparse.Namespace) -> int:
     """Print what a reference motion requires; write the torques that follow it."""
-    valid, allowed = 1e-9 <= options.period < math.inf, "must be a finite number >= 1e-9 [s]"
+    valid, allowed = (
+        1e-9 <= options.period < math.inf,
+        "must be a finite number >= 1e-9 [s]",
+    )
     refuse_unless("plan check", ("--period", options.period, valid, allowed))
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
-    scene, of_bag = load(options.scene), "recording.recording:read_run_motion"  # needs rosbags
+    # needs rosbags
+    scene, of_bag = load(options.scene), "recording.recording:read_run_motion"
     motion = reference_motion(scene, lambda bag: function(of_bag)(bag))
     plan = examine_motion(motion, scene)
     speeds = time_scaling(plan)
@@ -57,16 +61,24 @@ def check_plan(options: argparse.Namespace) -> int:
 def run_sweep(options: argparse.Namespace) -> None:
     """Run a study of many runs, or draw the results of one."""
     if str(options.study) == PLOT:
-        if options.folder is None or options.scheduler or options.workers or options.resume:
+        if (
+            options.folder is None
+            or options.scheduler
+            or options.workers
+            or options.resume
+        ):
             options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
-        draw = function("sweeps.sweep_pictures:draw_pictures")  # a sweep needs no Matplotlib
+        # a sweep needs no Matplotlib
+        draw = function("sweeps.sweep_pictures:draw_pictures")
         for path in draw(read_sweep(options.folder), options.out or options.folder):
             print(path)
         return
     if options.folder is not None:
         options.parser.error("DIR is an argument of `sweep plot`; give --out DIR")
     if options.scheduler and options.workers:
-        options.parser.error("--workers is for this machine; a scheduler has workers of its own")
+        options.parser.error(
+            "--workers is for this machine; a scheduler has workers of its own"
+        )
     out = options.out or options.study.with_name(f"{options.study.stem}_sweep")
     if not options.resume:
         free_out(options, out)
@@ -83,7 +95,10 @@ def run_sweep(options: argparse.Namespace) -> None:
 
 def run_identification(options: argparse.Namespace) -> None:
     """Identify a scene from a recorded run, or design a motion that determines its parameters."""
-    designing, later = options.bag == DESIGN, "must be given after design, and only there"
+    designing, later = (
+        options.bag == DESIGN,
+        "must be given after design, and only there",
+    )
     ours, others = (
         ("duration", "harmonics", "seed"),
         ("cutoff", "delay", "scene", "method", "namespace"),

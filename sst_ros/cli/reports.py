@@ -48,7 +48,10 @@ def draw_pictures(options: argparse.Namespace) -> int:
         return 0
     if options.compare:
         print("plot --compare is deprecated: use sst-ros compare", file=sys.stderr)
-        options.bags, options.csv = [*filter(None, [options.bag]), *options.compare], None
+        options.bags, options.csv = (
+            [*filter(None, [options.bag]), *options.compare],
+            None,
+        )
         options.namespace = [options.namespace] if options.namespace else []
         return compare_runs(options)
     if options.bag is None:
@@ -110,7 +113,10 @@ def run_demo(options: argparse.Namespace) -> None:
         for mode in options.mode or demo.MODES:
             print(f"{name}, {mode}: {load(name).description}", flush=True)
             bag = demo.follow(name, out / mode, mode)
-            print(function("report.tracking:write_tracking_report")(bag, out / mode), flush=True)
+            print(
+                function("report.tracking:write_tracking_report")(bag, out / mode),
+                flush=True,
+            )
         return
     for name in demo.EXAMPLES:
         folder = out if name == "example2" else out / name  # the main job

@@ -52,7 +52,9 @@ def check_files(options: argparse.Namespace) -> int:
 
 
 def check(name_or_path: str | Path) -> Scene:
-    """Read a scene and assemble it at its initial state, which `load` does not; faults have lines.
+    """Read a scene and assemble it at its initial state, which `load` does not.
+
+    Faults have lines.
 
     Every fault is in one InputError.
     """
@@ -64,21 +66,27 @@ def check(name_or_path: str | Path) -> Scene:
     except InputError as error:
         problems = list(error.problems)
     except SstError as error:
-        problems = [Problem("initial.gamma", scene.initial.gamma, f"cannot start here: {error}")]
+        problems = [
+            Problem("initial.gamma", scene.initial.gamma, f"cannot start here: {error}")
+        ]
     placed = [dataclasses.replace(p, line=line_of(source, p.key)) for p in problems]
     raise InputError(origin, placed)
 
 
 def implausible(scene: Scene) -> str:
-    """Describe numbers of the star that no body can have though each is allowed; "" for none."""
+    """Describe numbers of the star that no body can have though each is allowed.
+
+    "" for none.
+    """
     star = scene.star
     # A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O.
     trace, most = float(star.inertia.matrix.trace()), 2.0 * star.mass * star.radius**2
     if star.mass == 0.0 or trace <= most * (1.0 + ROUNDING):
         return ""
     return (
-        f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass = {star.mass:g} kg "
-        f"within star.radius = {star.radius:g} m has at most 2 m r^2 = {most:g} kg m^2"
+        f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass ="
+        f" {star.mass:g} kg within star.radius = {star.radius:g} m has at most 2 m r^2"
+        f" = {most:g} kg m^2"
     )
 
 
@@ -102,10 +110,14 @@ def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
     out, pictures = options.out, list[tuple[Path, str]]()
     ends = f"must end in {' or '.join(SUFFIXES)}"
-    refuse_unless("simulate", ("--out", str(out), out is None or out.suffix in SUFFIXES, ends))
+    refuse_unless(
+        "simulate", ("--out", str(out), out is None or out.suffix in SUFFIXES, ends)
+    )
     written = out is None or out.suffix == ".csv"
     shown = not options.reactions or (written and (out is not None or options.plot))
-    refuse_unless("simulate", ("--reactions", True, shown, "needs --plot, or --out FILE.csv"))
+    refuse_unless(
+        "simulate", ("--reactions", True, shown, "needs --plot, or --out FILE.csv")
+    )
     if out is not None:
         free_out(options, out)
         if library := {".parquet": "pyarrow", ".csv": "pandas"}.get(out.suffix):
@@ -151,7 +163,9 @@ def view(options: argparse.Namespace) -> int:
     """Serve the page of a bag, of a running simulator, or of one that is started for it."""
     if options.bag is not None:
         one = options.scene is None
-        refuse_unless("view", ("--scene", options.scene, one, "give a bag or a scene, not both"))
+        refuse_unless(
+            "view", ("--scene", options.scene, one, "give a bag or a scene, not both")
+        )
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as end:
@@ -164,7 +178,9 @@ def view(options: argparse.Namespace) -> int:
     require("rclpy")
     if options.scene is not None:
         load(options.scene)  # refused before a process of its own would be
-    given = {name: getattr(options, name) for name in ("simulator", "host", "port", "open")}
+    given = {
+        name: getattr(options, name) for name in ("simulator", "host", "port", "open")
+    }
     words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace or '/'}"]
     with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
         status: int = function("nodes.process:run")([*words, *processes.words(given)])
@@ -194,6 +210,9 @@ def write_tables(options: argparse.Namespace) -> None:
 def write_recovered(options: argparse.Namespace) -> None:
     """Write what is intact in a recording as a new one."""
     found = function("recording.bag_writer:recover")(options.bag, options.out)
-    print(f"{found.messages} messages recovered into {found.bag}, {found.lost} known to be lost")
+    print(
+        f"{found.messages} messages recovered into {found.bag}, {found.lost} known to"
+        " be lost"
+    )
     for line in found.damage:
         print(f"  {line}")

@@ -19,11 +19,17 @@ def list_all(_: argparse.Namespace) -> None:
 
 def print_schema(_: argparse.Namespace) -> None:
     """Print the JSON schema of scenes."""
-    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "sst_ros scene"}
+    head = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "sst_ros scene",
+    }
     print(json.dumps(head | json_schema(Scene), indent=2))
 
 
 def describe(options: argparse.Namespace) -> None:
     """Print a scene as URDF."""
     sync = options.ros2_control
-    print(urdf(load(options.scene), TOPICS if sync else (), lockstep=sync == "lockstep"), end="")
+    print(
+        urdf(load(options.scene), TOPICS if sync else (), lockstep=sync == "lockstep"),
+        end="",
+    )

@@ -2,9 +2,10 @@
 """The equations of a scene as C99: a file and its header, with nothing but libm.
 
 The functions do the operations of the package in its order, so they give its bits where
-the functions of libm do. A compiler must neither fuse a multiplication and an addition nor
-reorder them: the source switches the former off for GCC, Clang and all others that know
-the pragma of C99; the latter happens only with -ffast-math, which must not be given.
+the functions of libm do. A compiler must neither fuse a multiplication and an addition
+nor reorder them: the source switches the former off for GCC, Clang and all others that
+know the pragma of C99; the latter happens only with -ffast-math, which must not be
+given.
 """
 
 from __future__ import annotations
@@ -12,7 +13,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from sst_ros.code_generation.named_programs import Argument, NamedProgram, SceneEquations
+from sst_ros.code_generation.named_programs import (
+    Argument,
+    NamedProgram,
+    SceneEquations,
+)
 
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 PATTERNS = {
@@ -33,7 +38,9 @@ NO_FUSION = """\
 
 def identifier(equations: SceneEquations) -> str:
     """Return the name of the scene as an identifier of C and a name of files."""
-    return re.sub(r"^(?=\d)", "scene_", re.sub(r"\W", "_", equations.scene.name, flags=re.A))
+    return re.sub(
+        r"^(?=\d)", "scene_", re.sub(r"\W", "_", equations.scene.name, flags=re.A)
+    )
 
 
 def c_files(equations: SceneEquations) -> dict[str, str]:
@@ -118,7 +125,9 @@ def _body(named: NamedProgram) -> Iterator[str]:
     first = 0
     for argument in named.arguments:
         numbers = range(first, first + argument.size)
-        yield from _reads(argument, [number - first for number in numbers if number in used])
+        yield from _reads(
+            argument, [number - first for number in numbers if number in used]
+        )
         first += argument.size
     words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
     for i, (operation, operands) in enumerate(named.steps):

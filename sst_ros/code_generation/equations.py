@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """equations(): the equations of motion of a scene for other programs and languages.
 
-The package traces its dynamics into straight-line programs (`programs.expression`). Here
-they are written out: as C, as a module of Python on the numbers of another library, as a
-unit of the Functional Mock-up Interface, or as a model of MuJoCo.
+The package traces its dynamics into straight-line programs (`programs.expression`).
+Here they are written out: as C, as a module of Python on the numbers of another
+library, as a unit of the Functional Mock-up Interface, or as a model of MuJoCo.
 """
 
 from __future__ import annotations
@@ -62,10 +62,13 @@ class Equations(Explained):
         self.initial_state = initial_state
 
     def __getattr__(self, name: str) -> Any:
-        # Called for names alone that are no attribute; those of `outputs` are functions.
+        # Called for names alone that are no attribute; those of `outputs` are
+        # functions.
         outputs = self.__dict__.get("outputs", ())
         if name not in outputs or self.target not in LIBRARIES:
-            raise AttributeError(f"equations for {self.__dict__.get('target')} have no {name!r}")
+            raise AttributeError(
+                f"equations for {self.__dict__.get('target')} have no {name!r}"
+            )
         return self._functions[name]
 
     def write(self, folder: str | Path, *, force: bool = False) -> list[Path]:
@@ -111,18 +114,16 @@ def equations(
 ) -> Equations:
     """Write the equations of motion of a scene for another program.
 
-    Args:
-        scene: name or path of a scene, its document as a dict, or a `Scene`.
-        target: "c" (C99 with its header), "numpy", "jax", "casadi" or "mpmath" (a module of
-            Python, whose functions the result has too), "fmu" (FMI 3.0, Model Exchange and
-            Co-Simulation) or "mjcf" (the mechanism for MuJoCo).
-        parameters: keys of numbers of the scene that stay open, as "star.inertia.zz",
-            "payload.mass" or "friction.gamma.viscous", but not of its geometry; the
-            functions take their values as the last argument. A vector means each of its
-            components, a list each of its entries.
-        outputs: which equations, of "derivative", "joints", "energies",
-            "derivative_by_state", "derivative_by_torque", "derivative_by_parameters"; by
-            default all. "fmu" and "mjcf" have what their formats ask for.
+    Args: scene: name or path of a scene, its document as a dict, or a `Scene`. target:
+        "c" (C99 with its header), "numpy", "jax", "casadi" or "mpmath" (a module of
+        Python, whose functions the result has too), "fmu" (FMI 3.0, Model Exchange and
+        Co-Simulation) or "mjcf" (the mechanism for MuJoCo). parameters: keys of numbers
+        of the scene that stay open, as "star.inertia.zz", "payload.mass" or
+        "friction.gamma.viscous", but not of its geometry; the functions take their
+        values as the last argument. A vector means each of its components, a list each
+        of its entries. outputs: which equations, of "derivative", "joints", "energies",
+        "derivative_by_state", "derivative_by_torque", "derivative_by_parameters"; by
+        default all. "fmu" and "mjcf" have what their formats ask for.
 
     Raises:
         InputError: an argument is not allowed, or the scene has what the target lacks.
@@ -134,7 +135,12 @@ def equations(
     refuse_unless(
         CALLER,
         ("target", target, target in TARGETS, f"must be one of {', '.join(TARGETS)}"),
-        ("outputs", outputs, not (whole and outputs), f"are fixed for {target}: give none"),
+        (
+            "outputs",
+            outputs,
+            not (whole and outputs),
+            f"are fixed for {target}: give none",
+        ),
         (
             "parameters",
             parameters,

@@ -37,7 +37,12 @@ INPUTS = (
     *(f"torque_{leg}" for leg in (1, 2, 3)),
     *(f"moment_{axis}" for axis in "xyz"),
 )
-OUTPUTS = (*JOINTS, *(f"{name}_rate" for name in JOINTS), "kinetic_energy", "potential_energy")
+OUTPUTS = (
+    *JOINTS,
+    *(f"{name}_rate" for name in JOINTS),
+    "kinetic_energy",
+    "potential_energy",
+)
 STATE_UNITS = ("1",) * 4 + ("rad/s",) * 3 + ("N.m",) * 3
 OUTPUT_UNITS = ("rad",) * 9 + ("rad/s",) * 9 + ("J",) * 2
 UNITS: dict[str, dict[str, int]] = {
@@ -52,7 +57,8 @@ UNITS: dict[str, dict[str, int]] = {
 
 PLATFORMS = {("Linux", "x86_64"): "x86_64-linux", ("Linux", "aarch64"): "aarch64-linux"}
 FLAGS = ("-std=c99", "-O2", "-fvisibility=hidden", "-shared", "-fPIC")
-EPOCH = (1980, 1, 1, 0, 0, 0)  # of the files in the zip, so that equal scenes give equal bytes
+# of the files in the zip, so that equal scenes give equal bytes
+EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
@@ -65,7 +71,11 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
         equations.scene, equations.parameters, ("derivative", "joints", "energies")
     )
     templates = load_templates("code_generation")
-    token = str(uuid.uuid5(uuid.NAMESPACE_URL, f"{VERSION} {whole.scene_hash} {whole.parameters}"))
+    token = str(
+        uuid.uuid5(
+            uuid.NAMESPACE_URL, f"{VERSION} {whole.scene_hash} {whole.parameters}"
+        )
+    )
     sources = c_files(whole)
     sources["fmi3.c"] = templates.get_template("fmi3.c").render(
         name=name,
@@ -84,7 +94,9 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
         name=name,
         title=whole.scene.name,
         token=token,
-        description=f"{whole.scene.description} SHA-256 of the scene: {whole.scene_hash}",
+        description=(
+            f"{whole.scene.description} SHA-256 of the scene: {whole.scene_hash}"
+        ),
         version=VERSION,
         units=UNITS,
         duration=whole.scene.duration,
@@ -107,15 +119,25 @@ def _variables(equations: SceneEquations) -> Iterator[dict[str, Any]]:
     """Yield the attributes of each variable, in the order of value references."""
     continuous = {"variability": "continuous"}
     size = equations.state.size
-    rows: list[dict[str, Any]] = [{"name": "time", "causality": "independent", "unit": "s"}]
+    rows: list[dict[str, Any]] = [
+        {"name": "time", "causality": "independent", "unit": "s"}
+    ]
     rows[0] |= continuous
     for name, unit, start in zip(STATES, STATE_UNITS, equations.initial, strict=False):
         exact = {"initial": "exact", "start": repr(start)}
-        rows.append({"name": name, "causality": "output", "unit": unit} | continuous | exact)
+        rows.append(
+            {"name": name, "causality": "output", "unit": unit} | continuous | exact
+        )
     for i in range(size):
         derivative = {"initial": "calculated", "derivative": 1 + i}
-        rows.append({"name": f"der({STATES[i]})", "causality": "local"} | continuous | derivative)
-    for argument, names in zip(equations.acting, (INPUTS[:3], INPUTS[3:]), strict=False):
+        rows.append(
+            {"name": f"der({STATES[i]})", "causality": "local"}
+            | continuous
+            | derivative
+        )
+    for argument, names in zip(
+        equations.acting, (INPUTS[:3], INPUTS[3:]), strict=False
+    ):
         for name, quantity in zip(names, argument.quantities, strict=True):
             about = {"causality": "input", "unit": "N.m", "description": quantity}
             rows.append({"name": name, "start": "0.0"} | about | continuous)
@@ -124,10 +146,17 @@ def _variables(equations: SceneEquations) -> Iterator[dict[str, Any]]:
         rows.append({"name": name, "causality": "output"} | continuous | calculated)
     fixed = {"causality": "parameter", "variability": "fixed", "initial": "exact"}
     quantities = [text for argument in equations.open for text in argument.quantities]
-    for name, value, text in zip(equations.parameters, equations.values, quantities, strict=True):
+    for name, value, text in zip(
+        equations.parameters, equations.values, quantities, strict=True
+    ):
         rows.append({"name": name, "start": repr(value), "description": text} | fixed)
-    text = "Co-Simulation: length of a step [s]; 0 for steps that an error estimate controls"
-    rows.append({"name": "step", "start": "0.0", "unit": "s", "description": text} | fixed)
+    text = (
+        "Co-Simulation: length of a step [s]; 0 for steps that an error estimate"
+        " controls"
+    )
+    rows.append(
+        {"name": "step", "start": "0.0", "unit": "s", "description": text} | fixed
+    )
     for reference, row in enumerate(rows):
         yield {"valueReference": reference} | row
 
@@ -145,7 +174,10 @@ def _structure(equations: SceneEquations) -> Iterator[tuple[str, int]]:
 
 
 def _binary(name: str, sources: dict[str, str]) -> dict[str, bytes]:
-    """Compile the sources for this platform; return the binary by its path in the unit."""
+    """Compile the sources for this platform.
+
+    Return the binary by its path in the unit.
+    """
     compiler = shutil.which("cc")
     folder = PLATFORMS.get((platform.system(), platform.machine()))
     if compiler is None or folder is None:
@@ -158,8 +190,14 @@ def _binary(name: str, sources: dict[str, str]) -> dict[str, bytes]:
             (Path(place) / file).write_text(text, encoding="utf-8")
         units = [file for file in sources if file.endswith(".c")]
         command = [compiler, *FLAGS, "-o", f"{name}.so", *units, "-lm"]
-        done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, cwd=place, capture_output=True, text=True, check=False
+        )
         if done.returncode != 0:
             said = done.stderr.strip().splitlines()
-            raise SstError(f"the C compiler cc failed: {said[0] if said else done.returncode}")
-        return {f"binaries/{folder}/{name}.so": (Path(place) / f"{name}.so").read_bytes()}
+            raise SstError(
+                f"the C compiler cc failed: {said[0] if said else done.returncode}"
+            )
+        return {
+            f"binaries/{folder}/{name}.so": (Path(place) / f"{name}.so").read_bytes()
+        }

@@ -166,7 +166,8 @@ class SceneEquations:
         symbols = tuple(f"p{i}" for i in range(len(self.parameters)))
         keys = zip(self.parameters, self.values, strict=True)
         quantities = tuple(
-            f"{key} [{_unit_of(self.scene, key)}], in the scene {value!r}" for key, value in keys
+            f"{key} [{_unit_of(self.scene, key)}], in the scene {value!r}"
+            for key, value in keys
         )
         return (Argument(PARAMETERS, symbols, quantities),)
 
@@ -174,10 +175,16 @@ class SceneEquations:
     def header(self) -> list[str]:
         """Lines that say what the equations are, for the head of each file."""
         lines = [
-            f"Equations of motion of the scene {self.scene.name}, by sst_ros {VERSION}.",
+            (
+                f"Equations of motion of the scene {self.scene.name}, by sst_ros"
+                f" {VERSION}."
+            ),
             f"SHA-256 of the scene: {self.scene_hash}",
             "",
-            "They are those of the mechanism with its loads. Torques are not clamped to",
+            (
+                "They are those of the mechanism with its loads. Torques are not"
+                " clamped to"
+            ),
             "the limit of the actuators, and nothing stops at a limit: results are not",
             "finite where mu_k is 0 or pi, and the caller has to check that they are.",
         ]
@@ -236,7 +243,9 @@ def _energies(equations: SceneEquations) -> NamedProgram:
     def energies(*inputs: Any) -> tuple[Any, ...]:
         model = equations.model(inputs[size:])
         state = inputs[:size]
-        return kernel.kinetic_energy(model, state), kernel.potential_energy(model, state)
+        return kernel.kinetic_energy(model, state), kernel.potential_energy(
+            model, state
+        )
 
     program = trace(energies, _symbols(arguments))
     description = "kinetic and potential energy [J]"
@@ -264,7 +273,9 @@ def _jacobian(equations: SceneEquations, by: Argument) -> NamedProgram:
     entries = [whole.outputs[i] for i in columns.T.ravel()]
     program = whole.prune(entries)
     name = f"derivative_by_{by.name}"
-    description = f"Jacobian of the derivative by {by.name}: a row a number of the state"
+    description = (
+        f"Jacobian of the derivative by {by.name}: a row a number of the state"
+    )
     return NamedProgram(name, description, arguments, (rows, by.size), program)
 
 

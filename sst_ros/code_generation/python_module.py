@@ -75,28 +75,37 @@ LIBRARIES = {
     for library in (
         Library(
             name="numpy",
-            imports="import numpy\n"
-            "from numpy import arctan2, cos, exp, maximum, sin, sqrt, tanh, where",
+            imports=(
+                "import numpy\n"
+                "from numpy import arctan2, cos, exp, maximum, sin, sqrt, tanh, where"
+            ),
             about=ARRAYS.format(more="Numbers are doubles."),
             collect=STACK.format(library="numpy"),
             words={"atan2": "arctan2"},
         ),
         Library(
             name="jax",
-            imports="import jax.numpy as jnp\n"
-            "from jax.numpy import arctan2, cos, exp, maximum, sin, sqrt, tanh, where",
+            imports=(
+                "import jax.numpy as jnp\nfrom jax.numpy import arctan2, cos, exp,"
+                " maximum, sin, sqrt, tanh, where"
+            ),
             about=ARRAYS.format(
-                more="Functions are pure: jit, grad, vmap and scan take them.\n"
-                "Numbers have the precision of the arguments: for doubles call\n"
-                '`jax.config.update("jax_enable_x64", True)` before arrays are made.'
+                more=(
+                    "Functions are pure: jit, grad, vmap and scan take them.\nNumbers"
+                    " have the precision of the arguments: for doubles"
+                    ' call\n`jax.config.update("jax_enable_x64", True)` before arrays'
+                    " are made."
+                )
             ),
             collect=STACK.format(library="jnp"),
             words={"atan2": "arctan2"},
         ),
         Library(
             name="casadi",
-            imports="import casadi\n"
-            "from casadi import atan2, cos, exp, fmax, if_else, sin, sqrt, tanh",
+            imports=(
+                "import casadi\n"
+                "from casadi import atan2, cos, exp, fmax, if_else, sin, sqrt, tanh"
+            ),
             about="Each is a `casadi.Function` of column vectors.",
             collect=CASADI_TAIL,
             unpack="casadi.vertsplit({})",
@@ -106,10 +115,14 @@ LIBRARIES = {
         ),
         Library(
             name="mpmath",
-            imports="import mpmath\nfrom mpmath import atan2, cos, exp, sin, sqrt, tanh",
-            about="Arguments are sequences of numbers; the precision is that of mpmath.mp.\n"
-            "The constants are the doubles of the package: more digits than theirs are\n"
-            "those of the equations with exactly these constants.",
+            imports=(
+                "import mpmath\nfrom mpmath import atan2, cos, exp, sin, sqrt, tanh"
+            ),
+            about=(
+                "Arguments are sequences of numbers; the precision is that of"
+                " mpmath.mp.\nThe constants are the doubles of the package: more digits"
+                " than theirs are\nthose of the equations with exactly these constants."
+            ),
             collect=MPMATH_TAIL,
             unpack="map(mpmath.mpf, {})",
             positive="max({}, 0)",
@@ -152,7 +165,9 @@ def _function(named: NamedProgram, library: Library) -> Iterator[str]:
         yield f"\n\n{library.made.format(name=named.name, sizes=sizes)}"
 
 
-def _write_operations(named: NamedProgram, library: Library) -> tuple[list[str], list[str]]:
+def _write_operations(
+    named: NamedProgram, library: Library
+) -> tuple[list[str], list[str]]:
     """Return a line for each step, v0 = .., v1 = .., and what the outputs are called."""
     program = named.program
     words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]

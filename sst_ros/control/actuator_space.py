@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Desired motions, and the map between the star and the actuators, to rounding.
 
-One equation serves both directions: gamma_dot_k = g_k.W and its derivative gamma_ddot_k =
-g_k.W_dot + (acceleration at W_dot = 0), which is Eq. 40 solved for gamma_ddot. The orientation at
-given actuator angles comes from Newton's method, started so close that it stays in the assembly
-mode; `ActuatorSpaceMap.follow` sees to that from one set of angles to the next, however far apart.
+One equation serves both directions: gamma_dot_k = g_k.W and its derivative gamma_ddot_k
+= g_k.W_dot + (acceleration at W_dot = 0), which is Eq. 40 solved for gamma_ddot. The
+orientation at given actuator angles comes from Newton's method, started so close that
+it stays in the assembly mode; `ActuatorSpaceMap.follow` sees to that from one set of
+angles to the next, however far apart.
 """
 
 from __future__ import annotations
@@ -21,7 +22,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
-from sst_ros.errors import SingularConfiguration, check_kinds, check_kinds_late, refuse_unless
+from sst_ros.errors import (
+    SingularConfiguration,
+    check_kinds,
+    check_kinds_late,
+    refuse_unless,
+)
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
@@ -30,7 +36,8 @@ from sst_ros.programs.expression import compile_program, trace
 from sst_ros.state import ZERO, Explained, Quaternion, Vector3, find_lost_meaning
 
 ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
-CLOSED = 1e-14  # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
+# largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
+CLOSED = 1e-14
 _STEPS = 20
 _STAR = (*"xyzw", "wx", "wy", "wz", "ax", "ay", "az")
 _MOVING = (*_STAR[:4], "d1", "d2", "d3", "dd1", "dd2", "dd3")
@@ -39,7 +46,10 @@ _POSE = (*_STAR[:4], *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
 
 @dataclass(frozen=True)
 class Reference:
-    """Desired state and acceleration at one instant; all parts describe the same motion."""
+    """Desired state and acceleration at one instant.
+
+    All parts describe the same motion.
+    """
 
     quaternion: Quaternion  # of {E} in {B}, (x, y, z, w), of length 1 up to rounding
     body_rate: Vector3  # W in {E} [rad/s]
@@ -52,20 +62,28 @@ class Reference:
 class ReferenceMotion(Explained):
     """A desired motion; it rests before time 0 and after `duration` [s].
 
-    It is made of a function that gives the reference at a time from 0 to `duration`, in which an
-    ArithmeticError is a serial singularity, and of `pieces`, rising times from 0 to `duration`:
-    from one to the next the motion is so smooth that some ten samples resolve it.
+    It is made of a function that gives the reference at a time from 0 to `duration`, in
+    which an ArithmeticError is a serial singularity, and of `pieces`, rising times from
+    0 to `duration`: from one to the next the motion is so smooth that some ten samples
+    resolve it.
     """
 
     @check_kinds
-    def __init__(self, inside: Callable[[float], Reference], pieces: tuple[float, ...]) -> None:
+    def __init__(
+        self, inside: Callable[[float], Reference], pieces: tuple[float, ...]
+    ) -> None:
         some = isinstance(pieces, tuple) and len(pieces) > 0
-        refuse_unless("motion", ("pieces", pieces, some, "must be rising times [s], a tuple"))
+        refuse_unless(
+            "motion", ("pieces", pieces, some, "must be rising times [s], a tuple")
+        )
         self._inside, self.pieces, self.duration = inside, pieces, pieces[-1]
 
     @check_kinds_late
     def at(self, time: float) -> Reference:
-        """Return the reference at a time [s]; raises SingularConfiguration in a singularity."""
+        """Return the reference at a time [s].
+
+        Raises SingularConfiguration in a singularity.
+        """
         lost = "" if type(time) is float else find_lost_meaning(time)
         if lost or math.isnan(time):
             refuse_unless("motion", ("time", time, False, "must be a number [s]"))
@@ -81,7 +99,10 @@ class ReferenceMotion(Explained):
 
     def _facts(self) -> dict[str, object]:
         pieces = len(self.pieces) - 1
-        facts: dict[str, object] = {"duration [s]": self.duration, "smooth pieces": pieces}
+        facts: dict[str, object] = {
+            "duration [s]": self.duration,
+            "smooth pieces": pieces,
+        }
         with contextlib.suppress(Exception):  # a representation raises nothing
             facts["begins at gamma [rad]"] = self.at(0.0).gamma
             facts["ends at gamma [rad]"] = self.at(self.duration).gamma
@@ -93,26 +114,35 @@ def equal_pieces(duration: float, count: int) -> tuple[float, ...]:
     return tuple((duration * (np.arange(count + 1) / count)).tolist())
 
 
-def slow_down(motion: ReferenceMotion, begin: float, duration: float) -> ReferenceMotion:
+def slow_down(
+    motion: ReferenceMotion, begin: float, duration: float
+) -> ReferenceMotion:
     """Return a motion from its time `begin` [s] on, slowed down to rest over a duration > 0 [s].
 
-    Its time s has ds/dt = 1 - 3 u^2 + 2 u^3 with u = t / duration: 1 at first and 0 at the end,
-    with d^2s/dt^2 = 0 at both. It stays on the path of the given motion, which is inside all
-    limits of position, for half of `duration` more at most.
+    Its time s has ds/dt = 1 - 3 u^2 + 2 u^3 with u = t / duration: 1 at first and 0 at
+    the end, with d^2s/dt^2 = 0 at both. It stays on the path of the given motion, which
+    is inside all limits of position, for half of `duration` more at most.
     """
     inside = partial(_slowed_down, motion, begin, duration)
     return ReferenceMotion(inside, equal_pieces(duration, 4))
 
 
-def _slowed_down(motion: ReferenceMotion, begin: float, duration: float, time: float) -> Reference:
-    """Return the reference of `slow_down` at a time [s]; a function that pickle takes."""
+def _slowed_down(
+    motion: ReferenceMotion, begin: float, duration: float, time: float
+) -> Reference:
+    """Return the reference of `slow_down` at a time [s].
+
+    A function that pickle takes.
+    """
     u = time / duration
     at = motion.at(begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
     speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
     return replace(
         at,
         body_rate=multiply(speed, at.body_rate),
-        body_acceleration=axpy(speed * speed, at.body_acceleration, change, at.body_rate),
+        body_acceleration=axpy(
+            speed * speed, at.body_acceleration, change, at.body_rate
+        ),
         gamma_dot=multiply(speed, at.gamma_dot),
         gamma_ddot=axpy(speed * speed, at.gamma_ddot, change, at.gamma_dot),
     )
@@ -121,18 +151,24 @@ def _slowed_down(motion: ReferenceMotion, begin: float, duration: float, time: f
 class ActuatorSpaceMap:
     """Map between star and actuators: traced kinematics of one geometry.
 
-    Functions of numbers raise an ArithmeticError in a singularity: of_star and posture in a serial
-    one (sin(mu_k) = 0), newton_step in a parallel one (det J2 = 0), the others in both. Of arrays
-    they give numbers that are not finite there, and a warning of NumPy.
+    Functions of numbers raise an ArithmeticError in a singularity: of_star and posture
+    in a serial one (sin(mu_k) = 0), newton_step in a parallel one (det J2 = 0), the
+    others in both. Of arrays they give numbers that are not finite there, and a warning
+    of NumPy.
     """
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
-        rows = zip(geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True)
-        legs = (kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1]) for w, v, e in rows)
+        rows = zip(
+            geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True
+        )
+        legs = (
+            kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1]) for w, v, e in rows
+        )
         self._legs = tuple(legs)
-        # star_motion: W and W_dot in {E}, six numbers, of a quaternion, gamma_dot and gamma_ddot.
-        # posture: sin(mu) and beta [rad] of the legs, six numbers, and det J2, of a quaternion.
+        # star_motion: W and W_dot in {E}, six numbers, of a quaternion, gamma_dot and
+        # gamma_ddot. posture: sin(mu) and beta [rad] of the legs, six numbers, and det
+        # J2, of a quaternion.
         self._actuators, self.star_motion, self.posture, self._newton = _compile(self)
 
     def __eq__(self, other: object) -> bool:
@@ -149,19 +185,28 @@ class ActuatorSpaceMap:
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad]."""
-        g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(*q, *rate, *acceleration)
-        return Reference(q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3))
+        g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(
+            *q, *rate, *acceleration
+        )
+        return Reference(
+            q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3)
+        )
 
     def follow(
-        self, known: Quaternion, here: Vector3, gamma: Vector3, sigma: float | None = None
+        self,
+        known: Quaternion,
+        here: Vector3,
+        gamma: Vector3,
+        sigma: float | None = None,
     ) -> Quaternion:
         """Quaternion at gamma of the assembly mode that is known at other angles, however far.
 
-        It is found in the steps that `continuation` proves to stay in the mode. The proof needs
-        sigma, the least singular value of J2. The rows of J2 are unit vectors, so its squared
-        singular values sum to 3, the product of the larger two is at most 3/2, and
-        sigma >= 2/3 abs(det J2): enough for most steps, and cheap. Raises BranchEnds where a
-        parallel singularity lies between, or no assembly has these angles.
+        It is found in the steps that `continuation` proves to stay in the mode. The
+        proof needs sigma, the least singular value of J2. The rows of J2 are unit
+        vectors, so its squared singular values sum to 3, the product of the larger two
+        is at most 3/2, and sigma >= 2/3 abs(det J2): enough for most steps, and cheap.
+        Raises BranchEnds where a parallel singularity lies between, or no assembly has
+        these angles.
         """
         step = math.dist(gamma, here)
         with contextlib.suppress(ArithmeticError):
@@ -169,8 +214,11 @@ class ActuatorSpaceMap:
                 sigma = 2.0 / 3.0 * abs(self.posture(*known)[-1])
             if step <= continuation.SAFE * sigma * sigma:
                 found = self._find_orientation(known, gamma)
-                # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle / 2).
-                half = math.sqrt(max(0.0, 1.0 - sum(map(float.__mul__, found, known)) ** 2))
+                # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle /
+                # 2).
+                half = math.sqrt(
+                    max(0.0, 1.0 - sum(map(float.__mul__, found, known)) ** 2)
+                )
                 if half <= 0.25 * (sigma - step):
                     return found
         return follow_assembly(self.geometry, known, here, gamma)
@@ -209,12 +257,19 @@ class ActuatorSpaceMap:
         return np.stack(q, axis=1)
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
-        rows, rate, acceleration = gm.rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
+        rows, rate, acceleration = (
+            gm.rotation_rows(inputs[:4]),
+            inputs[4:7],
+            inputs[7:10],
+        )
         legs = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
         return (
             *(kernel.joint_angle(at, 0) for at in legs),
             *(at.gamma_dot for at in legs),
-            *(dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1] for at in legs),
+            *(
+                dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1]
+                for at in legs
+            ),
         )
 
     def postures(self, *q: Any) -> tuple[Any, ...]:
@@ -223,13 +278,23 @@ class ActuatorSpaceMap:
         legs = [kernel.leg_motion(leg, rows, ZERO) for leg in self._legs]
         sines = [gm.sqrt(at.u) for at in legs]
         # Rows t_k x r_k of J2; p = r sin(mu).
-        j2 = [multiply(1.0 / s, cross3(at.along, at.p)) for s, at in zip(sines, legs, strict=True)]
+        j2 = [
+            multiply(1.0 / s, cross3(at.along, at.p))
+            for s, at in zip(sines, legs, strict=True)
+        ]
         beta = (kernel.joint_angle(at, 2) for at in legs)
         return (*sines, *beta, dot3(j2[0], cross3(j2[1], j2[2])))
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:
-        """W [rad/s] and W_dot of quaternion, gamma_dot and gamma_ddot; numbers of any kind."""
-        rows, gamma_dot, gamma_ddot = gm.rotation_rows(inputs[:4]), inputs[4:7], inputs[7:10]
+        """W [rad/s] and W_dot of quaternion, gamma_dot and gamma_ddot.
+
+        Numbers of any kind.
+        """
+        rows, gamma_dot, gamma_ddot = (
+            gm.rotation_rows(inputs[:4]),
+            inputs[4:7],
+            inputs[7:10],
+        )
         reach = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
         rate = _solve(reach, gamma_dot)
         moving = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
@@ -238,7 +303,10 @@ class ActuatorSpaceMap:
         return (*rate, *_solve(reach, missing))
 
     def newton_step(self, *inputs: Any) -> tuple[Any, ...]:
-        """One step of Newton's method on r_k . R e_k = 0, and the residuals before it."""
+        """One step of Newton's method on r_k .
+
+        R e_k = 0, and the residuals before it.
+        """
         rows = gm.rotation_rows(inputs[:4])
         arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
         local = [gm.rotate_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
@@ -264,17 +332,27 @@ def _compile(space: ActuatorSpaceMap) -> tuple[Callable[..., Any], ...]:
 
 def _solve(rows: list[Any], right: Any) -> Any:
     """Solve rows . x = right by Cramer's rule."""
-    others = (cross3(rows[1], rows[2]), cross3(rows[2], rows[0]), cross3(rows[0], rows[1]))
+    others = (
+        cross3(rows[1], rows[2]),
+        cross3(rows[2], rows[0]),
+        cross3(rows[0], rows[1]),
+    )
     determinant = dot3(rows[0], others[0])
-    total = [sum(map(operator.mul, right, parts)) for parts in zip(*others, strict=True)]
+    total = [
+        sum(map(operator.mul, right, parts)) for parts in zip(*others, strict=True)
+    ]
     return tuple(part / determinant for part in total)
 
 
 def follow_assembly(
     geometry: Geometry, start: Quaternion, here: ArrayLike, there: ArrayLike
 ) -> Quaternion:
-    """Follow the assembly from one gamma straight to another; raises as `continuation.advance`."""
+    """Follow the assembly from one gamma straight to another.
+
+    Raises as `continuation.advance`.
+    """
     rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
     found = quaternion_of(rotation)
-    x, y, z, w = (found if found @ start >= 0.0 else -found).tolist()  # the sign of the start
+    # the sign of the start
+    x, y, z, w = (found if found @ start >= 0.0 else -found).tolist()
     return (x, y, z, w)

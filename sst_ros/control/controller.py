@@ -41,22 +41,26 @@ from sst_ros.state import (
     finite_vector,
 )
 
-SINGULAR = 1e-10  # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
+# sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
+SINGULAR = 1e-10
 
 
 class InverseDynamics(Explained):
     """Torques at the joints of a scene, all its terms included.
 
-    It is the model that the simulation integrates, solved for the torques: tau = M gamma_ddot + h
-    (the paper's Eq. 90 with every term of the scene). What lies between a command and a torque
-    (limit, lag) is no part of it.
+    It is the model that the simulation integrates, solved for the torques: tau = M
+    gamma_ddot + h (the paper's Eq. 90 with every term of the scene). What lies between
+    a command and a torque (limit, lag) is no part of it.
     """
 
     @check_kinds
     def __init__(self, scene: SceneInput) -> None:
         self.scene = scene_of(scene)
         dynamics = Dynamics.of(self.scene)
-        self._has_moment_topic, self._program = dynamics.has_moment_topic, dynamics.inverse
+        self._has_moment_topic, self._program = (
+            dynamics.has_moment_topic,
+            dynamics.inverse,
+        )
         self._model = dynamics.model
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -72,19 +76,26 @@ class InverseDynamics(Explained):
     ) -> Vector3:
         """Torques [N m] that give W_dot in {E} [rad/s^2] in a state.
 
-        The quaternion (x, y, z, w) of {E} in {B} has any length > 0, the body rate is W in {E}
-        [rad/s]; the moment on the star in {B} [N m] is used where a topic gives it. Raises
-        SingularConfiguration, serial (sin(mu_k) = 0) or parallel (det J2 = 0), where no torques
-        control the star; InputError for numbers that are no state.
+        The quaternion (x, y, z, w) of {E} in {B} has any length > 0, the body rate is W
+        in {E} [rad/s]; the moment on the star in {B} [N m] is used where a topic gives
+        it. Raises SingularConfiguration, serial (sin(mu_k) = 0) or parallel (det J2 =
+        0), where no torques control the star; InputError for numbers that are no state.
         """
-        parts = quaternion, body_rate, body_acceleration, moment if self._has_moment_topic else ()
+        parts = (
+            quaternion,
+            body_rate,
+            body_acceleration,
+            moment if self._has_moment_topic else (),
+        )
         given: Any = parts
         with contextlib.suppress(ArithmeticError, TypeError, ValueError, MemoryError):
             given = *parts[0], *parts[1], *parts[2], *parts[3]
             first, second, third, determinant, *squares = self._program(*given)
             total = first + second + third + determinant
             if isinstance(total, float):  # it is none of masked or complex numbers
-                det_j2 = abs(determinant) * math.sqrt(squares[0] * squares[1] * squares[2])
+                det_j2 = abs(determinant) * math.sqrt(
+                    squares[0] * squares[1] * squares[2]
+                )
                 # Comparisons with NaN are false: what is not finite is refused, too.
                 sound = math.isfinite(first + second + third) and det_j2 > SINGULAR
                 if sound and min(squares) > SINGULAR * SINGULAR:
@@ -94,19 +105,23 @@ class InverseDynamics(Explained):
     @check_kinds_late
     def reference_torque(self, reference: Reference) -> Vector3:
         """Torques [N m] of a reference: the feedforward; raises as `torque`."""
-        return self.torque(reference.quaternion, reference.body_rate, reference.body_acceleration)
+        return self.torque(
+            reference.quaternion, reference.body_rate, reference.body_acceleration
+        )
 
     def gravity_torque(self, at: State | Sequence[float]) -> Vector3:
         """Torques [N m] that hold the manipulator at rest against gravity, springs and the like.
 
-        It is in a state of a simulation; or in the admissible assembly at gamma [rad], shape (3,);
-        or at the quaternion (x, y, z, w) of {E} in {B}, shape (4,). Raises as `torque`, and
-        AssemblyError where gamma has no unique admissible assembly.
+        It is in a state of a simulation; or in the admissible assembly at gamma [rad],
+        shape (3,); or at the quaternion (x, y, z, w) of {E} in {B}, shape (4,). Raises
+        as `torque`, and AssemblyError where gamma has no unique admissible assembly.
         """
         return self.torque(self._orientation(at), ZERO, ZERO)
 
     def mass_matrix(self, at: State | Sequence[float]) -> Array:
-        """M of tau = M gamma_ddot + h [kg m^2], rotors included; symmetric, shape (3, 3).
+        """M of tau = M gamma_ddot + h [kg m^2], rotors included.
+
+        Symmetric, shape (3, 3).
 
         `at` and what is raised are as in `gravity_torque`.
         """
@@ -122,21 +137,27 @@ class InverseDynamics(Explained):
         The moment and what is raised are as in `torque`.
         """
         three = finite_vector(moment) is not None
-        refuse_unless("inverse dynamics", ("moment", moment, three, "must be three numbers [N m]"))
+        refuse_unless(
+            "inverse dynamics", ("moment", moment, three, "must be three numbers [N m]")
+        )
         q, rate = state.quaternion, state.body_rate
         rest = kernel.actuator_acceleration(self._model, (*q, *rate), ZERO)
         acceleration = np.linalg.solve(self._reduce(q)[1], np.negative(rest))
         return self.torque(q, rate, triple(acceleration.tolist()), moment)
 
     @check_kinds
-    def torque_of_moment(self, at: State | Sequence[float], moment: ArrayLike) -> Vector3:
+    def torque_of_moment(
+        self, at: State | Sequence[float], moment: ArrayLike
+    ) -> Vector3:
         """Torques [N m] at the actuators that do the work of a moment on the star in {B} [N m].
 
-        `at` and what is raised are as in `gravity_torque`. They stand for loads that a scene has
-        not, in a function for `simulate`.
+        `at` and what is raised are as in `gravity_torque`. They stand for loads that a
+        scene has not, in a function for `simulate`.
         """
         three = finite_vector(moment) is not None
-        refuse_unless("inverse dynamics", ("moment", moment, three, "must be three numbers [N m]"))
+        refuse_unless(
+            "inverse dynamics", ("moment", moment, three, "must be three numbers [N m]")
+        )
         q = self._orientation(at)
         _, reach = self._reduce(q)
         acting = rotation_matrix(q).T @ np.asarray(moment, dtype=float)
@@ -156,7 +177,10 @@ class InverseDynamics(Explained):
         return x, y, z, w
 
     def _reduce(self, q: Quaternion) -> tuple[Array, Array]:
-        """Return the inertia reduced to the star [kg m^2] and the rows g_k; raises as `torque`."""
+        """Return the inertia reduced to the star [kg m^2] and the rows g_k.
+
+        Raises as `torque`.
+        """
         self.torque(q, ZERO, ZERO)
         inertia, _, reach = kernel.balance(self._model, q, ZERO, ZERO)
         return np.array(symmetric_rows(inertia)), np.array(reach)
@@ -165,12 +189,18 @@ class InverseDynamics(Explained):
         actuators = ("torque limit", "actuator lag")
         return {
             "scene": self.scene.name,
-            "torques for": [term for term in ("star", *terms(self.scene)) if term not in actuators],
+            "torques for": [
+                term for term in ("star", *terms(self.scene)) if term not in actuators
+            ],
             "not for": actuators,
-            "external moment": "given with a state" if self._has_moment_topic else "none is given",
+            "external moment": (
+                "given with a state" if self._has_moment_topic else "none is given"
+            ),
         }
 
-    def _refusal(self, quaternion: Quaternion, given: Sequence[float]) -> SingularConfiguration:
+    def _refusal(
+        self, quaternion: Quaternion, given: Sequence[float]
+    ) -> SingularConfiguration:
         """Return why there is no torque; raises InputError where numbers are wrong."""
         lost, finite = find_lost_meaning([*given, quaternion]), False
         refuse_unless("inverse dynamics", ("state", tuple(given), not lost, lost))
@@ -192,12 +222,19 @@ class InverseDynamics(Explained):
             return SingularConfiguration("serial singularity, sin(mu)", least)
         determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
         parallel = abs(determinant) <= 2.0 * SINGULAR
-        said = "parallel singularity," if parallel else "no finite torque gives this acceleration:"
+        said = (
+            "parallel singularity,"
+            if parallel
+            else "no finite torque gives this acceleration:"
+        )
         return SingularConfiguration(f"{said} det J2", determinant)
 
 
 class ControlStopped(SstError):
-    """No torque can be computed at a `time` of the motion [s]; so in every call until a reset."""
+    """No torque can be computed at a `time` of the motion [s].
+
+    So in every call until a reset.
+    """
 
     def __init__(self, reason: str, time: float) -> None:
         self.time = time
@@ -242,10 +279,10 @@ class ChannelState:
 class Controller:
     """A controller that tracks one reference motion by one of the five schemes of the law.
 
-    It has a model of the manipulator, which may differ from the plant, and holds a command over a
-    control period [s]. Its `inertia` is M_kk at the start of the motion [kg m^2], by which gains
-    are made. Raises InputError where the integral action would be unstable, SingularConfiguration
-    where the motion begins in a singularity.
+    It has a model of the manipulator, which may differ from the plant, and holds a
+    command over a control period [s]. Its `inertia` is M_kk at the start of the motion
+    [kg m^2], by which gains are made. Raises InputError where the integral action would
+    be unstable, SingularConfiguration where the motion begins in a singularity.
     """
 
     @check_kinds
@@ -267,11 +304,18 @@ class Controller:
         t1, _ = virtual_work.equation_of_motion(mechanism, posture, (0.0, 0.0, 0.0))
         self.inertia: Vector3 = triple((-np.diag(t1)).tolist())
         column, rate = np.array(self.inertia)[:, None], settings.integral_rate
-        gains = law.feedback_gains(column, lambda name: getattr(settings, name), settings.direct)
+        gains = law.feedback_gains(
+            column, lambda name: getattr(settings, name), settings.direct
+        )
         kp, kd = (triple(gain[:, 0].tolist()) for gain in gains)
         # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
-        allowed = f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is unstable"
-        refuse_unless("control", ("integral_rate", rate, not rate or rate < min(kd), allowed))
+        allowed = (
+            f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is"
+            " unstable"
+        )
+        refuse_unless(
+            "control", ("integral_rate", rate, not rate or rate < min(kd), allowed)
+        )
         limit = float(law.command_limit(settings.torque_limit, model))
         known = limit if math.isfinite(limit) else None
         self._numbers = kp, kd, self.inertia, rate, known, period_s
@@ -281,7 +325,9 @@ class Controller:
     def _make_law(self) -> law.ControlLaw:
         functions = self._inverse.torque, self._space.star_motion
         kp, kd, inertia, rate, limit, period = self._numbers
-        return law.ControlLaw(self._settings, *functions, kp, kd, inertia, rate, limit, period)
+        return law.ControlLaw(
+            self._settings, *functions, kp, kd, inertia, rate, limit, period
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle gets: all but compiled functions."""
@@ -299,7 +345,10 @@ class Controller:
 
     @check_kinds
     def follow(self, motion: ReferenceMotion) -> None:
-        """Track another motion, from the present reference on; gains and integral stay."""
+        """Track another motion, from the present reference on.
+
+        Gains and integral stay.
+        """
         self._motion = motion
 
     def desire(self, time: float) -> tuple[Reference, Vector3, Vector3]:
@@ -312,15 +361,17 @@ class Controller:
             return desired, ZERO, ZERO
         now = held = self._inverse.reference_torque(desired)
         if self._settings.feedforward_at == "middle":
-            held = self._inverse.reference_torque(self._motion.at(time + 0.5 * self._period_s))
+            held = self._inverse.reference_torque(
+                self._motion.at(time + 0.5 * self._period_s)
+            )
         return desired, now, held
 
     @check_kinds_late
     def command(self, time: float, measured: Measurement) -> Command:
         """Return the command at a time of the motion [s], to be held for a period.
 
-        Raises ControlStopped where the measurement is not finite, the assembly mode ends, or the
-        model is singular.
+        Raises ControlStopped where the measurement is not finite, the assembly mode
+        ends, or the model is singular.
         """
         if self._failure is not None:
             raise self._failure
@@ -329,12 +380,20 @@ class Controller:
         allowed, observes = "must be finite numbers", self._settings.observes
         try:
             given = (*measured.gamma, *measured.gamma_dot)
-            refuse_unless("control", ("measured", given, all(map(math.isfinite, given)), allowed))
+            refuse_unless(
+                "control", ("measured", given, all(map(math.isfinite, given)), allowed)
+            )
             desired, *torques = self.desire(time)
-            observed: Any = self._space.follow(*self._known, measured.gamma) if observes else ()
-            command = self._law.answer(desired, torques, *measured, observed, self._integral)
+            observed: Any = (
+                self._space.follow(*self._known, measured.gamma) if observes else ()
+            )
+            command = self._law.answer(
+                desired, torques, *measured, observed, self._integral
+            )
             total = command.total
-            refuse_unless("control", ("torque", total, all(map(math.isfinite, total)), allowed))
+            refuse_unless(
+                "control", ("torque", total, all(map(math.isfinite, total)), allowed)
+            )
         except (SstError, ArithmeticError, ValueError) as error:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
@@ -353,9 +412,11 @@ BAND = 0.02  # settling band: share of the largest range of a joint
 
 _PARTS = ("gamma", "gamma_dot", "error", "feedforward", "feedback", "torque")
 TRACK = np.dtype([("time", float), *((name, float, 3) for name in _PARTS)])
-"""A sample of a tracking record, 19 numbers: the time since the start of the motion or of the run
-[s], gamma and gamma_dot as desired [rad], [rad/s], desired - measured gamma [rad], the two parts of
-the controller's command [N m], and the torque that was commanded or applied [N m]."""
+"""A sample of a tracking record, 19 numbers: the time since the start of the motion or
+of the run [s], gamma and gamma_dot as desired [rad], [rad/s], desired - measured gamma
+[rad], the two parts of the controller's command [N m], and the torque that was
+commanded or applied [N m].
+"""
 
 Track: TypeAlias = "np.recarray[Any, Any]"
 
@@ -366,20 +427,24 @@ def track_of(rows: ArrayLike) -> Track:
 
 
 class TrackingMetrics:
-    """Metrics of a tracking record, which may come part by part. Those of joints have shape (3,).
+    """Metrics of a tracking record, which may come part by part.
 
-    Beside the properties: the number of `samples`, the `largest` and the `last` error [rad],
-    `torque_largest` [N m], and `limited`, the samples in which a torque was limited, None where
-    that is not known.
+    Those of joints have shape (3,).
+
+    Beside the properties: the number of `samples`, the `largest` and the `last` error
+    [rad], `torque_largest` [N m], and `limited`, the samples in which a torque was
+    limited, None where that is not known.
     """
 
     def __init__(self, track: Track | None = None, limited: int | None = None) -> None:
         self.samples, self.limited = 0, limited
         self.largest, self.torque_largest, self.last = np.zeros((3, 3))
-        self._sums = np.zeros((4, 3))  # of error^2, torque^2, feedforward x torque, feedback x it
+        # of error^2, torque^2, feedforward x torque, feedback x it
+        self._sums = np.zeros((4, 3))
         self._lowest, self._highest = np.full(3, np.inf), np.full(3, -np.inf)
         self._rested: float | None = None  # when the motion ended
-        self._settled: float | None = None  # since when the error has been inside the band
+        # since when the error has been inside the band
+        self._settled: float | None = None
         if track is not None:
             self.add(track)
 
@@ -389,7 +454,9 @@ class TrackingMetrics:
         parts = error**2, torque**2, track.feedforward * torque, track.feedback * torque
         self._sums += [np.sum(part, axis=0) for part in parts]
         self.largest = np.maximum(self.largest, error.max(axis=0))
-        self.torque_largest = np.maximum(self.torque_largest, np.abs(torque).max(axis=0))
+        self.torque_largest = np.maximum(
+            self.torque_largest, np.abs(torque).max(axis=0)
+        )
         self._lowest = np.minimum(self._lowest, track.gamma.min(axis=0))
         self._highest = np.maximum(self._highest, track.gamma.max(axis=0))
         moving = np.any(track.gamma_dot != 0.0, axis=1)
@@ -410,10 +477,12 @@ class TrackingMetrics:
 
     @property
     def shares(self) -> Array:
-        """Shares of feedforward and feedback in the torque, shape (2, 3); nan without a torque.
+        """Shares of feedforward and feedback in the torque, shape (2, 3).
 
-        The mean of (part x torque) over the mean of torque^2; what a limit has cut off makes their
-        sum differ from 1.
+        Nan without a torque.
+
+        The mean of (part x torque) over the mean of torque^2; what a limit has cut off
+        makes their sum differ from 1.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(self._sums[2:] / self._sums[1])
@@ -435,7 +504,10 @@ class TrackingMetrics:
 
 
 def _since(known: float | None, wrong: NDArray[np.bool_], time: Array) -> float | None:
-    """Return since when nothing has been wrong, behind the next part; None where its end is."""
+    """Return since when nothing has been wrong, behind the next part.
+
+    None where its end is.
+    """
     if known is not None and not wrong.any():
         return known
     rest = int(np.max(np.flatnonzero(wrong), initial=-1)) + 1

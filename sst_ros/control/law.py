@@ -11,16 +11,17 @@ The five schemes, with e = desired - measured in gamma:
 
 ID is the inverse dynamics (Eq. 90) with all terms of the model, G its gravity torque.
 
-On SO(3) the error of computed_torque is the rotation vector phi = log(R^T R_d) in {E}, and W_dot =
-d/dt(R^T R_d W_d) + kd e_W + kp phi with e_W = R^T R_d W_d - W. As phi is an eigenvector of its own
-differential, kp phi^2 + e_W^2 falls at the rate 2 kd e_W^2 from every error below half a turn
-(Bullo and Murray 1995).
+On SO(3) the error of computed_torque is the rotation vector phi = log(R^T R_d) in {E},
+and W_dot = d/dt(R^T R_d W_d) + kd e_W + kp phi with e_W = R^T R_d W_d - W. As phi is an
+eigenvector of its own differential, kp phi^2 + e_W^2 falls at the rate 2 kd e_W^2 from
+every error below half a turn (Bullo and Murray 1995).
 
-Integral action adds K r times the integral of e. It is frozen while a torque is at its limit and
-the error would drive it further (conditional integration, Astrom and Hagglund 2006, section 3.5).
+Integral action adds K r times the integral of e. It is frozen while a torque is at its
+limit and the error would drive it further (conditional integration, Astrom and Hagglund
+2006, section 3.5).
 
-Floats make it the law of a `Controller`, traced numbers the compiled loop of a batch: it branches
-on settings, never on numbers.
+Floats make it the law of a `Controller`, traced numbers the compiled loop of a batch:
+it branches on settings, never on numbers.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ from sst_ros.state import ZERO, Array, Vector3, clamp
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 SPACES = ("gamma", "so3")
 INSTANTS = ("start", "middle")
-_ROUND = 1.5 * 2.0**52  # added and subtracted, it rounds to whole numbers, halves to even
+# added and subtracted, it rounds to whole numbers, halves to even
+_ROUND = 1.5 * 2.0**52
 
 
 def _joint_gain(name: str, unit: str, instead: str) -> Any:
@@ -54,32 +56,40 @@ def _joint_gain(name: str, unit: str, instead: str) -> Any:
 class ControllerSettings(Section):
     """Mode and gains.
 
-    Gains are of a joint, tau_k = stiffness_k e_k + damping_k e_dot_k with e = desired - measured.
-    By bandwidth they are those of the inertia M_kk that joint k has at the start of the motion:
-    stiffness M_kk bandwidth^2, damping 2 damping_ratio M_kk bandwidth; so pd, gravity_pd and
-    feedforward_pd have equal gains. computed_torque takes them over M_kk, as accelerations.
+    Gains are of a joint, tau_k = stiffness_k e_k + damping_k e_dot_k with e = desired -
+    measured. By bandwidth they are those of the inertia M_kk that joint k has at the
+    start of the motion: stiffness M_kk bandwidth^2, damping 2 damping_ratio M_kk
+    bandwidth; so pd, gravity_pd and feedforward_pd have equal gains. computed_torque
+    takes them over M_kk, as accelerations.
     """
 
     mode: str = choice(
-        "feedforward: torque of the desired motion; feedforward_pd: and feedback; computed_torque: "
-        "the model at the measured state, and feedback; pd: feedback alone; gravity_pd: and the "
-        "weight at the measured position",
+        "feedforward: torque of the desired motion; feedforward_pd: and feedback;"
+        " computed_torque: the model at the measured state, and feedback; pd: feedback"
+        " alone; gravity_pd: and the weight at the measured position",
         MODES,
     )
     space: str = choice(
-        "where computed_torque is linear: the actuator angles, or the orientation", SPACES
+        "where computed_torque is linear: the actuator angles, or the orientation",
+        SPACES,
     )
-    bandwidth: float = positive("natural frequency of the error", "rad/s", default=30.0, most=1e6)
-    damping_ratio: float = positive("damping ratio of the error", "1", default=1.0, most=1e3)
+    bandwidth: float = positive(
+        "natural frequency of the error", "rad/s", default=30.0, most=1e6
+    )
+    damping_ratio: float = positive(
+        "damping ratio of the error", "1", default=1.0, most=1e3
+    )
     stiffness: Vector3 = _joint_gain("stiffness", "N m/rad", "bandwidth")
     damping: Vector3 = _joint_gain("damping", "N m s/rad", "damping_ratio")
     integral_rate: float = coefficient(
-        "integral action: stiffness times this is the torque per sum of errors; 0 for none",
+        "integral action: stiffness times this is the torque per sum of errors; 0 for"
+        " none",
         "1/s",
         most=1e6,
     )
     torque_limit: float = coefficient(
-        "largest torque that is commanded, beside that of the scene's actuators; 0 for none",
+        "largest torque that is commanded, beside that of the scene's actuators; 0 for"
+        " none",
         "N m",
         most=1e9,
     )
@@ -114,17 +124,26 @@ class ControllerSettings(Section):
 class ControlChannel(Section):
     """What lies between plant and controller; zeros change nothing.
 
-    Until the first of what is delayed arrives it is there already. An encoder measures no rate:
-    that is the difference of its last two angles over the period. Noise is new at every sample.
+    Until the first of what is delayed arrives it is there already. An encoder measures
+    no rate: that is the difference of its last two angles over the period. Noise is new
+    at every sample.
     """
 
     period: float = entry("control period", "s", default=1e-3, least=1e-6, most=1.0)
     delay: int = entry("delay of commands", "periods", default=0, least=0, most=100)
     counts: int = entry(
-        "encoder steps per turn; 0 for exact angles and rates", "1", default=0, least=0, most=2**31
+        "encoder steps per turn; 0 for exact angles and rates",
+        "1",
+        default=0,
+        least=0,
+        most=2**31,
     )
-    angle_noise: float = coefficient("standard deviation of noise on gamma", "rad", most=1.0)
-    rate_noise: float = coefficient("standard deviation of noise on gamma_dot", "rad/s", most=1e3)
+    angle_noise: float = coefficient(
+        "standard deviation of noise on gamma", "rad", most=1.0
+    )
+    rate_noise: float = coefficient(
+        "standard deviation of noise on gamma_dot", "rad/s", most=1e3
+    )
 
     def count(self, angle: Scalar) -> Scalar:
         """Round an angle [rad] to the steps of the encoders."""
@@ -136,8 +155,8 @@ class ControlChannel(Section):
     ) -> tuple[Triple, Triple, Any]:
         """Return the angles and rates that the controller receives, and angles to remember.
 
-        `before` are those of the last sample, none without encoders; `noise` are six numbers that
-        are added to gamma [rad] and gamma_dot [rad/s], or none.
+        `before` are those of the last sample, none without encoders; `noise` are six
+        numbers that are added to gamma [rad] and gamma_dot [rad/s], or none.
         """
         if self.counts:
             gamma = triple(map(self.count, gamma))
@@ -147,7 +166,9 @@ class ControlChannel(Section):
             gamma, gamma_dot = add(gamma, noise[:3]), add(gamma_dot, noise[3:])
         return gamma, gamma_dot, before
 
-    def transmit(self, command: Triple, queue: Any, first: Scalar) -> tuple[Triple, Any]:
+    def transmit(
+        self, command: Triple, queue: Any, first: Scalar
+    ) -> tuple[Triple, Any]:
         """Return the command that acts, and the queue behind it: 3 `delay` numbers.
 
         `first` is 1 at the first sample, else 0.
@@ -162,7 +183,8 @@ class Command:
     """What the law answers at a sample."""
 
     torque: Vector3  # the command [N m]: feedforward + feedback, limited
-    feedforward: Vector3  # of the model without an error [N m]; gravity_pd: of the weight
+    # of the model without an error [N m]; gravity_pd: of the weight
+    feedforward: Vector3
     feedback: Vector3  # due to the error [N m]
     desired: Reference
     error: Vector3  # desired - measured gamma [rad]
@@ -180,8 +202,10 @@ class ControlLaw(NamedTuple):
     """The law of some settings, and its numbers; by joint where there are three."""
 
     settings: ControllerSettings
-    torque: Callable[[Any, Any, Any], Triple]  # of the model, by quaternion, W and W_dot [N m]
-    accelerate: Callable[..., Any]  # W and W_dot of the model, see `ActuatorSpaceMap.star_motion`
+    # of the model, by quaternion, W and W_dot [N m]
+    torque: Callable[[Any, Any, Any], Triple]
+    # W and W_dot of the model, see `ActuatorSpaceMap.star_motion`
+    accelerate: Callable[..., Any]
     kp: Triple  # gains of accelerations [1/s^2]
     kd: Triple  # [1/s]
     inertia: Triple  # M_kk at the start of the motion [kg m^2]
@@ -200,9 +224,10 @@ class ControlLaw(NamedTuple):
     ) -> Command:
         """Return the torques at a sample, of angles [rad] and rates [rad/s] as measured.
 
-        `torques` are those of the desired motion [N m], now and at the instant whose torque is
-        held; `observed` is the orientation at the measured angles, where the law needs it, and
-        `integral` the sum of errors [rad s], none without integral action.
+        `torques` are those of the desired motion [N m], now and at the instant whose
+        torque is held; `observed` is the orientation at the measured angles, where the
+        law needs it, and `integral` the sum of errors [rad s], none without integral
+        action.
         """
         mode, feedback, summed = self.settings.mode, ZERO, ZERO
         feedforward = torques[1] if self.settings.feeds else ZERO
@@ -216,7 +241,9 @@ class ControlLaw(NamedTuple):
             body_rate, acceleration = moving[:3], moving[3:]
             summed = error
             if self.settings.space == "so3":
-                summed, acceleration = self._correct_on_so3(desired, observed, body_rate, integral)
+                summed, acceleration = self._correct_on_so3(
+                    desired, observed, body_rate, integral
+                )
             needed = self.torque(observed, body_rate, acceleration)
             feedback = axpy(1.0, needed, -1.0, torques[0])
         elif mode != "feedforward":
@@ -228,7 +255,9 @@ class ControlLaw(NamedTuple):
             torque = bound(total, self.limit)
             weight = 1.0 - is_above(gm.dot3(axpy(1.0, total, -1.0, torque), error))
         integral = integral and axpy(1.0, integral, weight * self.period, summed)
-        return Command(torque, feedforward, feedback, desired, error, rates, integral, total)
+        return Command(
+            torque, feedforward, feedback, desired, error, rates, integral, total
+        )
 
     def _correct_on_so3(
         self, desired: Reference, observed: Any, body_rate: Triple, integral: Any
@@ -258,11 +287,15 @@ def feedback_gains(
 ) -> tuple[Array, Array]:
     """Return gains kp [1/s^2] and kd [1/s] of accelerations, shape (3, n).
 
-    The inertia is M_kk, shape (3, 1); `value` is that of a field of `ControllerSettings`, for n
-    loops or for all of them; gains are `direct` where stiffness and damping are given.
+    The inertia is M_kk, shape (3, 1); `value` is that of a field of
+    `ControllerSettings`, for n loops or for all of them; gains are `direct` where
+    stiffness and damping are given.
     """
     if direct:
-        kp, kd = (np.reshape(value(name), (3, -1)) / inertia for name in ("stiffness", "damping"))
+        kp, kd = (
+            np.reshape(value(name), (3, -1)) / inertia
+            for name in ("stiffness", "damping")
+        )
         return kp, kd
     ones, bandwidth = np.ones_like(inertia), value("bandwidth")
     return ones * bandwidth**2, ones * (2.0 * value("damping_ratio") * bandwidth)

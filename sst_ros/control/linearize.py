@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear models of the manipulator near a state: A and B for the design of controllers.
 
-With the state y of the dynamics, D = dx/dy for the coordinates x, and R for which D R = 1,
+With the state y of the dynamics, D = dx/dy for the coordinates x, and R for which D R =
+1,
 
     A = (d x_dot / dy) R,    B = d x_dot / d torque,
 
-by derivatives of the traced program, exact to rounding. Under torques that are held for dt, A is
-D S(dt) R and B is D S(dt), of the sensitivities S of the motion itself, S' = (df/dy) S + df/du
-(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14).
+by derivatives of the traced program, exact to rounding. Under torques that are held for
+dt, A is D S(dt) R and B is D S(dt), of the sensitivities S of the motion itself, S' =
+(df/dy) S + df/du (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations
+I, section I.14).
 """
 
 from __future__ import annotations
@@ -36,7 +38,10 @@ COORDINATES = {
     "star": [f"{name}_{axis}" for name in ("rotation", "body_rate") for axis in "xyz"],
 }
 _MOST, _CHECKS = 20_000, 8
-"""Evaluations for a period: without end in a singularity; parts after which limits are checked."""
+"""Evaluations for a period: without end in a singularity.
+
+Parts after which limits are checked.
+"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,14 +72,21 @@ class LinearModel(Explained, ReadOnly):
             "A": " x ".join(map(str, self.A.shape)),
             "B": " x ".join(map(str, self.B.shape)),
             "dt [s]": self.dt or "none: x' = A x + B u",
-            "largest abs(eigenvalue of A)": float(np.abs(np.linalg.eigvals(self.A)).max()),
+            "largest abs(eigenvalue of A)": float(
+                np.abs(np.linalg.eigvals(self.A)).max()
+            ),
         }
 
     def to_control(self) -> Any:
-        """Return a `control.StateSpace` with the outputs x; needs the package control."""
+        """Return a `control.StateSpace` with the outputs x.
+
+        Needs the package control.
+        """
         x, commands = list(self.states), [f"command_{k}" for k in (1, 2, 3)]
         given = self.A, self.B, np.eye(len(x)), np.zeros_like(self.B), self.dt or 0
-        return require("control").StateSpace(*given, states=x, outputs=x, inputs=commands)
+        return require("control").StateSpace(
+            *given, states=x, outputs=x, inputs=commands
+        )
 
 
 def equilibrium(scene: SceneInput, gamma: Any) -> State:
@@ -103,17 +115,16 @@ def linearize(
 ) -> LinearModel:
     """Linearize the dynamics of a scene, all its terms included, near a state and its torques.
 
-    Args:
-        scene: name or path of a scene, its document as a dict, or a `Scene`.
-        state: a `State`, as of `equilibrium` or `Simulation`; or an initial state as `simulate`
-            takes it, None for that of the scene. Where the actuators lag, a `State` has the torques
-            that they give; otherwise they give those commanded.
-        torque: torques that are commanded [N m], shape (3,).
-        dt: period for which they are held [s]. By default the model is continuous.
-        coordinates: "gamma" for deviations of gamma [rad] and gamma_dot [rad/s]; "star" for the
-            rotation vector from the motion's {E} to the deviating one, in {E} [rad], and the
-            deviation of the body rate [rad/s], also in a parallel singularity. The torques that
-            lagging actuators give [N m] follow.
+    Args: scene: name or path of a scene, its document as a dict, or a `Scene`. state: a
+        `State`, as of `equilibrium` or `Simulation`; or an initial state as `simulate`
+        takes it, None for that of the scene. Where the actuators lag, a `State` has the
+        torques that they give; otherwise they give those commanded. torque: torques
+        that are commanded [N m], shape (3,). dt: period for which they are held [s]. By
+        default the model is continuous. coordinates: "gamma" for deviations of gamma
+        [rad] and gamma_dot [rad/s]; "star" for the rotation vector from the motion's
+        {E} to the deviating one, in {E} [rad], and the deviation of the body rate
+        [rad/s], also in a parallel singularity. The torques that lagging actuators give
+        [N m] follow.
 
     Raises:
         InputError: an argument is not allowed, or no motion lasts for `dt`.
@@ -123,7 +134,10 @@ def linearize(
     """
     given, acting = scene_of(scene), finite_vector(torque)
     limit, largest = given.torque_limit, max(map(abs, acting or ZERO))
-    beyond = f"must be at most {limit} N m, the torque limit: beyond it torques have no effect"
+    beyond = (
+        f"must be at most {limit} N m, the torque limit: beyond it torques have no"
+        " effect"
+    )
     positive = isinstance(dt, (int, float)) and dt is not True and 0.0 < dt < math.inf
     known = isinstance(coordinates, str) and coordinates in COORDINATES
     refuse_unless(
@@ -149,10 +163,17 @@ def linearize(
         raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
     if dt is not None:
         dt = float(dt)
-        equations = VariationalEquations(given, (), ConstantTorque(acting), by_torque=True)
+        equations = VariationalEquations(
+            given, (), ConstantTorque(acting), by_torque=True
+        )
         begin = np.hstack([from_x, np.zeros((len(now), 3))])
-        run = equations.integrate(now, begin, np.linspace(0.0, dt, _CHECKS + 1), most=_MOST)
-        lasts = "must be a period for which the motion lasts: it meets a singularity or is too long"
+        run = equations.integrate(
+            now, begin, np.linspace(0.0, dt, _CHECKS + 1), most=_MOST
+        )
+        lasts = (
+            "must be a period for which the motion lasts: it meets a singularity or is"
+            " too long"
+        )
         if run is not None:
             angles = [Dynamics.of(given).joints(*y[:7]) for y in run[0]]
             limits = limits_of(given, Geometry.of(given))
@@ -161,7 +182,9 @@ def linearize(
                 for one in limits
                 if min(map(one.distance, angles)) < -GRAZING <= one.distance(angles[0])
             )
-            lasts = next((f"must end before a limit: {one.reason}" for one in passed), "")
+            lasts = next(
+                (f"must end before a limit: {one.reason}" for one in passed), ""
+            )
         refuse_unless("linearize", ("dt", dt, not lasts, lasts))
         assert run is not None
         end, flow = (part[-1] for part in run)
@@ -174,7 +197,9 @@ def linearize(
 def _differentiate(
     scene: Scene, y: Array, torque: Sequence[float], by_gamma: bool
 ) -> tuple[Array, Array, Array, Array]:
-    """Return D = dx/dy and R of the state's own changes, D R = 1; A and B of the continuous model.
+    """Return D = dx/dy and R of the state's own changes, D R = 1.
+
+    A and B of the continuous model.
 
     Shapes are (n, n + 1), (n + 1, n), (n, n) and (n, 3).
     """
@@ -185,7 +210,9 @@ def _differentiate(
     if by_gamma:
         dynamics = Dynamics.of(scene)
         drive = (*torque, *(0.0 for _ in dynamics.drive[3:]))
-        found = np.array(dynamics.actuator_motion(*y.tolist(), *drive)).reshape(size + 4, -1)
+        found = np.array(dynamics.actuator_motion(*y.tolist(), *drive)).reshape(
+            size + 4, -1
+        )
         x, x_dot = np.split(found[1:].T, 2)
         from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
         return x[:, :size], from_gamma, x_dot[:, :size] @ from_gamma, x_dot[:, size:]

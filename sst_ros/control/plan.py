@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feasibility of a reference motion before it is run: demands, distances from limits, top speed.
 
-At `factor` times the speed rates grow by the factor and accelerations by its square. Torques of
-inertia follow the square too, but weight and springs stay, and friction has its own dependence: the
-limits are tested on the dynamics themselves, not scaled.
+At `factor` times the speed rates grow by the factor and accelerations by its square.
+Torques of inertia follow the square too, but weight and springs stay, and friction has
+its own dependence: the limits are tested on the dynamics themselves, not scaled.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ SAMPLES = 16  # parts of a piece of the motion; even, for Simpson's rule
 SINGULAR_J2 = 1e-6  # det J2 within which a motion counts as singular
 SLOWEST, FASTEST = 1e-4, 1e8  # factors of speed between which ends are looked for
 UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
-"""Of what a motion demands of an actuator; power is negative where the actuator brakes."""
+"""Of what a motion demands of an actuator.
+
+Power is negative where the actuator brakes.
+"""
 _GRID = 360  # factors to try
 _FINE = 33  # instants between two samples beside a peak of a reaction
 _ROUNDING = 1e-13
@@ -78,8 +81,10 @@ class MotionPlan:
     """A reference motion of a scene with the result of its check."""
 
     motion: ReferenceMotion
-    trajectory: Trajectory  # the motion where it was sampled, with the torques that it demands
-    peaks: dict[str, list[Peak]]  # by quantity of UNITS and leg, the largest, with their signs
+    # the motion where it was sampled, with the torques that it demands
+    trajectory: Trajectory
+    # by quantity of UNITS and leg, the largest, with their signs
+    peaks: dict[str, list[Peak]]
     limits: dict[str, float]  # those that the actuators have, by quantity of UNITS
     torque_rms: list[float]  # root of the mean square over the duration, by leg [N m]
     distances: tuple[LimitDistance, ...]  # from all limits
@@ -87,11 +92,13 @@ class MotionPlan:
 
 
 def check_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
-    """Examine a motion; raises MotionRefused, with every reason, where it is infeasible.
+    """Examine a motion.
 
-    It is where it leaves the stroke or the workspace, or exceeds a limit of the actuators. Extremes
-    of the plan are sought between samples only where one could lie beyond a limit: that takes a
-    tenth of the time of `examine_motion`.
+    Raises MotionRefused, with every reason, where it is infeasible.
+
+    It is where it leaves the stroke or the workspace, or exceeds a limit of the
+    actuators. Extremes of the plan are sought between samples only where one could lie
+    beyond a limit: that takes a tenth of the time of `examine_motion`.
     """
     plan = examine_motion(motion, scene, exact=False)
     if plan.problems:
@@ -99,20 +106,25 @@ def check_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
     return plan
 
 
-def examine_motion(motion: ReferenceMotion, scene: Scene, *, exact: bool = True) -> MotionPlan:
+def examine_motion(
+    motion: ReferenceMotion, scene: Scene, *, exact: bool = True
+) -> MotionPlan:
     """Compute demands of a motion and its distances from all limits, between samples too.
 
     Those that lie inside all limits are not `exact` where that is not asked for.
 
-    An external moment from a topic counts as zero; the lag of actuators is not included. Raises
-    SingularConfiguration where the motion meets a singularity: no torque is defined there.
+    An external moment from a topic counts as zero; the lag of actuators is not
+    included. Raises SingularConfiguration where the motion meets a singularity: no
+    torque is defined there.
     """
     ends = pairwise(motion.pieces)
     parts = (np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in ends)
     times = np.concatenate([*parts, motion.pieces[-1:]])
     desired = tuple(map(motion.at, times.tolist()))
     distances = tuple(_distances(motion, scene, times, desired, exact))
-    limits = {name: x for name in UNITS for x in values_at(scene, f"actuators.{name}_limit")}
+    limits = {
+        name: x for name in UNITS for x in values_at(scene, f"actuators.{name}_limit")
+    }
     inverse = InverseDynamics(scene)
 
     def measure(at: Reference) -> tuple[float, ...]:
@@ -124,12 +136,16 @@ def examine_motion(motion: ReferenceMotion, scene: Scene, *, exact: bool = True)
     def states(times: Array) -> Array:
         """Quaternions, body rates and torques of the motion, shape (n, 10)."""
         found = map(motion.at, times.tolist())
-        rows = [(*at.quaternion, *at.body_rate, *inverse.reference_torque(at)) for at in found]
+        rows = [
+            (*at.quaternion, *at.body_rate, *inverse.reference_torque(at))
+            for at in found
+        ]
         return np.array(rows)
 
     samples, find = _sample(motion, measure, times, desired)
     star = np.array([(*at.quaternion, *at.body_rate) for at in desired])
-    t, rows = np.unique(times, return_index=True)  # ends of pieces may be equal up to rounding
+    # ends of pieces may be equal up to rounding
+    t, rows = np.unique(times, return_index=True)
     trajectory = Trajectory(
         scene, t, star[rows, :4], star[rows, 4:], samples[rows, :3], message="planned",
         law=lambda time: inverse.reference_torque(motion.at(time)), dense=states,
@@ -141,7 +157,9 @@ def examine_motion(motion: ReferenceMotion, scene: Scene, *, exact: bool = True)
         both = ([find(index, sign, floor) for sign in (1.0, -1.0)] for index in legs)
         peaks[name] = [max(ends, key=lambda peak: abs(peak.value)) for ends in both]
     pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
-    squares = simpson(samples[pieces, :3] ** 2, x=times[pieces][..., None], axis=1).sum(axis=0)
+    squares = simpson(samples[pieces, :3] ** 2, x=times[pieces][..., None], axis=1).sum(
+        axis=0
+    )
     rms = np.sqrt(squares / times[-1]).tolist()
     faults = tuple(_faults(distances, peaks, limits))
     return MotionPlan(motion, trajectory, peaks, limits, rms, distances, faults)
@@ -155,38 +173,49 @@ def _sample(
 ) -> tuple[Array, Callable[[int, float, float], Peak]]:
     """Return m numbers that are measured at n references, (n, m), and what finds their extremes.
 
-    That takes the index of a number, a sign, +1 for its highest value or -1 for its lowest, and the
-    floor of `maximum` for the number times the sign.
+    That takes the index of a number, a sign, +1 for its highest value or -1 for its
+    lowest, and the floor of `maximum` for the number times the sign.
     """
     samples = np.array(list(map(measure, desired)))
 
     def find(index: int, sign: float, floor: float) -> Peak:
         values = sign * samples[:, index]
-        found = maximum(lambda time: sign * measure(motion.at(time))[index], times, values, floor)
+        found = maximum(
+            lambda time: sign * measure(motion.at(time))[index], times, values, floor
+        )
         return Peak(sign * found.value, found.time)
 
     return samples, find
 
 
 def maximum(
-    function: Callable[[float], float], times: Array, values: Array, floor: float = -math.inf
+    function: Callable[[float], float],
+    times: Array,
+    values: Array,
+    floor: float = -math.inf,
 ) -> Peak:
     """Return the maximum of a function of time of which samples are known.
 
-    Every sample that no neighbour exceeds is a local maximum. It is refined between its neighbours
-    if the function could exceed the best sample, and `floor`, there: extrapolated by its change to
-    the lower neighbour. Times rise [s], shape (n,); values are those of the function there.
+    Every sample that no neighbour exceeds is a local maximum. It is refined between its
+    neighbours if the function could exceed the best sample, and `floor`, there:
+    extrapolated by its change to the lower neighbour. Times rise [s], shape (n,);
+    values are those of the function there.
     """
     top = int(np.argmax(values))
     best = Peak(float(values[top]), float(times[top]))
     left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
-    below = np.minimum(np.append(values[0], values[:-1]), np.append(values[1:], values[-1]))
+    below = np.minimum(
+        np.append(values[0], values[:-1]), np.append(values[1:], values[-1])
+    )
     high = 2.0 * values - below > max(best.value + _ROUNDING * abs(best.value), floor)
     for index in np.flatnonzero((values >= left) & (values >= right) & high):
         bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
         options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
         found = minimize_scalar(
-            lambda time: -function(time), bounds=bounds, method="bounded", options=options
+            lambda time: -function(time),
+            bounds=bounds,
+            method="bounded",
+            options=options,
         )
         if -found.fun > best.value + _ROUNDING * abs(best.value):
             best = Peak(float(-found.fun), float(found.x))
@@ -194,17 +223,25 @@ def maximum(
 
 
 def _distances(
-    motion: ReferenceMotion, scene: Scene, times: Array, desired: Sequence[Reference], exact: bool
+    motion: ReferenceMotion,
+    scene: Scene,
+    times: Array,
+    desired: Sequence[Reference],
+    exact: bool,
 ) -> Iterator[LimitDistance]:
     geometry = Geometry.of(scene)
     space = ActuatorSpaceMap(geometry)
 
     def measure(at: Reference) -> tuple[float, ...]:
-        """Gamma, sin(mu), beta and det J2, ten numbers; sin(mu) < 0 beyond a serial singularity."""
+        """Gamma, sin(mu), beta and det J2, ten numbers.
+
+        sin(mu) < 0 beyond a serial singularity.
+        """
         posture = list(space.posture(*at.quaternion))
         turned = space.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
         for leg in range(3):
-            # On the other branch of the leg r_k has the opposite direction: gamma differs by pi.
+            # On the other branch of the leg r_k has the opposite direction: gamma
+            # differs by pi.
             if math.cos(at.gamma[leg] - turned[leg]) < 0.0:
                 posture[leg] = -posture[leg]
         return (*at.gamma, *posture)
@@ -217,13 +254,18 @@ def _distances(
         return find(index, -sign, floor)
 
     arcs, edges = geometry.arc.tolist(), [geometry.beta_max] * 3
-    in_stroke, in_workspace = scene.stroke.at_end != "ignore", scene.workspace.at_edge != "ignore"
+    in_stroke, in_workspace = (
+        scene.stroke.at_end != "ignore",
+        scene.workspace.at_edge != "ignore",
+    )
     ranges = ("gamma", 0, arcs, in_stroke), ("beta", 6, edges, in_workspace)
     for name, first, ends, held in ranges:
         for leg, most in enumerate(ends):
             for end, sign in ((0.0, 1.0), (most, -1.0)):
                 reached = reach(first + leg, end, sign, held)
-                yield LimitDistance(f"{name}_{leg + 1}", end, sign, "rad", reached, held)
+                yield LimitDistance(
+                    f"{name}_{leg + 1}", end, sign, "rad", reached, held
+                )
     for leg in (1, 2, 3):
         low = reach(2 + leg, SINGULAR_MU, 1.0)
         if low.value < SINGULAR_MU:
@@ -245,7 +287,9 @@ def _distances(
 
 
 def _faults(
-    distances: Sequence[LimitDistance], peaks: dict[str, list[Peak]], limits: dict[str, float]
+    distances: Sequence[LimitDistance],
+    peaks: dict[str, list[Peak]],
+    limits: dict[str, float],
 ) -> Iterator[Problem]:
     for one in distances:
         if one.refused and one.least < 0.0:
@@ -254,7 +298,10 @@ def _faults(
     for name, limit in limits.items():
         for leg, peak in enumerate(peaks[name], start=1):
             if abs(peak.value) > limit:
-                allowed = f"exceeds the limit {limit:g} {UNITS[name]} at t = {peak.time:.9g} s"
+                allowed = (
+                    f"exceeds the limit {limit:g} {UNITS[name]} at t ="
+                    f" {peak.time:.9g} s"
+                )
                 yield Problem(f"{name}_{leg}", peak.value, allowed)
 
 
@@ -262,9 +309,10 @@ def _faults(
 class TimeScaling:
     """Factors of speed at which the actuators can do a motion, from `lowest` to `highest`.
 
-    The lowest is 0 where the actuators can hold the manipulator all along the path; the highest is
-    infinite where no limit is ever met, None where no factor is feasible. `binding` is the limit
-    that ends the range: torque, velocity or acceleration; empty if none does.
+    The lowest is 0 where the actuators can hold the manipulator all along the path; the
+    highest is infinite where no limit is ever met, None where no factor is feasible.
+    `binding` is the limit that ends the range: torque, velocity or acceleration; empty
+    if none does.
     """
 
     highest: float | None
@@ -275,8 +323,9 @@ class TimeScaling:
 def time_scaling(plan: MotionPlan) -> TimeScaling:
     """Find the highest feasible factor of speed.
 
-    The factors that torques allow are found on a grid first, then to rounding; a feasible range
-    narrower than the grid, between others that are not, may be overlooked.
+    The factors that torques allow are found on a grid first, then to rounding; a
+    feasible range narrower than the grid, between others that are not, may be
+    overlooked.
     """
     known, torque_limit = plan.limits, plan.trajectory.scene.torque_limit
     caps = {"": math.inf}
@@ -299,20 +348,30 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
         highest, binding = find_end(grid[last], grid[last + 1]), "torque"
     slow = np.flatnonzero(np.logical_not(fits[:last]))
     if len(slow):
-        return TimeScaling(highest, find_end(grid[slow[-1]], grid[slow[-1] + 1]), binding)
+        return TimeScaling(
+            highest, find_end(grid[slow[-1]], grid[slow[-1] + 1]), binding
+        )
     return TimeScaling(highest, 0.0 if excess(0.0) <= 0.0 else grid[0], binding)
 
 
 def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
-    """Return by how much a torque exceeds the limit [N m] at a factor of speed; <= 0 for none."""
+    """Return by how much a torque exceeds the limit [N m] at a factor of speed.
+
+    <= 0 for none.
+    """
     scene, times = plan.trajectory.scene, plan.trajectory.t
     model, inverse = kernel.model_of(scene), InverseDynamics(scene)
     quaternion, rate = plan.trajectory.quaternion.T, plan.trajectory.body_rate.T
-    acceleration = np.array([plan.motion.at(time).body_acceleration for time in times.tolist()]).T
+    acceleration = np.array(
+        [plan.motion.at(time).body_acceleration for time in times.tolist()]
+    ).T
 
     def torque(factor: float, leg: int, sign: float, time: float) -> float:
         at = plan.motion.at(time)
-        moving = multiply(factor, at.body_rate), multiply(factor * factor, at.body_acceleration)
+        moving = (
+            multiply(factor, at.body_rate),
+            multiply(factor * factor, at.body_acceleration),
+        )
         return sign * inverse.torque(at.quaternion, *moving)[leg]
 
     def excess(factor: float) -> float:
@@ -333,8 +392,8 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
 def examine_reactions(plan: MotionPlan) -> dict[str, dict[str, LoadFigures]]:
     """Return peak and RMS of the reactions of a plan, by kind of joint and `reactions.SIZES`.
 
-    The motion is sampled again, finely, beside each largest sample: a peak is off by some 1e-5 of
-    itself.
+    The motion is sampled again, finely, beside each largest sample: a peak is off by
+    some 1e-5 of itself.
     """
     t = plan.trajectory.t
     windows = [t]

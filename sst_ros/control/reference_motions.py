@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference motion of a scene: of the star, or of the actuators, which the star follows.
 
-Through waypoints, and through the samples of a recording, goes one quintic a segment: position,
-velocity and acceleration at both ends make it. Where a velocity or an acceleration is left open,
-all open ones together minimise the integral of the jerk squared: with positions alone that is the
-quintic spline with four continuous derivatives.
+Through waypoints, and through the samples of a recording, goes one quintic a segment:
+position, velocity and acceleration at both ends make it. Where a velocity or an
+acceleration is left open, all open ones together minimise the integral of the jerk
+squared: with positions alone that is the quintic spline with four continuous
+derivatives.
 """
 
 from __future__ import annotations
@@ -49,13 +50,15 @@ from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import ZERO, Quaternion, Vector3
 
 PIECES = 8  # pieces of a minimum-jerk motion, and of a quarter of a turn
-SAMPLES_A_PIECE = 8  # of a recording, whose samples lie much denser than the motion turns
+# of a recording, whose samples lie much denser than the motion turns
+SAMPLES_A_PIECE = 8
 STEP = 0.03  # distance in gamma [rad] between orientations that are kept
 LONGEST = 100.0  # longest path in gamma [rad] within a piece of a motion
 NEAR = 0.1  # largest distance of a first point at time 0 from the start [rad]
 _SAMPLES = 16
 
-# Share of the path to the turn from the start, and to W and its derivative by that share.
+# Share of the path to the turn from the start, and to W and its derivative by that
+# share.
 StarPath: TypeAlias = Callable[[float], tuple[Quaternion, Vector3, Vector3]]
 # Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2].
 ActuatorPath: TypeAlias = Callable[[float], tuple[Vector3, Vector3, Vector3]]
@@ -68,10 +71,11 @@ def reference_motion(
 ) -> ReferenceMotion:
     """Return the reference motion of a scene.
 
-    `read_motion` reads a bag as a `Trajectory`, as `recording.recording.read_run_motion` does.
-    Raises InputError where the scene has no motion, or one that cannot be made (`through_points`);
-    AssemblyError where the initial gamma has no unique admissible assembly; SingularConfiguration
-    where the motion meets a parallel singularity.
+    `read_motion` reads a bag as a `Trajectory`, as
+    `recording.recording.read_run_motion` does. Raises InputError where the scene has no
+    motion, or one that cannot be made (`through_points`); AssemblyError where the
+    initial gamma has no unique admissible assembly; SingularConfiguration where the
+    motion meets a parallel singularity.
     """
     scene = scene_of(scene)
     motion, geometry = scene.motion, Geometry.of(scene)
@@ -84,7 +88,9 @@ def reference_motion(
             raise refusal(scene.name, "motion.recorded", bag, allowed)
         found = read_motion(bag)
         x, y, z, w = found.quaternion[0].tolist()
-        return through_samples(geometry, (x, y, z, w), found.t, found.gamma, found.gamma_dot)
+        return through_samples(
+            geometry, (x, y, z, w), found.t, found.gamma, found.gamma_dot
+        )
     gamma = scene.initial.gamma
     x, y, z, w = initial_state(scene, geometry)[:4]
     start = (x, y, z, w)
@@ -93,11 +99,15 @@ def reference_motion(
     if motion.spiral:
         return spiral_motion(geometry, start, motion.spiral)
     if motion.waypoints:
-        points = [(at.time, at.gamma, at.gamma_dot, at.gamma_ddot) for at in motion.waypoints]
+        points = [
+            (at.time, at.gamma, at.gamma_dot, at.gamma_ddot) for at in motion.waypoints
+        ]
         try:
             return through_points(geometry, start, *zip(*points, strict=True))
         except InputError as error:
-            raise InputError(f"{scene.name}: motion.waypoints", error.problems) from None
+            raise InputError(
+                f"{scene.name}: motion.waypoints", error.problems
+            ) from None
     if motion.sweep:
         centre = motion.sweep.centre or gamma
         if centre != gamma:
@@ -107,10 +117,13 @@ def reference_motion(
     assert goal is not None
     span = axpy(1.0, goal.gamma, -1.0, gamma)
     path = partial(_on_line, gamma, span, goal.duration)
-    return move_actuators(geometry, path, equal_pieces(goal.duration, 2 * PIECES), start)
+    return move_actuators(
+        geometry, path, equal_pieces(goal.duration, 2 * PIECES), start
+    )
 
 
-# The paths below are functions of the module, which pickle takes, with their numbers in front.
+# The paths below are functions of the module, which pickle takes, with their numbers in
+# front.
 
 
 def _on_line(
@@ -135,7 +148,10 @@ def minimum_jerk(time: float, duration: float = 1.0) -> tuple[float, float, floa
 def move_star(
     geometry: Geometry, start: Quaternion, path: StarPath, duration: float, turn: float
 ) -> ReferenceMotion:
-    """Return a motion of the star along a path, with minimum jerk; it turns by `turn` [rad]."""
+    """Return a motion of the star along a path, with minimum jerk.
+
+    It turns by `turn` [rad].
+    """
     space, (x, y, z, w), length = ActuatorSpaceMap(geometry), start, math.hypot(*start)
     begin = x / length, y / length, z / length, w / length
     count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
@@ -144,7 +160,11 @@ def move_star(
 
 
 def _on_star_path(
-    space: ActuatorSpaceMap, begin: Quaternion, path: StarPath, duration: float, time: float
+    space: ActuatorSpaceMap,
+    begin: Quaternion,
+    path: StarPath,
+    duration: float,
+    time: float,
 ) -> Reference:
     """Return the reference of `move_star` at a time [s]."""
     s, rate, acceleration = minimum_jerk(time, duration)
@@ -168,18 +188,22 @@ def geodesic_motion(
     return move_star(geometry, start, path, duration, angle)
 
 
-def _on_geodesic(vector: Vector3, angle: float, s: float) -> tuple[Quaternion, Vector3, Vector3]:
+def _on_geodesic(
+    vector: Vector3, angle: float, s: float
+) -> tuple[Quaternion, Vector3, Vector3]:
     """Return what `StarPath` says, of a turn about one axis."""
     half = 0.5 * s * angle
     part = math.sin(half) / angle if angle else 0.0
     return (*multiply(part, vector), math.cos(half)), vector, ZERO
 
 
-def spiral_motion(geometry: Geometry, start: Quaternion, spiral: Spiral) -> ReferenceMotion:
+def spiral_motion(
+    geometry: Geometry, start: Quaternion, spiral: Spiral
+) -> ReferenceMotion:
     """R(0) Rz(theta) Ry(phi) Rz(psi - theta), the three angles [rad] grown by minimum jerk.
 
-    Tilt, its direction and torsion: at phi = 0 the star only turns by psi about E, so the motion
-    is smooth where ZYZ angles are not.
+    Tilt, its direction and torsion: at phi = 0 the star only turns by psi about E, so
+    the motion is smooth where ZYZ angles are not.
     """
     theta, phi, psi = spiral.theta, spiral.phi, spiral.psi
     path, turn = partial(_on_spiral, theta, phi, psi), abs(theta) + abs(phi) + abs(psi)
@@ -191,7 +215,12 @@ def _on_spiral(
 ) -> tuple[Quaternion, Vector3, Vector3]:
     """Return what `StarPath` says, of `spiral_motion`."""
     third = psi - theta
-    b, c, difference, total = s * phi, s * third, 0.5 * s * (third - theta), 0.5 * s * psi
+    b, c, difference, total = (
+        s * phi,
+        s * third,
+        0.5 * s * (third - theta),
+        0.5 * s * psi,
+    )
     sine, cosine = math.sin(0.5 * b), math.cos(0.5 * b)
     x, y = sine * math.sin(difference), sine * math.cos(difference)
     q = x, y, cosine * math.sin(total), cosine * math.cos(total)
@@ -211,19 +240,24 @@ def move_actuators(
 ) -> ReferenceMotion:
     """Return a motion of the actuators, with the orientation of one assembly mode along it.
 
-    Orientations are computed once along the path, by `continuation` in steps that cannot leave the
-    assembly mode; any other orientation is computed from the nearest of these. The motion therefore
-    does not depend on what was asked before. It starts from an orientation (x, y, z, w). Raises
-    SingularConfiguration, with the time, where the path meets a parallel singularity, InputError
-    where a piece is longer than LONGEST, AssemblyError where it does not begin at that orientation.
+    Orientations are computed once along the path, by `continuation` in steps that
+    cannot leave the assembly mode; any other orientation is computed from the nearest
+    of these. The motion therefore does not depend on what was asked before. It starts
+    from an orientation (x, y, z, w). Raises SingularConfiguration, with the time, where
+    the path meets a parallel singularity, InputError where a piece is longer than
+    LONGEST, AssemblyError where it does not begin at that orientation.
     """
     space, times = ActuatorSpaceMap(geometry), _space(path, pieces)
     gammas = [path(time)[0] for time in times]
     try:
-        rotations, sigmas = continuation.follow(geometry, gammas, rotation_matrix(start))
+        rotations, sigmas = continuation.follow(
+            geometry, gammas, rotation_matrix(start)
+        )
     except continuation.BranchEnds as error:
         said = f"parallel singularity before t = {times[error.row]:.9g} s"
-        raise SingularConfiguration(f"{said}, least singular value of J2", error.measure) from error
+        raise SingularConfiguration(
+            f"{said}, least singular value of J2", error.measure
+        ) from error
     quaternions = quaternion_of(rotations)
     # Their signs change as little as they can.
     turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
@@ -233,13 +267,18 @@ def move_actuators(
     return ReferenceMotion(partial(_on_path, space, path, kept), pieces)
 
 
-def _on_path(space: ActuatorSpaceMap, path: ActuatorPath, kept: Any, time: float) -> Reference:
+def _on_path(
+    space: ActuatorSpaceMap, path: ActuatorPath, kept: Any, time: float
+) -> Reference:
     """Return the reference at a time [s]; a function of a module, which pickle takes.
 
-    Each of what is kept is a time, the orientation and gamma there, and the singular value of J2.
+    Each of what is kept is a time, the orientation and gamma there, and the singular
+    value of J2.
     """
     gamma, gamma_dot, gamma_ddot = path(time)
-    _, known, here, sigma = kept[max(bisect_right(kept, time, key=itemgetter(0)) - 1, 0)]
+    _, known, here, sigma = kept[
+        max(bisect_right(kept, time, key=itemgetter(0)) - 1, 0)
+    ]
     q = space.follow(known, here, gamma, sigma)
     star: Any = space.star_motion(*q, *gamma_dot, *gamma_ddot)
     return Reference(q, star[:3], star[3:], gamma, gamma_dot, gamma_ddot)
@@ -249,10 +288,16 @@ def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
     """Return times from the first to the last between which gamma moves by no more than STEP."""
     times = [np.zeros(1)]
     for begin, end in pairwise(pieces):
-        rough = [path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()]
+        rough = [
+            path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()
+        ]
         length = sum(math.dist(a, b) for a, b in pairwise(rough))
-        allowed = f"must be less than {LONGEST:g} rad between {begin:.9g} s and {end:.9g} s"
-        refuse_unless("motion", ("path length of gamma", length, length < LONGEST, allowed))
+        allowed = (
+            f"must be less than {LONGEST:g} rad between {begin:.9g} s and {end:.9g} s"
+        )
+        refuse_unless(
+            "motion", ("path length of gamma", length, length < LONGEST, allowed)
+        )
         count = max(_SAMPLES, math.ceil(4.0 * length / STEP))
         times.append(np.linspace(begin, end, count + 1)[1:])
     fine = np.concatenate(times)
@@ -263,9 +308,15 @@ def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
     return [*fine[kept].tolist(), pieces[-1]]
 
 
-def _sweep_path(sweep: Sweep, centre: Vector3) -> tuple[ActuatorPath, tuple[float, ...]]:
+def _sweep_path(
+    sweep: Sweep, centre: Vector3
+) -> tuple[ActuatorPath, tuple[float, ...]]:
     """Sines that fade in and out, and pieces of a quarter of a period or less."""
-    last, fade, duration = sweep.last_frequency or sweep.frequency, sweep.fade, sweep.duration
+    last, fade, duration = (
+        sweep.last_frequency or sweep.frequency,
+        sweep.fade,
+        sweep.duration,
+    )
     slopes = [(b - a) / duration for a, b in zip(sweep.frequency, last, strict=True)]
     rows = list(zip(centre, sweep.amplitude, sweep.frequency, slopes, strict=True))
     fastest = max(map(abs, (*sweep.frequency, *last)))
@@ -275,7 +326,10 @@ def _sweep_path(sweep: Sweep, centre: Vector3) -> tuple[ActuatorPath, tuple[floa
 
 
 def _on_sines(
-    rows: Sequence[tuple[float, float, float, float]], fade: float, duration: float, time: float
+    rows: Sequence[tuple[float, float, float, float]],
+    fade: float,
+    duration: float,
+    time: float,
 ) -> tuple[Vector3, Vector3, Vector3]:
     """Return gamma and its derivatives at a time [s], of `_sweep_path`."""
     e, e1, e2 = 1.0, 0.0, 0.0  # the fading, and its derivatives by time
@@ -304,18 +358,22 @@ def through_points(
 ) -> ReferenceMotion:
     """Return the motion of the actuators through points, quintic between them.
 
-    The fields of trajectory_msgs/JointTrajectory: times of n >= 1 points [s], and n rows of gamma
-    [rad] and its derivatives in the order of the legs. A first point after time 0 is reached from
-    the start, an orientation (x, y, z, w), and `begin`, gamma_dot and gamma_ddot there; one at time
-    0 is the start itself, at rest. The motion ends at rest. Rates and accelerations that are not
-    given (no rows, or None or nothing in place of a row) are zero at the ends and chosen for
-    minimum jerk between them. Raises InputError for points that make no motion, and as
-    `move_actuators`.
+    The fields of trajectory_msgs/JointTrajectory: times of n >= 1 points [s], and n
+    rows of gamma [rad] and its derivatives in the order of the legs. A first point
+    after time 0 is reached from the start, an orientation (x, y, z, w), and `begin`,
+    gamma_dot and gamma_ddot there; one at time 0 is the start itself, at rest. The
+    motion ends at rest. Rates and accelerations that are not given (no rows, or None or
+    nothing in place of a row) are zero at the ends and chosen for minimum jerk between
+    them. Raises InputError for points that make no motion, and as `move_actuators`.
     """
-    checks: list[Check] = [("points", len(times), len(times) > 0, "must be one or more")]
+    checks: list[Check] = [
+        ("points", len(times), len(times) > 0, "must be one or more")
+    ]
     names = "times", "positions", "velocities", "accelerations"
     given = [[time] for time in times], positions, velocities, accelerations
-    rows = [_read_rows(*one, len(times), checks) for one in zip(names, given, strict=True)]
+    rows = [
+        _read_rows(*one, len(times), checks) for one in zip(names, given, strict=True)
+    ]
     refuse_unless("trajectory", *checks)
     at, gamma, rates, seconds = map(np.array, rows)
     at = at.ravel()
@@ -326,7 +384,9 @@ def through_points(
         rates, seconds = np.vstack([begin[0], rates]), np.vstack([begin[1], seconds])
     allowed = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
     first, near = gamma[0].tolist(), np.abs(gamma[0] - here).max() <= NEAR
-    refuse_unless("trajectory", ("positions[0]", first, near, allowed.format(NEAR, *here)))
+    refuse_unless(
+        "trajectory", ("positions[0]", first, near, allowed.format(NEAR, *here))
+    )
     for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
         ends[np.isnan(ends)] = 0.0
     begun = follow_assembly(geometry, start, here, gamma[0])
@@ -335,27 +395,41 @@ def through_points(
 
 
 def through_samples(
-    geometry: Geometry, start: Quaternion, times: Array, positions: Array, velocities: Array
+    geometry: Geometry,
+    start: Quaternion,
+    times: Array,
+    positions: Array,
+    velocities: Array,
 ) -> ReferenceMotion:
-    """Return the motion through dense samples, quintic between them; it may begin and end moving.
+    """Return the motion through dense samples, quintic between them.
 
-    It begins with the first sample, from an orientation (x, y, z, w). Samples are rising times [s],
-    shape (n,), gamma [rad] and gamma_dot [rad/s], shape (n, 3). Raises as `move_actuators`.
+    It may begin and end moving.
+
+    It begins with the first sample, from an orientation (x, y, z, w). Samples are
+    rising times [s], shape (n,), gamma [rad] and gamma_dot [rad/s], shape (n, 3).
+    Raises as `move_actuators`.
     """
     times, gamma = times - times[0], np.unwrap(positions, axis=0)
     pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
-    path = partial(_on_curve, quintic(times, gamma, velocities, np.full_like(gamma, np.nan)))
+    path = partial(
+        _on_curve, quintic(times, gamma, velocities, np.full_like(gamma, np.nan))
+    )
     return move_actuators(geometry, path, pieces, start)
 
 
 def _read_rows(
     name: str, rows: OpenPoints | None, count: int, checks: list[Check]
 ) -> list[list[float]]:
-    """Read rows of numbers; one that is open becomes NaN. What they must be joins the checks."""
+    """Read rows of numbers; one that is open becomes NaN.
+
+    What they must be joins the checks.
+    """
     rows = [None] * count if rows is None else rows
     whole = f"must have a row for each of {count} points"
     checks.append((name, len(rows), len(rows) == count, whole))
-    size, allowed = (1, "must be finite") if name == "times" else (3, "must be 3 finite numbers")
+    size, allowed = (
+        (1, "must be finite") if name == "times" else (3, "must be 3 finite numbers")
+    )
     found = [[] if row is None else list(map(float, row)) for row in rows]
     for index, numbers in enumerate(found):
         if not numbers and name in ("velocities", "accelerations"):
@@ -372,7 +446,12 @@ def _check_points(at: Array, rates: Array) -> Iterator[Check]:
         allowed = f"must be > {at[index - 1]:g} s, that of the point before"
         yield f"times[{index}]", float(at[index]), False, allowed
     early = at[0] < 0.0 or (at[0] == 0.0 and len(at) == 1)
-    yield "times[0]", float(at[0]), not early, "must be >= 0 s, that of a single point > 0 s"
+    yield (
+        "times[0]",
+        float(at[0]),
+        not early,
+        "must be >= 0 s, that of a single point > 0 s",
+    )
     for end in {0, len(at) - 1} if at[0] == 0.0 else {len(at) - 1}:
         still = not np.nan_to_num(rates[end]).any()
         allowed = "must be zero: a motion begins and ends at rest"
@@ -388,19 +467,25 @@ _UNIT = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))
 
 
 def quintic(
-    times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, accelerations: ArrayLike
+    times: ArrayLike,
+    positions: ArrayLike,
+    velocities: ArrayLike,
+    accelerations: ArrayLike,
 ) -> PPoly:
     """Return position, velocity and acceleration, shape (3, m), quintic between points.
 
-    Times of the points rise [s], shape (n,), n >= 2; the numbers there have shape (n, m), NaN where
-    a velocity or an acceleration is left open.
+    Times of the points rise [s], shape (n,), n >= 2; the numbers there have shape (n,
+    m), NaN where a velocity or an acceleration is left open.
     """
     at = np.asarray(times, dtype=float)
     nodes = np.stack([positions, velocities, accelerations], axis=1).astype(float)
     lengths = np.diff(at)
     _complete(nodes, lengths)
-    powers = lengths[:, None] ** np.arange(6)  # derivatives by the time of a segment, from 0 to 1
-    ends = np.concatenate([nodes[:-1], nodes[1:]], axis=1) * powers[:, [0, 1, 2] * 2, None]
+    # derivatives by the time of a segment, from 0 to 1
+    powers = lengths[:, None] ** np.arange(6)
+    ends = (
+        np.concatenate([nodes[:-1], nodes[1:]], axis=1) * powers[:, [0, 1, 2] * 2, None]
+    )
     unit = PPoly.from_bernstein_basis(_UNIT).c[:, 0]
     path = PPoly(np.einsum("ij,njm->inm", unit, ends) / powers.T[::-1, :, None], at)
     parts = [path.derivative(order).c for order in range(3)]
@@ -411,14 +496,17 @@ def quintic(
 def _complete(nodes: Array, lengths: Array) -> None:
     """Fill in what is open in nodes, shape (n, 3, m), in place: the least integral of jerk^2."""
     usual = float(np.median(lengths))
-    # A velocity times the usual length has the size of a position: the system stays well scaled.
+    # A velocity times the usual length has the size of a position: the system stays
+    # well scaled.
     scale = np.array([1.0, usual, usual * usual])[:, None]
     jerk = PPoly.from_bernstein_basis(_UNIT.derivative(3)).c[::-1, 0]
     h = (lengths / usual)[:, None, None]
     powers = h ** np.array([0, 1, 2] * 2)
-    # The integral of the jerk squared, as a form in the six numbers at the ends of each segment.
+    # The integral of the jerk squared, as a form in the six numbers at the ends of each
+    # segment.
     forms = np.swapaxes(powers, 1, 2) * (jerk.T @ hilbert(3) @ jerk) * powers / h**5
-    places = 3 * np.arange(len(lengths))[:, None] + np.arange(6)  # of these numbers among all
+    # of these numbers among all
+    places = 3 * np.arange(len(lengths))[:, None] + np.arange(6)
     rows, columns = np.broadcast_arrays(places[:, :, None], places[:, None])
     hessian = csc_array((forms.ravel(), (rows.ravel(), columns.ravel())))
     for column in range(nodes.shape[2]):

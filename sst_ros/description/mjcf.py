@@ -9,8 +9,8 @@ belong to bodies that weigh next to nothing: MuJoCo makes a tie as soft as the c
 mass of its body is mobile, and a centre at O would make it too stiff for any step.
 
 MuJoCo's constraints are springs and dampers, so a loop opens a little under load; its
-joints know viscous and dry friction, linear springs and no other loads. What a scene has
-beyond that is named at the head of the file.
+joints know viscous and dry friction, linear springs and no other loads. What a scene
+has beyond that is named at the head of the file.
 """
 
 from __future__ import annotations
@@ -81,7 +81,10 @@ def mjcf(scene: Scene) -> str:
             least=LEAST,
             gravity=ZERO if scene.gravity is None else scene.gravity.acceleration,
             base=BASE,
-            visuals={link: [*chain(*map(solids, some))] for link, some in shapes(scene).items()},
+            visuals={
+                link: [*chain(*map(solids, some))]
+                for link, some in shapes(scene).items()
+            },
             solid=_geom,
             chains=[*_nest(joints)],
             bodies=bodies,
@@ -91,7 +94,11 @@ def mjcf(scene: Scene) -> str:
             attributes=_joint_attributes(scene, geometry),
             sites=_sites(scene, geometry),
             end=[0.0, 0.0, scene.star.radius],
-            ties=[(f"{STAR}_{end}{k}", f"{STARS[k - 1]}_{end}") for k in (2, 3) for end in "et"],
+            ties=[
+                (f"{STAR}_{end}{k}", f"{STARS[k - 1]}_{end}")
+                for k in (2, 3)
+                for end in "et"
+            ],
             actuated=JOINTS[:3],
             motor=_motor(scene),
             start=[angles[i] for i in places],

@@ -5,21 +5,24 @@
                                                          -beta_2- star_from_2
                                                          -beta_3- star_from_3
 
-All joints turn about axes through O, so every frame has its origin there and a pose is a rotation.
-The star is attached to leg 1. Legs 2 and 3 end in a frame without a body: {E} as that leg sees it.
-The loops are closed where the three are one. Links are drawn as arcs, rods, balls and boxes in
-their own frames; thicknesses are for the eye, arcs and radii are the scene's, no shape is meant for
-collisions. URDF has no loops, no springs, no elastic stops and no Stribeck friction: a simulation
-of the file must add them.
+All joints turn about axes through O, so every frame has its origin there and a pose is
+a rotation. The star is attached to leg 1. Legs 2 and 3 end in a frame without a body:
+{E} as that leg sees it. The loops are closed where the three are one. Links are drawn
+as arcs, rods, balls and boxes in their own frames; thicknesses are for the eye, arcs
+and radii are the scene's, no shape is meant for collisions. URDF has no loops, no
+springs, no elastic stops and no Stribeck friction: a simulation of the file must add
+them.
 
-A scene gives inertias about O, and a mass only where something weighs; URDF wants a mass. Where the
-scene has none, it is the one that would have this tensor on the sphere of its link,
-trace / (2 radius^2), with its centre at O: the motion is then the same for any mass.
+A scene gives inertias about O, and a mass only where something weighs; URDF wants a
+mass. Where the scene has none, it is the one that would have this tensor on the sphere
+of its link, trace / (2 radius^2), with its centre at O: the motion is then the same for
+any mass.
 
-The actuators can be hardware of ros2_control, which drives them over topics, by LockstepSystem of
-the package in hardware/ or JointStateTopicSystem of joint_state_topic_hardware_interface. That one
-sends the names of all joints of its tag with the efforts of those that have one: the passive
-joints, which have states only, get a tag of their own.
+The actuators can be hardware of ros2_control, which drives them over topics, by
+LockstepSystem of the package in hardware/ or JointStateTopicSystem of
+joint_state_topic_hardware_interface. That one sends the names of all joints of its tag
+with the efforts of those that have one: the passive joints, which have states only, get
+a tag of their own.
 """
 
 from __future__ import annotations
@@ -50,17 +53,24 @@ GLOBE: Colour = (0.93, 0.94, 0.96)
 TRIANGLE: Colour = (0.35, 0.38, 0.42)
 STAR_COLOUR: Colour = (0.90, 0.62, 0.00)
 STEEL: Colour = (0.60, 0.63, 0.67)
-LEG_COLOURS: tuple[Colour, ...] = ((0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45))
+LEG_COLOURS: tuple[Colour, ...] = (
+    (0.00, 0.45, 0.70),
+    (0.84, 0.37, 0.00),
+    (0.00, 0.62, 0.45),
+)
 """Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
 
 LEAST = 1e-10
 """Mass [kg] and moments of inertia [kg m^2] that MuJoCo gives a link without them."""
 
-STEP = np.radians(6.0)  # arcs are drawn as chords of this length or less: 0.14 % of the radius off
+# arcs are drawn as chords of this length or less: 0.14 % of the radius off
+STEP = np.radians(6.0)
 
 SERVO_TORQUE, SERVO_RATE = 10.6, np.pi
-"""Limits of an actuator whose scene has none [N m], [rad/s]: stall torque and speed without load
-(30 rev/min) of a geared servo for arms of this size, ROBOTIS XM540-W270 at 12 V."""
+"""Limits of an actuator whose scene has none [N m], [rad/s]: stall torque and speed
+without load (30 rev/min) of a geared servo for arms of this size, ROBOTIS XM540-W270 at
+12 V.
+"""
 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
 LOCKSTEP_PLUGIN = "sst_ros_hardware/LockstepSystem"
@@ -70,7 +80,8 @@ TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
 NEGLIGIBLE_MASS, NEGLIGIBLE_INERTIA = 1e-12, 2e-14
 """Of a moving link that has none in the scene [kg, kg m^2]: MuJoCo refuses less than 1e-14.
 
-Beside the star's inertia, some 1e-2 kg m^2, they are lost in the rounding of a few operations.
+Beside the star's inertia, some 1e-2 kg m^2, they are lost in the rounding of a few
+operations.
 """
 
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -79,8 +90,9 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 class Joint(NamedTuple):
     """A joint between two links, named as in joint_states.
 
-    child = parent * origin * rotation about the axis by the angle, with the origin, shape (3, 3), a
-    rotation in the frame of the parent, and the axis a unit vector in the joint's frame.
+    child = parent * origin * rotation about the axis by the angle, with the origin,
+    shape (3, 3), a rotation in the frame of the parent, and the axis a unit vector in
+    the joint's frame.
     """
 
     name: str
@@ -93,10 +105,20 @@ class Joint(NamedTuple):
 def joints_of(geometry: Geometry) -> list[Joint]:
     """All nine joints, parents before children; signs are those of Eqs. 50 to 52."""
     z, found = np.array([0.0, 0.0, 1.0]), []
-    legs = zip(LEGS, geometry.v, geometry.w, geometry.e, ACTUATED, INTERMEDIATE, STARS, strict=True)
+    legs = zip(
+        LEGS,
+        geometry.v,
+        geometry.w,
+        geometry.e,
+        ACTUATED,
+        INTERMEDIATE,
+        STARS,
+        strict=True,
+    )
     for leg, v, w, e, actuated, intermediate, star in legs:
         at_rest = np.stack([v, np.cross(w, v), w], axis=1)  # 0kR at gamma = 0
-        # At beta = 0 the arc's end s lies at r: in {E} the vectors of {2k} are z, e x z and e.
+        # At beta = 0 the arc's end s lies at r: in {E} the vectors of {2k} are z, e x z
+        # and e.
         folded = np.stack([z, np.cross(e, z), e], axis=1).T
         back = (-float(e[0]), -float(e[1]), -float(e[2]))
         found += [
@@ -112,7 +134,9 @@ def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str,
     found: dict[str, Array] = {BASE: np.eye(3)}
     for joint in joints:
         angle, across = angles[joint.name], np.cross(np.eye(3), np.array(joint.axis))
-        turn = np.eye(3) + np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
+        turn = (
+            np.eye(3) + np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
+        )
         found[joint.child] = found[joint.parent] @ (joint.origin @ turn)
     return found
 
@@ -136,11 +160,16 @@ class Arc(NamedTuple):
         count = max(2, int(np.ceil(self.angle / STEP)) + 1)
         angles = np.linspace(0.0, self.angle, count)[:, None]
         across = np.cross(self.axis, self.begin)
-        return np.asarray(self.radius * (np.cos(angles) * self.begin + np.sin(angles) * across))
+        return np.asarray(
+            self.radius * (np.cos(angles) * self.begin + np.sin(angles) * across)
+        )
 
 
 class Rod(NamedTuple):
-    """A straight round bar between two points, shape (3,) [m]; `thickness` is its radius [m]."""
+    """A straight round bar between two points, shape (3,) [m].
+
+    `thickness` is its radius [m].
+    """
 
     begin: Array
     end: Array
@@ -182,7 +211,10 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
         ],
         # In {E} the carriage k is at s turned about e by +beta.
         STAR: [
-            *(Arc(z, e, geometry.beta_max, star, thick, STAR_COLOUR) for e in geometry.e),
+            *(
+                Arc(z, e, geometry.beta_max, star, thick, STAR_COLOUR)
+                for e in geometry.e
+            ),
             Ball(star * z, 2.2 * thick, STAR_COLOUR),
         ],
     }
@@ -190,7 +222,9 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
         centre = np.array(scene.payload.centre)
         rod = Rod(star * z, centre, 0.8 * thick, STEEL)
         found[STAR] += [rod, Ball(centre, 2.8 * thick, STEEL)]
-    for actuated, intermediate, colour in zip(ACTUATED, INTERMEDIATE, LEG_COLOURS, strict=True):
+    for actuated, intermediate, colour in zip(
+        ACTUATED, INTERMEDIATE, LEG_COLOURS, strict=True
+    ):
         # A quarter arc from the motor at w to the carriage at r, just above the base.
         middle = base + 1.5 * thick
         found[actuated] = [
@@ -207,10 +241,11 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
 def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) -> str:
     """Write a scene as a URDF document.
 
-    With topics of commands by name and of joint states it has the ros2_control tags of the
-    actuators and the passive joints. Until the first joint states arrive, the actuators have the
-    initial state of the scene: without it joint_trajectory_controller, activated before, holds nan,
-    and no command starts the run.
+    With topics of commands by name and of joint states it has the ros2_control tags of
+    the actuators and the passive joints. Until the first joint states arrive, the
+    actuators have the initial state of the scene: without it
+    joint_trajectory_controller, activated before, holds nan, and no command starts the
+    run.
     """
     geometry, drawn = Geometry.of(scene), shapes(scene)
     joints, own = joints_of(geometry), {body.name: body for body in bodies_of(scene)}
@@ -219,11 +254,18 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
     limited = []
     for joint in joints:
         ends = ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf))
-        limits = dict(zip(("lower", "upper"), ends, strict=True)) if np.isfinite(ends).all() else {}
+        limits = (
+            dict(zip(("lower", "upper"), ends, strict=True))
+            if np.isfinite(ends).all()
+            else {}
+        )
         kind = joint.name.split("_")[0]
         motor = scene.actuators if kind == "gamma" else None
-        # The passive joints have no motor; their rates are of the order of the actuators'.
-        torque, rate = (getattr(motor, f"{what}_limit", None) for what in ("torque", "velocity"))
+        # The passive joints have no motor; their rates are of the order of the
+        # actuators'.
+        torque, rate = (
+            getattr(motor, f"{what}_limit", None) for what in ("torque", "velocity")
+        )
         limits["effort"] = (torque or SERVO_TORQUE) if kind == "gamma" else 0.0
         limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
         limited.append((joint, limits, getattr(scene.friction, kind, None)))
@@ -234,11 +276,22 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
             # An XML name has no spaces.
             name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
             assumed=[body.name for body in bodies.values() if body.assumed],
-            links=list(dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))),
+            links=list(
+                dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))
+            ),
             bodies=bodies,
-            visuals={link: [*chain(*map(solids, some))] for link, some in drawn.items()},
+            visuals={
+                link: [*chain(*map(solids, some))] for link, some in drawn.items()
+            },
             joints=limited,
-            starts=list(zip(JOINTS[:3], scene.initial.gamma, scene.initial.gamma_dot, strict=True)),
+            starts=list(
+                zip(
+                    JOINTS[:3],
+                    scene.initial.gamma,
+                    scene.initial.gamma_dot,
+                    strict=True,
+                )
+            ),
             topics=topics,
             least=LEAST,
             passive=JOINTS[3:],
@@ -254,7 +307,9 @@ def load_description_templates() -> Any:
     templates = load_templates("description")
     templates.filters |= {
         "exact": lambda values: " ".join(repr(float(x) + 0.0) for x in values),
-        "short": lambda values: " ".join(f"{round(float(x), 6) + 0.0:g}" for x in values),
+        "short": lambda values: " ".join(
+            f"{round(float(x), 6) + 0.0:g}" for x in values
+        ),
     }
     return templates
 
@@ -272,7 +327,9 @@ class Body(NamedTuple):
     @property
     def inertia(self) -> dict[str, float]:
         """Entries of the tensor by their names in URDF."""
-        return dict(zip(_INERTIA, self.tensor[np.triu_indices(3)].tolist(), strict=True))
+        return dict(
+            zip(_INERTIA, self.tensor[np.triu_indices(3)].tolist(), strict=True)
+        )
 
 
 def bodies_of(scene: Scene) -> Iterator[Body]:
@@ -280,7 +337,11 @@ def bodies_of(scene: Scene) -> Iterator[Body]:
     star, base, payload, motor = scene.star, scene.base, scene.payload, scene.actuators
 
     def body(
-        name: str, radius: float, about_o: Array, mass: float = 0.0, at: Vector3 = (0.0, 0.0, 0.0)
+        name: str,
+        radius: float,
+        about_o: Array,
+        mass: float = 0.0,
+        at: Vector3 = (0.0, 0.0, 0.0),
     ) -> Body:
         c, assumed = np.array(at), float(np.trace(about_o)) / (2.0 * radius**2)
         own = about_o - mass * (c @ c * np.eye(3) - np.outer(c, c))
@@ -304,7 +365,9 @@ def bodies_of(scene: Scene) -> Iterator[Body]:
             yield body(f"rotor_{leg}", base.radius, disc)._replace(link=ACTUATED[k])
 
 
-def _with_negligible_bodies(bodies: Mapping[str, Body], joints: Iterable[Joint]) -> list[Body]:
+def _with_negligible_bodies(
+    bodies: Mapping[str, Body], joints: Iterable[Joint]
+) -> list[Body]:
     """Give each moving link that has no body one that changes no motion."""
     tensor, at_o = NEGLIGIBLE_INERTIA * np.eye(3), np.zeros(3)
     bare = (joint.child for joint in joints if joint.child not in bodies)
@@ -335,7 +398,8 @@ def solids(shape: Shape) -> Iterator[tuple[Any, ...]]:
         ends = shape.points() if isinstance(shape, Arc) else (shape.begin, shape.end)
         for begin, end in pairwise(ends):
             x, y, z = end - begin
-            # The cylinder's axis is z; it ends a little late, so that no gap shows at the bends.
+            # The cylinder's axis is z; it ends a little late, so that no gap shows at
+            # the bends.
             turn = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
             length = float(np.linalg.norm(end - begin)) + 0.1 * shape.thickness
             size = {"radius": [shape.thickness], "length": [length]}

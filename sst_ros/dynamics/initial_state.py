@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of a run from the paper's quantities: its begin, and its derivative by Eqs. 1 to 92.
 
-The derivative is the paper's own, in plain Python. Each evaluation solves Eq. 90 for gamma_ddot
-and takes omega_dot from Eq. 40.
+The derivative is the paper's own, in plain Python. Each evaluation solves Eq. 90 for
+gamma_ddot and takes omega_dot from Eq. 40.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ SINGULAR = 1.5e-5
 """det J2 below which rounding, over its square, leaves a rate of gamma less than six digits."""
 
 NO_ASSEMBLY, NO_RATE = -1, -2
-"""Codes of runs that cannot start: no unique admissible assembly; gamma_dot is no motion there."""
+"""Codes of runs that cannot start: no unique admissible assembly.
+
+gamma_dot is no motion there.
+"""
 
 _BLOCK = 2000  # starts solved at once: their arrays fit the cache
 
@@ -32,21 +35,24 @@ _BLOCK = 2000  # starts solved at once: their arrays fit the cache
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     """Quaternion (x, y, z, w) and body rate [rad/s] at t = 0, seven numbers.
 
-    Raises:
-        AssemblyError: the initial gamma has no admissible assembly, or several and the scene
-            selects none.
-        SingularConfiguration: gamma_dot does not determine the body rate there.
-
+    Raises: AssemblyError: the initial gamma has no admissible assembly, or several and
+        the scene selects none. SingularConfiguration: gamma_dot does not determine the
+        body rate there.
     """
     initial, gamma = scene.initial, np.array(scene.initial.gamma)
-    meant = None if initial.orientation is None else rotation_matrix(initial.orientation)
+    meant = (
+        None if initial.orientation is None else rotation_matrix(initial.orientation)
+    )
     assembly = kinematics.admissible(geometry, gamma, meant)
     rate, gamma_dot = np.zeros(3), np.array(initial.gamma_dot)
     if gamma_dot.any():  # rest needs no Jacobian, which a singular posture has not
         at = virtual_work.posture(geometry, gamma, assembly.rotation)
         determinant = float(np.linalg.det(at.j2))
         if abs(determinant) < SINGULAR:
-            message = "gamma_dot does not determine the body rate: parallel singularity, det J2"
+            message = (
+                "gamma_dot does not determine the body rate: parallel singularity,"
+                " det J2"
+            )
             raise SingularConfiguration(message, determinant)
         rate = assembly.rotation.T @ at.j @ gamma_dot
     return (*quaternion_of(assembly.rotation).tolist(), *rate.tolist())
@@ -57,11 +63,14 @@ def initial_states(
 ) -> tuple[Array, NDArray[np.int64]]:
     """States at t = 0 of many runs, of which one that cannot start stops no other.
 
-    They have gamma [rad] and gamma_dot [rad/s], shape (n, 3), and the geometries of index `which`,
-    shape (n,). Returns quaternions and body rates [rad/s], shape (7, n), at rest where there is no
-    start, and codes, shape (n,): 0, NO_ASSEMBLY or NO_RATE.
+    They have gamma [rad] and gamma_dot [rad/s], shape (n, 3), and the geometries of
+    index `which`, shape (n,). Returns quaternions and body rates [rad/s], shape (7, n),
+    at rest where there is no start, and codes, shape (n,): 0, NO_ASSEMBLY or NO_RATE.
     """
-    y, code = np.zeros((7, len(gamma))), np.full(len(gamma), NO_ASSEMBLY, dtype=np.int64)
+    y, code = (
+        np.zeros((7, len(gamma))),
+        np.full(len(gamma), NO_ASSEMBLY, dtype=np.int64),
+    )
     y[3] = 1.0
     for first in range(0, len(gamma), _BLOCK):
         part = slice(first, first + _BLOCK)
@@ -83,7 +92,8 @@ def initial_states(
         moves &= ~singular
         rows, rotation = rows[moves], found.rotation[chosen[moves]]
         geometry = geometries.of_rows(which[rows])
-        # gamma_dot_k = g_k . W, g_k = (w_k - a t_k) / (1 - a^2), a = t_k . w_k, all in {E}
+        # gamma_dot_k = g_k . W, g_k = (w_k - a t_k) / (1 - a^2), a = t_k . w_k, all in
+        # {E}
         w = geometry.w @ rotation
         a = np.sum(geometry.e * w, axis=-1, keepdims=True)
         g = (w - a * geometry.e) / (1.0 - a * a)
@@ -93,9 +103,14 @@ def initial_states(
 
 @lru_cache(maxsize=64)
 def start_of(scene: Scene) -> tuple[float, ...]:
-    """Return `initial_state` of a scene; InputError where gamma lies outside the stroke."""
+    """Return `initial_state` of a scene.
+
+    InputError where gamma lies outside the stroke.
+    """
     gamma, geometry = np.array(scene.initial.gamma), Geometry.of(scene)
-    inside = scene.stroke.at_end != "stop" or bool(np.all((gamma >= 0) & (gamma <= geometry.arc)))
+    inside = scene.stroke.at_end != "stop" or bool(
+        np.all((gamma >= 0) & (gamma <= geometry.arc))
+    )
     ends = ", ".join(f"{arc:.6f}" for arc in geometry.arc)
     allowed = f"must lie in the stroke, 0 to ({ends}) rad"
     refuse_unless(scene.name, ("initial.gamma", scene.initial.gamma, inside, allowed))
@@ -105,18 +120,22 @@ def start_of(scene: Scene) -> tuple[float, ...]:
 def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
     """Return the derivative of a scene's state by Eqs. 1 to 92, as integrators take it.
 
-    Its inputs are time, quaternion, body rate [rad/s], work [J], torques [N m], and a moment on the
-    star in {B} [N m] if it comes from a topic. In a singular posture it raises ArithmeticError.
+    Its inputs are time, quaternion, body rate [rad/s], work [J], torques [N m], and a
+    moment on the star in {B} [N m] if it comes from a topic. In a singular posture it
+    raises ArithmeticError.
 
-    The scene may have bodies, payload, rotors, torque limits and an external moment, as the paper
-    has them or in its inertias and n_ext; InputError names each other term.
+    The scene may have bodies, payload, rotors, torque limits and an external moment, as
+    the paper has them or in its inertias and n_ext; InputError names each other term.
     """
     lag = scene.actuators and scene.actuators.time_constant
     end, terms = scene.stroke.at_end, ("gravity", "friction", "springs", "own_loads")
     refused = "the equations of the paper have no such term: use equations = quaternion"
     refuse_unless(
         scene.name,
-        *((name, getattr(scene, name), not getattr(scene, name), refused) for name in terms),
+        *(
+            (name, getattr(scene, name), not getattr(scene, name), refused)
+            for name in terms
+        ),
         ("actuators.time_constant", lag, not scene.lags, refused),
         ("stroke.at_end", end, end != "elastic", refused),
     )
@@ -127,16 +146,28 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
         (x, y, z, w, *rate), torque = inputs[:7], np.array(inputs[8:11])
         moment = constant + inputs[11:14] if len(inputs) > 11 else constant
         rotation = rotation_matrix(inputs[:4])
-        gamma, omega = kinematics.inverse(mechanism.geometry, rotation)[0], rotation @ rate
+        gamma, omega = (
+            kinematics.inverse(mechanism.geometry, rotation)[0],
+            rotation @ rate,
+        )
         try:
             at = virtual_work.posture(mechanism.geometry, gamma, rotation)
         except SingularConfiguration as error:
             raise ArithmeticError(str(error)) from None
         gamma_dot = np.linalg.solve(at.j, omega)
-        gamma_ddot = virtual_work.direct_dynamics(mechanism, at, gamma_dot, torque, moment)
+        gamma_ddot = virtual_work.direct_dynamics(
+            mechanism, at, gamma_dot, torque, moment
+        )
         # Eq. 40; R W_dot = omega_dot, because W x W = 0.
         omega_dot = at.j @ gamma_ddot + virtual_work.bias(at, gamma_dot).omega_dot
-        acceleration, turning = rotation.T @ omega_dot, quaternion_rate((x, y, z, w), triple(rate))
-        return (*turning, *acceleration.tolist(), float(torque @ gamma_dot + moment @ omega))
+        acceleration, turning = (
+            rotation.T @ omega_dot,
+            quaternion_rate((x, y, z, w), triple(rate)),
+        )
+        return (
+            *turning,
+            *acceleration.tolist(),
+            float(torque @ gamma_dot + moment @ omega),
+        )
 
     return derivative

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The dynamics that run: state (quaternion q of {E} in {B}, body angular velocity W), rational.
 
-In {E} the axis t_k of arc k is constant and the actuator axis w_k is a combination of rows of R.
-With a = cos(mu_k) = t.w, p = t x w, u = 1 - a^2 and g = (w - a t)/u a leg moves as
+In {E} the axis t_k of arc k is constant and the actuator axis w_k is a combination of
+rows of R. With a = cos(mu_k) = t.w, p = t x w, u = 1 - a^2 and g = (w - a t)/u a leg
+moves as
 
     a_dot = p.W,    gamma_dot = g.W,
 
-both rates of true coordinates. Across t_k the intermediate link turns as the star does, so the part
-Ixx (1 - t t^T) of its inertia belongs to the star, for good; what is left of a leg is the kinetic
-energy C a_dot gamma_dot + A gamma_dot^2 / 2. Its inertia forces act on the star through p and g
-(virtual work). The loops are closed by construction, and M is positive definite wherever u > 0:
-only a serial singularity (t_k = +-w_k) has no dynamics.
+both rates of true coordinates. Across t_k the intermediate link turns as the star does,
+so the part Ixx (1 - t t^T) of its inertia belongs to the star, for good; what is left
+of a leg is the kinetic energy C a_dot gamma_dot + A gamma_dot^2 / 2. Its inertia forces
+act on the star through p and g (virtual work). The loops are closed by construction,
+and M is positive definite wherever u > 0: only a serial singularity (t_k = +-w_k) has
+no dynamics.
 
-The inertial part uses + - * / and, for a link with products of inertia xz or yz, one square root;
-loads may need angles. The functions run on floats, complex numbers, NumPy columns, mpmath numbers
-and expressions alike; the simulation runs what `trace` leaves of them for a scene.
+The inertial part uses + - * / and, for a link with products of inertia xz or yz, one
+square root; loads may need angles. The functions run on floats, complex numbers, NumPy
+columns, mpmath numbers and expressions alike; the simulation runs what `trace` leaves
+of them for a scene.
 """
 
 from __future__ import annotations
@@ -56,7 +59,10 @@ __all__ = ["Leg", "Model", "model_of"]
 
 
 class LegMotion(NamedTuple):
-    """One leg at one instant, vectors in {E} but for `outward`; for the letters see above."""
+    """One leg at one instant, vectors in {E} but for `outward`.
+
+    For the letters see above.
+    """
 
     leg: Leg
     axis: Triple  # w_k
@@ -73,17 +79,22 @@ class LegMotion(NamedTuple):
 
 
 def derivative(
-    model: Model, state: tuple[Scalar, ...], torque: Triple, moment: Triple | None = None
+    model: Model,
+    state: tuple[Scalar, ...],
+    torque: Triple,
+    moment: Triple | None = None,
 ) -> tuple[Scalar, ...]:
     """Time derivative of the state: quaternion (x, y, z, w), of any length > 0, W [rad/s] in {E}.
 
-    Where the actuators lag, the torques [N m] that they give follow, and `torque` has the commanded
-    ones. `moment` acts on the star, in {B} [N m].
+    Where the actuators lag, the torques [N m] that they give follow, and `torque` has
+    the commanded ones. `moment` acts on the star, in {B} [N m].
     """
     x, y, z, w, wx, wy, wz, *given = state
     more: tuple[Scalar, ...] = ()
     if (lag := model.time_constant) is not None:
-        more = tuple((asked - has) / lag for asked, has in zip(torque, given, strict=True))
+        more = tuple(
+            (asked - has) / lag for asked, has in zip(torque, given, strict=True)
+        )
         torque = triple(given)
     inertia, force, _ = balance(model, (x, y, z, w), (wx, wy, wz), torque, moment)
     acceleration = solve_symmetric(inertia, force)
@@ -91,12 +102,17 @@ def derivative(
 
 
 def actuator_torque(
-    model: Model, q: Quadruple, rate: Triple, acceleration: Triple, moment: Triple | None = None
+    model: Model,
+    q: Quadruple,
+    rate: Triple,
+    acceleration: Triple,
+    moment: Triple | None = None,
 ) -> tuple[Triple, Scalar]:
     """Torques [N m] of the inverse dynamics, and the determinant of the rows g_k.
 
-    The torques do the work tau_k g_k.W on the star: M W_dot = force + sum tau_k g_k. With
-    g_k = N_k / c_k the determinant is -det J2 / (c_1 c_2 c_3), zero at a parallel singularity.
+    The torques do the work tau_k g_k.W on the star: M W_dot = force + sum tau_k g_k.
+    With g_k = N_k / c_k the determinant is -det J2 / (c_1 c_2 c_3), zero at a parallel
+    singularity.
     """
     inertia, acting, (first, second, third) = balance(model, q, rate, ZERO, moment)
     rows = zip(symmetric_rows(inertia), acting, strict=True)
@@ -107,13 +123,17 @@ def actuator_torque(
 
 
 def balance(
-    model: Model, q: Quadruple, rate: Triple, torque: Triple, moment: Triple | None = None
+    model: Model,
+    q: Quadruple,
+    rate: Triple,
+    torque: Triple,
+    moment: Triple | None = None,
 ) -> tuple[Symmetric, Triple, Rows]:
     """Reduce everything to the star by virtual work: M W_dot = force in {E}.
 
-    Returns M (xx, yy, zz, xy, xz, yz) [kg m^2]; the moment of all that acts at W_dot = 0, velocity
-    products included [N m]; and the rows g_k: gamma_dot_k = g_k.W, and a torque at gamma_k acts as
-    tau_k g_k.
+    Returns M (xx, yy, zz, xy, xz, yz) [kg m^2]; the moment of all that acts at W_dot =
+    0, velocity products included [N m]; and the rows g_k: gamma_dot_k = g_k.W, and a
+    torque at gamma_k acts as tau_k g_k.
     """
     rows = rotation_rows(q)
     inertia: tuple[Scalar, ...] = model.star
@@ -143,8 +163,13 @@ def balance(
             a_slope = a_slope - 2.0 * leg.iyz * (1.0 - 2.0 * a * a) / root
         force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
         force_gamma = a_inertia * gamma_rest + c_inertia * a_rest - drive
-        force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
-        toward_a, toward_gamma = multiply(c_inertia, g), axpy(a_inertia, g, c_inertia, p)
+        force_gamma = (
+            force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
+        )
+        toward_a, toward_gamma = (
+            multiply(c_inertia, g),
+            axpy(a_inertia, g, c_inertia, p),
+        )
         at_gamma, at_mu, at_beta = joint_torques(at, field)
         if own is not None:
             at_gamma, at_mu, at_beta = add((at_gamma, at_mu, at_beta), own.joints[k])
@@ -167,7 +192,9 @@ def balance(
 def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
     parts = [(part, kind) for part in (joint_angle, joint_rate) for kind in range(3)]
-    of_legs = [[part(at, kind) for part, kind in parts] for at in leg_motions(model, state)]
+    of_legs = [
+        [part(at, kind) for part, kind in parts] for at in leg_motions(model, state)
+    ]
     return Joints(*zip(*of_legs, strict=True))
 
 
@@ -200,9 +227,14 @@ def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
     return a_rest, at.a_dot * (2.0 * at.a * at.gamma_dot - along) / at.u
 
 
-def actuator_acceleration(model: Model, state: Sequence[Scalar], acceleration: Triple) -> Triple:
+def actuator_acceleration(
+    model: Model, state: Sequence[Scalar], acceleration: Triple
+) -> Triple:
     """Return gamma_ddot [rad/s^2] of a state, which begins with quaternion and W, and W_dot."""
-    at_rest = ((at, rest_accelerations(at, triple(state[4:7]))) for at in leg_motions(model, state))
+    at_rest = (
+        (at, rest_accelerations(at, triple(state[4:7])))
+        for at in leg_motions(model, state)
+    )
     return triple(dot3(at.g, acceleration) + rest[1] for at, rest in at_rest)
 
 
@@ -252,11 +284,15 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
 
 
 def power(
-    model: Model, state: tuple[Scalar, ...], torque: Triple, moment: Triple | None = None
+    model: Model,
+    state: tuple[Scalar, ...],
+    torque: Triple,
+    moment: Triple | None = None,
 ) -> Scalar:
     """Power [W] that actuators and external moments put in, less what friction takes out.
 
-    It is the rate of kinetic plus potential energy. With lag the torques are the state's own.
+    It is the rate of kinetic plus potential energy. With lag the torques are the
+    state's own.
     """
     x, y, z, w, wx, wy, wz, *given = state
     rows = rotation_rows((x, y, z, w))
@@ -267,25 +303,33 @@ def power(
         leg, lost = at.leg, 0.0
         for kind, friction in enumerate(leg.friction):
             if friction is not None:
-                lost = lost + friction_torque(friction, joint_rate(at, kind)) * joint_rate(at, kind)
+                lost = lost + friction_torque(
+                    friction, joint_rate(at, kind)
+                ) * joint_rate(at, kind)
         if leg.stops is not None and leg.stops.damping:
             gamma, speed = joint_angle(at, 0), at.gamma_dot
             elastic = leg.stops._replace(damping=0.0)
-            excess = stop_torque(elastic, gamma, speed) - stop_torque(leg.stops, gamma, speed)
+            excess = stop_torque(elastic, gamma, speed) - stop_torque(
+                leg.stops, gamma, speed
+            )
             lost = lost + excess * speed
         total = total - lost
     for external in (model.moment, moment):
         if external is not None:
-            total = total + dot3(external, triple(dot3(row, (wx, wy, wz)) for row in rows))
+            total = total + dot3(
+                external, triple(dot3(row, (wx, wy, wz)) for row in rows)
+            )
     for load in model.own_loads:
         if load.formula.moment:
             legs = list(leg_motions(model, state))
-            total = total + dot3(_own_moment(load, rows, (wx, wy, wz), legs), (wx, wy, wz))
+            total = total + dot3(
+                _own_moment(load, rows, (wx, wy, wz), legs), (wx, wy, wz)
+            )
     return total
 
 
-# Loads of one leg: gravity, friction, springs and elastic stops. What the scene does not have is
-# Python's 0.0, which leaves nothing behind in a traced program.
+# Loads of one leg: gravity, friction, springs and elastic stops. What the scene does
+# not have is Python's 0.0, which leaves nothing behind in a traced program.
 
 
 def joint_torques(at: LegMotion, field: Triple) -> Triple:
@@ -296,7 +340,9 @@ def joint_torques(at: LegMotion, field: Triple) -> Triple:
         for kind, one in enumerate(leg.friction)
     )
     springs = triple(
-        0.0 if spring is None else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
+        0.0
+        if spring is None
+        else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
         for kind, spring in enumerate(leg.springs)
     )
     at_gamma, at_mu = 0.0, 0.0
@@ -304,7 +350,10 @@ def joint_torques(at: LegMotion, field: Triple) -> Triple:
         of_drive, of_link = _directions(at)
         on_link = cross3(_combine(leg.link, *of_link), field)
         on_drive = cross3(_combine(leg.drive, *of_drive), field)
-        at_gamma, at_mu = dot3(add(on_link, on_drive), at.axis), -dot3(on_link, of_drive[0])
+        at_gamma, at_mu = (
+            dot3(add(on_link, on_drive), at.axis),
+            -dot3(on_link, of_drive[0]),
+        )
     if leg.stops is not None:
         at_gamma = at_gamma + stop_torque(leg.stops, joint_angle(at, 0), at.gamma_dot)
     rubbing = zip(friction, springs, strict=True)
@@ -341,7 +390,9 @@ def own_torques(model: Model, rows: Rows, rate: Triple) -> OwnTorques:
     return OwnTorques(star, joints)
 
 
-def _own_moment(load: LoadConstants, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) -> Triple:
+def _own_moment(
+    load: LoadConstants, rows: Rows, rate: Triple, legs: Sequence[LegMotion]
+) -> Triple:
     """Moment of an own load on the star in {E} [N m]."""
     moment = triple(_run_load(load, rows, rate, legs))
     return moment if load.formula.in_star else rotate_back(rows, moment)
@@ -364,7 +415,10 @@ def _quantity(name: str, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) ->
         return dot3(rows[OMEGA.index(name)], rate)
     if name in BODY_RATE:
         return rate[BODY_RATE.index(name)]
-    kind, leg = ("gamma", "mu", "beta").index(name.partition("_")[0]), legs[int(name[-1]) - 1]
+    kind, leg = (
+        ("gamma", "mu", "beta").index(name.partition("_")[0]),
+        legs[int(name[-1]) - 1],
+    )
     return joint_angle(leg, kind) if name in ANGLES else joint_rate(leg, kind)
 
 
@@ -381,12 +435,17 @@ def friction_torque(friction: Friction, v: Scalar) -> Scalar:
 
 
 def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
-    """Torque of elastic stops; the damping grows from zero with the depth (Hunt-Crossley)."""
+    """Torque of elastic stops.
+
+    The damping grows from zero with the depth (Hunt-Crossley).
+    """
     low, high = positive(-gamma), positive(gamma - stops.arc)
     if not stops.damping:
         return stops.stiffness * (low - high)
     inward = stops.damping * gamma_dot
-    return stops.stiffness * (low * positive(1.0 - inward) - high * positive(1.0 + inward))
+    return stops.stiffness * (
+        low * positive(1.0 - inward) - high * positive(1.0 + inward)
+    )
 
 
 def joint_rate(at: LegMotion, kind: int) -> Scalar:
@@ -402,7 +461,10 @@ def joint_angle(at: LegMotion, kind: int) -> Scalar:
 
 
 def direction_of(at: LegMotion, kind: int) -> tuple[Scalar, Scalar]:
-    """Sine and cosine of gamma (0), mu (1) or beta (2); of gamma and beta times sqrt(u)."""
+    """Sine and cosine of gamma (0), mu (1) or beta (2).
+
+    Of gamma and beta times sqrt(u).
+    """
     if kind == 0:
         return dot3(at.outward, at.leg.across), dot3(at.outward, at.leg.v)
     if kind == 1:

@@ -17,9 +17,12 @@ from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
 from sst_ros.state import ZERO
 
-SINGULAR_MU = 1e-6  # distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
-CONTACT_BAND = 1e-9  # farther beyond than this [rad], an actuator has not just reached the contact
-GRAZING = 1e-12  # a distance below this [rad] counts as zero: closure and rounding reach 1e-15
+# distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
+SINGULAR_MU = 1e-6
+# farther beyond than this [rad], an actuator has not just reached the contact
+CONTACT_BAND = 1e-9
+# a distance below this [rad] counts as zero: closure and rounding reach 1e-15
+GRAZING = 1e-12
 
 
 class JointSpring(NamedTuple):
@@ -40,8 +43,8 @@ class ElasticStops(NamedTuple):
 class Leg(NamedTuple):
     """Constants of one leg and its loads: None or zero where the scene has none.
 
-    A = A0 + A2 a^2 - 2 Iyz a sqrt(u) and C = Ixz a/sqrt(u) - Ixy, with A0 = I_a(zz) + Iyy - Ixx and
-    A2 = Izz - Iyy + Ixx.
+    A = A0 + A2 a^2 - 2 Iyz a sqrt(u) and C = Ixz a/sqrt(u) - Ixy, with A0 = I_a(zz) +
+    Iyy - Ixx and A2 = Izz - Iyy + Ixx.
     """
 
     w: Triple  # axis of the arc in {B}
@@ -64,7 +67,8 @@ class Leg(NamedTuple):
 class Model(NamedTuple):
     """All constants of the dynamics; None for what the scene does not have."""
 
-    star: Symmetric  # of star, payload and what of the intermediate links turns with them, in {E}
+    # of star, payload and what of the intermediate links turns with them, in {E}
+    star: Symmetric
     legs: tuple[Leg, Leg, Leg]
     gravity: Triple | None = None  # acceleration of free fall in {B} [m/s^2]
     weight: Triple = ZERO  # mass times centre of star and payload in {E} [kg m]
@@ -78,12 +82,18 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
 
     The numbers of the scene and its geometry may be columns, of many scenes at once.
     """
-    geometry, star, legs = geometry or Geometry.of(scene), entries_of(scene.star.inertia), []
+    geometry, star, legs = (
+        geometry or Geometry.of(scene),
+        entries_of(scene.star.inertia),
+        [],
+    )
     carried: list[Star | Payload] = [scene.star]
     damping, kinds = damping_of(scene.stroke), ("gamma", "mu", "beta")
     if scene.payload is not None:
         carried.append(scene.payload)
-        star = [part + own for part, own in zip(star, scene.payload.entries, strict=True)]
+        star = [
+            part + own for part, own in zip(star, scene.payload.entries, strict=True)
+        ]
     for k in range(3):
         w, v, e = (tuple(geometry.of_leg(name, k)) for name in ("w", "v", "e"))
         bodies = scene.actuated_links[k], scene.intermediate_links[k]
@@ -99,9 +109,13 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
             drive, link = (multiply(body.mass, body.centre) for body in bodies)
         stops = None
         if scene.stroke.stiffness is not None:
-            stops = ElasticStops(geometry.of_leg("arc", k), scene.stroke.stiffness, damping)
+            stops = ElasticStops(
+                geometry.of_leg("arc", k), scene.stroke.stiffness, damping
+            )
         friction = tuple(getattr(scene.friction, kind, None) for kind in kinds)
-        springs = ([x for x in scene.springs if x.joint == f"{kind}_{k + 1}"] for kind in kinds)
+        springs = (
+            [x for x in scene.springs if x.joint == f"{kind}_{k + 1}"] for kind in kinds
+        )
         inertias = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
         loads = (friction, tuple(map(_join, springs)), drive, link, stops)
         legs.append(Leg(w, v, cross3(w, v), e[0], e[1], *inertias, *loads))
@@ -109,9 +123,13 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
         star=tuple(star),
         legs=(legs[0], legs[1], legs[2]),
         gravity=None if scene.gravity is None else scene.gravity.acceleration,
-        weight=triple(sum(body.mass * body.centre[i] for body in carried) for i in range(3)),
+        weight=triple(
+            sum(body.mass * body.centre[i] for body in carried) for i in range(3)
+        ),
         moment=None if scene.moment is None else scene.moment.value,
-        time_constant=None if scene.actuators is None else scene.actuators.time_constant,
+        time_constant=None
+        if scene.actuators is None
+        else scene.actuators.time_constant,
         own_loads=tuple(map(load_constants, scene.own_loads)),
     )
 
@@ -121,14 +139,15 @@ def damping_of(stroke: Stroke) -> Any:
 
     Its numbers may be columns.
 
-    For one freedom of inertia m, m v dv/dx = -k x (1 + c v) separates: from the rate v into the
-    stop to e v out of it, with d = c v,
+    For one freedom of inertia m, m v dv/dx = -k x (1 + c v) separates: from the rate v
+    into the stop to e v out of it, with d = c v,
 
         d (1 + e) = ln((1 + d) / (1 - d e)),
 
-    whatever m and k (Gonthier, McPhee, Lange & Piedboeuf, Multibody Syst. Dyn. 11 (2004) 209-233;
-    the force is that of Hunt & Crossley, J. Appl. Mech. 42 (1975) 440-445). With s = d (1 + e) it
-    reads L(s/2) = (1 - e) / (1 + e), where L(x) = coth x - 1/x is Langevin's function.
+    whatever m and k (Gonthier, McPhee, Lange & Piedboeuf, Multibody Syst. Dyn. 11
+    (2004) 209-233; the force is that of Hunt & Crossley, J. Appl. Mech. 42 (1975)
+    440-445). With s = d (1 + e) it reads L(s/2) = (1 - e) / (1 + e), where L(x) = coth
+    x - 1/x is Langevin's function.
     """
     if stroke.restitution is None or stroke.impact_rate is None:
         return stroke.damping
@@ -141,7 +160,14 @@ def damping_of(stroke: Stroke) -> Any:
 def _inverse_langevin(y: float) -> float:
     """Solve coth x - 1/x = y for x >= 0, 0 <= y < 1."""
     if y < 0.05:  # coth x - 1/x would cancel; the next term of the series is 2.1 y^13
-        coefficients = (3.0, 9 / 5, 297 / 175, 1539 / 875, 126117 / 67375, 43733439 / 21896875)
+        coefficients = (
+            3.0,
+            9 / 5,
+            297 / 175,
+            1539 / 875,
+            126117 / 67375,
+            43733439 / 21896875,
+        )
         return sum(c * y ** (2 * i + 1) for i, c in enumerate(coefficients))
     low, high = 3.0 * y, 1.0 / (1.0 - y) + 3.0 * y
     while True:  # at most some sixty bisections
@@ -158,7 +184,9 @@ def _join(springs: list[Any]) -> JointSpring | None:
     if not springs:
         return None
     stiffness = sum(spring.stiffness for spring in springs)
-    return JointSpring(stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness)
+    return JointSpring(
+        stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness
+    )
 
 
 class Limit(NamedTuple):
@@ -171,7 +199,10 @@ class Limit(NamedTuple):
     end: Any  # angle [rad]
 
     def distance(self, joints: Sequence[float]) -> Any:
-        """Distance to the end [rad], negative beyond it; nine angles, then nine rates."""
+        """Distance to the end [rad], negative beyond it.
+
+        Nine angles, then nine rates.
+        """
         return self.sign * (joints[self.joint] - self.end)
 
     def slope(self, joints: Sequence[float]) -> float:
@@ -180,7 +211,10 @@ class Limit(NamedTuple):
 
 
 def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
-    """Joint, lower and upper end of what the limits allow; infinite where there is none."""
+    """Joint, lower and upper end of what the limits allow.
+
+    Infinite where there is none.
+    """
     found: dict[int, tuple[float, float]] = {}
     for limit in limits:
         low, high = found.get(limit.joint, (-math.inf, math.inf))
@@ -195,12 +229,20 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
     """
 
     def above(name: str, end: Any) -> str:
-        return f"{name} > {end:.6f} rad" if isinstance(end, float) else f"{name} > its end"
+        return (
+            f"{name} > {end:.6f} rad" if isinstance(end, float) else f"{name} > its end"
+        )
 
     for k in range(3):
-        mu, gamma, beta = f"serial singularity, mu_{k + 1}", f"gamma_{k + 1}", f"beta_{k + 1}"
+        mu, gamma, beta = (
+            f"serial singularity, mu_{k + 1}",
+            f"gamma_{k + 1}",
+            f"beta_{k + 1}",
+        )
         yield Limit(f"{mu} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
-        yield Limit(f"{mu} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU)
+        yield Limit(
+            f"{mu} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU
+        )
         if scene.stroke.at_end == "stop":
             arc = geometry.of_leg("arc", k)
             yield Limit(f"{gamma} < 0", StrokeExceeded, k, 1.0, 0.0)
@@ -223,4 +265,7 @@ def contact_events_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
 def free_range(events: Sequence[Limit]) -> list[Limit]:
     """Return limits of the range in which no elastic stop can be in contact."""
     inner = [event for event in events if (event.end == 0.0) == (event.sign > 0.0)]
-    return [event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign) for event in inner]
+    return [
+        event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign)
+        for event in inner
+    ]

@@ -26,9 +26,12 @@ def _of_joints(name: str, meaning: str) -> Any:
 
 
 class MotionTable(Explained, ReadOnly):
-    """Quantities of a motion at n instants, of N scenarios, or of both, (n, N); read-only.
+    """Quantities of a motion at n instants, of N scenarios, or of both, (n, N).
 
-    In shapes, ... is that of t. A `Trajectory` is one motion, a `BatchResult` many scenarios.
+    read-only.
+
+    In shapes, ... is that of t. A `Trajectory` is one motion, a `BatchResult` many
+    scenarios.
 
     Attributes:
         scene: what moves.
@@ -64,7 +67,9 @@ class MotionTable(Explained, ReadOnly):
         """ZYZ angles (theta, phi, psi) of {E} in {B} [rad], shape (..., 3)."""
         return freeze(zyz_angles(rotation_matrix(self.quaternion)))
 
-    def columns(self, names: Iterable[str] = (*QUANTITIES, "energy")) -> dict[str, Array]:
+    def columns(
+        self, names: Iterable[str] = (*QUANTITIES, "energy")
+    ) -> dict[str, Array]:
         """Return the time and these quantities, a column a number, by the names of `state.UNITS`.
 
         Each has the shape of t.
@@ -98,7 +103,10 @@ class MotionTable(Explained, ReadOnly):
         return table
 
     def to_xarray(self) -> xr.Dataset:
-        """Arrays with the dimensions time, scenario, leg, axis and part; needs xarray."""
+        """Arrays with the dimensions time, scenario, leg, axis and part.
+
+        Needs xarray.
+        """
         axes, arrays = self._axes, dict[str, Any]()
         for name, (unit, dimension) in QUANTITIES.items():
             arrays[name] = (*axes, dimension), getattr(self, name), {"units": unit}
@@ -112,7 +120,9 @@ class MotionTable(Explained, ReadOnly):
         else:
             coordinates = {"time": ("time", self.t, time)}
         about = {"scene": self.scene.name} | self._of_run()
-        found: xr.Dataset = require("xarray").Dataset(arrays, coordinates | DIMENSIONS, about)
+        found: xr.Dataset = require("xarray").Dataset(
+            arrays, coordinates | DIMENSIONS, about
+        )
         return found
 
     def __len__(self) -> int:

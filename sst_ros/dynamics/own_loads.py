@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Own loads as the dynamics run them, and Python functions written as such.
 
-Formulas become straight-line programs. That of a potential also has its exact derivatives, which
-are the torques: by an angle at that joint, by the rotation on the star. With G_i = dU/dR_i for the
-rows R_i of R, a turn d of the star in {E} changes them by R_i x d, so the moment in {E} is
--sum_i G_i x R_i.
+Formulas become straight-line programs. That of a potential also has its exact
+derivatives, which are the torques: by an angle at that joint, by the rotation on the
+star. With G_i = dU/dR_i for the rows R_i of R, a turn d of the star in {E} changes them
+by R_i x d, so the moment in {E} is -sum_i G_i x R_i.
 """
 
 from __future__ import annotations
@@ -68,14 +68,17 @@ def load_constants(load: FormulaLoad) -> LoadConstants:
     names = tuple(parameter.name for parameter in load.parameters)
     terms = tuple(dict(load.terms).items())
     in_star = load.frame == "star"
-    formula = LoadFormula(load.name, names, terms, load.potential, tuple(load.moment), in_star)
+    formula = LoadFormula(
+        load.name, names, terms, load.potential, tuple(load.moment), in_star
+    )
     return LoadConstants(formula, tuple(one.value for one in load.parameters))
 
 
 class LoadProgram(NamedTuple):
     """The program of an own load: inputs are quantities of the state, then the parameters.
 
-    Its outputs are the energy and the derivatives by each quantity, or the three moments.
+    Its outputs are the energy and the derivatives by each quantity, or the three
+    moments.
     """
 
     quantities: tuple[str, ...]
@@ -84,7 +87,10 @@ class LoadProgram(NamedTuple):
 
 @lru_cache(maxsize=256)
 def load_program(formula: LoadFormula) -> LoadProgram:
-    """Trace the formulas of an own load; InputError where constants in it have no value."""
+    """Trace the formulas of an own load.
+
+    InputError where constants in it have no value.
+    """
     texts = [text for _, text in formula.terms] + [*formula.outputs]
     used = names_in(iter(texts))
     quantities = tuple(name for name in STATE if name in used)
@@ -173,7 +179,11 @@ def _step(x: Any) -> Any:
     """Return 1 where x > 0 and 0 elsewhere: the slope of `positive`."""
     if hasattr(x, "apply"):
         return x.apply("step")
-    return np.where(np.real(x) > 0, 1.0, 0.0) if isinstance(x, np.ndarray) else float(x > 0)
+    return (
+        np.where(np.real(x) > 0, 1.0, 0.0)
+        if isinstance(x, np.ndarray)
+        else float(x > 0)
+    )
 
 
 _STEPS: dict[str, Callable[..., Any]] = {
@@ -183,7 +193,10 @@ _STEPS: dict[str, Callable[..., Any]] = {
     "div": operator.truediv,
     "neg": operator.neg,
     "step": _step,
-    **{name: _CALLS[name] for name in ("sqrt", "exp", "sin", "cos", "tanh", "atan2", "positive")},
+    **{
+        name: _CALLS[name]
+        for name in ("sqrt", "exp", "sin", "cos", "tanh", "atan2", "positive")
+    },
 }
 
 
@@ -206,8 +219,8 @@ def run_program(program: Program, values: Sequence[Scalar]) -> list[Scalar]:
 class Symbol:
     """A number of the state or a parameter inside the function of an own load.
 
-    It takes part in arithmetic, in arrays of NumPy, and in NumPy's sqrt, exp, sin, cos, tan,
-    tanh, arctan2 and abs. It has no value, so nothing can be decided by it.
+    It takes part in arithmetic, in arrays of NumPy, and in NumPy's sqrt, exp, sin, cos,
+    tan, tanh, arctan2 and abs. It has no value, so nothing can be decided by it.
     """
 
     def __init__(self, value: Any) -> None:
@@ -305,13 +318,11 @@ def _value_of(number: Any) -> Any:
 class LoadState:
     """What the function of an own load is given: arrays of symbols.
 
-    Attributes:
-        rotation: R of {E} in {B}, shape (3, 3); column 2 is the direction of E.
-        gamma, mu, beta: angles of the joints [rad], shape (3,).
-        omega: angular velocity of the star in {B} [rad/s], shape (3,). For a moment only, as are
-            body_rate: the same in {E}.
-            gamma_dot, mu_dot, beta_dot: rates of the joints [rad/s], shape (3,).
-
+    Attributes: rotation: R of {E} in {B}, shape (3, 3); column 2 is the direction of E.
+        gamma, mu, beta: angles of the joints [rad], shape (3,). omega: angular velocity
+        of the star in {B} [rad/s], shape (3,). For a moment only, as are body_rate: the
+        same in {E}. gamma_dot, mu_dot, beta_dot: rates of the joints [rad/s], shape
+        (3,).
     """
 
     rotation: Any
@@ -357,30 +368,27 @@ def own_load(
 ) -> FormulaLoad:
     """Write a load of your own for `Scene.own_loads`: by its potential energy or by its moment.
 
-    A function is run once, on symbols, and what it does becomes formulas of the scene. So all that
-    takes a scene has the load: `simulate`, `Simulation`, `Batch`, `sweep`, `linearize`,
-    controllers, `certify` and the nodes.
+    A function is run once, on symbols, and what it does becomes formulas of the scene.
+    So all that takes a scene has the load: `simulate`, `Simulation`, `Batch`, `sweep`,
+    `linearize`, controllers, `certify` and the nodes.
 
-    Args:
-        name: short name.
-        potential: potential energy [J]: a formula, or a function of a `LoadState` and of the
-            parameters by name.
-        moment: moment on the star [N m]: three formulas, or a function of the same that returns
-            three numbers.
+    Args: name: short name. potential: potential energy [J]: a formula, or a function of
+        a `LoadState` and of the parameters by name. moment: moment on the star [N m]:
+        three formulas, or a function of the same that returns three numbers.
         parameters: numbers by name, in SI units. They are numbers of the scene, as in
-            "own_loads[0].parameters[0].value".
-        frame: axes of the moment: "base" for {B} or "star" for {E}.
+        "own_loads[0].parameters[0].value". frame: axes of the moment: "base" for {B} or
+        "star" for {E}.
 
-    Raises:
-        InputError: a function decides by a number of the state or does more than formulas can, or
-            a formula is none.
-
+    Raises: InputError: a function decides by a number of the state or does more than
+        formulas can, or a formula is none.
     """
     given = dict(parameters or {})
     one = (potential is None) != (moment is None)
     refuse_unless("own_load", ("potential, moment", None, one, "give one of them"))
     document: dict[str, Any] = {"name": name, "frame": frame}
-    document["parameters"] = tuple(LoadParameter(name=key, value=x) for key, x in given.items())
+    document["parameters"] = tuple(
+        LoadParameter(name=key, value=x) for key, x in given.items()
+    )
     if callable(potential):
         document["terms"], (energy,) = _write(potential, given, POSE, 1, "potential")
         document["potential"] = energy
@@ -405,7 +413,9 @@ def _write(
     inputs = (*names, *parameters)
 
     def run(*values: Expression) -> list[Any]:
-        symbols = {name: Symbol(value) for name, value in zip(inputs, values, strict=True)}
+        symbols = {
+            name: Symbol(value) for name, value in zip(inputs, values, strict=True)
+        }
 
         state = LoadState.of(symbols)
         result = function(state, **{name: symbols[name] for name in parameters})
@@ -422,7 +432,9 @@ def _write(
     return write_formulas(program)
 
 
-def write_formulas(program: Program) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
+def write_formulas(
+    program: Program,
+) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
     """Write a program as terms, what is used more than once, and a formula for each output."""
     first = len(program.inputs)
     uses = [0] * (first + len(program.steps))

@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Forces and moments that the joints transmit, link by link (Newton and Euler).
 
-All seven links turn about O, so every joint is a revolute about an axis through O: w_k (base to
-actuated link), r_k (to the intermediate link), t_k (the curved prismatic joint, to the star).
-What a link exerts on the next one is a force through O and a moment about O.
+All seven links turn about O, so every joint is a revolute about an axis through O: w_k
+(base to actuated link), r_k (to the intermediate link), t_k (the curved prismatic
+joint, to the star). What a link exerts on the next one is a force through O and a
+moment about O.
 
-The moments are determined by the motion. About its own axis a joint transmits what acts there:
-motor, friction, springs, stops. With the rate of change of the angular momentum of a link, less
-the moment of its weight, A_k of the actuated and B_k of the intermediate link, the moment m_k on
-the star obeys::
+The moments are determined by the motion. About its own axis a joint transmits what acts
+there: motor, friction, springs, stops. With the rate of change of the angular momentum
+of a link, less the moment of its weight, A_k of the actuated and B_k of the
+intermediate link, the moment m_k on the star obeys::
 
     t.m = -tau_beta,   r.(m + B) = -tau_mu,   w.(m + B + A) = tau + tau_gamma,
 
-three equations with the determinant c_k = (r x t).w, which is zero in a serial singularity only.
+three equations with the determinant c_k = (r x t).w, which is zero in a serial
+singularity only.
 
-The forces are not: all axes meet in O, so forces that run round the two loops change no motion.
-Six of the 27 components are free. Given here are the forces of least sum of squares, which are
-those of joints equally stiff in all directions (Castigliano's theorem of least work). The sums
-over the three legs do not depend on this choice.
+The forces are not: all axes meet in O, so forces that run round the two loops change no
+motion. Six of the 27 components are free. Given here are the forces of least sum of
+squares, which are those of joints equally stiff in all directions (Castigliano's
+theorem of least work). The sums over the three legs do not depend on this choice.
 """
 
 from __future__ import annotations
@@ -80,8 +82,8 @@ REACTION_UNITS = {
 class JointLoads:
     """What the joints of one kind transmit to the next link, shapes (..., 3, 3), rows by leg.
 
-    The vectors have the axes of the joint's frame: {1k} = [r, w x r, w] for the actuated joints,
-    {2k} = [r, t x r, t] for the revolute and the prismatic ones.
+    The vectors have the axes of the joint's frame: {1k} = [r, w x r, w] for the
+    actuated joints, {2k} = [r, t x r, t] for the revolute and the prismatic ones.
     """
 
     force: Array  #: through O [N]
@@ -121,9 +123,10 @@ class LoadFigures(NamedTuple):
 class Reactions(Explained):
     """Forces and moments at every joint of a motion. Arrays are read-only.
 
-    A joint exerts them on the link that is nearer the star; the other one feels the opposite.
-    Moments, and sums of forces over the legs, follow from the motion alone. The share of each leg
-    in a force is that of joints equally stiff in all directions: the links are over-constrained.
+    A joint exerts them on the link that is nearer the star; the other one feels the
+    opposite. Moments, and sums of forces over the legs, follow from the motion alone.
+    The share of each leg in a force is that of joints equally stiff in all directions:
+    the links are over-constrained.
 
     Attributes:
         t: times [s], shape (...).
@@ -175,7 +178,9 @@ class Reactions(Explained):
             panels.append((f"{name}\nforce [N]", leg_names("F"), force))
             bending = loads.bending_moment
             panels.append((f"{name}\nbending [N m]", leg_names("M"), bending))
-        panels.append(("motor and loads\nat γ [N m]", leg_names("τ"), self.actuated.axis_torque))
+        panels.append(
+            ("motor and loads\nat γ [N m]", leg_names("τ"), self.actuated.axis_torque)
+        )
         return draw_panels(self.t, panels, height=1.5)
 
     def _facts(self) -> dict[str, object]:
@@ -190,12 +195,15 @@ class Reactions(Explained):
 def load_figures(t: Array, values: Array) -> LoadFigures:
     """Return peak and root mean square of samples over time, the first axis of both.
 
-    The mean square is that of straight lines between the samples; of a single sample its own.
+    The mean square is that of straight lines between the samples; of a single sample
+    its own.
     """
     size = np.abs(values)
     row = np.nanargmax(np.where(np.isnan(size), -1.0, size), axis=0)
     peak = np.take_along_axis(size, row[None], axis=0)[0]
-    times = np.broadcast_to(t.reshape(*t.shape, *[1] * (values.ndim - t.ndim)), values.shape)
+    times = np.broadcast_to(
+        t.reshape(*t.shape, *[1] * (values.ndim - t.ndim)), values.shape
+    )
     when = np.take_along_axis(times, row[None], axis=0)[0]
     span = times[-1] - times[0]
     parts = np.diff(times, axis=0)
@@ -211,16 +219,13 @@ def reactions_of(
 ) -> Reactions:
     """Compute the reactions of a motion under torques that act at the actuators.
 
-    Accelerations are those of the scene's equations of motion. A moment from a topic is no part of
-    them.
+    Accelerations are those of the scene's equations of motion. A moment from a topic is
+    no part of them.
 
-    Args:
-        scene: what moves.
-        t: times [s], shape (n,).
-        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
-        body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
-        torque: torques that act at the actuators, without friction and springs [N m], (n, 3).
-
+    Args: scene: what moves. t: times [s], shape (n,). quaternion: orientations (x, y,
+        z, w) of {E} in {B}, shape (n, 4). body_rate: angular velocities of the star in
+        {E} [rad/s], shape (n, 3). torque: torques that act at the actuators, without
+        friction and springs [N m], (n, 3).
     """
     state = (*quaternion.T, *body_rate.T)
     with np.errstate(all="ignore"):
@@ -240,29 +245,37 @@ class ScenarioReactions:
     def __init__(self, scene: Any, model: Model) -> None:
         tree = scene, model
         numbers = leaves(tree)
-        columns = {place: x for place, x in numbers.items() if isinstance(x, np.ndarray)}
+        columns = {
+            place: x for place, x in numbers.items() if isinstance(x, np.ndarray)
+        }
         self._columns = list(columns.values())
         names = (*MOTION, *TORQUE, *(f"p{i}" for i in range(len(columns))))
 
         def run(*inputs: Any) -> list[Any]:
             given = map(mark_present, inputs[10:])
             own_scene, own_model = rebuild(tree, dict(zip(columns, given, strict=True)))
-            return _flatten(_legs(own_scene, own_model, inputs[:7], triple(inputs[7:10])))
+            return _flatten(
+                _legs(own_scene, own_model, inputs[:7], triple(inputs[7:10]))
+            )
 
         self._run = compile_for_arrays(trace(run, names))
 
     def of(self, t: Array, state: Array, torque: Array, rows: slice) -> Reactions:
         """Return the reactions of some rows.
 
-        Shapes of t [s], of the states (7, ...) and of the torques (3, ...) [N m] end in the number
-        of these rows.
+        Shapes of t [s], of the states (7, ...) and of the torques (3, ...) [N m] end in
+        the number of these rows.
         """
         with np.errstate(all="ignore"):
-            numbers = self._run(*state, *torque, *(column[rows] for column in self._columns))
+            numbers = self._run(
+                *state, *torque, *(column[rows] for column in self._columns)
+            )
         return _collect(t, list(numbers), rotation_rows(_quadruple(list(state))))
 
 
-def _legs(scene: Any, model: Model, state: Sequence[Scalar], torque: Triple) -> list[_LegReactions]:
+def _legs(
+    scene: Any, model: Model, state: Sequence[Scalar], torque: Triple
+) -> list[_LegReactions]:
     """Solve for the reactions of the legs under torques that act."""
     still = model._replace(time_constant=None)
     slope = kernel.derivative(still, tuple(state), torque)
@@ -292,7 +305,10 @@ def _collect(t: Array, numbers: Sequence[Scalar], rows: Rows) -> Reactions:
 
 
 class _LegReactions(NamedTuple):
-    """Forces and moments of a leg in the frames of the joints; axes of {1k} and {2k} in {E}."""
+    """Forces and moments of a leg in the frames of the joints.
+
+    Axes of {1k} and {2k} in {E}.
+    """
 
     actuated: tuple[Triple, Triple]
     revolute: tuple[Triple, Triple]
@@ -309,7 +325,11 @@ class _Change(NamedTuple):
 
 
 def _solve(
-    scene: Any, model: Model, state: Sequence[Scalar], acceleration: Triple, torque: Triple
+    scene: Any,
+    model: Model,
+    state: Sequence[Scalar],
+    acceleration: Triple,
+    torque: Triple,
 ) -> list[_LegReactions]:
     """Solve the balances of all links, leg by leg, in {E}."""
     rows, rate = rotation_rows(_quadruple(state)), triple(state[4:7])
@@ -323,8 +343,8 @@ def _solve(
         if own is not None:
             loads = add(loads, own.joints[k])
         legs.append(_Leg.of(scene, k, at, field, rate, acceleration, drive, loads))
-    # Least sum of squares of the forces x, x + b and x + b + a of each leg, whose x make up
-    # the star's: 3 x + 2 b + a is the same in all legs.
+    # Least sum of squares of the forces x, x + b and x + b + a of each leg, whose x
+    # make up the star's: 3 x + 2 b + a is the same in all legs.
     spread = [add(multiply(2.0, leg.link.force), leg.drive.force) for leg in legs]
     mean = multiply(1.0 / 3.0, add(add(spread[0], spread[1]), spread[2]))
     found = []
@@ -365,7 +385,8 @@ class _Leg(NamedTuple):
         turning = cross3(rate, t)
         products = at.gamma_dot * mu_dot + at.beta_dot * dot3(across, turning)
         beta_ddot = -(dot3(across, acceleration) + products) / root  # Eq. 46
-        # omega of the star is that of the intermediate link - t beta_dot, and t turns with it.
+        # omega of the star is that of the intermediate link - t beta_dot, and t turns
+        # with it.
         slide = add(multiply(beta_ddot, t), multiply(at.beta_dot, turning))
         link_rate = add(rate, multiply(at.beta_dot, t))
         link = scene.intermediate_links[k]
@@ -398,8 +419,14 @@ class _Leg(NamedTuple):
         on_link = add(force, self.link.force), add(self.moment, self.link.moment)
         on_drive = add(on_link[0], self.drive.force), add(on_link[1], self.drive.moment)
         return _LegReactions(
-            (_components(on_drive[0], self.first), _components(on_drive[1], self.first)),
-            (_components(on_link[0], self.second), _components(on_link[1], self.second)),
+            (
+                _components(on_drive[0], self.first),
+                _components(on_drive[1], self.first),
+            ),
+            (
+                _components(on_link[0], self.second),
+                _components(on_link[1], self.second),
+            ),
             (_components(force, self.second), _components(self.moment, self.second)),
             self.first,
             self.second,
@@ -407,7 +434,10 @@ class _Leg(NamedTuple):
 
 
 def _joint_loads(at: LegMotion) -> Triple:
-    """Torques of friction, springs and stops at gamma, mu and beta [N m]; weights are left out."""
+    """Torques of friction, springs and stops at gamma, mu and beta [N m].
+
+    Weights are left out.
+    """
     weightless = at._replace(leg=at.leg._replace(drive=ZERO, link=ZERO))
     return kernel.joint_torques(weightless, ZERO)
 
@@ -451,8 +481,8 @@ def _change(
 ) -> _Change:
     """Return Newton's and Euler's sides of a body that turns about O, less its weight.
 
-    Inertia (xx, yy, zz, xy, xz, yz) is about O in the axes of the body; mass times centre,
-    gravity, rate and acceleration are in {E}.
+    Inertia (xx, yy, zz, xy, xz, yz) is about O in the axes of the body; mass times
+    centre, gravity, rate and acceleration are in {E}.
     """
     xx, yy, zz, xy, xz, yz = inertia
     tensor = symmetric_rows((xx, yy, zz, xy, xz, yz))

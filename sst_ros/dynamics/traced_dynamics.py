@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions of scenes, traced: those that a run calls, the ODE that is integrated, many scenarios.
 
-The programs of many scenarios have the numbers that differ as inputs. What is the same in all of
-them stays a constant that `trace` folds, so a batch computes only what varies. A term whose
-coefficients are zero in some scenarios changes no bit there.
+The programs of many scenarios have the numbers that differ as inputs. What is the same
+in all of them stays a constant that `trace` folds, so a batch computes only what
+varies. A term whose coefficients are zero in some scenarios changes no bit there.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ OUTPUTS = (*Joints._fields, "energy")
 class Dynamics:
     """Programs of a manipulator with the constants `model`, numbers or not.
 
-    `state` has the names of the state's numbers: quaternion, body rate, lagged torques if any;
-    `drive` of what acts from outside: torques, and a moment if it comes from a topic.
+    `state` has the names of the state's numbers: quaternion, body rate, lagged torques
+    if any; `drive` of what acts from outside: torques, and a moment if it comes from a
+    topic.
     """
 
     def __init__(self, model: kernel.Model, *, has_moment_topic: bool = False) -> None:
@@ -89,33 +90,53 @@ class Dynamics:
     @cached_property
     def joints_program(self) -> Program:
         """The program of `joints`."""
-        return trace(lambda *state: [*chain(*kernel.joints(self.numbers, state))], MOTION)
+        return trace(
+            lambda *state: [*chain(*kernel.joints(self.numbers, state))], MOTION
+        )
 
     @cached_property
     def inverse(self) -> Function:
         """Torques that give a W_dot, det g and sin^2(mu_k), 7 numbers: `kernel.actuator_torque`.
 
-        Of the first seven numbers of the state, W_dot, and a moment if it comes from a topic.
+        Of the first seven numbers of the state, W_dot, and a moment if it comes from a
+        topic.
         """
 
         def torques(*inputs: Any) -> tuple[Any, ...]:
-            q, rate, acceleration, moment = inputs[:4], inputs[4:7], inputs[7:10], inputs[10:]
-            found = kernel.actuator_torque(self.model, q, rate, acceleration, moment or None)
-            return (*found[0], found[1], *(at.u for at in kernel.leg_motions(self.model, inputs)))
+            q, rate, acceleration, moment = (
+                inputs[:4],
+                inputs[4:7],
+                inputs[7:10],
+                inputs[10:],
+            )
+            found = kernel.actuator_torque(
+                self.model, q, rate, acceleration, moment or None
+            )
+            return (
+                *found[0],
+                found[1],
+                *(at.u for at in kernel.leg_motions(self.model, inputs)),
+            )
 
         more = MOMENT if self.has_moment_topic else ()
         return compile_program(trace(torques, (*MOTION, *BODY_ACCELERATION, *more)))
 
     @cached_property
     def actuator_motion(self) -> Function:
-        """Coordinates x and x_dot of state and drive; both by each number of the state, and torque.
+        """Coordinates x and x_dot of state and drive.
+
+        Both by each number of the state, and torque.
 
         They are x = (gamma, gamma_dot, lagged torques if any).
         """
         size = len(self.state)
 
         def motion(*inputs: Any) -> tuple[Any, ...]:
-            state, torque, moment = inputs[:size], inputs[size : size + 3], inputs[size + 3 :]
+            state, torque, moment = (
+                inputs[:size],
+                inputs[size : size + 3],
+                inputs[size + 3 :],
+            )
             slope = kernel.derivative(self.model, state, torque, moment or None)
             gamma_ddot = kernel.actuator_acceleration(self.model, state, slope[4:7])
             joints = kernel.joints(self.model, state)
@@ -152,10 +173,10 @@ recent = lru_cache(maxsize=32)(Dynamics)
 class ODE:
     """Derivative of a scene's state, as programs with the inputs t, `state` and `drive`.
 
-    These are those of `dynamics`, but for: `torque` over time, clamped to `limit` [N m], replaces
-    the torques of the drive; with `phases` the drive keeps three numbers for them, the phases
-    [rad]. `work` appends to the state the work [J] that actuators and moments have put in, less
-    what friction has taken out.
+    These are those of `dynamics`, but for: `torque` over time, clamped to `limit` [N
+    m], replaces the torques of the drive; with `phases` the drive keeps three numbers
+    for them, the phases [rad]. `work` appends to the state the work [J] that actuators
+    and moments have put in, less what friction has taken out.
     """
 
     def __init__(
@@ -216,7 +237,9 @@ class ODE:
         program = trace(self._of_numbers, self._inputs, ("t", *self.state, *TORQUE))
         return compile_functions({"linearised": program}, ("linearised",))["linearised"]
 
-    def derivative(self, time: Any, *inputs: Any, numbered: bool = False) -> tuple[Any, ...]:
+    def derivative(
+        self, time: Any, *inputs: Any, numbered: bool = False
+    ) -> tuple[Any, ...]:
         """Return the derivative at the time, the state and the drive given, of any kind.
 
         If `numbered` it is that of constants that may be others in another scene.
@@ -234,9 +257,13 @@ class ODE:
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
             if limit is not None:  # clamps to -limit and limit, numbers of any kind
                 most = 2.0 * limit
-                torque = tuple(limit - positive(most - positive(tau + limit)) for tau in torque)
+                torque = tuple(
+                    limit - positive(most - positive(tau + limit)) for tau in torque
+                )
         slope = kernel.derivative(model, state, torque, moment or None)
-        work = (kernel.power(model, state, torque, moment or None),) if self._work else ()
+        work = (
+            (kernel.power(model, state, torque, moment or None),) if self._work else ()
+        )
         return (*slope, *work)
 
 
@@ -244,12 +271,15 @@ recent_ode = lru_cache(maxsize=64)(ODE)  # traced once for all runs of the same 
 
 
 def limit_distances(
-    limits: Sequence[Limit], ends: Sequence[Any], model: kernel.Model, state: Sequence[Any]
+    limits: Sequence[Limit],
+    ends: Sequence[Any],
+    model: kernel.Model,
+    state: Sequence[Any],
 ) -> tuple[Scalar, ...]:
     """Return a number for each limit, positive inside, then the rate of each.
 
-    They hold for angles less than pi away from the limit. `ends` has cosine and sine of the end of
-    each limit; the state is quaternion and body rate.
+    They hold for angles less than pi away from the limit. `ends` has cosine and sine of
+    the end of each limit; the state is quaternion and body rate.
     """
     legs = list(kernel.leg_motions(model, state))
     distances, rates = [], []
@@ -260,7 +290,11 @@ def limit_distances(
         else:  # sqrt(u) sin(sign * (angle - end))
             across, along = kernel.direction_of(at, kind)
             distance = limit.sign * (across * cosine - along * sine)
-            rate = limit.sign * (along * cosine + across * sine) * kernel.joint_rate(at, kind)
+            rate = (
+                limit.sign
+                * (along * cosine + across * sine)
+                * kernel.joint_rate(at, kind)
+            )
             rate = rate - distance * at.a * at.a_dot / at.u
         distances.append(distance)
         rates.append(rate)
@@ -271,7 +305,8 @@ class Constants(NamedTuple):
     """All numbers that the traced programs of a scene are made of: a tree of numbers or columns."""
 
     model: kernel.Model
-    ends: tuple[tuple[float, float], ...]  # cosine and sine of the end of each of `limits_of`
+    # cosine and sine of the end of each of `limits_of`
+    ends: tuple[tuple[float, float], ...]
     torque: SineTorque | None  # the scene's own over time; None where it does not act
 
 
@@ -281,17 +316,23 @@ class ParameterColumns(NamedTuple):
     inputs: Array  # the program's varied numbers, shape (numbers, N)
     geometries: Geometry  # the distinct ones, or one for all rows
     geometry: NDArray[np.intp]  # index of the geometry of each row, shape (N,)
-    torque_limit: Array  # largest torque of an actuator [N m], infinite without one, shape (N,)
+    # largest torque of an actuator [N m], infinite without one, shape (N,)
+    torque_limit: Array
 
 
 class ParametricModel:
     """The programs of a scene, with the numbers that differ between scenarios, `names`, as inputs.
 
-    With `profile` the scene's own torques act. `ode` has the names of the state and the drive.
+    With `profile` the scene's own torques act. `ode` has the names of the state and the
+    drive.
     """
 
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
-        self.scene, self.profile, self._scenarios = scenarios.document, profile, scenarios
+        self.scene, self.profile, self._scenarios = (
+            scenarios.document,
+            profile,
+            scenarios,
+        )
         self._tree = self._constants_of(scenarios)[0]
         numbers = leaves(self._tree)
         self._varied = [place for place, x in numbers.items() if np.max(x) != np.min(x)]
@@ -315,21 +356,31 @@ class ParametricModel:
         for row, place in zip(inputs, self._varied, strict=True):
             row[:] = numbers[place]
             if place[-1] == "static":
-                # static = 0 is no breakaway torque, which is as if it were the Coulomb torque.
+                # static = 0 is no breakaway torque, which is as if it were the Coulomb
+                # torque.
                 level: Place = (*place[:-1], "coulomb")
                 row[:] = np.where(row == 0.0, numbers[level], row)
             elif place[-1] == "rest":
-                np.nan_to_num(row, copy=False)  # of a spring without stiffness any will do
+                # of a spring without stiffness any will do
+                np.nan_to_num(row, copy=False)
         given = getattr(scenarios.columns().actuators, "torque_limit", None)
         limit = np.full(len(which), np.inf if given is None else given)
         limit[limit == 0.0] = np.inf  # of actuators that are left out
-        lagging, lags = tree.model.time_constant, "must be > 0 [s] in every scenario, or in none"
+        lagging, lags = (
+            tree.model.time_constant,
+            "must be > 0 [s] in every scenario, or in none",
+        )
         checks = [("actuators.time_constant", 0.0, not np.any(lagging == 0.0), lags)]
         for place, x in self._fixed.items():
             allowed = f"must be {x} in all scenarios of this model"
-            checks.append((str(place), numbers[place], bool(np.all(numbers[place] == x)), allowed))
-        if tree.torque is not None:  # a fixed step does not resolve the kinks of a clamped torque
-            amplitudes = np.array(np.broadcast_arrays(*tree.torque.amplitude, limit)[:3])
+            checks.append(
+                (str(place), numbers[place], bool(np.all(numbers[place] == x)), allowed)
+            )
+        # a fixed step does not resolve the kinks of a clamped torque
+        if tree.torque is not None:
+            amplitudes = np.array(
+                np.broadcast_arrays(*tree.torque.amplitude, limit)[:3]
+            )
             largest = np.abs(amplitudes).max(axis=0)
             n = int(np.argmax(largest > limit))
             key = f"scenario {n}: " * bool(scenarios.count) + "actuators.torque_limit"
@@ -341,7 +392,9 @@ class ParametricModel:
     @cached_property
     def program(self) -> Program:
         """Derivative of the state; inputs t, state, drive, and the varied numbers."""
-        return trace(self.derivative, ("t", *self.ode.state, *self.ode.drive, *self.names))
+        return trace(
+            self.derivative, ("t", *self.ode.state, *self.ode.drive, *self.names)
+        )
 
     def derivative(self, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative at the inputs of `program`, of any kind."""
@@ -353,7 +406,10 @@ class ParametricModel:
 
     @cached_property
     def limit_distances(self) -> Program:
-        """Distances to the limits, and their rates; inputs: state (7) and the varied numbers."""
+        """Distances to the limits, and their rates.
+
+        inputs: state (7) and the varied numbers.
+        """
         return trace(self.distances, (*MOTION, *self.names))
 
     def distances(self, *inputs: Any) -> tuple[Scalar, ...]:
@@ -368,7 +424,9 @@ class ParametricModel:
 
     @cached_property
     def outputs(self) -> dict[str, Callable[..., tuple[Any, ...]]]:
-        """Functions of arrays for quantities of OUTPUTS by name; inputs as `limit_distances`.
+        """Functions of arrays for quantities of OUTPUTS by name.
+
+        Inputs as `limit_distances`.
 
         Three angles [rad] or rates [rad/s] each, or the energy [J].
         """
@@ -389,13 +447,19 @@ class ParametricModel:
         tree: Constants = rebuild(self._tree, self._fixed | given)
         return tree
 
-    def _constants_of(self, scenarios: Scenarios) -> tuple[Constants, Geometry, NDArray[np.intp]]:
-        """Return the constants of scenarios, as columns; their geometries, and that of each row."""
+    def _constants_of(
+        self, scenarios: Scenarios
+    ) -> tuple[Constants, Geometry, NDArray[np.intp]]:
+        """Return the constants of scenarios, as columns.
+
+        Their geometries, and that of each row.
+        """
         geometries, which = Geometry.of_scenarios(scenarios)
         columns, geometry = scenarios.columns(), geometries.of_rows(which)
         limits = limits_of(self.scene, geometry)
         ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
-        with np.errstate(invalid="ignore"):  # 0/0 is the rest of springs without stiffness
+        # 0/0 is the rest of springs without stiffness
+        with np.errstate(invalid="ignore"):
             model = kernel.model_of(columns, geometry)
         torque = columns.torque if self.profile else None
         return Constants(model, ends, torque), geometries, which

@@ -5,14 +5,14 @@ The sensitivities S = dy/dp of the motion y' = f(y, t, p) obey
 
     S' = (df/dy) S + df/dp,  S(0) = dy(0)/dp
 
-(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14). Both
-derivatives are those of the traced equation of motion, exact to rounding, and one error control
-holds for S and the motion.
+(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14).
+Both derivatives are those of the traced equation of motion, exact to rounding, and one
+error control holds for S and the motion.
 
-Where f jumps across a surface that the motion meets, S jumps by the saltation matrix, which is one
-where f is continuous (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical
-Systems, Springer 2004, 7.2): so it is where an elastic stop is met or left. Torques that jump do so
-at times that no parameter moves.
+Where f jumps across a surface that the motion meets, S jumps by the saltation matrix,
+which is one where f is continuous (Leine and Nijmeijer, Dynamics and Bifurcations of
+Non-Smooth Mechanical Systems, Springer 2004, 7.2): so it is where an elastic stop is
+met or left. Torques that jump do so at times that no parameter moves.
 """
 
 from __future__ import annotations
@@ -41,7 +41,12 @@ from sst_ros.mechanism.generic_math import (
     triple,
 )
 from sst_ros.mechanism.geometry import Geometry
-from sst_ros.programs.expression import compile_for_arrays, compile_program, mark_present, trace
+from sst_ros.programs.expression import (
+    compile_for_arrays,
+    compile_program,
+    mark_present,
+    trace,
+)
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, build_unchecked, key_of, leaves
 from sst_ros.scene.torque_profile import (
@@ -56,12 +61,17 @@ from sst_ros.scene.torque_profile import (
 from sst_ros.scene.yaml_document import find_fields, find_number, plain, replace_values
 from sst_ros.state import Array, clamp, freeze
 
-TOLERANCE = 1e-12  # of a step, relative and absolute; the latter over the size of a parameter
-AT_STOPS = 0.1  # of it where stops are elastic: a step across a jump of derivatives loses its order
+# of a step, relative and absolute; the latter over the size of a parameter
+TOLERANCE = 1e-12
+# of it where stops are elastic: a step across a jump of derivatives loses its order
+AT_STOPS = 0.1
 MOST = 4_000_000
 """Evaluations of a motion: minutes, where a stiff motion needs hours by an explicit method."""
 GEOMETRY = ("base.v", "star.alpha_deg")
-"""Keys of the geometry that the equations of motion have; the third alpha is what is left."""
+"""Keys of the geometry that the equations of motion have.
+
+The third alpha is what is left.
+"""
 ACTUATORS = (
     "actuators.torque_limit",
     "actuators.idle_damping",
@@ -72,7 +82,8 @@ OUTSIDE = (
     "torque", "motion", "duration", "initial.orientation", "base.radius", "star.radius",
     "workspace", "stroke.at_end", *ACTUATORS,
 )  # fmt: skip
-REBOUND = ("stroke.restitution", "stroke.impact_rate")  # known to the equations as one damping
+# known to the equations as one damping
+REBOUND = ("stroke.restitution", "stroke.impact_rate")
 FIRST = np.zeros(1)
 OWN_TORQUE = "torque"
 """Parameter that means all numbers of the torques."""
@@ -81,10 +92,11 @@ OWN_TORQUE = "torque"
 class VariationalEquations:
     """Motions of a scene under torques over time, and their derivatives by parameters.
 
-    Those are numbers of the scene by key, as "friction.gamma.smoothing", "initial.gamma_dot[0]" or
-    "actuators.time_constant"; a list without index means all its entries. Of the geometry they are
-    "base.v[0][1]" and "star.alpha_deg[0]", for `simulate` alone: `run` takes it as it is. With
-    `by_torque` the numbers of the torques follow. InputError names what is no such key.
+    Those are numbers of the scene by key, as "friction.gamma.smoothing",
+    "initial.gamma_dot[0]" or "actuators.time_constant"; a list without index means all
+    its entries. Of the geometry they are "base.v[0][1]" and "star.alpha_deg[0]", for
+    `simulate` alone: `run` takes it as it is. With `by_torque` the numbers of the
+    torques follow. InputError names what is no such key.
     """
 
     def __init__(
@@ -104,20 +116,27 @@ class VariationalEquations:
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:
         """Integrate the motion and its sensitivities with values of the parameters, shape (p,).
 
-        Returns states (q, W and lagged torques) at times t [s], shape (n,), ascending from 0 on, of
-        shape (n, m), and their derivatives, (n, m, p), with those by the numbers of the torques
-        last; raises InputError where there is no motion.
+        Returns states (q, W and lagged torques) at times t [s], shape (n,), ascending
+        from 0 on, of shape (n, m), and their derivatives, (n, m, p), with those by the
+        numbers of the torques last; raises InputError where there is no motion.
         """
-        # Inertias between iterations of a fit need not be those of bodies that can exist.
+        # Inertias between iterations of a fit need not be those of bodies that can
+        # exist.
         outer = zip(self.names, values.tolist(), strict=True)
         scene = self.scene.with_values(
-            {name: value for name, value in outer if name.startswith(("initial", "stroke"))}
+            {
+                name: value
+                for name, value in outer
+                if name.startswith(("initial", "stroke"))
+            }
         )
         state, slopes = self._start(scene)
         found = self.integrate(state, slopes, t, values, scene=scene)
         if found is None:
             allowed = "leave no motion to the last time"
-            raise refusal(self._caller, _argument(self._caller), values.tolist(), allowed)
+            raise refusal(
+                self._caller, _argument(self._caller), values.tolist(), allowed
+            )
         return found
 
     def integrate(
@@ -132,9 +151,9 @@ class VariationalEquations:
     ) -> tuple[Array, Array] | None:
         """Integrate from a state, shape (m,), and its derivatives, shape (m, k), to times t [s].
 
-        The last of the k numbers are the parameters, with these values, and those of the torques;
-        of others the motion depends by its state alone. Returns as `run`, None where there is no
-        motion, or where it needs more than `most` evaluations.
+        The last of the k numbers are the parameters, with these values, and those of
+        the torques; of others the motion depends by its state alone. Returns as `run`,
+        None where there is no motion, or where it needs more than `most` evaluations.
         """
         from scipy.integrate import solve_ivp  # takes 0.3 s, which few runs need
 
@@ -148,18 +167,28 @@ class VariationalEquations:
             given[rebound[0]] = damping_of(scene.stroke)
         own = np.append(values, _numbers(self._torque) if self._by_torque else [])
         size, y = len(state), np.concatenate([state, slopes.ravel()])
-        limit, left, free = scene.torque_limit, iter(range(most)), slopes.shape[1] - len(own)
+        limit, left, free = (
+            scene.torque_limit,
+            iter(range(most)),
+            slopes.shape[1] - len(own),
+        )
         derivatives = trace_derivatives(self.scene, self.names, self._by_torque)
         parts = np.cumsum([1, size, 3 * self._by_torque])
 
-        def rates(time: float, y: Array, acting: Any, forcing: Callable[[float], Array]) -> Array:
+        def rates(
+            time: float, y: Array, acting: Any, forcing: Callable[[float], Array]
+        ) -> Array:
             if next(left, None) is None:
                 raise ArithmeticError
             torque = clamp(torque_at(acting, time), limit)
-            found = np.array(derivatives(*y[:size].tolist(), *torque, *given)).reshape(-1, size)
+            found = np.array(derivatives(*y[:size].tolist(), *torque, *given)).reshape(
+                -1, size
+            )
             rate, by_state, by_torque, by_parameter = np.split(found, parts)
             flow = by_state.T @ y[size:].reshape(size, -1)
-            flow[:, free:] += np.hstack([by_parameter.T * factor, by_torque.T @ forcing(time)])
+            flow[:, free:] += np.hstack(
+                [by_parameter.T * factor, by_torque.T @ forcing(time)]
+            )
             return np.concatenate([rate[0], flow.ravel()])
 
         tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
@@ -216,7 +245,8 @@ class VariationalEquations:
         own = [i for i, name in enumerate(self.names) if name.startswith("initial")]
         shaped = [i for i, name in enumerate(self.names) if name.startswith(GEOMETRY)]
         if own or shaped:
-            # A rotation vector and W in {E} change gamma and gamma_dot: the inverse of that.
+            # A rotation vector and W in {E} change gamma and gamma_dot: the inverse of
+            # that.
             tangent = np.zeros((7, 6))
             tangent[4:, 3:] = np.eye(3)
             for i, axis in enumerate(np.eye(3)):
@@ -225,22 +255,39 @@ class VariationalEquations:
             try:
                 by_joints = tangent @ np.linalg.inv(forward)
             except np.linalg.LinAlgError:
-                message = "no derivative by initial angles or rates: parallel singularity, det"
+                message = (
+                    "no derivative by initial angles or rates: parallel"
+                    " singularity, det"
+                )
                 raise SingularConfiguration(message, 0.0) from None
         if shaped:  # the star moves so that gamma and gamma_dot stay
-            by_geometry = self.differentiate_joints_by_geometry(state[:7, None])[shaped, :, 0]
+            by_geometry = self.differentiate_joints_by_geometry(state[:7, None])[
+                shaped, :, 0
+            ]
             slopes[:7, shaped] = -by_joints @ by_geometry.T
         for i in own:
-            name, first = self.names[i], 3 * self.names[i].startswith("initial.gamma_dot")
-            legs = [first + int(name[-2])] if name.endswith("]") else [first, first + 1, first + 2]
+            name, first = (
+                self.names[i],
+                3 * self.names[i].startswith("initial.gamma_dot"),
+            )
+            legs = (
+                [first + int(name[-2])]
+                if name.endswith("]")
+                else [first, first + 1, first + 2]
+            )
             slopes[:7, i] = by_joints[:, legs].sum(axis=1)
         return state, slopes
 
-    def _forcing(self, begin: float, end: float, limit: float | None) -> Callable[[float], Array]:
+    def _forcing(
+        self, begin: float, end: float, limit: float | None
+    ) -> Callable[[float], Array]:
         """Return the function of derivatives of the torques between two kinks by their numbers."""
         if not self._by_torque:
             return lambda time: np.empty((0, 0))
-        slopes, middle = _differentiate_torque(self._torque, begin, end), 0.5 * (begin + end)
+        slopes, middle = (
+            _differentiate_torque(self._torque, begin, end),
+            0.5 * (begin + end),
+        )
         acting = np.abs(torque_at(self._torque.acting(begin, end), middle))
         free = (acting <= (np.inf if limit is None else limit))[:, None]
         return lambda time: slopes(time) * free
@@ -283,12 +330,17 @@ class _TracedAxes(NamedTuple):
         pairs = [(v[k], v[(k + 1) % 3]) for k in range(3)]
         normals = [cross3(*pair) for pair in pairs]
         sines = [sqrt(dot3(normal, normal)) for normal in normals]
-        w = [triple(part / sine for part in n) for n, sine in zip(normals, sines, strict=True)]
+        w = [
+            triple(part / sine for part in n)
+            for n, sine in zip(normals, sines, strict=True)
+        ]
         degree = float(np.radians(1.0))
         first, second, _ = (degree * angle for angle in scene.star.alpha_deg)
         turns = 0.0, first, first + second
         e = [(-sin(turn), cos(turn), 0.0) for turn in turns]
-        arc = [atan2(sine, dot3(*pair)) for sine, pair in zip(sines, pairs, strict=True)]
+        arc = [
+            atan2(sine, dot3(*pair)) for sine, pair in zip(sines, pairs, strict=True)
+        ]
         return cls(v, w, e, arc)
 
     def of_leg(self, name: str, k: int) -> Any:
@@ -331,7 +383,9 @@ def trace_derivatives(
 
 
 @lru_cache(maxsize=32)
-def _trace_joints(scene: Scene, names: tuple[str, ...]) -> Callable[..., tuple[Any, ...]]:
+def _trace_joints(
+    scene: Scene, names: tuple[str, ...]
+) -> Callable[..., tuple[Any, ...]]:
     """Return gamma and gamma_dot, then their derivatives by quaternion, W and named numbers."""
     inputs = (*MOTION, *(f"p{i}" for i in range(len(names))))
 
@@ -350,7 +404,9 @@ def _numbers(torque: TorqueProfile) -> Array:
         return np.array([*torque.amplitude, *torque.frequency, *torque.phase])
     if isinstance(torque, PolynomialTorque):
         return torque.c.ravel()
-    return np.ravel(torque.torques if isinstance(torque, TorqueTable) else torque.values(FIRST))
+    return np.ravel(
+        torque.torques if isinstance(torque, TorqueTable) else torque.values(FIRST)
+    )
 
 
 def _differentiate_torque(
@@ -359,7 +415,9 @@ def _differentiate_torque(
     """Return the derivatives of the torques by `_numbers`, (3, q), between two kinks [s]."""
     unit = np.eye(3)
     if isinstance(torque, SineTorque):
-        size, f, phase = map(np.array, (torque.amplitude, torque.frequency, torque.phase))
+        size, f, phase = map(
+            np.array, (torque.amplitude, torque.frequency, torque.phase)
+        )
 
         def sine(time: float) -> Array:
             turn = unit * size * np.cos(f * time + phase)
@@ -368,7 +426,9 @@ def _differentiate_torque(
         return sine
     if isinstance(torque, TorqueTable):
         held, middle = np.zeros((3, len(torque.times), 3)), 0.5 * (begin + end)
-        held[:, np.searchsorted(torque.times, middle) - 1] = unit * (middle > torque.times[0])
+        held[:, np.searchsorted(torque.times, middle) - 1] = unit * (
+            middle > torque.times[0]
+        )
         return lambda time: held.reshape(3, -1)
     if isinstance(torque, PolynomialTorque):
         here = int(np.searchsorted(torque.x, 0.5 * (begin + end))) - 1
@@ -386,8 +446,8 @@ def _differentiate_torque(
 def differentiate_damping(scene: Scene) -> tuple[float, float]:
     """Return the derivatives of the damping by restitution [s/rad] and impact rate [s^2/rad^2].
 
-    By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de =
-    d / (1 - e - e d), which is -3 where e = 1. The damping is d / v.
+    By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de
+    = d / (1 - e - e d), which is -3 where e = 1. The damping is d / v.
     """
     e, v = scene.stroke.restitution, scene.stroke.impact_rate
     assert e is not None and v is not None
@@ -399,8 +459,8 @@ def differentiate_damping(scene: Scene) -> tuple[float, float]:
 class Sensitivity(NamedTuple):
     """Derivatives of a motion at n instants by the k numbers of a parameter.
 
-    Their units are those below over the unit of the parameter. Samples stay at their times, also
-    where a limit ends the motion.
+    Their units are those below over the unit of the parameter. Samples stay at their
+    times, also where a limit ends the motion.
 
     Attributes:
         gamma: of the angles of the actuators [rad], shape (n, 3, k).
@@ -419,22 +479,34 @@ class Sensitivity(NamedTuple):
 class Sensitivities:
     """Derivatives of a motion by parameters as `simulate` takes them: each may be several numbers.
 
-    A vector means each of its components, a list each of its entries, in their order, and "torque"
-    the numbers of the profile: the three torques, `torques` of a `TorqueTable`, coefficients of a
-    `PolynomialTorque`, or amplitudes, frequencies and phases of a `SineTorque`. InputError: one
-    is no such number, or the torques are a function of the state.
+    A vector means each of its components, a list each of its entries, in their order,
+    and "torque" the numbers of the profile: the three torques, `torques` of a
+    `TorqueTable`, coefficients of a `PolynomialTorque`, or amplitudes, frequencies and
+    phases of a `SineTorque`. InputError: one is no such number, or the torques are a
+    function of the state.
     """
 
-    def __init__(self, scene: Scene, names: Iterable[str], torque: TorqueProfile) -> None:
-        keys = {name: [] if name == OWN_TORQUE else list_numbers(scene, name) for name in names}
+    def __init__(
+        self, scene: Scene, names: Iterable[str], torque: TorqueProfile
+    ) -> None:
+        keys = {
+            name: [] if name == OWN_TORQUE else list_numbers(scene, name)
+            for name in names
+        }
         flat = list(dict.fromkeys(chain(*keys.values())))
         self._columns: dict[str, Any] = {
-            name: slice(len(flat), None) if name == OWN_TORQUE else [flat.index(key) for key in own]
+            name: (
+                slice(len(flat), None)
+                if name == OWN_TORQUE
+                else [flat.index(key) for key in own]
+            )
             for name, own in keys.items()
         }
         by_torque, allowed = OWN_TORQUE in keys, ""
         if torque.feedback or isinstance(torque, LostTorque):
-            allowed = "need torques that are known over time, not a function of the state"
+            allowed = (
+                "need torques that are known over time, not a function of the state"
+            )
         elif by_torque and isinstance(torque, FunctionTorque):
             allowed = "torque needs three numbers or a profile, not a function"
         if allowed:
@@ -446,8 +518,12 @@ class Sensitivities:
         """Sensitivities by the name of their parameter at times [s] >= 0, ascending, shape (n,)."""
         states, slopes = self._equations.run(self._given, t)
         motion, slopes = states[:, :7].T, slopes[:, :7]
-        turn = np.array([quaternion_rate(tuple(motion[:4]), tuple(row)) for row in np.eye(3)])
-        rates = np.einsum("qcn,nqp->ncp", self._equations.differentiate_joints(motion), slopes)
+        turn = np.array(
+            [quaternion_rate(tuple(motion[:4]), tuple(row)) for row in np.eye(3)]
+        )
+        rates = np.einsum(
+            "qcn,nqp->ncp", self._equations.differentiate_joints(motion), slopes
+        )
         by_geometry = self._equations.differentiate_joints_by_geometry(motion)
         rates[..., : len(by_geometry)] += np.moveaxis(by_geometry, (0, 2), (2, 0))
         # quaternion_rate(q, .) has orthogonal columns of length abs(q) / 2.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One style for all figures: colours, lines, sizes, and how a figure is saved.
 
-A function that draws takes data and returns a `Figure`; `styled` gives it the style. Angles are
-drawn in degrees, their rates and errors in radians. Of a long curve matplotlib leaves out what no
-picture could show (its setting "path.simplify").
+A function that draws takes data and returns a `Figure`; `styled` gives it the style.
+Angles are drawn in degrees, their rates and errors in radians. Of a long curve
+matplotlib leaves out what no picture could show (its setting "path.simplify").
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ from sst_ros.state import Array
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
-"""Colours that the colour-blind can distinguish (Okabe and Ito); line styles differ too."""
+"""Colours that the colour-blind can distinguish (Okabe and Ito).
+
+Line styles differ too.
+"""
 
 MARKERS = {
     "rk4": (BLUE, "o"),
@@ -33,7 +36,8 @@ MARKERS = {
 }
 """Colour and marker of each method of integration."""
 
-Looks: TypeAlias = "dict[str, Any]"  # arguments of matplotlib that say how something looks
+# arguments of matplotlib that say how something looks
+Looks: TypeAlias = "dict[str, Any]"
 
 LINES: tuple[Looks, ...] = (
     {"color": BLUE, "linestyle": "-", "linewidth": 2.6},
@@ -52,7 +56,8 @@ SMALLEST_SHOWN = 1e-17
 
 _FILE = Path(__file__).with_suffix(".mplstyle")
 STYLE: Any = mpl.rc_params_from_file(_FILE, use_default_template=False)
-styled = mpl.rc_context(STYLE)  # gives a function that makes a figure the style, as a decorator
+# gives a function that makes a figure the style, as a decorator
+styled = mpl.rc_context(STYLE)
 
 
 @styled
@@ -64,9 +69,13 @@ def encode(figure: Figure, form: str) -> bytes:
 
 
 def save_figure(figure: Figure, *paths: Path) -> None:
-    """Write a figure into files, whose suffixes name the formats; raises OSError if it cannot."""
+    """Write a figure into files, whose suffixes name the formats.
+
+    Raises OSError if it cannot.
+    """
     for path in paths:
-        # Not straight into the file: on a full disk the PDF backend fails without an OSError.
+        # Not straight into the file: on a full disk the PDF backend fails without an
+        # OSError.
         path.write_bytes(encode(figure, path.suffix.removeprefix(".")))
 
 
@@ -95,7 +104,12 @@ def widen(axes: Axes, values: Array, least_span: float) -> None:
 
 
 def lines(
-    axes: Axes, seconds: Array, values: Array, names: Sequence[str], *, least_span: float = 0.0
+    axes: Axes,
+    seconds: Array,
+    values: Array,
+    names: Sequence[str],
+    *,
+    least_span: float = 0.0,
 ) -> None:
     """Draw columns over time, the legend above the panel; as `widen` does."""
     for column, name, style in zip(values.T, names, LINES, strict=False):
@@ -112,7 +126,10 @@ def draw_panels(
     height: float = 2.2,
     least_span: float = 0.0,
 ) -> Figure:
-    """Draw panels over time: label of the axis, names of curves, values (n, k); see `lines`."""
+    """Draw panels over time: label of the axis, names of curves, values (n, k).
+
+    See `lines`.
+    """
     figure, grid = stack([label for label, _, _ in panels], height)
     for axes, (_, names, values) in zip(grid, panels, strict=True):
         lines(axes, seconds, values, names, least_span=least_span)
@@ -121,7 +138,11 @@ def draw_panels(
 
 def legend(axes: Axes, **given: Any) -> None:
     """Put the legend above the panel, where no curve can be."""
-    place: Looks = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+    place: Looks = {
+        "loc": "lower right",
+        "bbox_to_anchor": (1.0, 1.0),
+        "borderaxespad": 0.1,
+    }
     axes.legend(**{**place, "ncol": 4, "fontsize": 8, "frameon": False, **given})
 
 
@@ -131,7 +152,9 @@ def mark_ends(axes: Axes, *path: Array) -> None:
     ends = (known[:1], "o", GREEN, "start"), (known[-1:], "s", VERMILION, "end")
     for at, marker, colour, name in ends:
         place = [column[at] for column in path]
-        axes.plot(*place, marker, color=colour, markersize=6, label=name, linestyle="none")
+        axes.plot(
+            *place, marker, color=colour, markersize=6, label=name, linestyle="none"
+        )
 
 
 def note(figure: Figure, text: str, width: int) -> None:

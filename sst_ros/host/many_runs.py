@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many runs of one function: in this thread, on threads, or on the workers of a Dask cluster.
 
-A result depends on its job alone. So a job may be computed again, which changes no bit: Dask does
-it where a worker dies or, by its `worker-ttl`, gives no sign of life. A worker that does not fit
-(another version, no space left) is retired.
+A result depends on its job alone. So a job may be computed again, which changes no bit:
+Dask does it where a worker dies or, by its `worker-ttl`, gives no sign of life. A
+worker that does not fit (another version, no space left) is retired.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from sst_ros.version import VERSION
 NO_WORKER, NO_SCHEDULER = 60.0, 15.0
 """Longest wait for a worker, and for a scheduler that does not answer [s]."""
 
-GATHER = 60.0  # longest wait for the outcome of a job that is done [s]: a busy worker answers late
+# longest wait for the outcome of a job that is done [s]: a busy worker answers late
+GATHER = 60.0
 LOOK = 0.1  # time between two looks for jobs that are done, and for workers [s]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -36,7 +37,10 @@ _OWN = threading.local()
 
 
 class SweepFailed(SstError):
-    """Runs could not be computed or their results not written; the others are complete."""
+    """Runs could not be computed or their results not written.
+
+    The others are complete.
+    """
 
 
 class UnfitWorker(SstError):
@@ -52,23 +56,27 @@ def run_many(
     label: str = "",
     name: str = "run",
 ) -> Iterator[tuple[int, Result]]:
-    """Call a function for each job; yield the number of the job and the result when it is done.
+    """Call a function for each job.
 
-    Args:
-        function: what is called; what it raises ends all. A worker of a cluster unpickles it once.
-        jobs: its arguments.
-        workers: threads of this process, 0 for one a core; 1 for none, in the order of the jobs.
-        client: a dask.distributed client, whose workers are taken in place of threads.
-        label: of a bar that is drawn on a terminal; none is drawn without it.
-        name: what a job is called where it fails on a cluster.
+    Yield the number of the job and the result when it is done.
 
-    Raises:
-        SweepFailed: on a cluster, an SstError of a job, no worker, or no scheduler; or, when all
-            others are done, a job that ended its workers.
+    Args: function: what is called; what it raises ends all. A worker of a cluster
+        unpickles it once. jobs: its arguments. workers: threads of this process, 0 for
+        one a core; 1 for none, in the order of the jobs. client: a dask.distributed
+        client, whose workers are taken in place of threads. label: of a bar that is
+        drawn on a terminal; none is drawn without it. name: what a job is called where
+        it fails on a cluster.
 
+    Raises: SweepFailed: on a cluster, an SstError of a job, no worker, or no scheduler;
+        or, when all others are done, a job that ended its workers.
     """
-    workers, bar = min(workers or len(os.sched_getaffinity(0)), len(jobs)), Bar(label, bool(label))
-    results: Iterator[tuple[int, Result]] = ((k, function(job)) for k, job in enumerate(jobs))
+    workers, bar = (
+        min(workers or len(os.sched_getaffinity(0)), len(jobs)),
+        Bar(label, bool(label)),
+    )
+    results: Iterator[tuple[int, Result]] = (
+        (k, function(job)) for k, job in enumerate(jobs)
+    )
     if client is not None:
         results = _on_cluster(client, function, jobs, name)
     elif workers > 1:
@@ -82,7 +90,9 @@ def _on_threads(
     function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
 ) -> Iterator[tuple[int, Result]]:
     stop = threading.Event()
-    pool = ThreadPoolExecutor(workers, initializer=setattr, initargs=(_OWN, "stop", stop))
+    pool = ThreadPoolExecutor(
+        workers, initializer=setattr, initargs=(_OWN, "stop", stop)
+    )
     futures = {pool.submit(function, job): number for number, job in enumerate(jobs)}
     try:
         for future in as_completed(futures):
@@ -108,9 +118,16 @@ def stop_if_asked() -> None:
 
 
 def connect(address: str) -> Any:
-    """Return a client of the scheduler at an address; raises InputError if none answers there."""
+    """Return a client of the scheduler at an address.
+
+    Raises InputError if none answers there.
+    """
     distributed = require("distributed")
-    known = "--scheduler", address, "must be the address of a Dask scheduler, as tcp://host:8786"
+    known = (
+        "--scheduler",
+        address,
+        "must be the address of a Dask scheduler, as tcp://host:8786",
+    )
     with refuse_errors("sweep", *known, OSError, ValueError):
         return distributed.Client(address, timeout=NO_SCHEDULER, set_as_default=False)
 
@@ -121,11 +138,15 @@ def _on_cluster(
     """Print which workers are retired, and why."""
     dask, sent, faults = require("distributed"), dict[Any, int](), dict[str, str]()
     work = pickle.dumps((function, jobs))
-    ask = partial(client.map, _on_worker, work=work, versions=describe_versions(), pure=False)
+    ask = partial(
+        client.map, _on_worker, work=work, versions=describe_versions(), pure=False
+    )
     # Before Python 3.11 asyncio's TimeoutError, which is Dask's, was another one.
     late = TimeoutError, dask.TimeoutError
 
-    def compute(numbers: Iterable[int]) -> Generator[tuple[int, Result], None, dict[int, str]]:
+    def compute(
+        numbers: Iterable[int],
+    ) -> Generator[tuple[int, Result], None, dict[int, str]]:
         """Return those whose workers died again and again, with Dask's error."""
         died, seen = dict[int, str](), time.monotonic()
         sent.update(zip(ask(numbers), numbers, strict=True))
@@ -135,8 +156,12 @@ def _on_cluster(
             if batch or client.nthreads():
                 seen = time.monotonic()
             elif time.monotonic() - seen > NO_WORKER:
-                why = "; ".join(f"{worker}: {fault}" for worker, fault in faults.items())
-                raise SweepFailed(f"no worker for {NO_WORKER:g} s ({why or 'none is there'})")
+                why = "; ".join(
+                    f"{worker}: {fault}" for worker, fault in faults.items()
+                )
+                raise SweepFailed(
+                    f"no worker for {NO_WORKER:g} s ({why or 'none is there'})"
+                )
             if not batch:
                 time.sleep(LOOK)
             for future in batch:
@@ -161,12 +186,17 @@ def _on_cluster(
         """Take a worker out of the cluster, and say so once: else job after job fails on it."""
         if worker not in faults:
             faults[worker] = fault
-            print(f"worker {worker} gets no more {name}s: {fault}", file=sys.stderr, flush=True)
+            print(
+                f"worker {worker} gets no more {name}s: {fault}",
+                file=sys.stderr,
+                flush=True,
+            )
             client.retire_workers([worker])
 
     failed: dict[int, str] = {}
     try:
-        # Dask blames all jobs that a worker had: the one that ends it shows itself alone.
+        # Dask blames all jobs that a worker had: the one that ends it shows itself
+        # alone.
         for suspect in (yield from compute(range(len(jobs)))):
             failed |= yield from compute([suspect])
     except (OSError, *late, dask.CancelledError) as error:  # the connection is closed
@@ -176,7 +206,9 @@ def _on_cluster(
         if client.status == "running":
             client.cancel(list(sent), force=True)
     if failed:
-        raise SweepFailed("; ".join(f"{name} {jobs[k]}: {failed[k]}" for k in sorted(failed)))
+        raise SweepFailed(
+            "; ".join(f"{name} {jobs[k]}: {failed[k]}" for k in sorted(failed))
+        )
 
 
 def _on_worker(number: int, work: bytes, versions: str) -> Any:
@@ -188,10 +220,13 @@ def _on_worker(number: int, work: bytes, versions: str) -> Any:
             function, jobs = _unpickle(work)
         return function(jobs[number])
     except (OSError, ImportError) as error:
-        raise UnfitWorker(str(require("distributed").get_worker().address), str(error)) from None
+        raise UnfitWorker(
+            str(require("distributed").get_worker().address), str(error)
+        ) from None
 
 
-_unpickle = lru_cache(maxsize=1)(pickle.loads)  # where the versions are known to be the sender's
+# where the versions are known to be the sender's
+_unpickle = lru_cache(maxsize=1)(pickle.loads)
 
 
 def describe_versions() -> str:

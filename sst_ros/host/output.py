@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a long command leaves and shows: its folder of results, tables, and a bar while it works.
 
-A folder is named after the recording, and is never written over unasked. A file that others may
-read has its name when it is whole. Tables of numbers are Parquet, NPZ or CSV: the first two hold
-every bit, texts about the table, and a checksum of both; Parquet has the checksums of its pages
-besides, for other readers. CSV has the columns alone, for other programs.
+A folder is named after the recording, and is never written over unasked. A file that
+others may read has its name when it is whole. Tables of numbers are Parquet, NPZ or
+CSV: the first two hold every bit, texts about the table, and a checksum of both;
+Parquet has the checksums of its pages besides, for other readers. CSV has the columns
+alone, for other programs.
 """
 
 from __future__ import annotations
@@ -48,13 +49,18 @@ def results_folder(bag: Path, kind: str) -> Path:
     return path.with_name(f"{name}_{kind}")
 
 
-def require_free(out: Path, origin: str, *, force: bool = False, option: str = "--out") -> Path:
+def require_free(
+    out: Path, origin: str, *, force: bool = False, option: str = "--out"
+) -> Path:
     """Return `out`, a file or a folder to be written, if nothing there would be overwritten.
 
-    An InputError names `origin`, the command that writes, and `option`, which gave `out`: that is
-    a file, or a folder that is not empty, and `force` is not set; or it cannot be read.
+    An InputError names `origin`, the command that writes, and `option`, which gave
+    `out`: that is a file, or a folder that is not empty, and `force` is not set; or it
+    cannot be read.
     """
-    with refuse_errors(origin, option, str(out), "must be a path that can be written", OSError):
+    with refuse_errors(
+        origin, option, str(out), "must be a path that can be written", OSError
+    ):
         taken = any(out.iterdir()) if out.is_dir() else out.exists()
     allowed = f"exists already: choose another {option}, or overwrite it with --force"
     refuse_unless(origin, (option, str(out), force or not taken, allowed))
@@ -64,16 +70,21 @@ def require_free(out: Path, origin: str, *, force: bool = False, option: str = "
 @contextmanager
 def write_into(out: Path, origin: str) -> Iterator[None]:
     """Make the folder `out` for a block that writes into it, or raise an InputError of `origin`."""
-    with refuse_errors(origin, "--out", str(out), "must be a folder that can be written", OSError):
+    with refuse_errors(
+        origin, "--out", str(out), "must be a folder that can be written", OSError
+    ):
         out.mkdir(parents=True, exist_ok=True)
         yield
 
 
 @contextmanager
 def hold_folder(out: Path, origin: str) -> Iterator[None]:
-    """Make the folder `out` for a block that alone writes into it; remove it if it stays empty.
+    """Make the folder `out` for a block that alone writes into it.
 
-    Raises InputError of `origin` where another writer has it, in this process or another.
+    Remove it if it stays empty.
+
+    Raises InputError of `origin` where another writer has it, in this process or
+    another.
     """
     with write_into(out, origin):
         lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
@@ -94,10 +105,12 @@ def hold_folder(out: Path, origin: str) -> Iterator[None]:
 
 @contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """Give a block a name of its own to write to; what it wrote then becomes `path` at once.
+    """Give a block a name of its own to write to.
 
-    A reader of `path` has the earlier file or the later one, even if several processes write it,
-    and after a power cut.
+    What it wrote then becomes `path` at once.
+
+    A reader of `path` has the earlier file or the later one, even if several processes
+    write it, and after a power cut.
     """
     own = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}")
     try:
@@ -121,12 +134,17 @@ class Bar:
         percent = int(100.0 * share)
         if self._drawn and percent != self._percent:
             self._percent, bar = percent, "#" * (40 * percent // 100)
-            line = f"\r{self._label} [{bar:40}] {percent:3d} %" + (f" {text:60.60}" if text else "")
+            line = f"\r{self._label} [{bar:40}] {percent:3d} %" + (
+                f" {text:60.60}" if text else ""
+            )
             print(line, end="\n" if percent == 100 else "", file=sys.stderr, flush=True)
 
 
 def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
-    """Yield slices of `size`, 0 for some fifty; where `shown`, draw a bar on a terminal."""
+    """Yield slices of `size`, 0 for some fifty.
+
+    Where `shown`, draw a bar on a terminal.
+    """
     size = size or max(1, total // _PARTS)
     bar = Bar(label, shown)
     for start in range(0, total, size):
@@ -157,9 +175,9 @@ def write_table(
 ) -> None:
     """Write columns of equal length, shape (n,), whole numbers or doubles.
 
-    The suffix of the path, one of SUFFIXES, says what the file is. Parquet keeps texts about each
-    column, as its unit, and about the table, NPZ the latter; nan is no value in Parquet and CSV,
-    which need pyarrow and pandas.
+    The suffix of the path, one of SUFFIXES, says what the file is. Parquet keeps texts
+    about each column, as its unit, and about the table, NPZ the latter; nan is no value
+    in Parquet and CSV, which need pyarrow and pandas.
     """
     texts = dict(texts or {})
     texts[_CHECKSUM] = compute_checksum(texts, columns)
@@ -170,15 +188,21 @@ def write_table(
                 np.savez(file, **named)
         elif path.suffix == ".csv":
             # pandas writes the fewest digits that read back as the same bits.
-            require("pandas").DataFrame(columns).to_csv(own, index=False, lineterminator="\n")
+            require("pandas").DataFrame(columns).to_csv(
+                own, index=False, lineterminator="\n"
+            )
         else:
             pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
-            arrays = [pyarrow.array(column, from_pandas=True) for column in columns.values()]
+            arrays = [
+                pyarrow.array(column, from_pandas=True) for column in columns.values()
+            ]
             fields = [
                 pyarrow.field(name, array.type, metadata=about[name])
                 for name, array in zip(columns, arrays, strict=True)
             ]
-            whole = pyarrow.Table.from_arrays(arrays, schema=pyarrow.schema(fields, texts))
+            whole = pyarrow.Table.from_arrays(
+                arrays, schema=pyarrow.schema(fields, texts)
+            )
             parquet.write_table(whole, own, write_page_checksum=True)
 
 
@@ -221,7 +245,9 @@ def load_table(
     return numbers, asked
 
 
-def compute_checksum(texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> str:
+def compute_checksum(
+    texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]
+) -> str:
     """CRC-32 of texts and of the bits of columns."""
     checksum = zlib.crc32("".join(texts.values()).encode())
     for column in columns.values():

@@ -27,7 +27,8 @@ from typing import Any, BinaryIO
 
 from sst_ros.errors import SstError
 
-PARENT = "SST_ROS_PARENT"  # variable with the number of the process without which a node is to end
+# variable with the number of the process without which a node is to end
+PARENT = "SST_ROS_PARENT"
 NO_LIMIT = "no limit"
 _SWITCH_INTERVAL_S = 1e-4
 _END_S = 10.0
@@ -36,14 +37,20 @@ _next = itertools.count(os.getpid())  # what comes later leaves the last ones to
 
 
 @contextmanager
-def run_beside(command: str, given: dict[str, object], **more: Any) -> Iterator[Popen[str]]:
-    """Have a node with parameters beside a block; it ends when this process does, however.
+def run_beside(
+    command: str, given: dict[str, object], **more: Any
+) -> Iterator[Popen[str]]:
+    """Have a node with parameters beside a block.
+
+    It ends when this process does, however.
 
     Behind the block it gets SIGINT, and is killed if its end takes 10 s.
     """
     keep_domain()
     started = [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)]
-    with Popen(started, env={**os.environ, PARENT: str(os.getpid())}, text=True, **more) as process:
+    with Popen(
+        started, env={**os.environ, PARENT: str(os.getpid())}, text=True, **more
+    ) as process:
         try:
             yield process
         finally:
@@ -65,7 +72,8 @@ def keep_domain() -> None:
 def lock_domain() -> tuple[int, int]:
     """Return the number of a domain, and the descriptor that keeps it until it is closed.
 
-    No node is in it, neither one whose parent has just ended nor one that a user has started.
+    No node is in it, neither one whose parent has just ended nor one that a user has
+    started.
     """
     for _ in range(_DOMAINS):
         number = 1 + next(_next) % _DOMAINS
@@ -79,7 +87,9 @@ def lock_domain() -> tuple[int, int]:
                 os.close(lock)
                 continue
             return number, lock
-    raise SstError(f"all ROS domains from 1 to {_DOMAINS} are in use: set ROS_DOMAIN_ID")
+    raise SstError(
+        f"all ROS domains from 1 to {_DOMAINS} are in use: set ROS_DOMAIN_ID"
+    )
 
 
 def _refuse_nodes(domain: int) -> None:
@@ -91,16 +101,20 @@ def _refuse_nodes(domain: int) -> None:
 
 def words(given: dict[str, object]) -> list[str]:
     """Give parameters as --ros-args takes them."""
-    shown = {key: str(x).lower() if isinstance(x, bool) else x for key, x in given.items()}
+    shown = {
+        key: str(x).lower() if isinstance(x, bool) else x for key, x in given.items()
+    }
     return [word for key, value in shown.items() for word in ("-p", f"{key}:={value}")]
 
 
 class Assistant:
-    """A process of low priority that calls one function, which pickle takes; it ends with this one.
+    """A process of low priority that calls one function, which pickle takes.
+
+    It ends with this one.
 
     What takes longer than a control period is computed there: a thread would share the
-    interpreter's lock with the control. A thread here waits for that process, which may take long
-    to read and to write what the kernel does not hold at once.
+    interpreter's lock with the control. A thread here waits for that process, which may
+    take long to read and to write what the kernel does not hold at once.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -127,7 +141,9 @@ class Assistant:
         self._calls.put(given)
 
     def result(self) -> Any:
-        """Return the result of the call, or the SstError why there is none; None until it is there.
+        """Return the result of the call, or the SstError why there is none.
+
+        None until it is there.
 
         Where the process has ended another one is begun.
         """
@@ -142,7 +158,10 @@ class Assistant:
             except (EOFError, OSError):
                 if self._closed:
                     return
-                text = f"the process beside this one has ended with status {self._process.wait()}"
+                text = (
+                    "the process beside this one has ended with status"
+                    f" {self._process.wait()}"
+                )
                 self._begin()
                 self._results.put(SstError(text))
 
@@ -157,7 +176,8 @@ class Assistant:
 def assist(number: int) -> None:
     """Be the process of an `Assistant` at the other end of the connection of this descriptor."""
     with contextlib.suppress(EOFError, OSError), Connection(number) as connection:
-        function = connection.recv()  # with all that it imports: nothing is checked before
+        # with all that it imports: nothing is checked before
+        function = connection.recv()
         os.nice(10)
         while True:
             given = connection.recv()
@@ -175,12 +195,15 @@ def is_orphan() -> bool:
 
 
 def schedule(priority: int, thread: int) -> str:
-    """Ask for SCHED_FIFO for all threads (0: for the usual scheduling); return what was granted.
+    """Ask for SCHED_FIFO for all threads (0: for the usual scheduling).
 
-    The thread of this native id gets the priority, 0 to 99. The others of this process get half
-    of it: they hold locks that it waits for, the interpreter's and those of DDS, and must not be
-    preempted meanwhile. What they begin later, threads or processes, is scheduled as usual until
-    the next call. If the thread has ended, a ProcessLookupError is raised.
+    Return what was granted.
+
+    The thread of this native id gets the priority, 0 to 99. The others of this process
+    get half of it: they hold locks that it waits for, the interpreter's and those of
+    DDS, and must not be preempted meanwhile. What they begin later, threads or
+    processes, is scheduled as usual until the next call. If the thread has ended, a
+    ProcessLookupError is raised.
     """
     if not hasattr(os, "sched_setscheduler"):
         return "usual: this system has no SCHED_FIFO"
@@ -209,8 +232,9 @@ def _schedule_all(policy: int, thread: int, priority: int, others: int) -> None:
 class CpuDmaLatency:
     """Request that no core uses an idle state with a longer exit latency (Linux PM QoS).
 
-    A core that leaves a deep idle state does so late and with cold caches. The kernel keeps the
-    request as long as the file is open: it ends with the process, however that ends.
+    A core that leaves a deep idle state does so late and with cold caches. The kernel
+    keeps the request as long as the file is open: it ends with the process, however
+    that ends.
     """
 
     def __init__(self, device: Path = Path("/dev/cpu_dma_latency")) -> None:
@@ -218,7 +242,10 @@ class CpuDmaLatency:
         self._file: BinaryIO | None = None
 
     def request(self, latency_us: int) -> str:
-        """Ask for this largest exit latency [us], -1 for no limit; return what was granted."""
+        """Ask for this largest exit latency [us], -1 for no limit.
+
+        Return what was granted.
+        """
         if latency_us == self._asked_us:
             return self._granted
         if self._file is not None:
@@ -230,7 +257,9 @@ class CpuDmaLatency:
                 self._file.write(latency_us.to_bytes(4, sys.byteorder))
                 self._granted = f"{latency_us} us"
             except OSError as error:
-                self._granted = f"{NO_LIMIT}: {latency_us} us is not permitted ({error})"
+                self._granted = (
+                    f"{NO_LIMIT}: {latency_us} us is not permitted ({error})"
+                )
         self._asked_us = latency_us
         return self._granted
 

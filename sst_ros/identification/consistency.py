@@ -1,26 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weighted linear least squares, and the nearest parameters of bodies that can exist.
 
-The variance of the noise differs between actuators; it is estimated from the residuals of an
-unweighted fit, over the equations of the actuator less the unknowns that they determine (their
-leverage), and the equations are then divided by it (Gautier 1997; Swevers, Verdonck and
-De Schutter, IEEE Control Systems 27 (2007) no. 5, 58-71).
+The variance of the noise differs between actuators; it is estimated from the residuals
+of an unweighted fit, over the equations of the actuator less the unknowns that they
+determine (their leverage), and the equations are then divided by it (Gautier 1997;
+Swevers, Verdonck and De Schutter, IEEE Control Systems 27 (2007) no. 5, 58-71).
 
-A body has mass m, first moment h and inertia I about O if and only if its pseudo-inertia
+A body has mass m, first moment h and inertia I about O if and only if its
+pseudo-inertia
 
     J = [[S, h], [h^T, m]],  S = tr(I) / 2 - I,
 
-is positive semidefinite: mass >= 0, I positive definite, and the triangle inequality of its
-principal moments (Wensing, Kim and Slotine, IEEE Robot. Autom. Lett. 3 (2018) 60-67). Its centre
-lies within a distance r of O if [[m r 1, h], [h^T, m r]] is. Friction, stiffness and rotors must be
->= 0. All this is linear in the parameters, and to minimise
+is positive semidefinite: mass >= 0, I positive definite, and the triangle inequality of
+its principal moments (Wensing, Kim and Slotine, IEEE Robot. Autom. Lett. 3 (2018)
+60-67). Its centre lies within a distance r of O if [[m r 1, h], [h^T, m r]] is.
+Friction, stiffness and rotors must be >= 0. All this is linear in the parameters, and
+to minimise
 
-    chi^2 of the base parameters + squared distance from the values given, in sizes of the bodies
+    chi^2 of the base parameters + squared distance from the values given, in sizes of
+    the bodies
 
-under it is a semidefinite programme (Sousa and Cortesao, Int. J. Robotics Research 33 (2014)
-931-944), solved by the logarithmic barrier. The distance decides what torques leave open, and
-nothing that torques determine. Newton's step of each barrier problem is itself a linear
-least-squares problem, so that data without noise are fitted to rounding.
+under it is a semidefinite programme (Sousa and Cortesao, Int. J. Robotics Research 33
+(2014) 931-944), solved by the logarithmic barrier. The distance decides what torques
+leave open, and nothing that torques determine. Newton's step of each barrier problem is
+itself a linear least-squares problem, so that data without noise are fitted to
+rounding.
 """
 
 from __future__ import annotations
@@ -33,10 +37,14 @@ from scipy.linalg import solve_triangular
 from sst_ros.identification.parameters import STANDARD
 from sst_ros.mechanism.geometry import Array
 
-EXACT = 1e-12  # noise over RMS terms that is assumed at least: simulations have no other
+# noise over RMS terms that is assumed at least: simulations have no other
+EXACT = 1e-12
 INTERIOR = 1e-3  # share of its size by which a parameter is lifted at the start
-BARRIERS = tuple(10.0**-k for k in range(0, 11))  # the last: chi^2 off by 1e-10 at each boundary
-CENTRED = 1e-2  # squared decrement over the barrier below which Newton converges quadratically
+BARRIERS = tuple(
+    10.0**-k for k in range(0, 11)
+)  # the last: chi^2 off by 1e-10 at each boundary
+# squared decrement over the barrier below which Newton converges quadratically
+CENTRED = 1e-2
 _NEWTON_STEPS = 100
 _CLOSE = 0.95  # share of the distance to the boundary that a step may cover
 
@@ -44,21 +52,28 @@ _PSEUDO = np.zeros((10, 4, 4))  # J of each of the ten parameters alone
 _PSEUDO[0, 3, 3] = 1.0
 for _i in range(3):
     _PSEUDO[1 + _i, [_i, 3], [3, _i]] = 1.0
-for _row, (_i, _j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4):
+for _row, (_i, _j) in enumerate(
+    ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4
+):
     _PSEUDO[_row, [_i, _j], [_j, _i]] = -1.0
     if _i == _j:
         _PSEUDO[_row, :3, :3] += 0.5 * np.eye(3)
 
 
 def fit_weighted(
-    columns: Array, torque: Array, noise: Sequence[float] | None = None, *, terms: float = 0.0
+    columns: Array,
+    torque: Array,
+    noise: Sequence[float] | None = None,
+    *,
+    terms: float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """Fit torque = columns estimate, with b independent columns, shape (m, 3, b).
 
-    Torques are measured less known ones [N m], shape (m, 3), and the noise their standard
-    deviations, three, by default estimated: at least EXACT of the torques, and of the RMS of the
-    `terms` that sum up to them [N m], which cancel in a free motion. Returns the estimates, shape
-    (b,), R of the weighted regressor, R^T R = covariance^-1, shape (b, b), and the noise, (3,).
+    Torques are measured less known ones [N m], shape (m, 3), and the noise their
+    standard deviations, three, by default estimated: at least EXACT of the torques, and
+    of the RMS of the `terms` that sum up to them [N m], which cancel in a free motion.
+    Returns the estimates, shape (b,), R of the weighted regressor, R^T R =
+    covariance^-1, shape (b, b), and the noise, (3,).
     """
     if noise is not None:
         given = np.array(noise)
@@ -81,20 +96,28 @@ def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, A
     q, r = np.linalg.qr(matrix / lengths)
     estimate = solve_triangular(r, q.T @ right)
     # One step of refinement: noise-free data are fitted to rounding.
-    estimate = estimate + solve_triangular(r, q.T @ (right - matrix / lengths @ estimate))
+    estimate = estimate + solve_triangular(
+        r, q.T @ (right - matrix / lengths @ estimate)
+    )
     leverage = np.sum((q**2).reshape(-1, 3, len(r)), axis=(0, 2))
     return estimate / lengths, r * lengths, leverage
 
 
 def find_consistent_values(
-    names: Sequence[str], given: Array, transform: Array, estimate: Array, root: Array, reach: float
+    names: Sequence[str],
+    given: Array,
+    transform: Array,
+    estimate: Array,
+    root: Array,
+    reach: float,
 ) -> tuple[Array, float]:
     """Values of all parameters that fit the base parameters, those of bodies that can exist.
 
-    Of p parameters with values given in the scene, b combinations (transform, shape (b, p)) were
-    estimated, with the covariance (R^T R)^-1 of the root R. Centres of mass lie within the reach of
-    O [m]. Returns the values, shape (p,), and chi^2 of the base parameters there: how much worse
-    the torques are fitted than without the constraints.
+    Of p parameters with values given in the scene, b combinations (transform, shape (b,
+    p)) were estimated, with the covariance (R^T R)^-1 of the root R. Centres of mass
+    lie within the reach of O [m]. Returns the values, shape (p,), and chi^2 of the base
+    parameters there: how much worse the torques are fitted than without the
+    constraints.
     """
     sizes, (constant, basis) = scales(names, given), make_cones(names, reach)
     rows = np.vstack([root @ transform, np.diag(1.0 / sizes)])
@@ -102,7 +125,10 @@ def find_consistent_values(
     identity = np.tile(np.eye(4), (len(constant), 1, 1)).ravel()
 
     def cost(values: Array, barrier: float) -> float:
-        """|rows values - right|^2 / 2 - barrier sum log det; infinite outside the cones."""
+        """|rows values - right|^2 / 2 - barrier sum log det.
+
+        Infinite outside the cones.
+        """
         try:
             factors = np.linalg.cholesky(constant + np.tensordot(values, basis, 1))
         except np.linalg.LinAlgError:
@@ -112,20 +138,30 @@ def find_consistent_values(
         return float(0.5 * off @ off - 2.0 * barrier * logs.sum())
 
     # Into the interior: flat bodies and what is zero lie on the boundary.
-    lifted = [".moment." not in name and name[-2:] not in ("xy", "xz", "yz") for name in names]
+    lifted = [
+        ".moment." not in name and name[-2:] not in ("xy", "xz", "yz") for name in names
+    ]
     values = given + INTERIOR * sizes * lifted
     for barrier in BARRIERS:
         for _ in range(_NEWTON_STEPS):
-            inverse = np.linalg.inv(np.linalg.cholesky(constant + np.tensordot(values, basis, 1)))
+            inverse = np.linalg.inv(
+                np.linalg.cholesky(constant + np.tensordot(values, basis, 1))
+            )
             # Of the matrices by the parameters, in units of themselves.
             slopes = inverse @ basis @ inverse.transpose(0, 2, 1)
-            matrix = np.vstack([rows, np.sqrt(barrier) * slopes.reshape(len(values), -1).T])
-            target = np.concatenate([right - rows @ values, np.sqrt(barrier) * identity])
+            matrix = np.vstack(
+                [rows, np.sqrt(barrier) * slopes.reshape(len(values), -1).T]
+            )
+            target = np.concatenate(
+                [right - rows @ values, np.sqrt(barrier) * identity]
+            )
             lengths = np.linalg.norm(matrix, axis=0)
             q, r = np.linalg.qr(matrix / lengths)
             part = q.T @ target
             step = solve_triangular(r, part) / lengths
-            least = float(np.linalg.eigvalsh(np.tensordot(step, slopes, 1)).min(initial=0.0))
+            least = float(
+                np.linalg.eigvalsh(np.tensordot(step, slopes, 1)).min(initial=0.0)
+            )
             size = 1.0 if least > -_CLOSE else -_CLOSE / least
             if part @ part < CENTRED * barrier:
                 values = values + size * step
@@ -142,8 +178,8 @@ def find_consistent_values(
 def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
     """Return k matrices that must be positive semidefinite, linear in p parameters.
 
-    That is their constant part, shape (k, 4, 4), which fills the diagonal of smaller ones, and what
-    each parameter adds for a unit, shape (p, k, 4, 4).
+    That is their constant part, shape (k, 4, 4), which fills the diagonal of smaller
+    ones, and what each parameter adds for a unit, shape (p, k, 4, 4).
     """
     cones: list[dict[str, Array]] = []
     # [[m r 1, h], [h^T, m r]] of m and h.
@@ -151,7 +187,10 @@ def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
     for body in dict.fromkeys(name.partition(".")[0] for name in names):
         parts = [f"{body}.{part}" for part in STANDARD]
         if set(parts) <= set(names):
-            cones += dict(zip(parts, _PSEUDO, strict=True)), dict(zip(parts, centre, strict=False))
+            cones += (
+                dict(zip(parts, _PSEUDO, strict=True)),
+                dict(zip(parts, centre, strict=False)),
+            )
         elif set(parts[4:]) <= set(names):
             cones.append(dict(zip(parts[4:], _PSEUDO[4:], strict=True)))
     cones += [
@@ -173,7 +212,10 @@ def scales(names: Sequence[str], given: Array) -> Array:
     sizes = []
     for name in names:
         body, _, part = name.partition(".")
-        trace = sum(abs(values.get(f"{body}.inertia.{axis}", 0.0)) for axis in ("xx", "yy", "zz"))
+        trace = sum(
+            abs(values.get(f"{body}.inertia.{axis}", 0.0))
+            for axis in ("xx", "yy", "zz")
+        )
         mass = abs(values.get(f"{body}.mass", 0.0)) or 1.0
         of_body = {"mass": mass, "moment": np.sqrt(mass * trace), "inertia": trace}
         sizes.append(of_body.get(part.partition(".")[0], abs(values[name])) or 1.0)

@@ -3,16 +3,18 @@
 
 The motion is a Fourier series that begins and ends at rest,
 
-    gamma_k(t) = c_k + sum over n of a_nk sin(n w t) + b_nk cos(n w t), w = 2 pi / duration
+    gamma_k(t) = c_k + sum over n of a_nk sin(n w t) + b_nk cos(n w t), w = 2 pi /
+    duration
 
-(Swevers, Ganseman, Tukel, De Schutter and Van Brussel, IEEE Trans. Robotics Autom. 13 (1997)
-730-740). The coefficients are taken from the subspace in which gamma = c and gamma_dot =
-gamma_ddot = 0 at both ends. They minimise
+(Swevers, Ganseman, Tukel, De Schutter and Van Brussel, IEEE Trans. Robotics Autom. 13
+(1997) 730-740). The coefficients are taken from the subspace in which gamma = c and
+gamma_dot = gamma_ddot = 0 at both ends. They minimise
 
     log condition number + mean log standard deviation
 
-of the base parameters at equal noise, with quadratic penalties beyond a share of the limits:
-stroke, workspace, singularities, torque, rate and acceleration of the actuators.
+of the base parameters at equal noise, with quadratic penalties beyond a share of the
+limits: stroke, workspace, singularities, torque, rate and acceleration of the
+actuators.
 """
 
 from __future__ import annotations
@@ -30,13 +32,18 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import MotionRefused, Problem, refuse_unless
 from sst_ros.identification import parameters
-from sst_ros.identification.parameters import BaseParameters, Regressor, find_base_parameters
+from sst_ros.identification.parameters import (
+    BaseParameters,
+    Regressor,
+    find_base_parameters,
+)
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import values_at
 
 POINTS = 12  # samples, and points of the scene, in a period of the highest harmonic
-SHARE = 0.9  # of each range that the motion may use: the manipulator is not quite its model
+# of each range that the motion may use: the manipulator is not quite its model
+SHARE = 0.9
 LEAST_SINE = 0.15  # of mu_k, and det J2: torques and rates grow with their inverse
 _FIRST = 0.05  # amplitude of the first guess [rad]
 _PENALTY = 100.0
@@ -48,13 +55,10 @@ _HOMOTOPY = 8  # steps from the centre to all samples
 class ExcitingMotion:
     """A designed motion.
 
-    Attributes:
-        scene: the scene with the motion.
-        base: the parameters that it determines.
-        condition: of the regressor with columns of length one.
-        deviation: standard deviations of the base parameters for 1 N m of noise in each of 1000
-            samples a second, shape (b,).
-
+    Attributes: scene: the scene with the motion. base: the parameters that it
+        determines. condition: of the regressor with columns of length one. deviation:
+        standard deviations of the base parameters for 1 N m of noise in each of 1000
+        samples a second, shape (b,).
     """
 
     scene: Scene
@@ -67,7 +71,9 @@ class ExcitingMotion:
         condition = f"condition number {self.condition:.3g} (columns of length one)"
         rows = zip(self.deviation, self.base.labels, strict=True)
         lines = [f"{deviation:19.3g}  {label}" for deviation, label in rows]
-        return "\n".join([condition, "", f"{'std. dev. at 1 N m':>19}  base parameter", *lines, ""])
+        return "\n".join(
+            [condition, "", f"{'std. dev. at 1 N m':>19}  base parameter", *lines, ""]
+        )
 
 
 def design(
@@ -103,7 +109,9 @@ def design(
     trial = _Trial(scene, names, duration, harmonics)
     free = np.random.default_rng(seed).normal(size=trial.size)
     free *= _FIRST / np.abs(trial.series(free)[0] - trial.centre).max()
-    found = minimize(trial.cost, free, method="L-BFGS-B", options={"maxiter": iterations}).x
+    found = minimize(
+        trial.cost, free, method="L-BFGS-B", options={"maxiter": iterations}
+    ).x
     origin = "designed to identify parameters: Fourier series"
     changes = {"initial.gamma_dot": 0.0, "torque": None, "provenance.motion": origin}
     for _ in range(40):
@@ -120,18 +128,22 @@ def design(
             deviation = np.sqrt(np.diag(np.linalg.inv(information)))
             return ExcitingMotion(designed, trial.base, _condition(columns), deviation)
         found = 0.95 * found
-    room = Problem("initial.gamma", scene.initial.gamma, "leaves no room for a motion about it")
+    room = Problem(
+        "initial.gamma", scene.initial.gamma, "leaves no room for a motion about it"
+    )
     raise MotionRefused("identify design", plan.problems or [room])
 
 
 class _Trial:
     """Fourier series of free numbers about `centre`, at `times`, and how far they determine `base`.
 
-    `base` are the parameters that some motion of the scene determines; samples are POINTS in a
-    period of the highest harmonic, n of them.
+    `base` are the parameters that some motion of the scene determines; samples are
+    POINTS in a period of the highest harmonic, n of them.
     """
 
-    def __init__(self, scene: Scene, names: Sequence[str], duration: float, harmonics: int) -> None:
+    def __init__(
+        self, scene: Scene, names: Sequence[str], duration: float, harmonics: int
+    ) -> None:
         self._regressor = Regressor(scene, names)
         self.base = find_base_parameters(self._regressor)
         allowed = "must determine something: no torque depends on these parameters"
@@ -141,9 +153,12 @@ class _Trial:
         self._space = ActuatorSpaceMap(Geometry.of(scene))
         self._start = np.array(initial_state(scene, self._space.geometry)[:4])
         self.centre = np.array(scene.initial.gamma)
-        self.times = np.arange(1, POINTS * harmonics + 1) * duration / (POINTS * harmonics)
+        self.times = (
+            np.arange(1, POINTS * harmonics + 1) * duration / (POINTS * harmonics)
+        )
         n = np.arange(1, harmonics + 1)
-        rest = np.zeros((3, 2 * harmonics))  # gamma, gamma_dot, gamma_ddot at the beginning
+        # gamma, gamma_dot, gamma_ddot at the beginning
+        rest = np.zeros((3, 2 * harmonics))
         rest[0, harmonics:], rest[1, :harmonics], rest[2, harmonics:] = 1.0, n, n * n
         basis, w = null_space(rest), 2.0 * np.pi * n / duration
         self.size = 3 * basis.shape[1]
@@ -173,7 +188,9 @@ class _Trial:
             quaternion = np.tile(self._start, (len(gamma), 1))
             for part in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
                 here = self.centre + part * (gamma - self.centre)
-                quaternion = space.orientations(quaternion, here, 5 if part == 1.0 else 2)
+                quaternion = space.orientations(
+                    quaternion, here, 5 if part == 1.0 else 2
+                )
             moving = *quaternion.T, *rate.T, *acceleration.T
             star = np.stack(space.star_accelerations(*moving), axis=1)
             known, columns = self._regressor(quaternion, star[:, :3], star[:, 3:])

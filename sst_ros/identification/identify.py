@@ -1,31 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """identify(): constants of a scene from a recorded or simulated motion.
 
-Torques are fitted by weighted least squares on the inverse dynamics, which is linear in most of
-them. Any other constant is found by simulation: the motion that fits measured angles.
+Torques are fitted by weighted least squares on the inverse dynamics, which is linear in
+most of them. Any other constant is found by simulation: the motion that fits measured
+angles.
 
-With measured rates the motion is a Hermite spline, exact to rounding where the data are. Without,
-or with a cut-off, angles pass a Butterworth filter of order 4 forwards and backwards (no phase) and
-a quintic spline. Torques that are held ask for the mean of the equation over each interval (weak
-form with a box as test function). Two Gauss points take it: there the second derivative of a cubic
-Hermite spline is of third order, and the errors of the pair cancel, so that the mean is of fourth
-order in the period although the acceleration jumps at each sample.
+With measured rates the motion is a Hermite spline, exact to rounding where the data
+are. Without, or with a cut-off, angles pass a Butterworth filter of order 4 forwards
+and backwards (no phase) and a quintic spline. Torques that are held ask for the mean of
+the equation over each interval (weak form with a box as test function). Two Gauss
+points take it: there the second derivative of a cubic Hermite spline is of third order,
+and the errors of the pair cancel, so that the mean is of fourth order in the period
+although the acceleration jumps at each sample.
 
-Noise of the angles shrinks estimates (errors in variables), and a lower cut-off of the angles would
-change the motion itself. So the regressor is made of angles filtered little, and then torques and
-columns alike are projected on the m sines of lowest frequency,
+Noise of the angles shrinks estimates (errors in variables), and a lower cut-off of the
+angles would change the motion itself. So the regressor is made of angles filtered
+little, and then torques and columns alike are projected on the m sines of lowest
+frequency,
 
     sqrt(2 / (n + 1)) sum over i of x_i sin(pi i k / (n + 1)), k = 1 to m.
 
-What holds for samples holds for the components (Gautier, Proc. IEEE ICRA 1997, 1922-1927). The
-sines are orthonormal, so that white noise stays white, and vanish at both ends, where cosines or
-sums would leave noise of the rates (Shinbrot, Trans. ASME 79 (1957) 547-552).
-docs/howto/identify.md has the bias with and without them, measured.
+What holds for samples holds for the components (Gautier, Proc. IEEE ICRA 1997,
+1922-1927). The sines are orthonormal, so that white noise stays white, and vanish at
+both ends, where cosines or sums would leave noise of the rates (Shinbrot, Trans. ASME
+79 (1957) 547-552). docs/howto/identify.md has the bias with and without them, measured.
 
-What was measured of the angles at a time is what they were a delay before, of sensors and of what
-transports their readings. The delay is one more unknown, in which the torques are not linear: by
-Gauss-Newton, beside the base parameters. Its column is the derivative of the residuals, so that the
-standard deviations of the others hold its uncertainty, too.
+What was measured of the angles at a time is what they were a delay before, of sensors
+and of what transports their readings. The delay is one more unknown, in which the
+torques are not linear: by Gauss-Newton, beside the base parameters. Its column is the
+derivative of the residuals, so that the standard deviations of the others hold its
+uncertainty, too.
 """
 
 from __future__ import annotations
@@ -58,7 +62,11 @@ from sst_ros.errors import (
     refuse_unless,
 )
 from sst_ros.identification import parameters
-from sst_ros.identification.consistency import find_consistent_values, fit_weighted, scales
+from sst_ros.identification.consistency import (
+    find_consistent_values,
+    fit_weighted,
+    scales,
+)
 from sst_ros.identification.measured_motion import (
     Measured,
     MeasuredMotion,
@@ -74,40 +82,46 @@ from sst_ros.scene.yaml_document import find_number
 from sst_ros.state import finite_vector
 
 STILL = 1e-6  # range of gamma [rad] below which a motion is none
-SIGNIFICANT = 25.0  # chi^2 from which no bodies that can exist explain the estimates (5 sigma)
-# Highest frequency of the sines over the bandwidth of the motion: products of rates double the
-# frequencies of torques. From 2 to 5, 95 % intervals cover 0.90 to 0.99 in 200 long recordings; the
-# bias of short ones grows.
+# chi^2 from which no bodies that can exist explain the estimates (5 sigma)
+SIGNIFICANT = 25.0
+# Highest frequency of the sines over the bandwidth of the motion: products of rates
+# double the frequencies of torques. From 2 to 5, 95 % intervals cover 0.90 to 0.99 in
+# 200 long recordings; the bias of short ones grows.
 BAND = 3.0
 MARGIN = 10.0  # default cut-off over the bandwidth of the motion
-STEP = 0.03  # between poses that continuation follows [rad]; Newton's method takes the rest
-POSITIVE = re.compile(r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$")
+# between poses that continuation follows [rad]; Newton's method takes the rest
+STEP = 0.03
+POSITIVE = re.compile(
+    r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$"
+)
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
-LONGEST_DELAY = 0.2  # [s] that is looked for: at 5 Hz this is a whole period of the motion
+# [s] that is looked for: at 5 Hz this is a whole period of the motion
+LONGEST_DELAY = 0.2
 FIRST_DELAY = 10.0  # periods, up to which a delay is looked for first
 SETTLED = 1e-7  # change of the delay, in periods, that ends its iteration
-APART = 0.05  # median difference [rad] of measured mu and beta from those of gamma, that is refused
-NEAR = 0.1  # largest difference [rad] of the first angles from those of a given orientation
-_DELAY_STEPS, _SLOPES = 20, 4  # of the delay, and of its column, which depends on the estimates
-_EDGE = 8  # samples at both ends at which an interpolating quintic spline has not its full order
+# median difference [rad] of measured mu and beta from those of gamma, that is refused
+APART = 0.05
+# largest difference [rad] of the first angles from those of a given orientation
+NEAR = 0.1
+# of the delay, and of its column, which depends on the estimates
+_DELAY_STEPS, _SLOPES = 20, 4
+# samples at both ends at which an interpolating quintic spline has not its full order
+_EDGE = 8
 
 
 @dataclass(frozen=True)
 class TorqueFit(Identification):
     """Constants identified by torques; its estimates are those of the base parameters.
 
-    Attributes:
-        base: the combinations of parameters that the motion determines; `estimate` is without the
-            constraint that bodies can exist.
-        noise: standard deviations of the torques [N m], shape (3,).
-        condition: condition number of the weighted regressor with columns of length one.
-        excess: chi^2 of `values` against the estimates.
-        vague: combinations whose standard deviation exceeds their size.
-        samples: of the torques that were fitted.
-        band: frequency below which they were [Hz]; None where angles were not filtered.
-        delay: of the measured angles [s].
-        delay_deviation: its standard deviation [s]; None where the delay was given, or is none.
-
+    Attributes: base: the combinations of parameters that the motion determines;
+        `estimate` is without the constraint that bodies can exist. noise: standard
+        deviations of the torques [N m], shape (3,). condition: condition number of the
+        weighted regressor with columns of length one. excess: chi^2 of `values` against
+        the estimates. vague: combinations whose standard deviation exceeds their size.
+        samples: of the torques that were fitted. band: frequency below which they were
+        [Hz]; None where angles were not filtered. delay: of the measured angles [s].
+        delay_deviation: its standard deviation [s]; None where the delay was given, or
+        is none.
     """
 
     base: BaseParameters
@@ -127,7 +141,10 @@ class TorqueFit(Identification):
 
     @property
     def largest_correlation(self) -> tuple[float, str, str] | None:
-        """The largest correlation of two estimates, and their parameters; None for one alone."""
+        """The largest correlation of two estimates, and their parameters.
+
+        None for one alone.
+        """
         pairs = np.abs(np.triu(self.correlation, 1))
         if pairs.size < 2:
             return None
@@ -149,53 +166,59 @@ def identify(
 ) -> Identification:
     """Identify constants of a scene from a motion.
 
-    By inverse dynamics: torques are linear in inertial parameters, friction coefficients, stiffness
-    and rotor inertia; weighted least squares gives the combinations of them that the motion
-    determines, with their covariance, and the nearest scene whose bodies can exist.
+    By inverse dynamics: torques are linear in inertial parameters, friction
+    coefficients, stiffness and rotor inertia; weighted least squares gives the
+    combinations of them that the motion determines, with their covariance, and the
+    nearest scene whose bodies can exist.
 
-    By simulation: the motion is integrated from the initial state of the scene, and nonlinear least
-    squares fits it to measured angles by any number of the scene ("friction.gamma.smoothing",
-    "actuators.time_constant", "stroke.restitution", "initial.gamma_dot[0]").
+    By simulation: the motion is integrated from the initial state of the scene, and
+    nonlinear least squares fits it to measured angles by any number of the scene
+    ("friction.gamma.smoothing", "actuators.time_constant", "stroke.restitution",
+    "initial.gamma_dot[0]").
 
-    Args:
-        data: a recording or its path, a `Trajectory`, or a mapping of arrays: t [s], gamma [rad]
-            (n, 3), torque [N m] (n, 3), and where they are known gamma_dot [rad/s] (n, 3),
-            quaternion (4,) at the first sample, held (torques act to the next sample), mu and beta
-            [rad] (n, 3), by which the angles are checked. Angles may wrap, times may be those of an
-            epoch, uneven, and have gaps: what was done about it is in `warnings`.
-        scene: what is known of the manipulator, and the values to start from; by default the
-            scene of the data.
-        parameters: names of unknowns, by inverse dynamics also how their names begin ("star",
-            "friction.gamma", "offset"), and by default the bodies, friction, springs and rotors
-            that the scene has.
-        method: "inverse_dynamics" or "simulation".
-        cutoff: of the zero-phase filter of the angles [Hz]; by default none where rates were
-            measured, else ten times the bandwidth of the motion.
-        noise: standard deviations of the torques [N m], three; by default estimated.
-        delay: how long before its stamp a measured angle was what it says, against the torques [s];
-            by default estimated where angles are filtered, else none.
+    Args: data: a recording or its path, a `Trajectory`, or a mapping of arrays: t [s],
+        gamma [rad] (n, 3), torque [N m] (n, 3), and where they are known gamma_dot
+        [rad/s] (n, 3), quaternion (4,) at the first sample, held (torques act to the
+        next sample), mu and beta [rad] (n, 3), by which the angles are checked. Angles
+        may wrap, times may be those of an epoch, uneven, and have gaps: what was done
+        about it is in `warnings`. scene: what is known of the manipulator, and the
+        values to start from; by default the scene of the data. parameters: names of
+        unknowns, by inverse dynamics also how their names begin ("star",
+        "friction.gamma", "offset"), and by default the bodies, friction, springs and
+        rotors that the scene has. method: "inverse_dynamics" or "simulation". cutoff:
+        of the zero-phase filter of the angles [Hz]; by default none where rates were
+        measured, else ten times the bandwidth of the motion. noise: standard deviations
+        of the torques [N m], three; by default estimated. delay: how long before its
+        stamp a measured angle was what it says, against the torques [s]; by default
+        estimated where angles are filtered, else none.
 
     Returns:
         A `TorqueFit` by inverse dynamics, a `SimulationFit` by simulation.
 
-    Raises:
-        InputError: the data are not sound, the motion determines nothing, or an argument is not
-            allowed.
+    Raises: InputError: the data are not sound, the motion determines nothing, or an
+        argument is not allowed.
 
     """
     known = method in ("inverse_dynamics", "simulation")
-    refuse_unless("identify", ("method", method, known, "must be inverse_dynamics or simulation"))
+    refuse_unless(
+        "identify", ("method", method, known, "must be inverse_dynamics or simulation")
+    )
     if isinstance(data, (str, Path)):
-        from sst_ros.recording.recording import read  # needs rosbags, which other data do not
+        # needs rosbags, which other data do not
+        from sst_ros.recording.recording import read
 
         data = read(data)
     given: Any = scene if scene is not None else getattr(data, "scene", None)
-    refuse_unless("identify", ("scene", None, given is not None, "must be given with arrays"))
+    refuse_unless(
+        "identify", ("scene", None, given is not None, "must be given with arrays")
+    )
     given = scene_of(given)
     if method == "inverse_dynamics":
         return fit_torques(data, given, parameters, cutoff, noise, delay)
     plain = cutoff is None and noise is None and delay is None
-    refuse_unless("identify", ("method", method, plain, "takes no cutoff, noise or delay"))
+    refuse_unless(
+        "identify", ("method", method, plain, "takes no cutoff, noise or delay")
+    )
     return fit_simulation(data, given, parameters)
 
 
@@ -211,7 +234,9 @@ def fit_torques(
     names = parameters.select_names(scene, requested)
     segments = read_segments(data)
     reached = max(float(np.ptp(part.gamma, axis=0).max()) for part in segments.parts)
-    allowed = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
+    allowed = (
+        f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
+    )
     weights = finite_vector(noise)
     three = noise is None or (weights is not None and min(weights) > 0.0)
     late = delay is None or abs(delay) <= LONGEST_DELAY
@@ -220,15 +245,27 @@ def fit_torques(
         ("gamma", reached, reached >= STILL or scene.gravity is not None, allowed),
         ("parameters", requested, bool(names), "must name one or more"),
         ("noise", noise, three, "must be three finite standard deviations > 0 [N m]"),
-        ("delay", delay, late, f"must be from -{LONGEST_DELAY:g} to {LONGEST_DELAY:g} s"),
+        (
+            "delay",
+            delay,
+            late,
+            f"must be from -{LONGEST_DELAY:g} to {LONGEST_DELAY:g} s",
+        ),
     )
     equations = RegressionEquations(segments.parts, Regressor(scene, names), cutoff)
     fitted = equations.fit(weights, delay)
-    base, estimate, root, spread = fitted.base, fitted.estimate, fitted.root, fitted.noise
+    base, estimate, root, spread = (
+        fitted.base,
+        fitted.estimate,
+        fitted.root,
+        fitted.noise,
+    )
     given = parameters.values(scene, names)
     inverse = solve_triangular(root, np.eye(len(root)))
     reach = max(scene.base.radius, scene.star.radius)
-    values, excess = find_consistent_values(names, given, base.transform, estimate, root, reach)
+    values, excess = find_consistent_values(
+        names, given, base.transform, estimate, root, reach
+    )
     whole = parameters.find_base_parameters(equations.regressor)
     lost = [chosen not in base.chosen for chosen in whole.chosen]
     vague = np.linalg.norm(inverse, axis=1) > scales(names, given)[base.chosen]
@@ -256,7 +293,10 @@ def fit_torques(
 
 
 class WeightedFit(NamedTuple):
-    """What `RegressionEquations.fit` finds; root, R^T R, is the inverse of the covariance."""
+    """What `RegressionEquations.fit` finds.
+
+    Root, R^T R, is the inverse of the covariance.
+    """
 
     base: BaseParameters
     estimate: Array  # of the base parameters, shape (b,)
@@ -271,16 +311,16 @@ class WeightedFit(NamedTuple):
 class RegressionEquations:
     """The equation of motion along measured segments, as a function of the delay of the angles.
 
-    Attributes:
-        regressor: known torques, and columns of the parameters.
-        band: frequency [Hz] up to which the equations are sound, where angles are filtered;
-            else None.
+    Attributes: regressor: known torques, and columns of the parameters. band: frequency
+        [Hz] up to which the equations are sound, where angles are filtered; else None.
         notes: what was done to the data.
-
     """
 
     def __init__(
-        self, parts: Sequence[MeasuredMotion], regressor: Regressor, cutoff: float | None
+        self,
+        parts: Sequence[MeasuredMotion],
+        regressor: Regressor,
+        cutoff: float | None,
     ) -> None:
         self.regressor = regressor
         paths, notes = list[_Path](), list[str]()
@@ -296,8 +336,8 @@ class RegressionEquations:
     def fit(self, noise: Sequence[float] | None, delay: float | None) -> WeightedFit:
         """Fit the base parameters, and the delay [s] where none is given and angles are filtered.
 
-        The noise is that of the torques [N m], three, by default estimated. InputError is raised
-        where the motion determines nothing.
+        The noise is that of the torques [N m], three, by default estimated. InputError
+        is raised where the motion determines nothing.
         """
         if delay is not None or self.band is None:
             given = delay or 0.0
@@ -323,7 +363,11 @@ class RegressionEquations:
         return found._replace(delay=delay)
 
     def _fit_at(
-        self, delay: float, step: float | None, noise: Sequence[float] | None, longest: float
+        self,
+        delay: float,
+        step: float | None,
+        noise: Sequence[float] | None,
+        longest: float,
     ) -> WeightedFit:
         """Fit the base parameters at a delay [s]; with a `step` [s] its change, too.
 
@@ -333,7 +377,9 @@ class RegressionEquations:
         torque, columns, samples, notes = self._form(delay, longest)
         base = parameters.find_independent(columns, names)
         allowed = "must determine something: no torque depends on these parameters here"
-        refuse_unless("identify", ("parameters", list(names), bool(base.chosen), allowed))
+        refuse_unless(
+            "identify", ("parameters", list(names), bool(base.chosen), allowed)
+        )
         given = parameters.values(self.regressor.scene, names)
         terms = float(np.sqrt(np.mean((np.abs(columns) @ np.abs(given)) ** 2)))
         chosen = columns[..., base.chosen]
@@ -345,8 +391,8 @@ class RegressionEquations:
         for _ in range(_SLOPES):
             before = torque - chosen @ estimate
             slope = (later - moved[..., base.chosen] @ estimate - before) / step
-            # The delay comes first: what is below its row of the root is what it leaves to
-            # the others.
+            # The delay comes first: what is below its row of the root is what it leaves
+            # to the others.
             both = np.concatenate([-slope[..., None], chosen], axis=2)
             together, whole, spread = fit_weighted(both, torque, noise, terms=terms)
             estimate = together[1:]
@@ -359,10 +405,14 @@ class RegressionEquations:
             delay_deviation=float(np.linalg.norm(inverse[0])),
         )
 
-    def _form(self, delay: float, longest: float) -> tuple[Array, Array, int, tuple[str, ...]]:
+    def _form(
+        self, delay: float, longest: float
+    ) -> tuple[Array, Array, int, tuple[str, ...]]:
         """Return torques less known ones, (m, 3), columns, (m, 3, p), number of samples, notes."""
         scene, names = self.regressor.scene, self.regressor.names
-        limit = np.inf if scene.torque_limit is None else scene.torque_limit * (1.0 - 1e-9)
+        limit = (
+            np.inf if scene.torque_limit is None else scene.torque_limit * (1.0 - 1e-9)
+        )
         torques, columns = list[Array](), list[Array]()
         samples = cut = total = 0
         for path in self._paths:
@@ -380,7 +430,9 @@ class RegressionEquations:
                 )
             torques.append(left)
             columns.append(part)
-        allowed = f"must leave more than {len(names)} samples for {len(names)} parameters"
+        allowed = (
+            f"must leave more than {len(names)} samples for {len(names)} parameters"
+        )
         refuse_unless("identify", ("t", samples, samples > len(names), allowed))
         warning = (
             f"{cut} of {total} samples left out: a torque was at the limit of "
@@ -393,24 +445,29 @@ class RegressionEquations:
 class _Path(NamedTuple):
     """Angles, rates and accelerations along one segment, and where the equation is taken.
 
-    Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at MARGIN times
-    the bandwidth of the motion.
+    Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at
+    MARGIN times the bandwidth of the motion.
     """
 
     measured: MeasuredMotion
     space: ActuatorSpaceMap
-    times: Array  # of the equation [s], shape (m, 1 or 2): the second is of held torques
+    # of the equation [s], shape (m, 1 or 2): the second is of held torques
+    times: Array
     curves: Any  # angles, rates and accelerations over time
-    unsettled: int  # samples at both ends that the filter or the spline has not settled for
-    band: float | None  # frequency up to which they are sound; None where they are not filtered
+    # samples at both ends that the filter or the spline has not settled for
+    unsettled: int
+    # frequency up to which they are sound; None where they are not filtered
+    band: float | None
     period: float  # usual time between samples [s]
 
     @classmethod
-    def of(cls, measured: MeasuredMotion, scene: Scene, cutoff: float | None) -> tuple[_Path, str]:
+    def of(
+        cls, measured: MeasuredMotion, scene: Scene, cutoff: float | None
+    ) -> tuple[_Path, str]:
         """Return the path of a segment, and a note of what was done to its samples.
 
-        Raises InputError where the cut-off is not allowed, the segment is too short to be filtered,
-        or measured mu and beta are not those of gamma.
+        Raises InputError where the cut-off is not allowed, the segment is too short to
+        be filtered, or measured mu and beta are not those of gamma.
         """
         note, band, unsettled, rate = "", None, 0, measured.gamma_dot
         space = ActuatorSpaceMap(Geometry.of(scene))
@@ -430,8 +487,15 @@ class _Path(NamedTuple):
                 spline = CubicHermiteSpline(t, measured.gamma, rate)
                 curves = spline, spline.derivative(), spline.derivative(2)
             else:
-                spline, unsettled = make_interp_spline(t, rate, k=5), min(_EDGE, len(t) // 4)
-                curves = make_interp_spline(t, measured.gamma, k=5), spline, spline.derivative()
+                spline, unsettled = (
+                    make_interp_spline(t, rate, k=5),
+                    min(_EDGE, len(t) // 4),
+                )
+                curves = (
+                    make_interp_spline(t, measured.gamma, k=5),
+                    spline,
+                    spline.derivative(),
+                )
         times = t[:, None]
         if measured.held:  # two Gauss points in each interval
             middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t) / np.sqrt(3.0)
@@ -444,9 +508,9 @@ class _Path(NamedTuple):
     ) -> tuple[Array, Array, Array]:
         """Evaluate the equation of motion at the samples, or its means where torques are held.
 
-        Returns known and measured torques [N m], each shape (m, 3), between them the regressor of p
-        parameters, shape (m, 3, p). Angles were measured a delay [s] late. Angles that no assembly
-        has are refused.
+        Returns known and measured torques [N m], each shape (m, 3), between them the
+        regressor of p parameters, shape (m, 3, p). Angles were measured a delay [s]
+        late. Angles that no assembly has are refused.
         """
         cut = self.unsettled + int(np.ceil(longest / self.period * (1.0 - 1e-9)))
         rows = slice(cut, max(len(self.times) - cut, cut))
@@ -454,21 +518,27 @@ class _Path(NamedTuple):
         allowed = f"must last longer than {2.0 * cut * self.period:g} s"
         last = float(np.ptp(self.measured.t))
         refuse_unless("identify", ("t", last, len(times) > 1, allowed))
-        angles, rates, accelerations = (one(times.ravel() + delay) for one in self.curves)
+        angles, rates, accelerations = (
+            one(times.ravel() + delay) for one in self.curves
+        )
         quaternion = _follow_orientations(self.space, angles, self.measured)
         moving = *quaternion.T, *rates.T, *accelerations.T
         star = np.stack(self.space.star_accelerations(*moving), axis=1)
         found = regressor(quaternion, star[:, :3], star[:, 3:])
         known, columns = (
-            one.reshape(-1, times.shape[1], *one.shape[1:]).mean(axis=1) for one in found
+            one.reshape(-1, times.shape[1], *one.shape[1:]).mean(axis=1)
+            for one in found
         )
         return known, columns, self.measured.torque[rows]
 
 
-def _check_passive(space: ActuatorSpaceMap, measured: MeasuredMotion, scene: Scene) -> None:
+def _check_passive(
+    space: ActuatorSpaceMap, measured: MeasuredMotion, scene: Scene
+) -> None:
     """Refuse measured mu and beta that are not those of the measured gamma.
 
-    What is measured need not close the loops: APART is what no sensor is off, but another assembly.
+    What is measured need not close the loops: APART is what no sensor is off, but
+    another assembly.
     """
     given = {name: getattr(measured, name) for name in ("mu", "beta")}
     if all(values is None for values in given.values()):
@@ -482,13 +552,18 @@ def _check_passive(space: ActuatorSpaceMap, measured: MeasuredMotion, scene: Sce
         turns = np.exp(1j * (values - np.stack(getattr(found, name), axis=1)))
         apart = float(np.median(np.abs(np.angle(turns)).max(axis=1)))
         allowed = f"must be within {APART:g} rad of those that gamma has in this scene"
-        refuse_unless("identify", (name, f"{apart:.3g} rad off", apart <= APART, allowed))
+        refuse_unless(
+            "identify", (name, f"{apart:.3g} rad off", apart <= APART, allowed)
+        )
 
 
-def _follow_orientations(space: ActuatorSpaceMap, gamma: Array, measured: MeasuredMotion) -> Array:
+def _follow_orientations(
+    space: ActuatorSpaceMap, gamma: Array, measured: MeasuredMotion
+) -> Array:
     """Quaternions (n, 4) at gamma (n, 3) in the assembly mode of the first sample.
 
-    A given orientation says which one that is: measured angles are only near those of it.
+    A given orientation says which one that is: measured angles are only near those of
+    it.
     """
     begin, first = measured.quaternion, measured.gamma[:1]
     length = np.cumsum(np.linalg.norm(np.diff(gamma, axis=0, prepend=first), axis=1))
@@ -526,7 +601,12 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
     lasting = f"must last {least * period:g} s or more at {cutoff:g} Hz"
     refuse_unless(
         "identify",
-        ("t", spacing, even, "must be evenly spaced (to 0.1 %) for angles to be filtered"),
+        (
+            "t",
+            spacing,
+            even,
+            "must be evenly spaced (to 0.1 %) for angles to be filtered",
+        ),
         ("cutoff", cutoff, 0.0 < cutoff < 0.5 / period, slow),
         ("t", float(t[-1] - t[0]), len(t) >= least, lasting),
     )
@@ -546,13 +626,13 @@ def find_bandwidth(period: float, gamma: Array) -> float:
 
 @dataclass(frozen=True)
 class SimulationFit(Identification):
-    """Constants identified by simulation; `values` differ from estimates that no body has.
+    """Constants identified by simulation.
 
-    Attributes:
-        relative: relative standard deviations of the combinations `directions`, rising, (p,).
-        directions: combinations as rows, relative changes of the parameters, shape (p, p).
-        error: root of the mean square of the residuals [rad].
+    `values` differ from estimates that no body has.
 
+    Attributes: relative: relative standard deviations of the combinations `directions`,
+        rising, (p,). directions: combinations as rows, relative changes of the
+        parameters, shape (p, p). error: root of the mean square of the residuals [rad].
     """
 
     relative: Array
@@ -566,24 +646,31 @@ class SimulationFit(Identification):
         return list(zip(self.relative.tolist(), texts, strict=True))
 
 
-def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None) -> SimulationFit:
+def fit_simulation(
+    data: Measured, scene: Scene, requested: Iterable[str] | None
+) -> SimulationFit:
     """Identify by simulation; arguments as for `identify`.
 
-    Gauss-Newton steps take the sensitivities of the motion, exact to rounding. In sizes of the
-    parameters, their singular values over the measuring errors show which combinations are known
-    and how well: often fewer than there are parameters.
+    Gauss-Newton steps take the sensitivities of the motion, exact to rounding. In sizes
+    of the parameters, their singular values over the measuring errors show which
+    combinations are known and how well: often fewer than there are parameters.
     """
     given = () if requested is None else requested
     names = (given,) if isinstance(given, str) else tuple(given)
     allowed = "must be keys of numbers of the scene, with method simulation"
     refuse_unless("identify", ("parameters", requested, bool(names), allowed))
     torque, t, gamma = take_angles(data, scene)
-    motion, model = VariationalEquations(scene, names, torque, caller="identify"), model_of(scene)
+    motion, model = (
+        VariationalEquations(scene, names, torque, caller="identify"),
+        model_of(scene),
+    )
     given = np.array([find_number(scene, name) for name in names], dtype=float)
     least = np.where([bool(POSITIVE.match(name)) for name in names], 1e-3, -np.inf)
     allowed = "must not be 0 in the scene: it begins there, and must be > 0"
     begins = zip(names, given, (given > 0.0) | np.isinf(least), strict=True)
-    refuse_unless("identify", *((name, x, bool(good), allowed) for name, x, good in begins))
+    refuse_unless(
+        "identify", *((name, x, bool(good), allowed) for name, x, good in begins)
+    )
     size = np.abs(given) + (given == 0.0)
 
     @lru_cache(maxsize=1)  # SciPy asks for residuals and slopes one after the other
@@ -591,7 +678,9 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
         """Return computed less measured angles [rad], (3 n,), and derivatives, (3 n, p)."""
         states, slopes = motion.run(np.array(x) * size, t)
         rows = states[:, :7].T
-        turned = np.exp(1j * (np.stack(joints(model, tuple(rows)).gamma, axis=1) - gamma))
+        turned = np.exp(
+            1j * (np.stack(joints(model, tuple(rows)).gamma, axis=1) - gamma)
+        )
         by_state = motion.differentiate_joints(rows)[:, :3]
         changes = np.einsum("qcn,nqp->ncp", by_state, slopes[:, :7])
         return np.angle(turned).ravel(), changes.reshape(-1, len(names))
@@ -625,7 +714,9 @@ def fit_simulation(data: Measured, scene: Scene, requested: Iterable[str] | None
             raise
         chosen = [name in kept for name in names]
         adjusted = parameters.with_parameters(scene, kept, fitted[chosen], note)
-        warnings = ("no bodies have the inertias that fit best: the scene keeps the given ones",)
+        warnings = (
+            "no bodies have the inertias that fit best: the scene keeps the given ones",
+        )
     return SimulationFit(
         scene=adjusted,
         names=names,

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What was measured: angles and torques of the actuators, cut where it was lost.
 
-Torques are samples at the times of the angles, or each is held over an interval, as a controller's
-are. Angles of encoders may count whole turns or wrap; stamps may be uneven; samples may be missing:
-over some of them the motion is smooth, at more of them it is cut into segments.
+Torques are samples at the times of the angles, or each is held over an interval, as a
+controller's are. Angles of encoders may count whole turns or wrap; stamps may be
+uneven; samples may be missing: over some of them the motion is smooth, at more of them
+it is cut into segments.
 """
 
 from __future__ import annotations
@@ -33,33 +34,41 @@ Known: TypeAlias = NDArray[np.bool_]
 
 Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any]"
 
-FEWEST = 20  # samples to identify anything: filters and splines have transients at both ends
+# samples to identify anything: filters and splines have transients at both ends
+FEWEST = 20
 GAP = 10.0  # periods without a sample from which a motion is cut
 EVEN = 1e-3  # share of a period by which even samples may be off
 _HELD = (torques.TorqueTable, torques.ConstantTorque)
 
 
 class MeasuredMotion(Section):
-    """Samples of the actuators. Held torques act from sample k to the next (n or n - 1 rows)."""
+    """Samples of the actuators.
+
+    Held torques act from sample k to the next (n or n - 1 rows).
+    """
 
     ORIGIN = "identify"
 
     t: Array = entry("times, rising", "s")
     gamma: Array = entry("angles", "rad", shape=(3,))
     torque: Array = entry(
-        "torques at the joints: at the samples, or means over the intervals between them where "
-        "they are held",
+        "torques at the joints: at the samples, or means over the intervals between"
+        " them where they are held",
         "N m",
         shape=(3,),
     )
     gamma_dot: Array | None = entry("measured rates", "rad/s", shape=(3,))
     quaternion: Quaternion | None = entry(
-        "orientation (x, y, z, w) of {E} in {B} at the first sample, to select the assembly mode; "
-        "by default the admissible one",
+        "orientation (x, y, z, w) of {E} in {B} at the first sample, to select the"
+        " assembly mode; by default the admissible one",
         "1",
     )
-    mu: Array | None = entry("measured angles of the carriages, checked alone", "rad", shape=(3,))
-    beta: Array | None = entry("measured angles of the star, checked alone", "rad", shape=(3,))
+    mu: Array | None = entry(
+        "measured angles of the carriages, checked alone", "rad", shape=(3,)
+    )
+    beta: Array | None = entry(
+        "measured angles of the star, checked alone", "rad", shape=(3,)
+    )
     held: bool = entry("whether torques are held over the intervals", default=False)
 
     def settle(self) -> Iterator[Problem]:
@@ -71,7 +80,12 @@ class MeasuredMotion(Section):
     def rules(self) -> Rules:
         """Refuse times that do not rise, few samples, and other numbers of rows."""
         n = len(self.t)
-        yield not torques.ascend(self.t), "t", self.t, "must be rising times [s], shape (n,)"
+        yield (
+            not torques.ascend(self.t),
+            "t",
+            self.t,
+            "must be rising times [s], shape (n,)",
+        )
         yield n < FEWEST, "t", n, f"must be {FEWEST} samples or more"
         rows = {"gamma": n, "torque": n - self.held, "gamma_dot": n, "mu": n, "beta": n}
         for name, count in rows.items():
@@ -101,21 +115,30 @@ def read_segments(data: Measured) -> Segments:
     bounds = [0, *(cuts + 1).tolist(), len(motion.t)]
     spans = [(a, b) for a, b in pairwise(bounds) if b - a >= FEWEST]
     if len(cuts):
-        lost = ", ".join(f"{t:g} s" for t in (motion.t[cuts] - motion.t[0]).tolist()[:5])
+        lost = ", ".join(
+            f"{t:g} s" for t in (motion.t[cuts] - motion.t[0]).tolist()[:5]
+        )
         more = ", ..." if len(cuts) > 5 else ""
-        text = f"samples or torques are lost after {lost}{more}: {len(spans)} segments are fitted"
+        text = (
+            f"samples or torques are lost after {lost}{more}: {len(spans)} segments are"
+            " fitted"
+        )
         notes.append(text)
     if not spans:
         allowed = f"must have {FEWEST} samples or more without a gap"
         raise refusal("identify", "t", len(motion.t), allowed)
-    return Segments(tuple(_cut(motion, first, end) for first, end in spans), tuple(notes))
+    return Segments(
+        tuple(_cut(motion, first, end) for first, end in spans), tuple(notes)
+    )
 
 
 def resample(motion: MeasuredMotion) -> tuple[MeasuredMotion, str]:
-    """Return the motion at even times, without rates, and a note of it; as it is where it is even.
+    """Return the motion at even times, without rates, and a note of it.
 
-    Angles, and torques that are not held, are interpolated by a cubic spline; held torques are
-    averaged.
+    As it is where it is even.
+
+    Angles, and torques that are not held, are interpolated by a cubic spline; held
+    torques are averaged.
     """
     t = motion.t - motion.t[0]  # seconds since an epoch have few digits left
     spacing = np.diff(t)
@@ -131,14 +154,17 @@ def resample(motion: MeasuredMotion) -> tuple[MeasuredMotion, str]:
         torque = CubicSpline(t, motion.torque)(even)
     passive: dict[str, Any] = dict.fromkeys(("mu", "beta", "gamma_dot"))
     note = (
-        f"stamps are uneven, {spacing.min():.3g} to {spacing.max():.3g} s apart: the motion is "
-        f"sampled again each {period:.3g} s"
+        f"stamps are uneven, {spacing.min():.3g} to {spacing.max():.3g} s apart: the"
+        f" motion is sampled again each {period:.3g} s"
     )
     return replace(motion, t=even, gamma=gamma, torque=torque, **passive), note
 
 
 def _read(data: Measured) -> tuple[MeasuredMotion, Known, str]:
-    """Read a motion; say of each interval whether its torque is known, and what was unwrapped."""
+    """Read a motion.
+
+    Say of each interval whether its torque is known, and what was unwrapped.
+    """
     given: dict[str, Any]
     known: Known | None
     if isinstance(data, Mapping):
@@ -155,8 +181,8 @@ def _read(data: Measured) -> tuple[MeasuredMotion, Known, str]:
     row, leg = jumps[0].tolist()
     step = float(motion.gamma[row + 1, leg] - motion.gamma[row, leg])
     text = (
-        f"angles wrap {len(jumps)} times, gamma_{leg + 1} first by {step:+.3f} rad at row "
-        f"{row + 1}: whole turns are taken out"
+        f"angles wrap {len(jumps)} times, gamma_{leg + 1} first by {step:+.3f} rad at"
+        f" row {row + 1}: whole turns are taken out"
     )
     return replace(motion, gamma=np.unwrap(motion.gamma, axis=0)), known, text
 
@@ -176,22 +202,28 @@ def _cut(motion: MeasuredMotion, first: int, end: int) -> MeasuredMotion:
 def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Known]:
     """Take a simulated motion, or what was measured in a recorded run while it has torques.
 
-    Also whether the torque of each interval is known. Rates of a run count only where they are
-    those of its motion: what was measured has noise, and its rates more than its angles.
+    Also whether the torque of each interval is known. Rates of a run count only where
+    they are those of its motion: what was measured has noise, and its rates more than
+    its angles.
     """
     if not isinstance(data, Trajectory) and hasattr(data, "measured"):
         return _take_measured(data)
     if not isinstance(data, Trajectory):
-        allowed = "must be a recording or its path, a Trajectory, or a mapping of arrays"
+        allowed = (
+            "must be a recording or its path, a Trajectory, or a mapping of arrays"
+        )
         raise refusal("identify", "data", data, allowed)
     motion, law = data, data.law
     t, torque = motion.t, motion.torque
-    # With a lag the torques at the joints are behind those of the law: they are samples.
+    # With a lag the torques at the joints are behind those of the law: they are
+    # samples.
     held = not motion.scene.lags and (law is None or isinstance(law, _HELD))
     if held:  # without a law to their sample, see `Trajectory`
         torque = torque[1:] if law is None else _average(law, t)
     begin, end = t[:-1, None], t[1:, None]
-    lost: Known = np.any((begin < motion.gaps[:, 1]) & (end > motion.gaps[:, 0]), axis=1)
+    lost: Known = np.any(
+        (begin < motion.gaps[:, 1]) & (end > motion.gaps[:, 0]), axis=1
+    )
     return {
         "t": t,
         "gamma": np.unwrap(motion.gamma, axis=0),
@@ -205,9 +237,15 @@ def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Known]:
 def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
     """Take what was measured in a recorded run, while its torques are known."""
     passive: tuple[Array | None, Array | None] = (None, None)
-    if run.motion is run.measured:  # samples without an orientation are none of the motion
+    # samples without an orientation are none of the motion
+    if run.motion is run.measured:
         motion = run.trajectory
-        t, gamma, rates, effort = motion.t, motion.gamma, motion.gamma_dot, motion.torque
+        t, gamma, rates, effort = (
+            motion.t,
+            motion.gamma,
+            motion.gamma_dot,
+            motion.torque,
+        )
         quaternions = motion.quaternion
     else:
         shown = run.measured
@@ -218,7 +256,9 @@ def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
     begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
     rows = (t >= begins[0] - 1e-12) & (t <= ends[-1] + 1e-12)
     t, held = t[rows], not run.scene.lags
-    torque = _average(torques.TorqueTable(begins, ticks.torque), t) if held else effort[rows]
+    torque = (
+        _average(torques.TorqueTable(begins, ticks.torque), t) if held else effort[rows]
+    )
     # How long torques are known from the start on, up to each sample.
     edges = np.stack([begins, ends], axis=1).ravel()
     lengths = np.stack([ends - begins, np.zeros(len(begins))], axis=1).ravel()
@@ -252,15 +292,23 @@ def _average(law: torques.TorqueProfile, t: Array) -> Array:
     return np.asarray(total / np.diff(t)[:, None])
 
 
-def take_angles(data: Measured, scene: Scene) -> tuple[torques.TorqueProfile, Array, Array]:
+def take_angles(
+    data: Measured, scene: Scene
+) -> tuple[torques.TorqueProfile, Array, Array]:
     """Take the torques that move a scene, times from 0 on [s] (n,), and measured gamma (n, 3)."""
     measured = read_motion(data)
     t = measured.t - measured.t[0]
-    if hasattr(data, "ticks"):  # a recording: torques before the lag, which the model has
+    # a recording: torques before the lag, which the model has
+    if hasattr(data, "ticks"):
         begins = np.round(data.ticks.start_ns / 1e9 - measured.t[0], 9)
         return torques.TorqueTable(begins, data.ticks.torque), t, measured.gamma
-    # A simulated motion as well, while its torques are known: not of the state, and not lost.
-    if isinstance(data, Trajectory) and data.t[0] == 0.0 and data.scene.lags <= scene.lags:
+    # A simulated motion as well, while its torques are known: not of the state, and not
+    # lost.
+    if (
+        isinstance(data, Trajectory)
+        and data.t[0] == 0.0
+        and data.scene.lags <= scene.lags
+    ):
         law, limit = data.law, data.scene.torque_limit or np.inf
         if law and np.isfinite(values := law.values(t)).all():
             if limit == (scene.torque_limit or np.inf) or np.abs(values).max() <= limit:

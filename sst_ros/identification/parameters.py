@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unknown constants of a scene: their names, and how torques depend on them.
 
-The names are the keys of a scene, and for a body "star.moment.x": mass times centre [kg m], in
-which torques are linear. "actuated_links.mass" means all three alike, "actuated_links[0].mass" one.
-"offset[0]" is a constant torque at an actuator, as of a sensor without zero balance [N m].
+The names are the keys of a scene, and for a body "star.moment.x": mass times centre [kg
+m], in which torques are linear. "actuated_links.mass" means all three alike,
+"actuated_links[0].mass" one. "offset[0]" is a constant torque at an actuator, as of a
+sensor without zero balance [N m].
 
-Torques are linear in the inertial parameters, the friction coefficients, the stiffness of springs
-and the inertia of the rotors (Atkeson, An and Hollerbach, Int. J. Robotics Research 5 (1986)
-101-119): torque = known part + Y parameters. So the regressor Y is the derivative of the traced
-inverse dynamics by these parameters, which has no parameter in it: it is exact, and covers each
-term that the dynamics have.
+Torques are linear in the inertial parameters, the friction coefficients, the stiffness
+of springs and the inertia of the rotors (Atkeson, An and Hollerbach, Int. J. Robotics
+Research 5 (1986) 101-119): torque = known part + Y parameters. So the regressor Y is
+the derivative of the traced inverse dynamics by these parameters, which has no
+parameter in it: it is exact, and covers each term that the dynamics have.
 
-Base parameters are the combinations of parameters that torques depend on, and no others. A QR
-decomposition of the regressor shows which columns are combinations of earlier ones (Gautier,
-J. Robotic Systems 8 (1991) 485-506). With random states it does so for the mechanism; with the
-states of a motion it shows what that motion leaves undetermined as well.
+Base parameters are the combinations of parameters that torques depend on, and no
+others. A QR decomposition of the regressor shows which columns are combinations of
+earlier ones (Gautier, J. Robotic Systems 8 (1991) 485-506). With random states it does
+so for the mechanism; with the states of a motion it shows what that motion leaves
+undetermined as well.
 """
 
 from __future__ import annotations
@@ -42,19 +44,25 @@ from sst_ros.state import ReadOnly
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 NEGLIGIBLE = 1e-12  # friction coefficient below which a scene has no such friction
-# Distance of a column from the span of those before it, over its own length, below which it counts
-# as one of them: between rounding (1e-13) and the least of any mechanism tried (1e-4).
+# Distance of a column from the span of those before it, over its own length, below
+# which it counts as one of them: between rounding (1e-13) and the least of any
+# mechanism tried (1e-4).
 DEPENDENT = 1e-8
 ROUNDED = 1e-10  # share of a column's length that is rounding
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
-STANDARD = ("mass", *(f"moment.{axis}" for axis in "xyz"), *(f"inertia.{part}" for part in INERTIA))
+STANDARD = (
+    "mass",
+    *(f"moment.{axis}" for axis in "xyz"),
+    *(f"inertia.{part}" for part in INERTIA),
+)
 """The ten inertial parameters of a body about O, in the order of a body's columns."""
 
 
 def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ...]:
     """Names of parameters: all that the scene has, or those that begin as one of `requested`.
 
-    Names begin as in ("star", "friction.gamma", "offset"); a beginning of none is refused.
+    Names begin as in ("star", "friction.gamma", "offset"); a beginning of none is
+    refused.
     """
     own, others = _list_names(scene)
     if requested is None:
@@ -62,7 +70,11 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
     names: dict[str, None] = {}
     checks, known = list[Check](), dict.fromkeys(own + others)
     for begin in [requested] if isinstance(requested, str) else requested:
-        found = [name for name in known if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)]
+        found = [
+            name
+            for name in known
+            if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)
+        ]
         if str(begin) in LINKS:  # the three alike
             found = [name for name in found if "[" not in name]
         near = "" if found else suggestion(str(begin), known)
@@ -92,7 +104,9 @@ def _of_centre(name: str) -> str:
     return re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
 
 
-def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: str) -> Scene:
+def with_parameters(
+    scene: Scene, names: Sequence[str], numbers: Array, note: str
+) -> Scene:
     """Return the scene with identified values and a note of their provenance, or refuse them."""
     found = dict(zip(names, (float(number) for number in numbers), strict=True))
     changed: dict[str, Any] = {}
@@ -101,7 +115,9 @@ def with_parameters(scene: Scene, names: Sequence[str], numbers: Array, note: st
         if part.startswith("moment."):
             mass = found.get(f"{body}.mass", find_number(scene, f"{body}.mass"))
             centre = [found.get(f"{body}.moment.{axis}", 0.0) for axis in "xyz"]
-            changed[f"{body}.centre"] = [h / mass for h in centre] if mass else [0.0] * 3
+            changed[f"{body}.centre"] = (
+                [h / mass for h in centre] if mass else [0.0] * 3
+            )
         elif not name.startswith("offset"):
             changed[name] = number
     document = replace_values(plain(scene), changed)
@@ -128,33 +144,40 @@ def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
 
     own, others = name_parts("star"), list[str]()
     for kind in LINKS:
-        each, alike = name_parts(*(f"{kind}[{k}]" for k in range(3))), name_parts(f"{kind}[0]")
+        each, alike = (
+            name_parts(*(f"{kind}[{k}]" for k in range(3))),
+            name_parts(f"{kind}[0]"),
+        )
         alike = [name.replace("[0]", "") for name in alike]
         first, *rest = values_at(scene, kind)[0]
         own += alike if rest == [first, first] else each
         others += each + alike
-    terms = [f"friction.{kind}.{part}" for kind in JOINT_KINDS for part in Friction.EFFECTS]
+    terms = [
+        f"friction.{kind}.{part}" for kind in JOINT_KINDS for part in Friction.EFFECTS
+    ]
     springs = [f"springs[{i}].stiffness" for i in range(len(scene.springs))]
-    own += filter(partial(find_number, scene), [*terms, *springs, "actuators.rotor_inertia"])
+    own += filter(
+        partial(find_number, scene), [*terms, *springs, "actuators.rotor_inertia"]
+    )
     others += (name for name in terms if not name.endswith("static"))
-    return own, [*others, "actuators.rotor_inertia", *(f"offset[{k}]" for k in range(3))]
+    return own, [
+        *others,
+        "actuators.rotor_inertia",
+        *(f"offset[{k}]" for k in range(3)),
+    ]
 
 
 @dataclass(frozen=True)
 class Identification(ReadOnly):
     """Identified constants of a scene, by torques or by simulation.
 
-    Attributes:
-        scene: the scene with identified values, whose bodies can exist.
-        names: of the parameters, length p.
-        values: their values in `scene`, shape (p,).
-        labels: quantities that are estimated: parameters or combinations of them, length b.
-        before: their values in the scene that was given, shape (b,).
-        estimate: their estimates, shape (b,).
-        covariance: of the estimates, shape (b, b).
-        undetermined: combinations that this motion leaves open, as text.
-        warnings: what else to know.
-
+    Attributes: scene: the scene with identified values, whose bodies can exist. names:
+        of the parameters, length p. values: their values in `scene`, shape (p,).
+        labels: quantities that are estimated: parameters or combinations of them,
+        length b. before: their values in the scene that was given, shape (b,).
+        estimate: their estimates, shape (b,). covariance: of the estimates, shape (b,
+        b). undetermined: combinations that this motion leaves open, as text. warnings:
+        what else to know.
     """
 
     scene: Scene
@@ -191,18 +214,28 @@ class Regressor:
 
     def __init__(self, scene: Scene, names: Sequence[str]) -> None:
         self.scene, self.names = scene, tuple(names)
-        traced = [n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"]
+        traced = [
+            n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"
+        ]
         geometry, document = Geometry.of(scene), plain(scene)
-        # Torques depend on mass times centre alone: bodies of mass 1 have it as their centre.
-        for body in (document["star"], *(link for kind in LINKS for link in document[kind])):
+        # Torques depend on mass times centre alone: bodies of mass 1 have it as their
+        # centre.
+        for body in (
+            document["star"],
+            *(link for kind in LINKS for link in document[kind]),
+        ):
             body["centre"] = [body["mass"] * part for part in body["centre"]]
             body["mass"] = 1.0
 
         def torques(*inputs: Any) -> tuple[Any, ...]:
-            varied = zip(map(_of_centre, traced), map(mark_present, inputs[10:]), strict=True)
+            varied = zip(
+                map(_of_centre, traced), map(mark_present, inputs[10:]), strict=True
+            )
             opened = build_unchecked(Scene, replace_values(document, dict(varied)))
             model = kernel.model_of(opened, geometry)
-            return kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])[0]
+            return kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])[
+                0
+            ]
 
         symbols = tuple(f"p{i}" for i in range(len(traced)))
         inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
@@ -210,16 +243,21 @@ class Regressor:
         self._traced = [self.names.index(name) for name in traced]
         self._springs = np.array([name.startswith("springs") for name in self.names])
 
-    def __call__(self, quaternion: Array, rate: Array, acceleration: Array) -> tuple[Array, Array]:
+    def __call__(
+        self, quaternion: Array, rate: Array, acceleration: Array
+    ) -> tuple[Array, Array]:
         """Return the known torques [N m], shape (n, 3), and Y, shape (n, 3, len(names)).
 
-        States are quaternions (x, y, z, w) of {E} in {B}, W [rad/s] and W_dot [rad/s^2] in {E}.
+        States are quaternions (x, y, z, w) of {E} in {B}, W [rad/s] and W_dot [rad/s^2]
+        in {E}.
         """
         count = len(quaternion)
         # A stiffness of zero leaves no rest angle: springs are evaluated at 1 N m/rad.
         at = self._springs[self._traced].astype(float)
         found = self._torques(*quaternion.T, *rate.T, *acceleration.T, *at)
-        rows = np.stack([np.broadcast_to(row, (count,)) for row in found]).reshape(-1, 3, count)
+        rows = np.stack([np.broadcast_to(row, (count,)) for row in found]).reshape(
+            -1, 3, count
+        )
         columns = np.zeros((count, 3, len(self.names)))
         columns[:, :, self._traced] = rows[1:].T
         for i, name in enumerate(self.names):
@@ -231,12 +269,10 @@ class Regressor:
 class BaseParameters(NamedTuple):
     """Combinations of parameters: beta = transform parameters.
 
-    Attributes:
-        labels: each combination as text, length b; the chosen parameter comes first.
-        chosen: indices of the parameters whose columns are independent, length b.
-        transform: shape (b, p); row i has 1 at the chosen parameter i, and the coefficients of
-            those whose columns depend on it.
-
+    Attributes: labels: each combination as text, length b; the chosen parameter comes
+        first. chosen: indices of the parameters whose columns are independent, length
+        b. transform: shape (b, p); row i has 1 at the chosen parameter i, and the
+        coefficients of those whose columns depend on it.
     """
 
     labels: tuple[str, ...]
@@ -247,14 +283,23 @@ class BaseParameters(NamedTuple):
 def find_base_parameters(regressor: Regressor, seed: int = 0) -> BaseParameters:
     """Return the base parameters of the mechanism: those that some motion determines.
 
-    The regressor is taken at random admissible poses within the stroke, rates and accelerations.
+    The regressor is taken at random admissible poses within the stroke, rates and
+    accelerations.
     """
     geometry, rng = Geometry.of(regressor.scene), np.random.default_rng(seed)
-    found = kinematics.direct_many(geometry, rng.uniform(0.1, 0.9, (300, 3)) * geometry.arc)
-    regular = found.admissible & (np.abs(found.det_j2) > 0.05) & np.all(np.sin(found.mu) > 0.1, 1)
+    found = kinematics.direct_many(
+        geometry, rng.uniform(0.1, 0.9, (300, 3)) * geometry.arc
+    )
+    regular = (
+        found.admissible
+        & (np.abs(found.det_j2) > 0.05)
+        & np.all(np.sin(found.mu) > 0.1, 1)
+    )
     quaternion = quaternion_of(found.rotation[regular])
     rate, acceleration = rng.normal(size=(2, len(quaternion), 3)) * [[[2.0]], [[20.0]]]
-    return find_independent(regressor(quaternion, rate, acceleration)[1], regressor.names)
+    return find_independent(
+        regressor(quaternion, rate, acceleration)[1], regressor.names
+    )
 
 
 def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
@@ -266,7 +311,8 @@ def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
     chosen: list[int] = []
     for i in range(len(there)):
         trial = [*chosen, i]
-        # The last diagonal entry of R is the distance from the span of the columns before.
+        # The last diagonal entry of R is the distance from the span of the columns
+        # before.
         triangle: Any = np.linalg.qr(scaled[:, trial], mode="r")
         if abs(triangle[-1, -1]) > DEPENDENT:
             chosen = trial

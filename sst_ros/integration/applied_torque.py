@@ -36,18 +36,24 @@ class AppliedTorque:
 
     """
 
-    def __init__(self, dynamics: Dynamics, limit: float | None, *, traced: bool = True) -> None:
+    def __init__(
+        self, dynamics: Dynamics, limit: float | None, *, traced: bool = True
+    ) -> None:
         self._dynamics, self.limit, self._traced = dynamics, limit, traced
         self._lags = len(dynamics.state) > 7
 
     def acting(self, torque: Torque) -> Torque:
-        """Return what acts: numbers within the limit of the actuators; functions as they are.
+        """Return what acts: numbers within the limit of the actuators.
 
-        A sine becomes a function where it is no part of the program: the actuators clamp it, or
-        the equations are not traced.
+        Functions as they are.
+
+        A sine becomes a function where it is no part of the program: the actuators
+        clamp it, or the equations are not traced.
         """
         if isinstance(torque, SineTorque):
-            return torque if self._traced and self.limit_of(torque) is None else torque.at
+            return (
+                torque if self._traced and self.limit_of(torque) is None else torque.at
+            )
         if callable(torque):
             return torque
         first, second, third = map(float, torque)
@@ -56,14 +62,17 @@ class AppliedTorque:
     def limit_of(self, torque: SineTorque) -> float | None:
         """Return the limit of the actuators where it clamps a sine [N m]."""
         limit = self.limit
-        return None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
+        return (
+            None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
+        )
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m].
 
-        In the state that a function is given are the lagged torques of the actuators; without lag
-        zero, for torques of this instant are what it returns. Where the state is not finite, as in
-        a trial step that is too long, the function is not called, and the torques are nan.
+        In the state that a function is given are the lagged torques of the actuators;
+        without lag zero, for torques of this instant are what it returns. Where the
+        state is not finite, as in a trial step that is too long, the function is not
+        called, and the torques are nan.
 
         Raises:
             InputError: what the function returns is not three numbers.
@@ -87,8 +96,9 @@ class AppliedTorque:
     ) -> tuple[float, float] | None:
         """Locate a jump of a function's torques: the last time before it and the first one after.
 
-        Bisection keeps the half with the larger change: that of a jump stays, any other shrinks
-        (Gear & Osterby, ACM Trans. Math. Softw. 10 (1984) 23-44, locate them for the same purpose).
+        Bisection keeps the half with the larger change: that of a jump stays, any other
+        shrinks (Gear & Osterby, ACM Trans. Math. Softw. 10 (1984) 23-44, locate them
+        for the same purpose).
 
         Between two times of the steps [s], at the same state y.
         """
@@ -109,19 +119,29 @@ class AppliedTorque:
                 return None
         return low, high
 
-    def rate(self, drive: Drive, t: float, y: Sequence[float], torque: Vector3) -> Array:
+    def rate(
+        self, drive: Drive, t: float, y: Sequence[float], torque: Vector3
+    ) -> Array:
         """Differentiate a function's torques by time, forward from `torque` [N m/s], shape (3,).
 
-        Forward, as a step may begin at a kink, behind which the torque has another rate.
+        Forward, as a step may begin at a kink, behind which the torque has another
+        rate.
         """
-        near, far = (np.array(self.of_drive(drive, t + k * _TIME_STEP, y)) for k in (1, 2))
-        return np.asarray((4.0 * near - far - 3.0 * np.array(torque)) / (2.0 * _TIME_STEP))
+        near, far = (
+            np.array(self.of_drive(drive, t + k * _TIME_STEP, y)) for k in (1, 2)
+        )
+        return np.asarray(
+            (4.0 * near - far - 3.0 * np.array(torque)) / (2.0 * _TIME_STEP)
+        )
 
-    def by_state(self, drive: Drive, t: float, y: Sequence[float], torque: Vector3) -> Array:
+    def by_state(
+        self, drive: Drive, t: float, y: Sequence[float], torque: Vector3
+    ) -> Array:
         """Differentiate a function's torques by each number of the state, shape (3, size)."""
         slopes = np.zeros((3, len(y)))
         if has_feedback(drive.function):
-            for i in range(len(y) - 1):  # the last number is the work, which no torque sees
+            # the last number is the work, which no torque sees
+            for i in range(len(y) - 1):
                 step = _STATE_STEP * max(1.0, abs(y[i]))
                 moved = [*y[:i], y[i] + step, *y[i + 1 :]]
                 change = np.array(self.of_drive(drive, t, moved)) - torque

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many scenarios of one scene at once, on all cores; the results as arrays.
 
-Results have the names of a `Trajectory`, with an axis of scenarios before that of components.
+Results have the names of a `Trajectory`, with an axis of scenarios before that of
+components.
 """
 
 from __future__ import annotations
@@ -72,22 +73,21 @@ _SCENARIO = {"status": "", "message": "", "fault_time": "s", "local_error": ""}
 class Batch(Explained):
     """Many scenarios of a scene, by an explicit method with fixed steps.
 
-    With llvmlite the steps are machine code; without it NumPy takes them, slower, to the same bits.
+    With llvmlite the steps are machine code; without it NumPy takes them, slower, to
+    the same bits.
 
-    Args:
-        scene: what is simulated.
-        method: explicit method.
-        profile: apply the scene's own torques over time on top of none given to `run`.
-        parameters: numbers of the scene that differ between scenarios, by their keys in the
-            document, as in {"star.inertia.zz": [...], "gravity.acceleration": [[...], ...]}: a row
-            a scenario. A list without an index means all of its entries.
+    Args: scene: what is simulated. method: explicit method. profile: apply the scene's
+        own torques over time on top of none given to `run`. parameters: numbers of the
+        scene that differ between scenarios, by their keys in the document, as in
+        {"star.inertia.zz": [...], "gravity.acceleration": [[...], ...]}: a row a
+        scenario. A list without an index means all of its entries.
 
     Attributes:
         model: the traced programs.
         columns: the numbers of the scenarios.
 
-    Raises:
-        InputError: the scene has no torque to apply, or the numbers of a scenario make no scene.
+    Raises: InputError: the scene has no torque to apply, or the numbers of a scenario
+        make no scene.
 
     """
 
@@ -101,7 +101,9 @@ class Batch(Explained):
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         scene = scene_of(scene)
-        unused = _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
+        unused = (
+            _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
+        )
         given = {key: unused.get(key.partition(".")[0], "") for key in parameters or ()}
         torque = not profile or scene.torque is not None
         refuse_unless(
@@ -116,15 +118,25 @@ class Batch(Explained):
         self.columns = self.model.columns(self._scenarios)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle what was given; programs are traced and compiled again where they are needed."""
-        return _make_batch, (self.scene, self._method, self.model.profile, self._scenarios.rows)
+        """Pickle what was given.
+
+        Programs are traced and compiled again where they are needed.
+        """
+        return _make_batch, (
+            self.scene,
+            self._method,
+            self.model.profile,
+            self._scenarios.rows,
+        )
 
     def result_of(
         self, code: NDArray[np.int64], fault_time: Array, error: Array, t: Array, torque: Array,
         y: Array,
     ) -> BatchResult:  # fmt: skip
         """Return states of all scenarios as a result, see `BatchResult` for the arguments."""
-        return BatchResult(self.model, self.columns, torque, code, fault_time, error, t, y)
+        return BatchResult(
+            self.model, self.columns, torque, code, fault_time, error, t, y
+        )
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios, already checked, that shares this one's programs.
@@ -156,17 +168,14 @@ class Batch(Explained):
     ) -> BatchResult:
         """Run all scenarios for `count` steps.
 
-        Args:
-            gamma: initial actuator angles [rad], shape (N, 3), or (3,) where parameters vary.
-            gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
-            torque: constant torques [N m], shape (N, 3) or (3,), within the actuators' limit where
-                they have one; not used with a profile.
-            step: length of a step [s].
-            count: number of steps.
-            keep_every: keep the states every so many steps, see `BatchResult.kept`; 0 keeps none.
-            threads: how many; 0 takes all cores. No bit depends on it.
-            progress: draw a bar on a terminal.
-            advance: a loop of one's own in place of `Batch.advance`, see `Advance`.
+        Args: gamma: initial actuator angles [rad], shape (N, 3), or (3,) where
+            parameters vary. gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
+            torque: constant torques [N m], shape (N, 3) or (3,), within the actuators'
+            limit where they have one; not used with a profile. step: length of a step
+            [s]. count: number of steps. keep_every: keep the states every so many
+            steps, see `BatchResult.kept`; 0 keeps none. threads: how many; 0 takes all
+            cores. No bit depends on it. progress: draw a bar on a terminal. advance: a
+            loop of one's own in place of `Batch.advance`, see `Advance`.
 
         Raises:
             InputError: an argument is not allowed; names it and what is.
@@ -186,7 +195,8 @@ class Batch(Explained):
         given = self.drives(torque, number)
         time, error = np.full(number, np.nan), np.zeros(number)
         kept, ends = [y.copy()], [0]
-        size = keep_every or (0 if progress else max(count, 1))  # few calls: each passes all rows
+        # few calls: each passes all rows
+        size = keep_every or (0 if progress else max(count, 1))
         for part in slices(count, size, self.scene.name, progress):
             span = part.stop - part.start
             loop(part.start, span, step, y, given, code, time, error, rows=None)
@@ -194,7 +204,8 @@ class Batch(Explained):
                 kept.append(y.copy())
                 ends.append(part.stop)
         time[code < 0] = 0.0
-        # A step in which a limit was passed is left out: its beginning is the last valid state.
+        # A step in which a limit was passed is left out: its beginning is the last
+        # valid state.
         begins = np.asarray(np.ceil(time / step - 0.1 * EARLIEST) - 1.0)
         steps = np.where(code > 0, begins, count)
         steps[code < 0] = 0
@@ -226,15 +237,13 @@ class Batch(Explained):
     ) -> BatchSession:
         """Start robots that are driven step by step, as by a policy.
 
-        Args:
-            gamma: initial actuator angles [rad], shape (N, 3), or (3,) where parameters vary.
-            gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
+        Args: gamma: initial actuator angles [rad], shape (N, 3), or (3,) where
+            parameters vary. gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
             step: length of a step of the session, in which torques are constant [s].
             substeps: steps of the method in it.
 
-        Raises:
-            InputError: an argument is not allowed, or the batch has a profile of torques.
-
+        Raises: InputError: an argument is not allowed, or the batch has a profile of
+            torques.
         """
         allowed = f"must be >= 1 and <= {_MOST:g}"
         torque = self.model.ode.drive[:3] == TORQUE
@@ -242,15 +251,24 @@ class Batch(Explained):
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
             ("substeps", substeps, 1 <= substeps <= _MOST, allowed),
-            ("profile", True, torque, "must be False: the torques are given step by step"),
+            (
+                "profile",
+                True,
+                torque,
+                "must be False: the torques are given step by step",
+            ),
         )
         return BatchSession(self, gamma, gamma_dot, float(step), int(substeps))
 
-    def initial(self, gamma: ArrayLike, gamma_dot: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+    def initial(
+        self, gamma: ArrayLike, gamma_dot: ArrayLike
+    ) -> tuple[Array, NDArray[np.int64]]:
         """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
         count, columns = self._scenarios.count, self.columns
         # One start for all is solved once.
-        alike = np.ndim(gamma) == np.ndim(gamma_dot) == columns.geometries.alpha.ndim == 1
+        alike = (
+            np.ndim(gamma) == np.ndim(gamma_dot) == columns.geometries.alpha.ndim == 1
+        )
         angles = _rows("gamma", gamma, 1 if alike and count else count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
         which = np.broadcast_to(columns.geometry[: len(angles)], len(angles))
@@ -283,10 +301,12 @@ class Batch(Explained):
         threads: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> None:
-        """Advance by `count` steps from step `first`; y, given, code, time and error change.
+        """Advance by `count` steps from step `first`.
 
-        Threads take several blocks in turn, more shares than threads; the interpreter's lock is
-        released in each step. A few `rows` need no threads.
+        Y, given, code, time and error change.
+
+        Threads take several blocks in turn, more shares than threads; the interpreter's
+        lock is released in each step. A few `rows` need no threads.
         """
         threads = threads or len(os.sched_getaffinity(0))
         if rows is not None:
@@ -340,22 +360,21 @@ def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
 
 
 class BatchResult(MotionTable):
-    """N scenarios, each in its state at the end, or in its last valid one. Arrays are read-only.
+    """N scenarios, each in its state at the end, or in its last valid one.
 
-    Attributes:
-        t: times of the states [s], shape (N,).
-        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (N, 4).
-        body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3).
-        status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where it has no
-            start or its numbers ceased to be finite, shape (N,).
-        code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start, shape (N,).
-        fault_time: when a scenario passed a limit [s], the end of the step in which its numbers
-            ceased to be finite, 0 without a start, nan where it reached its end,
-            shape (N,).
-        local_error: largest local error estimate of a quaternion in a step, shape (N,).
-        kept: the same scenarios every `keep_every` steps from the start on, with an axis of samples
-            before that of scenarios in t and in all states; None unless asked for.
+    Arrays are read-only.
 
+    Attributes: t: times of the states [s], shape (N,). quaternion: orientations (x, y,
+        z, w) of {E} in {B}, shape (N, 4). body_rate: angular velocities of the star in
+        {E} [rad/s], shape (N, 3). status: 0 where a scenario reached its end, 1 where a
+        limit ended it, -1 where it has no start or its numbers ceased to be finite,
+        shape (N,). code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0
+        without a start, shape (N,). fault_time: when a scenario passed a limit [s], the
+        end of the step in which its numbers ceased to be finite, 0 without a start, nan
+        where it reached its end, shape (N,). local_error: largest local error estimate
+        of a quaternion in a step, shape (N,). kept: the same scenarios every
+        `keep_every` steps from the start on, with an axis of samples before that of
+        scenarios in t and in all states; None unless asked for.
     """
 
     def __init__(
@@ -378,7 +397,8 @@ class BatchResult(MotionTable):
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
         self.kept: BatchResult | None = None
-        self.sent: Array | None = None  # torques of a controller, where they are not `torque`
+        # torques of a controller, where they are not `torque`
+        self.sent: Array | None = None
         self._computed: dict[str, Array] = {}
         self._freeze()
 
@@ -431,7 +451,8 @@ class BatchResult(MotionTable):
     def reasons(self) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
         """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
         geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
-        limited = (self.code > 0) & (self.code < NOT_FINITE)  # only these depend on the geometry
+        # only these depend on the geometry
+        limited = (self.code > 0) & (self.code < NOT_FINITE)
         # One number for both: of pairs np.unique takes a tenth of the time of a sweep.
         both = np.where(limited, geometry, 0) * 4 * NOT_FINITE + self.code
         _, first, index = np.unique(both, return_index=True, return_inverse=True)
@@ -450,5 +471,7 @@ class BatchResult(MotionTable):
             "scene": self.scene.name,
             "scenarios": len(self),
             "ended early": np.count_nonzero(self.status),
-            "time [s]": f"{self.t.min():g} to {self.t.max():g}" if self.t.size else "none",
+            "time [s]": f"{self.t.min():g} to {self.t.max():g}"
+            if self.t.size
+            else "none",
         }

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many robots step by step: torques go in, states come out, in arrays that stay in place.
 
-The robots are divided into as many blocks as threads take them, and a step of a block is
-one call of the compiled program of `batch_step`.
+The robots are divided into as many blocks as threads take them, and a step of a block
+is one call of the compiled program of `batch_step`.
 """
 
 from __future__ import annotations
@@ -34,24 +34,27 @@ class BatchState(NamedTuple):
     gamma_dot: Array  #: their rates [rad/s], shape (N, 3)
     quaternion: Array  #: orientations (x, y, z, w) of {E} in {B}, shape (N, 4)
     body_rate: Array  #: angular velocities of the star in {E} [rad/s], shape (N, 3)
-    code: NDArray[np.int64]  #: 0 while a robot runs on, else why not, see `BatchResult`; (N,)
+    # : 0 while a robot runs on, else why not, see `BatchResult`; (N,)
+    code: NDArray[np.int64]
 
 
 class BatchSession:
     """Robots of a batch that are driven step by step; made by `Batch.start`.
 
-    A robot that passes a limit, or whose numbers cease to be finite, stays in its last valid
-    state until it is reset; the others go on.
+    A robot that passes a limit, or whose numbers cease to be finite, stays in its last
+    valid state until it is reset; the others go on.
 
-    Attributes:
-        state: of all robots, see `BatchState`.
-        fault_time: when a robot passed a limit, since its last reset [s], nan where it runs on,
-            shape (N,).
-
+    Attributes: state: of all robots, see `BatchState`. fault_time: when a robot passed
+        a limit, since its last reset [s], nan where it runs on, shape (N,).
     """
 
     def __init__(
-        self, batch: Any, gamma: ArrayLike, gamma_dot: ArrayLike, step: float, substeps: int
+        self,
+        batch: Any,
+        gamma: ArrayLike,
+        gamma_dot: ArrayLike,
+        step: float,
+        substeps: int,
     ) -> None:
         self._batch, self._h, self._substeps = batch, step / substeps, substeps
         self._y, code = batch.initial(gamma, gamma_dot)
@@ -61,7 +64,8 @@ class BatchSession:
         self._given = batch.drives((0.0, 0.0, 0.0), number)
         self.fault_time = np.full(number, np.nan)
         self._error, self._done = np.zeros(number), 0
-        self._begun = np.zeros(number, dtype=np.int64)  # steps that were done at the last reset
+        # steps that were done at the last reset
+        self._begun = np.zeros(number, dtype=np.int64)
         self._joints = np.zeros((6, number))
         self.state = BatchState(
             self._joints[:3].T, self._joints[3:].T, self._y[:4].T, self._y[4:7].T, code
@@ -77,8 +81,8 @@ class BatchSession:
     def step(self, torque: ArrayLike) -> BatchState:
         """Advance all robots by a step under constant torques.
 
-        Args:
-            torque: of the actuators [N m], shape (N, 3) or (3,); clamped to their limit.
+        Args: torque: of the actuators [N m], shape (N, 3) or (3,); clamped to their
+            limit.
 
         Returns:
             The state, whose arrays are those of the step before.
@@ -109,10 +113,9 @@ class BatchSession:
     ) -> BatchState:
         """Let robots begin again.
 
-        Args:
-            rows: indices of the robots, or a mask of shape (N,); all by default.
-            gamma: new initial angles [rad], shape (len(rows), 3) or (3,); by default the last.
-            gamma_dot: new initial rates [rad/s], alike.
+        Args: rows: indices of the robots, or a mask of shape (N,); all by default.
+            gamma: new initial angles [rad], shape (len(rows), 3) or (3,); by default
+            the last. gamma_dot: new initial rates [rad/s], alike.
 
         Raises:
             InputError: a row is none of this batch, or an initial value is not allowed.
@@ -122,9 +125,16 @@ class BatchSession:
         index = np.arange(number) if rows is None else np.asarray(rows)
         if index.dtype == bool and index.shape == (number,):
             index = np.flatnonzero(index)
-        whole = index.ndim == 1 and (index.size == 0 or np.issubdtype(index.dtype, np.integer))
-        fits = bool(whole and (index.size == 0 or (index.min() >= 0 and index.max() < number)))
-        allowed = f"must be whole numbers from 0 to {number - 1}, or a mask of shape ({number},)"
+        whole = index.ndim == 1 and (
+            index.size == 0 or np.issubdtype(index.dtype, np.integer)
+        )
+        fits = bool(
+            whole and (index.size == 0 or (index.min() >= 0 and index.max() < number))
+        )
+        allowed = (
+            f"must be whole numbers from 0 to {number - 1}, or a mask of shape"
+            f" ({number},)"
+        )
         refuse_unless("batch", ("rows", rows, fits, allowed))
         index = index.astype(np.intp)
         if gamma is not None or gamma_dot is not None:
@@ -147,7 +157,9 @@ class BatchSession:
         batch, code, fault = self._batch, self.state.code.copy(), self.fault_time.copy()
         torque = self._given[:3].T.copy()
         last = np.where(np.isnan(fault), time, fault)
-        return batch.result_of(code, fault, self._error.copy(), last, torque, self._y.copy())
+        return batch.result_of(
+            code, fault, self._error.copy(), last, torque, self._y.copy()
+        )
 
     def _locate(self, rows: NDArray[np.intp]) -> None:
         """Find when robots that ended in this step did so, from their last reset on."""

@@ -9,9 +9,9 @@
 3. What is rare is done for the few columns concerned: which limit was passed first, and
    when. A column that has ended keeps its last valid state; the others continue.
 
-Which limit a step passes first is found from the distances to all: over a step each is a
-cubic in its values and rates at both ends (Hermite). Its error is at most h^4 max|d^(4)|
-/ 384. A step that ends outside is found, and one that leaves and comes back.
+Which limit a step passes first is found from the distances to all: over a step each is
+a cubic in its values and rates at both ends (Hermite). Its error is at most h^4
+max|d^(4)| / 384. A step that ends outside is found, and one that leaves and comes back.
 """
 
 from __future__ import annotations
@@ -30,7 +30,14 @@ from sst_ros.dynamics.traced_dynamics import ParametricModel
 from sst_ros.host.many_runs import stop_if_asked
 from sst_ros.integration.methods import Tableau
 from sst_ros.integration.steps import explicit_step, normalise
-from sst_ros.mechanism.generic_math import Scalar, absolute, larger, positive, select, sqrt
+from sst_ros.mechanism.generic_math import (
+    Scalar,
+    absolute,
+    larger,
+    positive,
+    select,
+    sqrt,
+)
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
@@ -41,7 +48,10 @@ BLOCK = 192
 takes a hundred times as long as the interpreter between two steps."""
 
 NOT_FINITE = 1000
-"""Code of a scenario whose numbers are no longer finite; others are 1 + the limit's index."""
+"""Code of a scenario whose numbers are no longer finite.
+
+Others are 1 + the limit's index.
+"""
 
 EARLIEST = 1e-8
 """Least share of a step at which a crossing is reported, so that its time lies in this step."""
@@ -78,7 +88,9 @@ class ColumnStep:
         ends = (*shared, "before", "rate_before", "after", "rate_after")
         self.traced = {
             "advance": trace(self._advance, inputs),
-            "distances": trace(self._distances, (*shared, *state[:7], *given[self.varied])),
+            "distances": trace(
+                self._distances, (*shared, *state[:7], *given[self.varied])
+            ),
             "crossing": trace(share_of_crossing, ends),
         }
         functions = compile_columns(self.traced, len(shared))
@@ -86,16 +98,21 @@ class ColumnStep:
         self.crossing = functions["crossing"]
 
     def _advance(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
-        """Return state, distances and their rates, and largest error after a step; and a flag.
+        """Return state, distances and their rates, and largest error after a step.
 
-        The flag is positive where a limit may have been passed or a number is not finite.
+        And a flag.
+
+        The flag is positive where a limit may have been passed or a number is not
+        finite.
         """
         rest = iter(inputs)
         old = [next(rest) for _ in range(self.size)]
         was = [next(rest) for _ in range(2 * self.limits)]
         error, running, *given = rest
 
-        def derivative(time: Scalar, y: Sequence[Scalar], drive: Any) -> tuple[Scalar, ...]:
+        def derivative(
+            time: Scalar, y: Sequence[Scalar], drive: Any
+        ) -> tuple[Scalar, ...]:
             return self._model.derivative(time, *y, *drive)
 
         drives = [given] * len(self._method.b)
@@ -107,7 +124,10 @@ class ColumnStep:
             worst = larger(worst, absolute(one))
         flag = larger(may_cross(h, was, far), is_not_finite(reduce(add, new)))
         # A scenario that has ended stays where it is.
-        kept = [select(running, after, before) for before, after in zip(old, new, strict=True)]
+        kept = [
+            select(running, after, before)
+            for before, after in zip(old, new, strict=True)
+        ]
         return (*kept, *far, select(running, worst, error), select(running, flag, 0.0))
 
     def _distances(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
@@ -179,11 +199,14 @@ class Block:
         y[:, part] = self.states(self._now)[:, :number]
         error[part] = self._states[self._now][-1, :number]
 
-    def run(self, part: slice, first: int, count: int, h: float, *columns: NDArray[Any]) -> None:
+    def run(
+        self, part: slice, first: int, count: int, h: float, *columns: NDArray[Any]
+    ) -> None:
         """Advance the columns that were taken over by `count` steps.
 
-        Step `number` begins at `number` times h [s]. Codes and times of columns that end
-        change: to 1 + the index of a limit, or NOT_FINITE, and to when that was [s].
+        Step `number` begins at `number` times h [s]. Codes and times of columns that
+        end change: to 1 + the index of a limit, or NOT_FINITE, and to when that was
+        [s].
         """
         _, _, code, time, _ = columns
         for number in range(first, first + count):
@@ -199,7 +222,9 @@ class Block:
     def prepare_step(self, number: int) -> None:
         """Do what is to be done before a step: nothing here."""
 
-    def _end_columns(self, number: int, h: float, code: NDArray[np.int64], time: Array) -> None:
+    def _end_columns(
+        self, number: int, h: float, code: NDArray[np.int64], time: Array
+    ) -> None:
         """End the columns that have passed a limit in a step, or are not finite after it."""
         before, after = self._states[1 - self._now], self._states[self._now]
         columns = np.flatnonzero(self._flag > 0.0)
@@ -226,7 +251,10 @@ class Block:
         ends = [
             np.ascontiguousarray(states[rows, padded]).ravel()
             for states in (before[size:, :], after[size:, :])
-            for rows in (np.arange(limits)[:, None], np.arange(limits, 2 * limits)[:, None])
+            for rows in (
+                np.arange(limits)[:, None],
+                np.arange(limits, 2 * limits)[:, None],
+            )
         ]
         shares = np.full((limits, len(padded)), _NO_SHARE)
         if limits:
@@ -257,7 +285,12 @@ def may_cross(h: Scalar, was: Sequence[Scalar], far: Sequence[Scalar]) -> Scalar
 
 
 def share_of_crossing(
-    t: Scalar, h: Scalar, before: Scalar, rate_before: Scalar, after: Scalar, rate_after: Scalar
+    t: Scalar,
+    h: Scalar,
+    before: Scalar,
+    rate_before: Scalar,
+    after: Scalar,
+    rate_after: Scalar,
 ) -> tuple[Scalar]:
     """Return the share of a step of h at which a distance becomes negative, _NO_SHARE if not.
 
@@ -325,20 +358,35 @@ FINE = 16
 """Parts of a step that is repeated to locate an end: the error of a cubic falls 65,536 times."""
 
 Advance = Callable[..., None]
-"""(first, count, step, *arrays, rows=None): advances states by steps from step `first`, and changes
-`arrays`: states, drives, codes, times and errors. `rows` are those whose last step is repeated;
-None for all."""
+"""(first, count, step, *arrays, rows=None): advances states by steps from step `first`,
+and changes `arrays`: states, drives, codes, times and errors. `rows` are those whose
+last step is repeated; None for all.
+"""
 
 
 def locate_ends(
-    advance: Advance, step: float, steps: Array, y: Array, given: Array, code: Any, time: Array
+    advance: Advance,
+    step: float,
+    steps: Array,
+    y: Array,
+    given: Array,
+    code: Any,
+    time: Array,
 ) -> None:
-    """Repeat the steps in which limits were passed by finer ones; `code` and `time` change."""
+    """Repeat the steps in which limits were passed by finer ones.
+
+    `code` and `time` change.
+    """
     ended = np.flatnonzero((code > 0) & (code < NOT_FINITE))
     for number in np.unique(steps[ended]):
         rows = ended[steps[ended] == number]
         found, when = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), np.nan)
-        arrays = np.ascontiguousarray(y[:, rows]), np.ascontiguousarray(given[:, rows]), found, when
+        arrays = (
+            np.ascontiguousarray(y[:, rows]),
+            np.ascontiguousarray(given[:, rows]),
+            found,
+            when,
+        )
         first = int(number) * FINE
         advance(first, FINE, step / FINE, *arrays, np.zeros(len(rows)), rows=rows)
         located = (found > 0) & (found < NOT_FINITE)

@@ -24,11 +24,13 @@ _REACH = 10.0
 """A joint whose rate has turned comes at most this many times as far as its rates allow."""
 
 
-def all_far(ranges: JointRanges, begin: Sequence[float], end: Sequence[float], h: float) -> bool:
+def all_far(
+    ranges: JointRanges, begin: Sequence[float], end: Sequence[float], h: float
+) -> bool:
     """Test quickly that no limit may have been crossed in h.
 
-    That is so where a joint is inside before and after, and its rate has not turned, or the joint
-    is farther from the limits than it would come in ten times h.
+    That is so where a joint is inside before and after, and its rate has not turned, or
+    the joint is farther from the limits than it would come in ten times h.
     """
     for joint, least, most in ranges:
         if not (least < begin[joint] < most and least <= end[joint] <= most):
@@ -45,13 +47,16 @@ def all_far(ranges: JointRanges, begin: Sequence[float], end: Sequence[float], h
 def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:
     """Test cheaply whether an event may lie in a step, given the joints at both ends.
 
-    A limit counts where the step starts on it; a contact that the step starts on does not.
+    A limit counts where the step starts on it; a contact that the step starts on does
+    not.
     """
     before = event.distance(begin)
     if event.error is not None:
         if before <= 0.0:
             return True
-    elif before <= GRAZING and not (before > -CONTACT_BAND and event.slope(begin) > 0.0):
+    elif before <= GRAZING and not (
+        before > -CONTACT_BAND and event.slope(begin) > 0.0
+    ):
         return False
     return event.distance(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
 
@@ -59,9 +64,10 @@ def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> boo
 def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
     """Time x in [0, h] at which `distance` becomes negative, or None.
 
-    Both signals are smooth functions of the time since the step began and `slope` is the rate of
-    `distance`. A dip below zero and back inside the step is found where the slope changes sign
-    once. A distance that starts at zero counts if it shrinks, and not if it grows.
+    Both signals are smooth functions of the time since the step began and `slope` is
+    the rate of `distance`. A dip below zero and back inside the step is found where the
+    slope changes sign once. A distance that starts at zero counts if it shrinks, and
+    not if it grows.
     """
     begin, end = 0.0, h
     rising, falling = slope(0.0) > 0.0, slope(h) < 0.0
@@ -82,12 +88,16 @@ def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
     return _root(distance, begin, end)
 
 
-def first_event(limits: Iterable[Limit], joints: Joints, h: float) -> tuple[float, Limit] | None:
+def first_event(
+    limits: Iterable[Limit], joints: Joints, h: float
+) -> tuple[float, Limit] | None:
     """Return time in [0, h] and limit of the first event, None where there is none."""
     first: tuple[float, Limit] | None = None
     for limit in limits:
         x = first_crossing(
-            partial(_evaluate, limit.distance, joints), partial(_evaluate, limit.slope, joints), h
+            partial(_evaluate, limit.distance, joints),
+            partial(_evaluate, limit.slope, joints),
+            h,
         )
         if x is not None and (first is None or x < first[0]):
             first = (x, limit)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps of one scene by one method, as functions of floats.
 
-`steps.py` has the steps as ordinary functions. Here they are traced, as programs that call
-the derivative of the scene, and become machine code where llvmlite is installed, else flat
-Python with the same bits. Torques that are numbers, or a function of time, go in as inputs. A
-function of the state is called in each stage: those steps run as they are read.
+`steps.py` has the steps as ordinary functions. Here they are traced, as programs that
+call the derivative of the scene, and become machine code where llvmlite is installed,
+else flat Python with the same bits. Torques that are numbers, or a function of time, go
+in as inputs. A function of the state is called in each stage: those steps run as they
+are read.
 """
 
 from __future__ import annotations
@@ -95,16 +96,23 @@ class MethodSteps:
     ) -> tuple[Point, float]:
         """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
 
-        The second one has the drive `other`, by default that of the first. Returns where they end,
-        and the local error estimate in units of the tolerance; infinite where a number of the step
-        is not finite.
+        The second one has the drive `other`, by default that of the first. Returns
+        where they end, and the local error estimate in units of the tolerance; infinite
+        where a number of the step is not finite.
         """
         second = drive if other is None else other
-        numbers = self._functions["pair"](t, h, *at.y, *at.z, *drive.numbers, *second.numbers)
+        numbers = self._functions["pair"](
+            t, h, *at.y, *at.z, *drive.numbers, *second.numbers
+        )
         return _read_pair(numbers, at, self._size)
 
-    def single(self, t: float, h: float, y: Sequence[float], drive: Drive) -> list[float]:
-        """Advance a state alone by h; its error is not looked at. Where it has no value: nan."""
+    def single(
+        self, t: float, h: float, y: Sequence[float], drive: Drive
+    ) -> list[float]:
+        """Advance a state alone by h; its error is not looked at.
+
+        Where it has no value: nan.
+        """
         return self._functions["single"](t, h, *y, *drive.numbers)
 
     def fixed(
@@ -125,7 +133,10 @@ class MethodSteps:
         return self._functions["slope"](t, *y, *drive.numbers)
 
     def eigenvalues(self, t: float, y: Sequence[float], drive: Drive) -> Array:
-        """Eigenvalues of the exact Jacobian [1/s], shape (size,); ArithmeticError: not finite."""
+        """Eigenvalues of the exact Jacobian [1/s], shape (size,).
+
+        ArithmeticError: not finite.
+        """
         return self._ode.eigenvalues(t, y, drive.numbers)
 
 
@@ -150,9 +161,18 @@ class FunctionSteps:
         derivative: Callable[..., Sequence[float]] | None = None,
     ) -> None:
         if derivative is not None and isinstance(method, Rosenbrock):
-            raise ValueError("a derivative of its own has no Jacobian, which the method needs")
-        self.method, self._ode, self._torque, self._given = method, ode, torque, derivative
-        self.cost = len(method.a) + (JACOBIAN_COST if isinstance(method, Rosenbrock) else 0)
+            raise ValueError(
+                "a derivative of its own has no Jacobian, which the method needs"
+            )
+        self.method, self._ode, self._torque, self._given = (
+            method,
+            ode,
+            torque,
+            derivative,
+        )
+        self.cost = len(method.a) + (
+            JACOBIAN_COST if isinstance(method, Rosenbrock) else 0
+        )
         self._size = len(ode.state)
 
     @cached_property
@@ -170,7 +190,9 @@ class FunctionSteps:
         programs = {
             "slope": ode.program,
             "joints": ode.dynamics.joints_program,
-            **trace_steps(self.method, self._size, len(ode.drive), _lagged(ode), by_stage=True),
+            **trace_steps(
+                self.method, self._size, len(ode.drive), _lagged(ode), by_stage=True
+            ),
         }
         return compile_functions(programs, ("pair", "single"))
 
@@ -193,7 +215,9 @@ class FunctionSteps:
             return _read_pair(numbers, at, self._size)
         drives = (drive, other or drive, other or drive)
 
-        def step(part: int, t: float, h: float, y: Sequence[float], near: Any) -> NewState:
+        def step(
+            part: int, t: float, h: float, y: Sequence[float], near: Any
+        ) -> NewState:
             return self._step(t, h, y, near, drives[part])
 
         pair = step_pair(step, t, h, at.y, at.z, _lagged(self._ode))
@@ -201,7 +225,9 @@ class FunctionSteps:
         total = pair.total + add_up(joints)
         return _read_pair([*pair.y, *pair.z, *joints, pair.size, total], at, self._size)
 
-    def single(self, t: float, h: float, y: Sequence[float], drive: Drive) -> list[float]:
+    def single(
+        self, t: float, h: float, y: Sequence[float], drive: Drive
+    ) -> list[float]:
         """See `MethodSteps.single`."""
         if self._is_of_time(drive):
             return self._by_stage["single"](t, h, *y, *self._stage_drives(t, h, drive))
@@ -237,7 +263,12 @@ class FunctionSteps:
         return numbers
 
     def _step(
-        self, t: float, h: float, y: Sequence[float], near: Sequence[float], drive: Drive
+        self,
+        t: float,
+        h: float,
+        y: Sequence[float],
+        near: Sequence[float],
+        drive: Drive,
     ) -> NewState:
         method = self.method
         if isinstance(method, Tableau):
@@ -250,7 +281,12 @@ class FunctionSteps:
         size, torque = self._size, self._torque.of_drive(drive, t, y)
         numbers = self._ode.linearised_by_torque(t, *y, *torque, *drive.numbers[3:])
         rows = np.array(numbers).reshape(size + 5, size)
-        slope, by_time, by_state, by_torque = rows[0], rows[1], rows[2 : size + 2], rows[size + 2 :]
+        slope, by_time, by_state, by_torque = (
+            rows[0],
+            rows[1],
+            rows[2 : size + 2],
+            rows[size + 2 :],
+        )
         rate = self._torque.rate(drive, t, y, torque)
         columns = by_state + self._torque.by_state(drive, t, y, torque).T @ by_torque
         return Linearisation(
@@ -270,11 +306,12 @@ def trace_steps(
 ) -> dict[str, Program]:
     """Trace the programs `step`, `pair` and `single` of a method.
 
-    They call the programs `slope` (t, state, drive), `joints` (first seven numbers of the state)
-    and, of a Rosenbrock method, `linearise`, which has the outputs of `ODE.jacobian`. Inputs of
-    `pair` are t, h, both solutions and their drives; outputs both new solutions, the joints of the
-    first, the size of its error, and a total that is finite where all numbers are. Inputs of
-    `single` are t, h, state and drive; its outputs are the new state.
+    They call the programs `slope` (t, state, drive), `joints` (first seven numbers of
+    the state) and, of a Rosenbrock method, `linearise`, which has the outputs of
+    `ODE.jacobian`. Inputs of `pair` are t, h, both solutions and their drives; outputs
+    both new solutions, the joints of the first, the size of its error, and a total that
+    is finite where all numbers are. Inputs of `single` are t, h, state and drive; its
+    outputs are the new state.
 
     Args:
         method: how.
@@ -294,7 +331,9 @@ def trace_steps(
     drives = [f"d{i}" for i in range(stages * drive)]
     others = [f"e{i}" for i in range((2 if by_stage else 1) * stages * drive)]
     step = Routine(
-        "step", 2 + size + len(near) + len(drives), size * (2 if _has_error(method) else 1)
+        "step",
+        2 + size + len(near) + len(drives),
+        size * (2 if _has_error(method) else 1),
     )
 
     def derivative(t: Any, y: Sequence[Any], numbers: Sequence[Any]) -> Sequence[Any]:
@@ -316,7 +355,9 @@ def trace_steps(
         return (*new.state, *(new.error or ()))
 
     def _linearise(t: Any, y: Sequence[Any], numbers: Sequence[Any]) -> Linearisation:
-        results = Routine("linearise", 1 + size + drive, (size + 2) * size)(t, *y, *numbers)
+        results = Routine("linearise", 1 + size + drive, (size + 2) * size)(
+            t, *y, *numbers
+        )
         rows = [results[size * k : size * (k + 1)] for k in range(size + 2)]
         return Linearisation(rows[0], rows[1], rows[2:])
 
@@ -326,7 +367,9 @@ def trace_steps(
         first, rest = given[: len(drives)], given[len(drives) :]
         by_part = (first, rest[: len(drives)], rest[-len(drives) :])
 
-        def call(part: int, t: Any, h: Any, y: Sequence[Any], near: Sequence[Any]) -> NewState:
+        def call(
+            part: int, t: Any, h: Any, y: Sequence[Any], near: Sequence[Any]
+        ) -> NewState:
             results = step(t, h, *y, *(near if implicit else ()), *by_part[part])
             return NewState([*results[:size]], [*results[size:]] or None)
 

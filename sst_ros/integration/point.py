@@ -24,13 +24,15 @@ class MethodChange(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Where a run stands: all that its next step depends on; and how far it can be trusted.
+    """Where a run stands: all that its next step depends on.
 
-    A second solution goes through each step by two of half the length: its distance is the error.
-    No order is assumed, as none holds where a torque jumps, a clamp or a contact bends the motion,
-    or friction is sharp. Where the method has its order, the second solution is nearly exact, and
-    the distance is the error; where each step loses its order, the error halves, and the distance
-    is half of the error.
+    And how far it can be trusted.
+
+    A second solution goes through each step by two of half the length: its distance is
+    the error. No order is assumed, as none holds where a torque jumps, a clamp or a
+    contact bends the motion, or friction is sharp. Where the method has its order, the
+    second solution is nearly exact, and the distance is the error; where each step
+    loses its order, the error halves, and the distance is half of the error.
     """
 
     y: list[float]  # the solution
@@ -61,7 +63,10 @@ def estimate_error(distance: float, steps: int) -> float:
 
 
 def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
-    """Angle between the orientations of two states that are near [rad]; q and -q are the same."""
+    """Angle between the orientations of two states that are near [rad].
+
+    q and -q are the same.
+    """
     return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
 
 
@@ -79,7 +84,8 @@ class Drive(NamedTuple):
     """What acts from outside over a period."""
 
     numbers: tuple[float, ...]
-    """Torques [N m], or phases of a sine [rad], or zero where a function gives the torques; then
-    the moment on the star in {B} [N m] where the scene takes one."""
+    """Torques [N m], or phases of a sine [rad], or zero where a function gives the
+    torques; then the moment on the star in {B} [N m] where the scene takes one.
+    """
     function: Any = None  # torques as a function of the time, or of it and the state
     start: float = 0.0  # time of the run at which that of the steps is zero [s]

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop that advances a scene: periods, steps, their length and method, and events.
 
-1. A period has torques that are numbers, a sine, or a function; it is a tick of a node, a
-   period of a controller, or a whole motion.
-2. Its steps are as long as the error estimate of the last one allows; one whose error exceeds
-   the tolerance is taken again, shorter. Where a function jumps, a step ends.
-3. `auto` looks at the eigenvalues of the Jacobian now and then, and takes the method whose
-   steps would be longer.
-4. A step that may pass a limit, or meet or leave an elastic stop, ends at the first of them.
-5. A limit ends the motion: LimitReached. So does a motion that no step resolves: CannotStep.
+1. A period has torques that are numbers, a sine, or a function; it is a tick of a node,
+   a period of a controller, or a whole motion.
+2. Its steps are as long as the error estimate of the last one allows; one whose error
+   exceeds the tolerance is taken again, shorter. Where a function jumps, a step ends.
+3. `auto` looks at the eigenvalues of the Jacobian now and then, and takes the method
+   whose steps would be longer.
+4. A step that may pass a limit, or meet or leave an elastic stop, ends at the first of
+them.
+5. A limit ends the motion: LimitReached. So does a motion that no step resolves:
+CannotStep.
 
 What a step computes is in `steps.py`; what it starts from and ends with is a `Point`.
 """
@@ -22,11 +24,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.model import Limit, contact_events_of, free_range, limits_of, ranges_of
+from sst_ros.dynamics.model import (
+    Limit,
+    contact_events_of,
+    free_range,
+    limits_of,
+    ranges_of,
+)
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.events import all_far, first_event, may_occur
-from sst_ros.integration.method_steps import JACOBIAN_COST, FunctionSteps, MethodSteps, steps_of
+from sst_ros.integration.method_steps import (
+    JACOBIAN_COST,
+    FunctionSteps,
+    MethodSteps,
+    steps_of,
+)
 from sst_ros.integration.methods import (
     DOP853,
     DORMAND_PRINCE,
@@ -112,10 +125,15 @@ class EvaluationBudget:
             self._end = self.per_period + self.spent
 
     def charge(self, evaluations: int) -> None:
-        """Count evaluations before they are made; BudgetSpent: the period has none left."""
+        """Count evaluations before they are made.
+
+        BudgetSpent: the period has none left.
+        """
         if self.spent + evaluations > self._end:
             span = "motion" if self._whole_run else "step"
-            raise BudgetSpent(f"{self.per_period} evaluations do not reach the end of the {span}")
+            raise BudgetSpent(
+                f"{self.per_period} evaluations do not reach the end of the {span}"
+            )
         self.spent += evaluations
 
 
@@ -137,25 +155,25 @@ class Step(NamedTuple):
         return (3 if self.other is None else 6) * self.steps.cost
 
     def inside(self, x: float) -> list[float]:
-        """Return the state x [s] after its begin, by one shorter step; nan where not finite."""
+        """Return the state x [s] after its begin, by one shorter step.
+
+        Nan where not finite.
+        """
         return self.steps.single(self.t, x, self.begin.y, self.drive)
 
 
 class Stepper:
     """Advances a scene through periods.
 
-    Nothing changes in it as a run goes on but what its budget has spent: the run is its points.
+    Nothing changes in it as a run goes on but what its budget has spent: the run is its
+    points.
 
-    Args:
-        scene: what is simulated.
-        method: a method of `methods.METHODS`, or auto.
-        tolerance: largest local error estimate of a step: of the quaternion, and of the rate
-            relative to its length.
-        budget: counts evaluations, and ends a period that takes too many.
-        derivative: of the state in plain Python, in place of the traced one and with its inputs;
-            for explicit methods.
-        limits: whether the limits of the scene end the motion.
-        max_step: longest step [s].
+    Args: scene: what is simulated. method: a method of `methods.METHODS`, or auto.
+        tolerance: largest local error estimate of a step: of the quaternion, and of the
+        rate relative to its length. budget: counts evaluations, and ends a period that
+        takes too many. derivative: of the state in plain Python, in place of the traced
+        one and with its inputs; for explicit methods. limits: whether the limits of the
+        scene end the motion. max_step: longest step [s].
 
     Attributes:
         dynamics, ode: of the scene.
@@ -230,14 +248,10 @@ class Stepper:
     ) -> Point:
         """Advance through a period, by steps up to the first event in each.
 
-        Args:
-            at: where it begins.
-            start: when it begins [s].
-            h: its length [s].
-            torque: one of `AppliedTorque.acting`.
-            moment: from a topic.
-            other: constant torques of the second solution, by default those of the first [N m].
-            visit: called with each step that is done.
+        Args: at: where it begins. start: when it begins [s]. h: its length [s]. torque:
+            one of `AppliedTorque.acting`. moment: from a topic. other: constant torques
+            of the second solution, by default those of the first [N m]. visit: called
+            with each step that is done.
 
         Raises:
             LimitReached: a limit of the scene ends the motion, after the last step.
@@ -293,12 +307,16 @@ class Stepper:
         key = kind, method.name
         if key not in self._steps:
             if kind == "function":
-                steps: Steps = FunctionSteps(self.ode, method, self.torque, self._derivative)
+                steps: Steps = FunctionSteps(
+                    self.ode, method, self.torque, self._derivative
+                )
             elif sine is None:
                 steps = steps_of(self.ode, method)
             else:
                 limit = self.torque.limit_of(sine)
-                ode = recent_ode(self.dynamics, sine, limit=limit, work=True, phases=True)
+                ode = recent_ode(
+                    self.dynamics, sine, limit=limit, work=True, phases=True
+                )
                 steps = steps_of(ode, method)
             self._steps[key] = steps
         return self._steps[key]
@@ -314,7 +332,8 @@ class Stepper:
     ) -> Step:
         """Take one step that is accepted, from t to `end` at most.
 
-        `stops` are the times just before and after a jump that was found, where steps end.
+        `stops` are the times just before and after a jump that was found, where steps
+        end.
         """
         rejected = 0
         while True:
@@ -333,7 +352,9 @@ class Stepper:
                 longest = _next_length(at, h, error, cut=stopped or h == left)
                 end_point = after._replace(h=longest, attempts=at.attempts)
                 if h < left or isinstance(at.method, Rosenbrock):
-                    end_point = self._choose_method(steps, t + h, h, end_point, drive, 0)
+                    end_point = self._choose_method(
+                        steps, t + h, h, end_point, drive, 0
+                    )
                 return Step(t, h, at, end_point, drive, other, steps, h == left)
             stops[:] = self._jump_in(t, h, at.y, drive)
             if stops:
@@ -353,7 +374,9 @@ class Stepper:
         `rejected` counts the attempts in a row that were rejected.
         """
         at = at._replace(attempts=at.attempts + 1)
-        early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(at.method, Rosenbrock)
+        early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(
+            at.method, Rosenbrock
+        )
         if not self._chooses or (at.attempts < _CHOOSE_EVERY and not early):
             return at
         if not early:
@@ -371,7 +394,9 @@ class Stepper:
         change = MethodChange(drive.start + t, method.name, reason)
         return at._replace(method=method, changes=(*at.changes, change))
 
-    def _jump_in(self, t: float, h: float, y: Sequence[float], drive: Drive) -> list[float]:
+    def _jump_in(
+        self, t: float, h: float, y: Sequence[float], drive: Drive
+    ) -> list[float]:
         """Return times just before and after a jump of the torques in a step, if there is one."""
         if not callable(drive.function) or isinstance(drive.function, SineTorque):
             return []
@@ -439,8 +464,8 @@ def better_method(
 ) -> tuple[Method, str]:
     """Choose the method that would take longer steps, the one in use if none is, and state why.
 
-    `steps` is the length of a step times the eigenvalues of the Jacobian; `only_stiff` looks for
-    stiffness alone.
+    `steps` is the length of a step times the eigenvalues of the Jacobian; `only_stiff`
+    looks for stiffness alone.
     """
     radius, decay = np.abs(steps).max(), -steps.real.min()
     implicit = isinstance(method, Rosenbrock)
@@ -458,7 +483,8 @@ def better_method(
 def _next_length(at: Point, h: float, error: float, *, cut: bool) -> float:
     """Longest step after an accepted one of h with a local error, relative to the tolerance.
 
-    A step that was cut does not say that the next must be shorter than the longest of before.
+    A step that was cut does not say that the next must be shorter than the longest of
+    before.
     """
     length = h * _step_factor(error, at.method)
     return max(at.h, length) if cut else length

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One step of a method, as ordinary functions on numbers of any kind.
 
-On floats they compute a step. On expressions they are traced to the straight-line program
-that runs as machine code: what is read here is what runs.
+On floats they compute a step. On expressions they are traced to the straight-line
+program that runs as machine code: what is read here is what runs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from sst_ros.mechanism.generic_math import absolute, larger, select, sqrt
 Number = Any
 Numbers = Sequence[Any]
 Derivative = Callable[[Number, Numbers, Any], Numbers]
-"""(time [s], state, drive) -> the derivative of the state; what a drive is, the caller knows."""
+"""(time [s], state, drive) -> the derivative of the state.
+
+What a drive is, the caller knows.
+"""
 
 _RADIANS_PER_STEP = 1e-3
 """Below so much in a step a rate counts as so large: else rest could not be reached [rad]."""
@@ -25,7 +28,10 @@ _NO_DIVISION_BY_ZERO = 1e-300
 
 
 class NewState(NamedTuple):
-    """Where a step ends, and what the method knows of its error; None where it knows nothing."""
+    """Where a step ends, and what the method knows of its error.
+
+    None where it knows nothing.
+    """
 
     state: list[Number]
     error: list[Number] | None
@@ -59,10 +65,13 @@ def explicit_step(
     return NewState(state, _estimate_error(method, h, slopes))
 
 
-def _move(y: Numbers, h: Number, weights: Sequence[float], slopes: Sequence[Numbers]) -> list[Any]:
+def _move(
+    y: Numbers, h: Number, weights: Sequence[float], slopes: Sequence[Numbers]
+) -> list[Any]:
     """Return y + h (sum of weights times slopes)."""
     return [
-        number + h * _weigh(weights, [slope[i] for slope in slopes]) for i, number in enumerate(y)
+        number + h * _weigh(weights, [slope[i] for slope in slopes])
+        for i, number in enumerate(y)
     ]
 
 
@@ -76,7 +85,9 @@ def _weigh(weights: Sequence[float], numbers: Numbers) -> Number:
     return 0.0 if total is None else total
 
 
-def _estimate_error(method: Tableau, h: Number, slopes: Sequence[Numbers]) -> list[Number] | None:
+def _estimate_error(
+    method: Tableau, h: Number, slopes: Sequence[Numbers]
+) -> list[Number] | None:
     """Return the error estimate of each number of the state, None where there is none."""
     if not method.error:
         return None
@@ -115,8 +126,8 @@ def rosenbrock_step(
 ) -> NewState:
     """Take one step of a Rosenbrock method (Hairer & Wanner, Solving ODEs II, section IV.7).
 
-    The last stage is what the solution adds to the embedded one. The Jacobian may be that of a
-    point near y. See `explicit_step` for the arguments.
+    The last stage is what the solution adds to the embedded one. The Jacobian may be
+    that of a point near y. See `explicit_step` for the arguments.
     """
     size = len(y)
     matrix = [[-column[i] for column in linearisation.columns] for i in range(size)]
@@ -130,14 +141,19 @@ def rosenbrock_step(
     ):
         point = list(y)
         for weight, stage in zip(weights, stages, strict=True):
-            point = [number + weight * x for number, x in zip(point, stage, strict=True)]
+            point = [
+                number + weight * x for number, x in zip(point, stage, strict=True)
+            ]
         slope = derivative(t + node * h, point, drive)
         right = [
             number + h * by_time * rate
             for number, rate in zip(slope, linearisation.by_time, strict=True)
         ]
         for coupling, stage in zip(couplings, stages, strict=True):
-            right = [number + coupling / h * x for number, x in zip(right, stage, strict=True)]
+            right = [
+                number + coupling / h * x
+                for number, x in zip(right, stage, strict=True)
+            ]
         stages.append(substitute(decomposition, right))
     error = list(stages[-1])
     return NewState([number + x for number, x in zip(point, error, strict=True)], error)
@@ -146,7 +162,8 @@ def rosenbrock_step(
 class Decomposition(NamedTuple):
     """L and U of a matrix with exchanged rows, and where rows were exchanged.
 
-    `exchanges[k]` has a number for each row below the k-th: where it is > 0 they changed places.
+    `exchanges[k]` has a number for each row below the k-th: where it is > 0 they
+    changed places.
     """
 
     rows: list[list[Number]]
@@ -156,8 +173,9 @@ class Decomposition(NamedTuple):
 def factorise(matrix: Sequence[Numbers]) -> Decomposition:
     """Decompose a matrix with partial pivoting.
 
-    Without a branch: each row below changes places with the k-th where it has the larger number,
-    so the largest comes to stand in the k-th row, and which rows change is data.
+    Without a branch: each row below changes places with the k-th where it has the
+    larger number, so the largest comes to stand in the k-th row, and which rows change
+    is data.
     """
     rows = [list(row) for row in matrix]
     size = len(rows)
@@ -206,12 +224,14 @@ def normalise(y: Numbers) -> list[Number]:
     return [*(number * factor for number in y[:4]), *y[4:]]
 
 
-def size_of_error(error: Numbers, old: Numbers, new: Numbers, h: Number, lagged: int) -> Number:
+def size_of_error(
+    error: Numbers, old: Numbers, new: Numbers, h: Number, lagged: int
+) -> Number:
     """Return the largest error of a step relative to what it is an error of.
 
-    Quaternion: absolute. Rate: relative to its length, but not below 1e-3 rad a step, so that
-    rest can be reached. Lagging torques, which are `lagged` numbers: relative to the largest of
-    them. The work is not looked at.
+    Quaternion: absolute. Rate: relative to its length, but not below 1e-3 rad a step,
+    so that rest can be reached. Lagging torques, which are `lagged` numbers: relative
+    to the largest of them. The work is not looked at.
     """
     largest: Number = 0.0
     for number in error[:4]:
@@ -260,16 +280,11 @@ def step_pair(
 ) -> Pair:
     """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
 
-    Args:
-        step: (part, time, length, state, near) -> the new state: part 0 is the step of y, and 1
-            and 2 are those of z. A Jacobian is that of the state `near`, which is y for the first
-            step of z: beside a kink of a force both solutions then have the same.
-        t: time at which the step begins [s].
-        h: its length [s].
-        y: first solution.
-        z: second one.
-        lagged: numbers of the state that are lagging torques.
-
+    Args: step: (part, time, length, state, near) -> the new state: part 0 is the step
+        of y, and 1 and 2 are those of z. A Jacobian is that of the state `near`, which
+        is y for the first step of z: beside a kink of a force both solutions then have
+        the same. t: time at which the step begins [s]. h: its length [s]. y: first
+        solution. z: second one. lagged: numbers of the state that are lagging torques.
     """
     half = 0.5 * h
     new_y, error_y = step(0, t, h, y, y)
@@ -278,7 +293,9 @@ def step_pair(
     if error_y is None:  # the method has no estimate of its own
         error_y = [
             (after_z - before_z) - (after_y - before_y)
-            for after_z, before_z, after_y, before_y in zip(new_z, z, new_y, y, strict=True)
+            for after_z, before_z, after_y, before_y in zip(
+                new_z, z, new_y, y, strict=True
+            )
         ]
     size = size_of_error(error_y, y, new_y, h, lagged)
     total = add_up([*new_y, *error_y, *new_z, *(error_z or ())])

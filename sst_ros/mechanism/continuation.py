@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Follow one assembly along a motion gamma, with a proof at every step that it is the same one.
 
-Let A have the rows t_k x r_k, so that turning R by a small phi changes r_k . R e_k by A phi, and
-let sigma be its least singular value. Along a straight segment of length d in gamma the residual
-and the slope change by at most d, and second derivatives by phi are at most 1 a row. By the
-Newton-Kantorovich theorem (L = sqrt(3), beta = 1/(sigma - d), eta = beta d) a unique assembly
-exists near R for every point of the segment, and Newton's method from R finds it, as long as
+Let A have the rows t_k x r_k, so that turning R by a small phi changes r_k . R e_k by A
+phi, and let sigma be its least singular value. Along a straight segment of length d in
+gamma the residual and the slope change by at most d, and second derivatives by phi are
+at most 1 a row. By the Newton-Kantorovich theorem (L = sqrt(3), beta = 1/(sigma - d),
+eta = beta d) a unique assembly exists near R for every point of the segment, and
+Newton's method from R finds it, as long as
 
     sqrt(3) d / (sigma - d)^2 <= 1/2,   for which   d <= 0.18 sigma^2   is enough.
 
-So no step jumps to another branch, however near it is; steps shrink only toward a parallel
-singularity (sigma = 0). The edge of the workspace, beta_k = 0, is no place of interest here.
+So no step jumps to another branch, however near it is; steps shrink only toward a
+parallel singularity (sigma = 0). The edge of the workspace, beta_k = 0, is no place of
+interest here.
 """
 
 from __future__ import annotations
@@ -36,15 +38,17 @@ class BranchEnds(SingularConfiguration):
     `measure` is sigma, the least singular value of J2, at the last assembly.
     """
 
-    def __init__(self, measure: float, row: int, gamma: Array, rotation: Array, j2: Array) -> None:
+    def __init__(
+        self, measure: float, row: int, gamma: Array, rotation: Array, j2: Array
+    ) -> None:
         self.row = row  #: index of the point of the motion that was not reached
         self.gamma = gamma  #: actuator angles of the last assembly [rad], shape (3,)
         self.rotation = rotation  #: R of the last assembly, shape (3, 3)
         self.det_j2 = float(np.linalg.det(j2))  #: determinant of J2 there
         angles = np.array2string(gamma, precision=9)
         super().__init__(
-            f"parallel singularity before point {row}: the branch ends at gamma = {angles} rad,"
-            f" det J2 = {self.det_j2:.3e}, least singular value",
+            f"parallel singularity before point {row}: the branch ends at gamma ="
+            f" {angles} rad, det J2 = {self.det_j2:.3e}, least singular value",
             measure,
         )
 
@@ -54,16 +58,14 @@ def follow(
 ) -> tuple[Array, Array]:
     """Follow a branch along the straight segments between the points gamma [rad], shape (n, 3).
 
-    Sample a curved motion finely enough that the chords stand for it. `rotation` is R of the
-    assembly at gamma[0], by default of the admissible one. Returns R, shape (n, 3, 3), and the
-    least singular values of J2, shape (n,), read-only.
+    Sample a curved motion finely enough that the chords stand for it. `rotation` is R
+    of the assembly at gamma[0], by default of the admissible one. Returns R, shape (n,
+    3, 3), and the least singular values of J2, shape (n,), read-only.
 
-    Raises:
-        AssemblyError: rotation is None and there is no unique admissible assembly, rotation is
-            no assembly at gamma[0], or gamma is not (n, 3) finite numbers.
-        BranchEnds: a parallel singularity lies on the path (or the motion runs along one so near
-            that no number of steps would do); carries where, and how near.
-
+    Raises: AssemblyError: rotation is None and there is no unique admissible assembly,
+        rotation is no assembly at gamma[0], or gamma is not (n, 3) finite numbers.
+        BranchEnds: a parallel singularity lies on the path (or the motion runs along
+        one so near that no number of steps would do); carries where, and how near.
     """
     points = np.array(gamma, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
@@ -84,14 +86,20 @@ def follow(
 
 
 def advance(
-    geometry: Geometry, rotation: ArrayLike, start: ArrayLike, end: ArrayLike, row: int = 1
+    geometry: Geometry,
+    rotation: ArrayLike,
+    start: ArrayLike,
+    end: ArrayLike,
+    row: int = 1,
 ) -> Array:
     """Return R, shape (3, 3), at gamma = end [rad] of the branch that has `rotation` at start.
 
-    Its steps are proved not to leave the branch. Where a parallel singularity lies on the path,
-    BranchEnds is raised; it says that the end is point `row` of a motion.
+    Its steps are proved not to leave the branch. Where a parallel singularity lies on
+    the path, BranchEnds is raised; it says that the end is point `row` of a motion.
     """
-    here, end, rotation = (np.array(given, dtype=float) for given in (start, end, rotation))
+    here, end, rotation = (
+        np.array(given, dtype=float) for given in (start, end, rotation)
+    )
     start = here
     length, done = float(np.linalg.norm(end - start)), 0.0
     for _ in range(_BUDGET):
@@ -105,7 +113,8 @@ def advance(
         done = length if done + step >= length else done + step
         there = end if done == length else start + (done / length) * (end - start)
         moved = _newton(geometry, there, rotation)
-        # The theorem speaks of a ball about R; a result beyond it would be another assembly.
+        # The theorem speaks of a ball about R; a result beyond it would be another
+        # assembly.
         if np.linalg.norm(moved - rotation) > _SQRT2 * (sigma - step) / 2.0:
             break
         here, rotation = there, moved

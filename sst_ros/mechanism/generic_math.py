@@ -27,11 +27,16 @@ def _function(name: str) -> Callable[[Any], Any]:
     return lambda x: of_float(x) if type(x) is float else _other(name, x)
 
 
-sqrt, tanh, exp, log, sin, cos = map(_function, ("sqrt", "tanh", "exp", "log", "sin", "cos"))
+sqrt, tanh, exp, log, sin, cos = map(
+    _function, ("sqrt", "tanh", "exp", "log", "sin", "cos")
+)
 
 
 def positive(x: Any) -> Any:
-    """Return x where x > 0 and 0 elsewhere; of a complex number the real part decides."""
+    """Return x where x > 0 and 0 elsewhere.
+
+    Of a complex number the real part decides.
+    """
     if type(x) is float:
         return x if x > 0.0 else 0.0
     if hasattr(x, "apply"):
@@ -64,7 +69,10 @@ def select(condition: Any, x: Any, y: Any) -> Any:
 
 
 def atan2(y: Any, x: Any) -> Any:
-    """Angle of the point (x, y); complex numbers as the analytic continuation near the reals."""
+    """Angle of the point (x, y).
+
+    Complex numbers as the analytic continuation near the reals.
+    """
     if type(y) is float and type(x) is float:
         return math.atan2(y, x)
     for number in (y, x):
@@ -138,7 +146,11 @@ def multiply(factor: Scalar, a: Triple) -> Triple:
 
 def axpy(alpha: Scalar, a: Triple, beta: Scalar, b: Triple) -> Triple:
     """Return alpha a + beta b."""
-    return (alpha * a[0] + beta * b[0], alpha * a[1] + beta * b[1], alpha * a[2] + beta * b[2])
+    return (
+        alpha * a[0] + beta * b[0],
+        alpha * a[1] + beta * b[1],
+        alpha * a[2] + beta * b[2],
+    )
 
 
 def triple(numbers: Iterable[Scalar]) -> Triple:
@@ -181,4 +193,8 @@ def dot3(a: Triple, b: Triple) -> Scalar:
 
 def cross3(a: Triple, b: Triple) -> Triple:
     """Vector product of two triples."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The constant vectors of one manipulator, and the arrays of three numbers that all rooms use.
 
-Vectors lie along the last axis; rotations are matrices, quaternions (x, y, z, w) or ZYZ angles.
+Vectors lie along the last axis; rotations are matrices, quaternions (x, y, z, w) or ZYZ
+angles.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.state import Array as Array
 
-_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")  # what a geometry is made from
+# what a geometry is made from
+_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 _SMALL = 1000  # numbers of an array below which `take` is faster than slices
 _AHEAD, _BEHIND = np.array([1, 2, 0]), np.array([2, 0, 1])
 
@@ -39,7 +41,8 @@ class Geometry:
     w: Array  #: actuator axes, Eq. 1, shape (3, 3)
     e: Array  #: axes t_k of the star's arcs in {E}, shape (3, 3); t_k = R e_k
     alpha: Array  #: angles between the arcs [rad], shape (3,)
-    #: lengths of the base arcs P_k P_k+1, the upper ends of the stroke [rad], shape (3,)
+    # : lengths of the base arcs P_k P_k+1, the upper ends of the stroke [rad], shape
+    # (3,)
     arc: Array
     beta_max: Any  #: largest admissible beta_k [rad]
 
@@ -52,16 +55,23 @@ class Geometry:
 
     @classmethod
     @check_kinds
-    def build(cls, v: ArrayLike, alpha: ArrayLike, beta_max: ArrayLike = np.pi / 2) -> Geometry:
+    def build(
+        cls, v: ArrayLike, alpha: ArrayLike, beta_max: ArrayLike = np.pi / 2
+    ) -> Geometry:
         """Derive the geometry from directions v, shape (3, 3), and angles alpha [rad], (3,).
 
         Shapes (n, 3, 3), (n, 3) and (n,) of beta_max [rad] give n geometries.
 
-        The sense of the star (t_k+1 = Rot(s, +alpha_k) t_k) is the one that has admissible
-        assemblies over a right-handed base triangle. InputError refuses other shapes.
+        The sense of the star (t_k+1 = Rot(s, +alpha_k) t_k) is the one that has
+        admissible assemblies over a right-handed base triangle. InputError refuses
+        other shapes.
         """
         directions = np.array(v, dtype=float)
-        shapes = v_shape, *others = directions.shape, np.shape(alpha), np.shape(beta_max)
+        shapes = v_shape, *others = (
+            directions.shape,
+            np.shape(alpha),
+            np.shape(beta_max),
+        )
         good = v_shape[-2:] == (3, 3) and others[0] == v_shape[:-1]
         good = good and others[1] in ((), v_shape[:-2])
         allowed = "must have the shapes (3, 3), (3,) and ()"
@@ -76,7 +86,13 @@ class Geometry:
         f = np.stack([np.zeros_like(first), first, first + second], axis=-1)
         e = np.stack([-np.sin(f), np.cos(f), np.zeros_like(f)], axis=-1)
         most: Any = beta_max if others[1] else float(np.asarray(beta_max))
-        arrays = (directions, normals / sines[..., None], e, angles, np.arctan2(sines, cosines))
+        arrays = (
+            directions,
+            normals / sines[..., None],
+            e,
+            angles,
+            np.arctan2(sines, cosines),
+        )
         frozen(*arrays)
         return cls(*arrays, most)
 
@@ -84,7 +100,9 @@ class Geometry:
     def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
         """Derive the distinct geometries of `Scenarios`, and the index of that of each row."""
         scene, rows = scenarios.document, [scenarios.rows.get(key) for key in _KEYS]
-        varied = [values.reshape(len(values), -1) for values in rows if values is not None]
+        varied = [
+            values.reshape(len(values), -1) for values in rows if values is not None
+        ]
         if not varied:
             return cls.of(scene), np.zeros(scenarios.count or 1, dtype=np.intp)
         _, first, index = np.unique(
@@ -101,7 +119,10 @@ class Geometry:
         return found, index.ravel()
 
     def of_rows(self, rows: Any) -> Geometry:
-        """Return the geometries of rows, or of a row; this one where it is a single one."""
+        """Return the geometries of rows, or of a row.
+
+        This one where it is a single one.
+        """
         if self.v.ndim == 2:
             return self
         return Geometry(*(array[rows] for array in vars(self).values()))
@@ -142,12 +163,13 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
 def quaternion_of(rotation: ArrayLike) -> Array:
     """Quaternions (x, y, z, w) with w >= 0, shape (..., 4), of rotation matrices (..., 3, 3).
 
-    The largest component comes from the diagonal (Markley, J. Guid. Control Dyn. 31 (2008)
-    440-442). Where w is zero, the first other component that is not is positive.
+    The largest component comes from the diagonal (Markley, J. Guid. Control Dyn. 31
+    (2008) 440-442). Where w is zero, the first other component that is not is positive.
     """
     m = np.asarray(rotation, dtype=float)
     trace = np.trace(m, axis1=-2, axis2=-1)
-    found = np.empty((*m.shape[:-2], 4, 4))  # four times a row's own component times all four
+    # four times a row's own component times all four
+    found = np.empty((*m.shape[:-2], 4, 4))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         found[..., i, i] = 1.0 - trace + 2.0 * m[..., i, i]
         found[..., i, j] = m[..., j, i] + m[..., i, j]
@@ -167,15 +189,17 @@ def quaternion_of(rotation: ArrayLike) -> Array:
 def zyz_angles(rotation: ArrayLike) -> Array:
     """ZYZ angles [rad], (..., 3), of R = Rz(theta) Ry(phi) Rz(psi), (..., 3, 3), Eqs. 3, 6 to 8.
 
-    theta and psi are in (-pi, pi], phi in [0, pi]. Where sin(phi) = 0 only theta + psi (phi = 0) or
-    theta - psi (phi = pi) exists; there theta is 0 and psi carries it all.
+    theta and psi are in (-pi, pi], phi in [0, pi]. Where sin(phi) = 0 only theta + psi
+    (phi = 0) or theta - psi (phi = pi) exists; there theta is 0 and psi carries it all.
     """
     r = np.asarray(rotation, dtype=float)
     sine = np.hypot(r[..., 0, 2], r[..., 1, 2])
     pole = sine == 0.0
     theta = np.where(pole, 0.0, np.arctan2(r[..., 1, 2], r[..., 0, 2]))
     psi = np.where(
-        pole, np.arctan2(r[..., 1, 0], r[..., 1, 1]), np.arctan2(r[..., 2, 1], -r[..., 2, 0])
+        pole,
+        np.arctan2(r[..., 1, 0], r[..., 1, 1]),
+        np.arctan2(r[..., 2, 1], -r[..., 2, 0]),
     )
     return np.stack([theta, np.arctan2(sine, r[..., 2, 2]), psi], axis=-1)
 
@@ -183,32 +207,43 @@ def zyz_angles(rotation: ArrayLike) -> Array:
 def unwrap_zyz(angles: ArrayLike) -> Array:
     """ZYZ angles [rad] of a trajectory without jumps, shape (n, 3), as from `zyz_angles`.
 
-    (theta, phi, psi) and (theta + pi, -phi, psi + pi) are the same rotation, so a motion straight
-    through the pole is smooth in angles if phi may change its sign. Each sample takes that of the
-    two forms, give or take full turns, that is nearest to the sample before; the first one off the
-    pole is as given. At the pole itself (sin(phi) = 0, theta = 0) theta stays what it was and psi
-    takes the rest, so theta + psi at phi = 0 and theta - psi at phi = pi are kept.
+    (theta, phi, psi) and (theta + pi, -phi, psi + pi) are the same rotation, so a
+    motion straight through the pole is smooth in angles if phi may change its sign.
+    Each sample takes that of the two forms, give or take full turns, that is nearest to
+    the sample before; the first one off the pole is as given. At the pole itself
+    (sin(phi) = 0, theta = 0) theta stays what it was and psi takes the rest, so theta +
+    psi at phi = 0 and theta - psi at phi = pi are kept.
     """
     result = np.array(angles, dtype=float)
     off = np.flatnonzero(~np.isin(result[:, 1], (0.0, np.pi)))
     start = int(off[0]) if len(off) else 0
     ahead, back = range(start + 1, len(result)), range(start - 1, -1, -1)
     for row in (*ahead, *back):
-        before, (theta, phi, psi) = result[row - 1 if row > start else row + 1], result[row]
+        before, (theta, phi, psi) = (
+            result[row - 1 if row > start else row + 1],
+            result[row],
+        )
         half_turn = np.pi
         if phi in (0.0, np.pi):
             shift, half_turn = before[0] - theta, 0.0
             theta, psi = before[0], psi + (shift if phi else -shift)
-        forms = np.array([[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]])
+        forms = np.array(
+            [[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]]
+        )
         forms += 2.0 * np.pi * np.round((before - forms) / (2.0 * np.pi))
         result[row] = forms[np.argmin(np.abs(forms - before).sum(axis=1))]
     return result
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
-    """Angle of the rotation between quaternions [rad], shape (...,); exact for tiny angles."""
+    """Angle of the rotation between quaternions [rad], shape (...,).
+
+    Exact for tiny angles.
+    """
     a, b = np.asarray(first), np.asarray(second)
-    difference = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    difference = np.minimum(
+        np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
+    )
     return np.asarray(4.0 * np.arcsin(np.minimum(difference / 2.0, 1.0)))
 
 
@@ -220,7 +255,11 @@ def cross(a: Array, b: Array) -> Array:
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    out[..., 0], out[..., 1], out[..., 2] = (
+        ay * bz - az * by,
+        az * bx - ax * bz,
+        ax * by - ay * bx,
+    )
     return out
 
 

@@ -2,17 +2,20 @@
 """Positions: orientation -> joint angles, and actuator angles -> every orientation.
 
 A leg holds t_k at a right angle to r_k; that is all there is to the position problem:
-r_k(gamma_k) . R e_k = 0 for k = 1, 2, 3. Its roots R are those of one quartic, for many r at once:
+r_k(gamma_k) . R e_k = 0 for k = 1, 2, 3. Its roots R are those of one quartic, for many
+r at once:
 
-t_1 = cos(x) n + sin(x) m spans the plane across r_1 and s = cos(y) r_1 + sin(y) t_1 x r_1. Legs 2
-and 3 then read a cos(y) + b sin(y) + c = 0, so (cos y, sin y, 1) is the cross product of the two
-rows (a, b, c), and cos^2 + sin^2 = 1 is a form of degree four in (cos x, sin x). Its roots come
-from a companion matrix; each is polished on the rotation itself. t_1 and -t_1 give two
-assemblies, R and R Rot(z, pi), that share s: up to eight.
+t_1 = cos(x) n + sin(x) m spans the plane across r_1 and s = cos(y) r_1 + sin(y) t_1 x
+r_1. Legs 2 and 3 then read a cos(y) + b sin(y) + c = 0, so (cos y, sin y, 1) is the
+cross product of the two rows (a, b, c), and cos^2 + sin^2 = 1 is a form of degree four
+in (cos x, sin x). Its roots come from a companion matrix; each is polished on the
+rotation itself. t_1 and -t_1 give two assemblies, R and R Rot(z, pi), that share s: up
+to eight.
 
-Resolution: two roots are distinguished when the residual r_k . t_k midway between them is more than
-rounding, so that they are some 1e-6 rad apart or gamma is some 1e-12 rad off the fold where they
-meet. Closer ones, real or a complex pair, are a double root in this arithmetic, for r_k and e_k
+Resolution: two roots are distinguished when the residual r_k . t_k midway between them
+is more than rounding, so that they are some 1e-6 rad apart or gamma is some 1e-12 rad
+off the fold where they meet. Closer ones, real or a complex pair, are a double root in
+this arithmetic, for r_k and e_k
 are rounded too: they come out as one, with det J2 near 0.
 """
 
@@ -52,15 +55,20 @@ _STEPS, _LONGEST_TURN, _LAST_STEP, _REGULAR = 40, 0.3, 1e-9, 1e-5
 
 @dataclass(frozen=True)
 class Assemblies:
-    """The assemblies of many gamma at once; m of them for n configurations. Read-only arrays."""
+    """The assemblies of many gamma at once; m of them for n configurations.
 
-    configuration: Index  #: row of gamma that each assembly belongs to, ascending, shape (m,)
+    Read-only arrays.
+    """
+
+    # : row of gamma that each assembly belongs to, ascending, shape (m,)
+    configuration: Index
     rotation: Array  #: this and what follows as in `Assembly`, with m first
     mu: Array
     beta: Array
     det_j2: Array
     admissible: Mask
-    #: shape (n,); False where gamma has a continuum of assemblies, of which none is listed
+    # : shape (n,); False where gamma has a continuum of assemblies, of which none is
+    # listed
     isolated: Mask
 
 
@@ -72,7 +80,10 @@ def carriage_directions(geometry: Geometry, gamma: ArrayLike) -> Array:
 
 
 def closure(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Array:
-    """Products r_k . R e_k of gamma (..., 3) [rad] and R (..., 3, 3), zero in closed loops."""
+    """Products r_k .
+
+    R e_k of gamma (..., 3) [rad] and R (..., 3, 3), zero in closed loops.
+    """
     t = geometry.e @ np.swapaxes(np.asarray(rotation, dtype=float), -1, -2)
     return dot(carriage_directions(geometry, gamma), t)
 
@@ -83,20 +94,25 @@ def inverse(
 ) -> tuple[Array, Array, Array]:
     """Joint angles (gamma, mu, beta) [rad], each shape (..., 3), of orientations R (..., 3, 3).
 
-    The planes across w_k and t_k meet in one line, so every leg has two solutions, r_k and -r_k,
-    and an orientation has eight:
+    The planes across w_k and t_k meet in one line, so every leg has two solutions, r_k
+    and -r_k, and an orientation has eight:
 
-    - sign +1, r_k = t_k x w_k / sin(mu_k): mu_k in (0, pi). All admissible assemblies have it, and
-      on it beta_k changes sign smoothly at the edge of the workspace.
+    - sign +1, r_k = t_k x w_k / sin(mu_k): mu_k in (0, pi). All admissible assemblies
+      have it, and on it beta_k changes sign smoothly at the edge of the workspace.
     - sign -1, -r_k: gamma_k + pi, -mu_k and beta_k + pi, wrapped to (-pi, pi].
 
-    Where t_k = +-w_k (serial singularity) every gamma_k fits and it comes out as 0. InputError
-    refuses other shapes.
+    Where t_k = +-w_k (serial singularity) every gamma_k fits and it comes out as 0.
+    InputError refuses other shapes.
     """
     matrices = np.asarray(rotation, dtype=float)
     refuse_unless(
         "inverse",
-        ("rotation", matrices.shape, matrices.shape[-2:] == (3, 3), "must be (..., 3, 3)"),
+        (
+            "rotation",
+            matrices.shape,
+            matrices.shape[-2:] == (3, 3),
+            "must be (..., 3, 3)",
+        ),
         ("signs", signs, np.shape(signs) == (3,), "must be three of 1 and -1"),
     )
     t, s = geometry.e @ np.swapaxes(matrices, -1, -2), matrices[..., None, :, 2]
@@ -114,53 +130,75 @@ def inverse(
 def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     """All real assemblies at actuator angles gamma [rad], shape (3,); up to eight.
 
-    They come in pairs R, R Rot(z, pi), in the order of (s_z, s_y, s_x) of their shared s. A double
-    root comes out as one, with det J2 near 0. Where gamma is not finite, or the assemblies are not
-    isolated, AssemblyError is raised.
+    They come in pairs R, R Rot(z, pi), in the order of (s_z, s_y, s_x) of their shared
+    s. A double root comes out as one, with det J2 near 0. Where gamma is not finite, or
+    the assemblies are not isolated, AssemblyError is raised.
     """
     angles = np.array(gamma, dtype=float)
     found = direct_many(geometry, angles[None])
     if not found.isolated[0]:
         raise AssemblyError("the assemblies are not isolated", angles)
-    rows = zip(found.rotation, found.mu, found.beta, found.det_j2, found.admissible, strict=True)
+    rows = zip(
+        found.rotation,
+        found.mu,
+        found.beta,
+        found.det_j2,
+        found.admissible,
+        strict=True,
+    )
     return [Assembly(*row[:3], float(row[3]), bool(row[4])) for row in rows]
 
 
 def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
-    """All real assemblies of many gamma [rad], shape (n, 3), at once; the order is `direct`'s.
+    """All real assemblies of many gamma [rad], shape (n, 3), at once.
 
-    The geometry may be one for each. AssemblyError refuses what is not (n, 3) finite numbers.
+    The order is `direct`'s.
+
+    The geometry may be one for each. AssemblyError refuses what is not (n, 3) finite
+    numbers.
     """
     angles = np.asarray(gamma, dtype=float)
     if angles.ndim != 2 or angles.shape[1] != 3 or not np.all(np.isfinite(angles)):
-        raise AssemblyError("gamma must be three finite numbers, or rows of them", angles)
+        raise AssemblyError(
+            "gamma must be three finite numbers, or rows of them", angles
+        )
     r = carriage_directions(geometry, angles)
-    configuration, rotation, isolated = _solve_closure(r, np.broadcast_to(geometry.e, r.shape))
+    configuration, rotation, isolated = _solve_closure(
+        r, np.broadcast_to(geometry.e, r.shape)
+    )
     mu, beta, det_j2, admissible = describe_assemblies(
         geometry.of_rows(configuration), r[configuration], rotation
     )
-    return Assemblies(*frozen(configuration, rotation, mu, beta, det_j2, admissible, isolated))
+    return Assemblies(
+        *frozen(configuration, rotation, mu, beta, det_j2, admissible, isolated)
+    )
 
 
-def admissible(geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = None) -> Assembly:
+def admissible(
+    geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = None
+) -> Assembly:
     """Return the one assembly in which the manipulator can be built at gamma [rad], section 4.1.
 
-    Where several are admissible, the rotation `near` selects the only one within NEAR of it.
+    Where several are admissible, the rotation `near` selects the only one within NEAR
+    of it.
 
-    Raises:
-        NoAdmissibleAssembly: no assembly has E on the base triangle and 0 < beta_k <= beta_max.
-        AmbiguousAssembly: more than one has, and `near` names none; the error carries them.
-        AssemblyError: gamma is not finite, or the assemblies are not isolated.
-
+    Raises: NoAdmissibleAssembly: no assembly has E on the base triangle and 0 < beta_k
+        <= beta_max. AmbiguousAssembly: more than one has, and `near` names none; the
+        error carries them. AssemblyError: gamma is not finite, or the assemblies are
+        not isolated.
     """
-    candidates = [assembly for assembly in direct(geometry, gamma) if assembly.admissible]
+    candidates = [
+        assembly for assembly in direct(geometry, gamma) if assembly.admissible
+    ]
     angles = np.asarray(gamma, dtype=float)
     if not candidates:
         raise NoAdmissibleAssembly("no admissible assembly", angles)
     if len(candidates) > 1:
         orientations = quaternion_of(np.stack([one.rotation for one in candidates]))
         if near is not None:
-            (meant,) = np.nonzero(angle_between(orientations, quaternion_of(near)) < NEAR)
+            (meant,) = np.nonzero(
+                angle_between(orientations, quaternion_of(near)) < NEAR
+            )
             if len(meant) == 1:
                 return candidates[int(meant[0])]
         raise AmbiguousAssembly(angles, candidates, orientations)
@@ -172,7 +210,8 @@ def describe_assemblies(
 ) -> tuple[Array, Array, Array, Mask]:
     """Passive angles mu, beta (..., 3) [rad], det J2 and admissibility (...) of assemblies.
 
-    They have the carriage directions r in rows and R, (..., 3, 3) each, with r_k . R e_k = 0.
+    They have the carriage directions r in rows and R, (..., 3, 3) each, with r_k . R
+    e_k = 0.
     """
     t, s = geometry.e @ np.swapaxes(rotation, -1, -2), rotation[..., None, :, 2]
     mu = np.arctan2(dot(cross(t, geometry.w), r), dot(geometry.w, t))
@@ -188,9 +227,9 @@ def describe_assemblies(
 def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     """Solve r_k . R e_k = 0 for n configurations with r and e, (n, 3, 3) each.
 
-    Rows are unit vectors, e_1 = (0, 1, 0). Returns the configuration of each root, ascending, (m,);
-    the rotations, (m, 3, 3), in the order of `direct`; and whether the roots of a configuration are
-    isolated, (n,): where they are not, none is given.
+    Rows are unit vectors, e_1 = (0, 1, 0). Returns the configuration of each root,
+    ascending, (m,); the rotations, (m, 3, 3), in the order of `direct`; and whether the
+    roots of a configuration are isolated, (n,): where they are not, none is given.
     """
     r0, rest = r[:, 0], r[:, 1:]
     n = cross(r0, np.eye(3)[np.argmin(np.abs(r0), axis=1)])
@@ -198,7 +237,8 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     m = cross(r0, n)
     rn, rm = (rest @ n[:, :, None])[..., 0], (rest @ m[:, :, None])[..., 0]
     ex, ey = e[..., 1:, 0], e[..., 1:, 1]
-    # Coefficients of (cos x, sin x) in a and c, and the number b; shapes (n, 2, 2) and (n, 2).
+    # Coefficients of (cos x, sin x) in a and c, and the number b; shapes (n, 2, 2) and
+    # (n, 2).
     a = ex[..., None] * np.stack([-rm, rn], axis=-1)
     b = -ex * (rest @ r0[:, :, None])[..., 0]
     c = ey[..., None] * np.stack([rn, rm], axis=-1)
@@ -246,7 +286,9 @@ def _turn_forms(count: int) -> tuple[Array, Array]:
     """Angles x0 and matrices that turn a quartic form's coefficients from x to x - x0."""
     angles = np.arange(count) * np.pi / count
     matrices = np.zeros((count, 5, 5))
-    for turn, (cosine, sine) in enumerate(zip(np.cos(angles), np.sin(angles), strict=True)):
+    for turn, (cosine, sine) in enumerate(
+        zip(np.cos(angles), np.sin(angles), strict=True)
+    ):
         for power in range(5):
             term = np.ones(1)
             for factor in [[cosine, -sine]] * (4 - power) + [[sine, cosine]] * power:
@@ -260,7 +302,8 @@ _TURN, _TURNED = _turn_forms(5)
 
 def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
     """Angles x of the roots, shape (n, 4), modulo pi, and which of them may be real."""
-    # Count x from where the form is largest: then its leading coefficient is no small number.
+    # Count x from where the form is largest: then its leading coefficient is no small
+    # number.
     best = np.argmax(np.abs(form @ _TURNED[:, 0].T), axis=1)
     turned = (_TURNED[best] @ form[:, :, None])[..., 0]
     lead = np.where(isolated, turned[:, 0], 1.0)
@@ -284,9 +327,15 @@ def _second_angles(x: Array, a: Array, b: Array, c: Array) -> tuple[Array, Mask]
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.clip(-np.where(steep, c[:, 1], c[:, 0]) / chosen, -1.0, 1.0)
     swing = np.arccos(np.where(chosen > 0.0, cosine, 0.0))
-    middle = np.arctan2(np.where(steep, b[:, 1], b[:, 0]), np.where(steep, a[:, 1], a[:, 0]))
+    middle = np.arctan2(
+        np.where(steep, b[:, 1], b[:, 0]), np.where(steep, a[:, 1], a[:, 0])
+    )
     y = np.stack([middle + swing, middle - swing], axis=-1)
-    misfit = a[..., None] * np.cos(y)[:, None] + b[..., None] * np.sin(y)[:, None] + c[..., None]
+    misfit = (
+        a[..., None] * np.cos(y)[:, None]
+        + b[..., None] * np.sin(y)[:, None]
+        + c[..., None]
+    )
     return y, np.abs(misfit).max(axis=1) < _MISFIT
 
 
@@ -309,13 +358,19 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
         step = _newton_step(cross(t, r), residual)
         last = np.sqrt(dot(step, step))
         if last.max() > _LONGEST_TURN:
-            step = step * np.minimum(1.0, _LONGEST_TURN / np.maximum(last, 1e-300))[:, None]
+            step = (
+                step
+                * np.minimum(1.0, _LONGEST_TURN / np.maximum(last, 1e-300))[:, None]
+            )
         rotation = rotate(rotation, step)
     return best, least
 
 
 def _newton_step(slope: Array, residual: Array) -> Array:
-    """Solve slope step = -residual; the shortest such step where slope is nearly singular."""
+    """Solve slope step = -residual.
+
+    The shortest such step where slope is nearly singular.
+    """
     first, second, third = slope[:, 0], slope[:, 1], slope[:, 2]
     # A^-1 is the adjugate over the determinant; its columns are these vector products.
     adjugate = columns(cross(second, third), cross(third, first), cross(first, second))
@@ -371,7 +426,8 @@ def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
     s = np.round(rotation[:, :, 2], 6)
     order = np.lexsort((s[:, 0], s[:, 1], s[:, 2], owner))
     owner, rotation = owner[order], rotation[order]
-    # t_1 first, then -t_1: first the one further along the first base vector where they differ.
+    # t_1 first, then -t_1: first the one further along the first base vector where they
+    # differ.
     t = np.round(rotation[:, :, 1], 6)
     lead = t[np.arange(len(t)), np.argmax(t != 0.0, axis=1)] < 0.0
     rotation = np.where(lead[:, None, None], rotation * [-1.0, -1.0, 1.0], rotation)

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rates and accelerations of every joint and link.
 
-One leg equation, Eqs. 9 and 24 to 27, serves both directions; with c_k = (r x t).w = (w x r).t::
+One leg equation, Eqs. 9 and 24 to 27, serves both directions; with c_k = (r x t).w = (w
+x r).t::
 
     omega     = w gamma_dot - r mu_dot - t beta_dot
     omega_dot = w gamma_ddot - r mu_ddot - t beta_ddot
                 - gamma_dot mu_dot (w x r) - beta_dot (omega x t)
 
-Scalar products with N = r x t, r and w x r give gamma, mu and beta of a leg from the star; this
-needs no J2 and works at a parallel singularity. From the actuators, omega = J gamma_dot, Eq. 15,
-and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40, come first.
+Scalar products with N = r x t, r and w x r give gamma, mu and beta of a leg from the
+star; this needs no J2 and works at a parallel singularity. From the actuators, omega =
+J gamma_dot, Eq. 15, and omega_dot = J gamma_ddot - J2^-1 (M gamma_dot + n), Eq. 40,
+come first.
 """
 
 from __future__ import annotations
@@ -29,7 +31,10 @@ from sst_ros.state import ZERO
 
 @dataclass(frozen=True)
 class BodyRates:
-    """Velocities and accelerations of all nine joints and seven links. Read-only, rows by leg."""
+    """Velocities and accelerations of all nine joints and seven links.
+
+    Read-only, rows by leg.
+    """
 
     omega: Array  #: of the star, in {B} [rad/s], shape (3,)
     omega_dot: Array  #: [rad/s^2]
@@ -41,13 +46,19 @@ class BodyRates:
     beta_ddot: Array
     omega_a: Array  #: of actuated links, in {1k} [rad/s], Eqs. 53 to 57, shape (3, 3)
     omega_a_dot: Array
-    omega_ipl: Array  #: of intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3)
+    # : of intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3)
+    omega_ipl: Array
     omega_ipl_dot: Array
 
 
-def of_actuators(at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = ZERO) -> BodyRates:
+def of_actuators(
+    at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = ZERO
+) -> BodyRates:
     """Everything from gamma_dot [rad/s] and gamma_ddot [rad/s^2], each shape (3,)."""
-    rate, acceleration = np.array(gamma_dot, dtype=float), np.array(gamma_ddot, dtype=float)
+    rate, acceleration = (
+        np.array(gamma_dot, dtype=float),
+        np.array(gamma_ddot, dtype=float),
+    )
     omega = at.j @ rate
     omega_dot = at.j @ acceleration + virtual_work.bias(at, rate).omega_dot
     return _motion(at.r, at.t, at.w, omega, omega_dot, rate, acceleration)
@@ -62,9 +73,9 @@ def of_star(
 ) -> BodyRates:
     """Everything from omega [rad/s] and omega_dot [rad/s^2] of the star in {B}, each shape (3,).
 
-    The rotation R of {E} in {B} has the shape (3, 3); the actuator angles gamma [rad] choose the
-    branch of each leg, by default mu_k in (0, pi). SingularConfiguration is raised where some
-    c_k = 0 (serial).
+    The rotation R of {E} in {B} has the shape (3, 3); the actuator angles gamma [rad]
+    choose the branch of each leg, by default mu_k in (0, pi). SingularConfiguration is
+    raised where some c_k = 0 (serial).
     """
     matrix = np.asarray(rotation, dtype=float)
     if gamma is None:
@@ -73,17 +84,26 @@ def of_star(
     t, w = geometry.e @ matrix.T, geometry.w
     c = np.sum(cross(r, t) * w, axis=1)
     if np.min(np.abs(c)) < SINGULAR:
-        raise SingularConfiguration("serial singularity, c_k = 0", float(np.min(np.abs(c))))
-    return _motion(r, t, w, np.array(omega, dtype=float), np.array(omega_dot, dtype=float))
+        raise SingularConfiguration(
+            "serial singularity, c_k = 0", float(np.min(np.abs(c)))
+        )
+    return _motion(
+        r, t, w, np.array(omega, dtype=float), np.array(omega_dot, dtype=float)
+    )
 
 
 def body_rates(
-    geometry: Geometry, quaternion: Array, gamma_dot: Array, mu_dot: Array, beta_dot: Array
+    geometry: Geometry,
+    quaternion: Array,
+    gamma_dot: Array,
+    mu_dot: Array,
+    beta_dot: Array,
 ) -> Array:
     """Compute W in {E} [rad/s], shape (..., 3), from the rates of the joints [rad/s], (..., 3).
 
-    It follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without a matrix
-    that could be singular; the mean of the three is taken. Where the orientation is nan, it is.
+    It follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without
+    a matrix that could be singular; the mean of the three is taken. Where the
+    orientation is nan, it is.
     """
     known = np.isfinite(quaternion).all(axis=-1, keepdims=True)
     rotation = rotation_matrix(np.where(known, quaternion, (0.0, 0.0, 0.0, 1.0)))
@@ -97,7 +117,10 @@ def body_rates(
 def _motion(
     r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, *actuators: Array
 ) -> BodyRates:
-    """All joints and links; gamma_dot and gamma_ddot are those of `actuators` where given."""
+    """All joints and links.
+
+    gamma_dot and gamma_ddot are those of `actuators` where given.
+    """
     normal, wr, turning = cross(r, t), cross(w, r), cross(omega, t)
     c = np.sum(normal * w, axis=1)
     gamma_dot = (normal @ omega) / c  # Eq. 10
@@ -110,18 +133,25 @@ def _motion(
         + beta_dot * np.sum(normal * turning, axis=1)
     ) / c  # Eq. 29
     mu_ddot = -(r @ omega_dot) - beta_dot * np.sum(r * turning, axis=1)  # Eq. 42
-    beta_ddot = -(wr @ omega_dot + push + beta_dot * np.sum(wr * turning, axis=1)) / c  # Eq. 46
+    # Eq. 46
+    beta_ddot = -(wr @ omega_dot + push + beta_dot * np.sum(wr * turning, axis=1)) / c
     gamma_dot, gamma_ddot = actuators or (gamma_dot, gamma_ddot)
     joints = gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot
     x, zero = np.array([1.0, 0.0, 0.0]), np.zeros(3)
-    omega_a, omega_a_dot = (np.stack([zero, zero, x], axis=1) for x in (gamma_dot, gamma_ddot))
+    omega_a, omega_a_dot = (
+        np.stack([zero, zero, x], axis=1) for x in (gamma_dot, gamma_ddot)
+    )
     # {2k} = [r, t x r, t]; w has no component along r.
-    turn = np.stack([zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)], axis=1)
+    turn = np.stack(
+        [zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)], axis=1
+    )
     omega_ipl = gamma_dot[:, None] * turn - mu_dot[:, None] * x
     # (d/dt)(-r mu_dot) in {B} is -r mu_ddot - gamma_dot mu_dot (w x r); w is constant.
     across = cross(turn, np.broadcast_to(x, turn.shape))
     omega_ipl_dot = (
-        gamma_ddot[:, None] * turn - mu_ddot[:, None] * x - (gamma_dot * mu_dot)[:, None] * across
+        gamma_ddot[:, None] * turn
+        - mu_ddot[:, None] * x
+        - (gamma_dot * mu_dot)[:, None] * across
     )
     links = omega_a, omega_a_dot, omega_ipl, omega_ipl_dot
     return BodyRates(*frozen(omega, omega_dot, *joints, *links))
@@ -132,7 +162,8 @@ class OrientationSensitivity(NamedTuple):
 
     gamma: Array  #: by the actuator angles, shape (..., 3, 3)
     v: Array  #: by the unit directions v_k, leg and axis, shape (..., 3, 3, 3)
-    alpha: Array  #: by the angles of the star [rad], the last of which is 2 pi less the others
+    # : by the angles of the star [rad], the last of which is 2 pi less the others
+    alpha: Array
 
 
 def orientation_sensitivity(
@@ -144,9 +175,9 @@ def orientation_sensitivity(
 
         (t_k x r_k) . d = -(dr_k . t_k + r_k . R de_k),
 
-    three equations with the matrix J2. The change of r_k is that of gamma_k, of v_k, and of
-    w_k, which v_k and v_k+1 span. With these derivatives, tolerances of encoders and parts give
-    the error of the orientation.
+    three equations with the matrix J2. The change of r_k is that of gamma_k, of v_k,
+    and of w_k, which v_k and v_k+1 span. With these derivatives, tolerances of encoders
+    and parts give the error of the orientation.
 
     Args:
         geometry: of the manipulator.

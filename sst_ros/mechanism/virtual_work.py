@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's method, equation by equation: the readable form of the dynamics.
 
-Equation numbers are those of Akbarzadeh & Enferadi, J. Intell. Robot. Syst. 63 (2011) 25-49, with
-the signs that its printed text lost. Rows of (3, 3) arrays named after a leg's vector (r, t, w)
-belong to legs; matrices of Jacobians act on columns. Everything is in {B} unless stated
-otherwise. The simulation runs `kernel`, which the tests hold against this file.
+Equation numbers are those of Akbarzadeh & Enferadi, J. Intell. Robot. Syst. 63 (2011)
+25-49, with the signs that its printed text lost. Rows of (3, 3) arrays named after a
+leg's vector (r, t, w) belong to legs; matrices of Jacobians act on columns. Everything
+is in {B} unless stated otherwise. The simulation runs `kernel`, which the tests hold
+against this file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
 Three: TypeAlias = ArrayLike  # three numbers, one a leg or an axis
-SINGULAR = 1e-12  # smallest abs(det J2) and abs(c_k) for which the velocity analysis is done
+# smallest abs(det J2) and abs(c_k) for which the velocity analysis is done
+SINGULAR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,10 @@ class Posture:
 
 @dataclass(frozen=True)
 class Bias:
-    """Velocity products, Eqs. 26 to 49; accelerations are these plus Jacobians times gamma_ddot."""
+    """Velocity products, Eqs. 26 to 49.
+
+    Accelerations are these plus Jacobians times gamma_ddot.
+    """
 
     omega: Array  #: angular velocity of the star [rad/s], Eq. 15
     omega_dot: Array  #: J2^-1 (M gamma_dot + n) with its sign, Eq. 40 [rad/s^2]
@@ -73,10 +78,13 @@ class Bias:
     beta_ddot: Array  #: u_k, Eq. 49 [rad/s^2]
 
 
-def posture(geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None) -> Posture:
+def posture(
+    geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None
+) -> Posture:
     """Velocity analysis at gamma [rad], shape (3,), Eqs. 1 to 23.
 
-    It is that of the assembly with the rotation R, shape (3, 3), or of the admissible one.
+    It is that of the assembly with the rotation R, shape (3, 3), or of the admissible
+    one.
 
     Raises:
         AssemblyError: rotation is None and there is no unique admissible assembly.
@@ -96,7 +104,9 @@ def posture(geometry: Geometry, gamma: ArrayLike, rotation: Array | None = None)
     if abs(determinant) < SINGULAR:
         raise SingularConfiguration("parallel singularity, det J2 = 0", determinant)
     if np.min(np.abs(c)) < SINGULAR:
-        raise SingularConfiguration("serial singularity, c_k = 0", float(np.min(np.abs(c))))
+        raise SingularConfiguration(
+            "serial singularity, c_k = 0", float(np.min(np.abs(c)))
+        )
     j = np.asarray(-np.linalg.solve(j2, np.diag(c)), dtype=float)
     a = -r @ j
     wr = cross(w, r)
@@ -133,7 +143,10 @@ def link_jacobians(at: Posture) -> tuple[Array, Array]:
     d = np.eye(3)
     ja = np.stack([first[k].T @ np.outer(at.w[k], d[k]) for k in range(3)])
     jipl = np.stack(
-        [second[k].T @ (np.outer(at.w[k], d[k]) - np.outer(at.r[k], at.a[k])) for k in range(3)]
+        [
+            second[k].T @ (np.outer(at.w[k], d[k]) - np.outer(at.r[k], at.a[k]))
+            for k in range(3)
+        ]
     )
     return ja, jipl
 
@@ -143,8 +156,9 @@ def equation_of_motion(
 ) -> tuple[Array, Array]:
     """T1 (3, 3) [kg m^2] and T2 (3,) [N m] of T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
 
-    M = -T1 is the mass matrix, positive definite; -T2 without a moment has the velocity products.
-    gamma_dot is in rad/s, the moment n_ext on the star in {B} in N m. Inertia tensors may be full.
+    M = -T1 is the mass matrix, positive definite; -T2 without a moment has the velocity
+    products. gamma_dot is in rad/s, the moment n_ext on the star in {B} in N m. Inertia
+    tensors may be full.
     """
     rate = np.asarray(gamma_dot, dtype=float)
     products = bias(at, rate)
@@ -157,7 +171,11 @@ def equation_of_motion(
     first, second = link_frames(at)
     for k in range(3):
         turn = second[k].T @ first[k]
-        r, ia, iipl = second[k].T @ at.r[k], mechanism.actuated[k], mechanism.intermediate[k]
+        r, ia, iipl = (
+            second[k].T @ at.r[k],
+            mechanism.actuated[k],
+            mechanism.intermediate[k],
+        )
         omega_a, omega_ipl = ja[k] @ rate, jipl[k] @ rate
         big_l, small_l = -ia @ ja[k], -cross(omega_a, ia @ omega_a)  # Eqs. 73, 74
         big_p = turn @ ja[k] + np.outer(r, at.r[k] @ at.j)  # Eq. 78
@@ -171,7 +189,11 @@ def equation_of_motion(
 
 
 def direct_dynamics(
-    mechanism: Mechanism, at: Posture, gamma_dot: Three, torque: Three, moment: Three = ZERO
+    mechanism: Mechanism,
+    at: Posture,
+    gamma_dot: Three,
+    torque: Three,
+    moment: Three = ZERO,
 ) -> Array:
     """gamma_ddot [rad/s^2], shape (3,), of actuator torques [N m], Eq. 90."""
     t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)
@@ -179,7 +201,11 @@ def direct_dynamics(
 
 
 def inverse_dynamics(
-    mechanism: Mechanism, at: Posture, gamma_dot: Three, gamma_ddot: Three, moment: Three = ZERO
+    mechanism: Mechanism,
+    at: Posture,
+    gamma_dot: Three,
+    gamma_ddot: Three,
+    moment: Three = ZERO,
 ) -> Array:
     """Actuator torques [N m], shape (3,), that give gamma_ddot [rad/s^2], Eq. 90."""
     t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the star can go, how far every limit is, how well the actuators hold it, what is singular.
 
-A pose is admissible when E lies on the base triangle (Eq. 4), 0 < beta_k <= beta_max, and gamma_k
-lies in its stroke. The map is over orientations (direction of s, turn psi about it), where the
-inverse kinematics has one answer.
+A pose is admissible when E lies on the base triangle (Eq. 4), 0 < beta_k <= beta_max,
+and gamma_k lies in its stroke. The map is over orientations (direction of s, turn psi
+about it), where the inverse kinematics has one answer.
 
-Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means t_k = +-w_k, so
-w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever at the edge of what
-is admissible, never inside. Parallel (det J2 = 0): may lie inside when some alpha_k > 180 deg; none
-for all alpha_k < 180 deg and beta_k < 90 deg.
+Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means t_k =
++-w_k, so w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever
+at the edge of what is admissible, never inside. Parallel (det J2 = 0): may lie inside
+when some alpha_k > 180 deg; none for all alpha_k < 180 deg and beta_k < 90 deg.
 """
 
 from __future__ import annotations
@@ -35,14 +35,19 @@ _MOST = 20_000_000  # poses of a map: 4 GB
 
 @dataclass(frozen=True)
 class Measures:
-    """What a designer asks of poses; arrays share the shape (...) of the poses. Read-only."""
+    """What a designer asks of poses; arrays share the shape (...) of the poses.
+
+    Read-only.
+    """
 
     gamma: Array  #: joint angles [rad], shape (..., 3)
     mu: Array
     beta: Array
     admissible: NDArray[np.bool_]  #: the manipulator can be there
-    stroke: Array  #: distance of the nearest gamma_k to an end of its stroke [rad], negative beyond
-    edge: Array  #: smallest beta_k [rad]: distance to the edge of the workspace, negative beyond
+    # : distance of the nearest gamma_k to an end of its stroke [rad], negative beyond
+    stroke: Array
+    # : smallest beta_k [rad]: distance to the edge of the workspace, negative beyond
+    edge: Array
     reach: Array  #: smallest beta_max - beta_k [rad]
     det_j1: Array  #: 0 at a serial singularity
     det_j2: Array  #: 0 at a parallel singularity
@@ -85,7 +90,10 @@ class OrientationMap:
 
     @property
     def best_margin(self) -> Array:
-        """Largest distance to all limits over psi [rad], shape (m,); NaN where there is none."""
+        """Largest distance to all limits over psi [rad], shape (m,).
+
+        NaN where there is none.
+        """
         values = np.where(self.measures.admissible, self.measures.margin, np.nan)
         return np.asarray(np.fmax.reduce(values, axis=1))
 
@@ -100,13 +108,19 @@ def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measu
     c = np.sum(n * geometry.w, axis=-1)
     stroke = np.minimum(angles, geometry.arc - angles).min(axis=-1)
     # J is det J2 times this up to its sign: the condition number needs no division.
-    rows = [cross(n[..., i, :], n[..., i - 2, :]) * c[..., i - 1, None] for i in range(3)]
+    rows = [
+        cross(n[..., i, :], n[..., i - 2, :]) * c[..., i - 1, None] for i in range(3)
+    ]
     singular = np.linalg.svd(np.nan_to_num(np.stack(rows, axis=-2)), compute_uv=False)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cond_j = np.where(singular[..., 2] > 0.0, singular[..., 0] / singular[..., 2], np.inf)
+        cond_j = np.where(
+            singular[..., 2] > 0.0, singular[..., 0] / singular[..., 2], np.inf
+        )
     edge, reach = beta.min(axis=-1), geometry.beta_max - beta.max(axis=-1)
     limits = (admissible & (stroke >= 0.0), stroke, edge, reach)
-    return Measures(*frozen(angles, mu, beta, *limits, np.prod(c, axis=-1), det_j2, cond_j))
+    return Measures(
+        *frozen(angles, mu, beta, *limits, np.prod(c, axis=-1), det_j2, cond_j)
+    )
 
 
 @check_kinds
@@ -115,15 +129,23 @@ def workspace(
 ) -> OrientationMap:
     """Map the workspace: every direction of E on the base triangle, every turn about it.
 
-    The geometry is `Geometry.of(scene)` or `Geometry.build(v, alpha)`. An edge of the triangle has
-    `divisions`; `turns` are values of the third ZYZ angle psi, evenly over a full turn. InputError
-    refuses less than 1 of them. With `progress` a bar is drawn on a terminal.
+    The geometry is `Geometry.of(scene)` or `Geometry.build(v, alpha)`. An edge of the
+    triangle has `divisions`; `turns` are values of the third ZYZ angle psi, evenly over
+    a full turn. InputError refuses less than 1 of them. With `progress` a bar is drawn
+    on a terminal.
     """
-    counts, poses = {"divisions": divisions, "turns": turns}, int(divisions) ** 2 * int(turns) // 2
+    counts, poses = (
+        {"divisions": divisions, "turns": turns},
+        int(divisions) ** 2 * int(turns) // 2,
+    )
     allowed = f"must be at least 1, and make no more than {_MOST:g} poses"
-    checks = ((name, n, n >= 1 and poses <= _MOST, allowed) for name, n in counts.items())
+    checks = (
+        (name, n, n >= 1 and poses <= _MOST, allowed) for name, n in counts.items()
+    )
     refuse_unless("workspace", *checks)
-    return over_orientations(geometry, triangle_directions(geometry, divisions)[0], turns, progress)
+    return over_orientations(
+        geometry, triangle_directions(geometry, divisions)[0], turns, progress
+    )
 
 
 def over_orientations(
@@ -135,9 +157,13 @@ def over_orientations(
     """
     directions = np.array(s, dtype=float)
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    psi = np.asarray((np.arange(turns) + 0.5) * (2.0 * np.pi / turns) - np.pi, dtype=float)
+    psi = np.asarray(
+        (np.arange(turns) + 0.5) * (2.0 * np.pi / turns) - np.pi, dtype=float
+    )
     parts = []
-    for block in slices(len(directions), max(1, _BLOCK // turns), "orientations", progress):
+    for block in slices(
+        len(directions), max(1, _BLOCK // turns), "orientations", progress
+    ):
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         parts.append(measures(geometry, gamma, rotation))
@@ -155,17 +181,26 @@ def orientations(s: Array, psi: ArrayLike) -> Array:
     sine = np.hypot(s[..., 0], s[..., 1])
     pole = sine == 0.0
     safe = np.where(pole, 1.0, sine)
-    ct, st = np.where(pole, 1.0, s[..., 0] / safe), np.where(pole, 0.0, s[..., 1] / safe)
+    ct, st = (
+        np.where(pole, 1.0, s[..., 0] / safe),
+        np.where(pole, 0.0, s[..., 1] / safe),
+    )
     along = np.stack([ct * s[..., 2], st * s[..., 2], -sine], axis=-1)
     across = np.stack([-st, ct, np.zeros_like(st)], axis=-1)
     angle = np.asarray(psi, dtype=float)[..., None]
     x = np.cos(angle) * along + np.sin(angle) * across
-    return columns(x, np.cos(angle) * across - np.sin(angle) * along, np.broadcast_to(s, x.shape))
+    return columns(
+        x, np.cos(angle) * across - np.sin(angle) * along, np.broadcast_to(s, x.shape)
+    )
 
 
-def triangle_directions(geometry: Geometry, divisions: int = 40) -> tuple[Array, NDArray[np.intp]]:
+def triangle_directions(
+    geometry: Geometry, divisions: int = 40
+) -> tuple[Array, NDArray[np.intp]]:
     """Directions inside the base triangle, shape (m, 3), and their triangles, shape (n, 3)."""
-    i, j = np.nonzero(np.add.outer(range(divisions + 1), range(divisions + 1)) <= divisions)
+    i, j = np.nonzero(
+        np.add.outer(range(divisions + 1), range(divisions + 1)) <= divisions
+    )
     number = np.full((divisions + 2, divisions + 2), -1)
     number[i, j] = np.arange(len(i))
     upward = number[i, j], number[i + 1, j], number[i, j + 1]
@@ -186,7 +221,8 @@ class SingularPoses:
     #: joint angles [rad], shape (m, 3); NaN of the singular leg at a serial one
     gamma: Array
     beta: Array
-    leg: Array  #: index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
+    # : index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
+    leg: Array
     determinant: Array  #: det J2 or c_k that was found, shape (m,): 0 up to rounding
 
     def __len__(self) -> int:
@@ -196,15 +232,18 @@ class SingularPoses:
 def parallel_singularities(chart: OrientationMap) -> SingularPoses:
     """Admissible poses with det J2 = 0, one for each change of sign along psi in the map.
 
-    The poses fill a surface in (s, psi); the resolution of the map sets how many points of it are
-    found. Each is exact to rounding.
+    The poses fill a surface in (s, psi); the resolution of the map sets how many points
+    of it are found. Each is exact to rounding.
     """
     measured, geometry = chart.measures, chart.geometry
     after = np.roll(np.arange(len(chart.psi)), -1)
     change = np.sign(measured.det_j2) * np.sign(measured.det_j2[:, after]) < 0
-    # gamma jumps by pi where the pose passes t_k = +-w_k, and det J2 with it: these are serial.
+    # gamma jumps by pi where the pose passes t_k = +-w_k, and det J2 with it: these are
+    # serial.
     smooth = np.abs(measured.gamma[:, after] - measured.gamma).max(axis=2) < 1.0
-    rows, starts = np.nonzero(change & smooth & measured.admissible & measured.admissible[:, after])
+    rows, starts = np.nonzero(
+        change & smooth & measured.admissible & measured.admissible[:, after]
+    )
     s = chart.s[rows]
     low = chart.psi[starts].copy()
     high = low + (chart.psi[1] - chart.psi[0])
@@ -220,7 +259,9 @@ def parallel_singularities(chart: OrientationMap) -> SingularPoses:
         same = np.sign(at(middle)[-1]) == sign
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     *found, determinant = at(low)
-    return SingularPoses("parallel", *frozen(*found, np.full(len(rows), -1), determinant))
+    return SingularPoses(
+        "parallel", *frozen(*found, np.full(len(rows), -1), determinant)
+    )
 
 
 def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
@@ -241,14 +282,19 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
         gamma[:, k] = beta[:, k] = np.nan
         c = np.linalg.norm(cross(t, np.broadcast_to(geometry.w[k], t.shape)), axis=1)
         inside = valid.all(axis=1)
-        found.append([part[inside] for part in (rotation, gamma, beta, np.full(points, k), c)])
+        found.append(
+            [part[inside] for part in (rotation, gamma, beta, np.full(points, k), c)]
+        )
     arrays = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return SingularPoses("serial", *frozen(*arrays))
 
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """The singular pose that the least turn of the star reaches. Arrays are read-only."""
+    """The singular pose that the least turn of the star reaches.
+
+    Arrays are read-only.
+    """
 
     kind: str  #: "parallel" or "serial"
     leg: int  #: index k of the singular leg; -1 of a parallel one, which involves all
@@ -258,13 +304,16 @@ class NearestSingularity:
 
 
 @check_kinds
-def distance_to_singularity(where: SceneInput | Geometry, gamma: ArrayLike) -> NearestSingularity:
+def distance_to_singularity(
+    where: SceneInput | Geometry, gamma: ArrayLike
+) -> NearestSingularity:
     """Find the singular pose that is nearest to a pose: by the least turn of the star.
 
-    Limits of strokes and arcs are not looked at. To a serial one the distance is closed: that of
-    t_k from the line of w_k. Nearer than it det J2 is smooth: rays in even directions find where it
-    changes sign, and from the nearest of these the least turn is sought. A parallel singularity is
-    overlooked only where it comes nearer than that between all rays.
+    Limits of strokes and arcs are not looked at. To a serial one the distance is
+    closed: that of t_k from the line of w_k. Nearer than it det J2 is smooth: rays in
+    even directions find where it changes sign, and from the nearest of these the least
+    turn is sought. A parallel singularity is overlooked only where it comes nearer than
+    that between all rays.
 
     Args:
         where: a scene, as `simulate` takes it, or its geometry.
@@ -281,9 +330,14 @@ def distance_to_singularity(where: SceneInput | Geometry, gamma: ArrayLike) -> N
     start = kinematics.admissible(geometry, gamma).rotation
     t = start.T @ geometry.w.T  # columns: w_k in {E}
     cosines = np.sum(geometry.e.T * t, axis=0)
-    angles = np.arctan2(np.linalg.norm(np.cross(geometry.e, t.T), axis=1), np.abs(cosines))
+    angles = np.arctan2(
+        np.linalg.norm(np.cross(geometry.e, t.T), axis=1), np.abs(cosines)
+    )
     leg = int(angles.argmin())
-    kind, turn = "serial", np.cross(geometry.e[leg], np.copysign(1.0, cosines[leg]) * t[:, leg])
+    kind, turn = (
+        "serial",
+        np.cross(geometry.e[leg], np.copysign(1.0, cosines[leg]) * t[:, leg]),
+    )
     turn = angles[leg] * turn / np.linalg.norm(turn)
 
     def det_j2(turns: Array) -> Array:
@@ -304,9 +358,14 @@ def distance_to_singularity(where: SceneInput | Geometry, gamma: ArrayLike) -> N
     equal: Any = {"type": "eq", "fun": lambda turn: det_j2(turn) / at_pose}
     for row in np.argsort(first, kind="stable")[:_REFINED]:
         if first[row] < _RAY:
-            begin, most = rays[row] * lengths[first[row]], {"ftol": 1e-12, "maxiter": 60}
+            begin, most = (
+                rays[row] * lengths[first[row]],
+                {"ftol": 1e-12, "maxiter": 60},
+            )
             found = minimize(lambda x: x @ x, begin, constraints=equal, options=most).x
-            if abs(equal["fun"](found)) < 1e-9 and np.linalg.norm(found) < np.linalg.norm(turn):
+            if abs(equal["fun"](found)) < 1e-9 and np.linalg.norm(
+                found
+            ) < np.linalg.norm(turn):
                 kind, leg, turn = "parallel", -1, found
     distance = float(np.linalg.norm(turn))
     rotation = start @ Rotation.from_rotvec(turn).as_matrix()

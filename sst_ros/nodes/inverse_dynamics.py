@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inverse-dynamics controller: answers every sample with the torque that follows a motion.
 
-The motion is that of the scene, of ~/joint_trajectory, or of a goal of ~/follow_joint_trajectory,
-of which there is one at a time.
+The motion is that of the scene, of ~/joint_trajectory, or of a goal of
+~/follow_joint_trajectory, of which there is one at a time.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ KEYS = {
     "samples_irregular": "samples that came at another period than that of rate",
     "samples_limited": "samples of the motion in which a torque was limited",
     "foreign_states": "messages on joint_states of other robots, which are ignored",
-    "error_rms_rad": "root of the mean square of the error of gamma_1..3 since the motion began",
+    "error_rms_rad": (
+        "root of the mean square of the error of gamma_1..3 since the motion began"
+    ),
     "error_max_rad": "largest error of gamma_1..3 since then",
     "trajectories_refused": "trajectories that were refused",
     "last_refusal": "reason of the last refusal",
@@ -50,7 +52,8 @@ KEYS = {
 _FEEDBACK_PERIOD_S = 0.05
 _LOG_PERIOD_S = 1.0  # trajectories of a stream are not logged more often
 _SPINS_AT_END = 20
-_SPIN_S = 0.01  # least time to deliver the result of a goal that the end of the node aborts: 0.2 s
+# least time to deliver the result of a goal that the end of the node aborts: 0.2 s
+_SPIN_S = 0.01
 
 
 class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
@@ -68,8 +71,10 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._refused, self._last_refusal = 0, ""
         self._has_heard = False
         self._active: topics.ActionGoal | None = None
-        self._goal: tuple[TrajectoryGoal, Order] | None = None  # the active one, or accepted last
-        render("tracking.txt", found=TrackingMetrics())  # later it would delay the control
+        # the active one, or accepted last
+        self._goal: tuple[TrajectoryGoal, Order] | None = None
+        # later it would delay the control
+        render("tracking.txt", found=TrackingMetrics())
         self._feedback: Any = None
         self._action_type: Any = None  # FollowJointTrajectory, where that is installed
         self.connect(own, joint_trajectory=self._replace)
@@ -85,7 +90,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
                 self._begin,
                 goal_callback=self._check,
                 cancel_callback=self._cancel,
-                callback_group=ReentrantCallbackGroup(),  # samples come while a goal is checked
+                # samples come while a goal is checked
+                callback_group=ReentrantCallbackGroup(),
             )
             every(self.node, _FEEDBACK_PERIOD_S, self._report_goal)
 
@@ -96,7 +102,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             reason = f": {self.failure}" if self.failure is not None else ""
             self._interrupt(f"the controller ends{reason}")
             for _ in range(_SPINS_AT_END):
-                with contextlib.suppress(SstError):  # of other callbacks: the node ends already
+                # of other callbacks: the node ends already
+                with contextlib.suppress(SstError):
                     executor.spin_once(timeout_sec=_SPIN_S)
         super().close()
         self.follower.close()
@@ -106,8 +113,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
     def hear(self, phase: String) -> None:
         """End with the simulator; begin anew when it does.
 
-        The first phase that is heard is no news: discovery may find this topic after joint_states,
-        and the simulator's "waiting" then comes after the first samples of the run.
+        The first phase that is heard is no news: discovery may find this topic after
+        joint_states, and the simulator's "waiting" then comes after the first samples
+        of the run.
         """
         super().hear(phase)
         news, self._has_heard = self._has_heard, True
@@ -132,7 +140,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         missing = super().missing_subscribers()
         if self.parameters.wait_for_recorder:
             recorded = (self._reference, self._error)
-            missing += [one.topic_name for one in recorded if not one.get_subscription_count()]
+            missing += [
+                one.topic_name for one in recorded if not one.get_subscription_count()
+            ]
         return missing
 
     def preview(self) -> Vector3 | None:
@@ -142,7 +152,10 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def answer(self, state: JointState, stamp_ns: int) -> None:
         """Answer a sample of the run."""
-        if self._seen is None or (command := self.follower.answer(stamp_ns, self._seen)) is None:
+        if (
+            self._seen is None
+            or (command := self.follower.answer(stamp_ns, self._seen)) is None
+        ):
             return
         self.begun = True
         self.send(command.torque)
@@ -176,23 +189,32 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             order.outcome.add_done_callback(settle)
 
     def _take(self, trajectory: JointTrajectory) -> Order | None:
-        """Have a trajectory checked and followed; None, with the reason logged, where it is bad."""
+        """Have a trajectory checked and followed.
+
+        None, with the reason logged, where it is bad.
+        """
         try:
             return self.follower.take(trajectory, self._seen, self._seen_ns)
         except SstError as error:
             self._refuse(error)
             return None
         finally:
-            self.heard_s = time.monotonic()  # in lockstep no message was received meanwhile
+            # in lockstep no message was received meanwhile
+            self.heard_s = time.monotonic()
 
     def _is_accepted(self, outcome: concurrent.futures.Future[None]) -> bool:
-        """Whether a trajectory is followed; else count, log and publish the refusal, if any."""
+        """Whether a trajectory is followed.
+
+        Else count, log and publish the refusal, if any.
+        """
         if outcome.cancelled():
             return False
         if (error := outcome.exception()) is not None:
             self._refuse(error)
             return False
-        self.node.get_logger().info("trajectory taken", throttle_duration_sec=_LOG_PERIOD_S)
+        self.node.get_logger().info(
+            "trajectory taken", throttle_duration_sec=_LOG_PERIOD_S
+        )
         return True
 
     def _refuse(self, error: BaseException) -> None:
@@ -208,8 +230,15 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def _report(self) -> None:
         follower = self.follower
-        stage = "waiting for joint_states" if self._seen is None else follower.stage.value
-        counts = follower.samples, follower.irregular, follower.limited, self.foreign_states
+        stage = (
+            "waiting for joint_states" if self._seen is None else follower.stage.value
+        )
+        counts = (
+            follower.samples,
+            follower.irregular,
+            follower.limited,
+            self.foreign_states,
+        )
         refusals = self._refused, self._last_refusal
         row = (stage, self.parameters.mode, *counts, *follower.errors, *refusals)
         doubts = {
@@ -219,10 +248,14 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         }
         said = [stage, *(text for text, count in doubts.items() if count)]
         values, level = dict(zip(KEYS, row, strict=True)), int(len(said) > 1)
-        message = topics.diagnostics(self.node, "control", level, "; ".join(said), values)
+        message = topics.diagnostics(
+            self.node, "control", level, "; ".join(said), values
+        )
         self._diagnostics.publish(message)
 
-    def _judge(self, state: JointState, measured: Measurement, command: Command) -> None:
+    def _judge(
+        self, state: JointState, measured: Measurement, command: Command
+    ) -> None:
         """Test the tolerances of the active goal at a sample of the run that was answered."""
         if self._goal is None or not self._is_active():
             return
@@ -293,10 +326,16 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         desired = command.desired
         message = self._action_type.Feedback(joint_names=list(ACTUATORS))
         message.header.stamp, message.index = stamp, index
-        message.desired = _point(time, desired.gamma, desired.gamma_dot, command.feedforward)
+        message.desired = _point(
+            time, desired.gamma, desired.gamma_dot, command.feedforward
+        )
         message.desired.accelerations = array("d", desired.gamma_ddot)
-        message.actual = _point(time, measured.gamma, measured.gamma_dot, command.torque)
-        message.error = _point(time, command.error, command.error_rate, command.feedback)
+        message.actual = _point(
+            time, measured.gamma, measured.gamma_dot, command.torque
+        )
+        message.error = _point(
+            time, command.error, command.error_rate, command.feedback
+        )
         self._active.handle.publish_feedback(message)
 
 
@@ -315,7 +354,9 @@ def _print(tracking: TrackingMetrics | None) -> None:
         print(render("tracking.txt", found=tracking), flush=True)
 
 
-def _point(time: float, angles: Vector3, rates: Vector3, torques: Vector3) -> JointTrajectoryPoint:
+def _point(
+    time: float, angles: Vector3, rates: Vector3, torques: Vector3
+) -> JointTrajectoryPoint:
     point = JointTrajectoryPoint()
     point.positions, point.velocities = array("d", angles), array("d", rates)
     point.effort = array("d", torques)

@@ -47,7 +47,8 @@ _PROFILES = {
     "FASTDDS_DEFAULT_PROFILES_FILE": "fast_dds_3.xml",
 }
 """Our profile, by the variable that names it: for Fast DDS 2, libfastrtps, and 3, libfastdds."""
-_POLL_S = 0.1  # longest delay of a signal. The executor would take half a millisecond for each look
+# longest delay of a signal. The executor would take half a millisecond for each look
+_POLL_S = 0.1
 _CALLBACK_S = 1.0
 """Wait for a callback in progress: a service that waits for the run ends once that is closed."""
 _ACKNOWLEDGE_S = 1.2
@@ -76,12 +77,14 @@ A = TypeVar("A", bound=settings.AnsweringParameters)
 class Worker(Generic[P]):
     """What a process runs: a node with checked `parameters`, `done` when its work is.
 
-    Fields of `cls` are read-only, except those of `cls.CHANGEABLE`; some defaults depend on the
-    values given at the start. An InputError lists all that are refused, and all unknown names.
-    Where a callback has raised an error, that is its `failure`.
+    Fields of `cls` are read-only, except those of `cls.CHANGEABLE`; some defaults
+    depend on the values given at the start. An InputError lists all that are refused,
+    and all unknown names. Where a callback has raised an error, that is its `failure`.
     """
 
-    def __init__(self, node: str, cls: type[P], more: Defaults = lambda given: {}) -> None:
+    def __init__(
+        self, node: str, cls: type[P], more: Defaults = lambda given: {}
+    ) -> None:
         self.node, self.done = Node(node), threading.Event()
         self.failure: BaseException | None = None
         self.parameters = _declare(self.node, cls, more)
@@ -114,15 +117,19 @@ class Worker(Generic[P]):
 
 
 def _declare(node: Node, cls: type[P], more: Defaults) -> P:
-    # rclpy has no public call for the values that were given; Jazzy and Kilted have this.
-    given: dict[str, Any] = {name: one.value for name, one in node._parameter_overrides.items()}
+    # rclpy has no public call for the values that were given; Jazzy and Kilted have
+    # this.
+    given: dict[str, Any] = {
+        name: one.value for name, one in node._parameter_overrides.items()
+    }
     defaults, values = {**vars(cls()), **more(given)}, dict[str, Any]()
     origin, checks = node.get_fully_qualified_name(), list[Check]()
     for name, spec in cls.SPECS.items():
         value = given.get(name, defaults[name])
         if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
             value = float(value)
-        elif value is None or isinstance(value, (array, tuple)):  # None is what rcl has for []
+        # None is what rcl has for []
+        elif value is None or isinstance(value, (array, tuple)):
             value = [float(x) if type(x) is int else x for x in value or ()]
         values[name], descriptor = value, _descriptor(name, spec)
         descriptor.read_only = name not in getattr(cls, "CHANGEABLE", ())
@@ -130,7 +137,11 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
             node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
             checks.append((name, value, False, spec.describe()))
-    ours = {name for _, parameters in settings.COMMANDS.values() for name in parameters.SPECS}
+    ours = {
+        name
+        for _, parameters in settings.COMMANDS.values()
+        for name in parameters.SPECS
+    }
     for name in sorted(given.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")
@@ -138,22 +149,29 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
             checks.append(settings.unknown_name(name, values))
     refuse_unless(origin, *checks)
     try:
-        return cls(**values)  # `build` would take a number for text, as a YAML file has it
+        # `build` would take a number for text, as a YAML file has it
+        return cls(**values)
     except InputError as error:
         raise InputError(origin, error.problems) from None
 
 
 def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(name=name, additional_constraints=spec.describe())
-    descriptor.type = (Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]).value
+    descriptor.type = (
+        Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]
+    ).value
     descriptor.description = spec.doc + (f" [{spec.unit}]" if spec.unit else "")
     low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
     if spec.kind == "number" and not spec.shape:
         # Only a parameter with a range refuses NaN.
         low = math.nextafter(spec.above, math.inf) if math.isfinite(spec.above) else low
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=low, to_value=high)
+        ]
     if spec.kind == "integer":
-        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(low), to_value=int(high))
+        ]
     return descriptor
 
 
@@ -162,23 +180,26 @@ class AnsweringWorker(Worker[A]):
 
     The phase and the joint states are two topics, whose messages come in any order.
 
-    Attributes:
-        begun: a sample of the run has been answered.
-        commanded: a torque has been sent, or was about to be: the simulator is this node's concern.
-        phase: what the simulator said last of its run; empty before.
-        heard_s: monotonic time of the last joint states of this robot [s].
-        foreign_states: messages on joint_states of other robots, which are ignored.
-
+    Attributes: begun: a sample of the run has been answered. commanded: a torque has
+        been sent, or was about to be: the simulator is this node's concern. phase: what
+        the simulator said last of its run; empty before. heard_s: monotonic time of the
+        last joint states of this robot [s]. foreign_states: messages on joint_states of
+        other robots, which are ignored.
     """
 
-    def connect(self, own: dict[str, topics.Endpoint], **more: Callable[[Any], None]) -> None:
+    def connect(
+        self, own: dict[str, topics.Endpoint], **more: Callable[[Any], None]
+    ) -> None:
         """Publish commands, and listen to topics of its own table, as soon as it can answer."""
         given, self._own = self.parameters, own
         self.begun = self.commanded = False
         self.phase = ""
         self.heard_s = time.monotonic()
         self.foreign_states = 0
-        topic, torques = own["commands_stamped" if given.stamped else "commands"], array("d", ZERO)
+        topic, torques = (
+            own["commands_stamped" if given.stamped else "commands"],
+            array("d", ZERO),
+        )
         if given.stamped:
             self._message: Any = topic.kind(name=list(ACTUATORS), effort=torques)
         else:
@@ -214,7 +235,10 @@ class AnsweringWorker(Worker[A]):
 
     def missing_subscribers(self) -> list[str]:
         """Return the topics without as many subscribers as the parameters ask for, with counts."""
-        count, least = self._commands.get_subscription_count(), self.parameters.min_subscribers
+        count, least = (
+            self._commands.get_subscription_count(),
+            self.parameters.min_subscribers,
+        )
         if count >= least:
             return []
         return [f"{self._commands.topic_name} has {count} of {least}"]
@@ -242,7 +266,9 @@ class AnsweringWorker(Worker[A]):
             return
         if absent:
             names = list(state.name)
-            raise SstError(f"joint_states has no {', '.join(absent)}: its names are {names}")
+            raise SstError(
+                f"joint_states has no {', '.join(absent)}: its names are {names}"
+            )
         self.heard_s = time.monotonic()
         self.see(state)
         # Once begun, the simulator may end before its last sample has arrived.
@@ -271,17 +297,25 @@ class AnsweringWorker(Worker[A]):
         self._publish_torque(torque)
 
     def watch(self) -> None:
-        """End with the run; raise SstError after a long silence, or where no answer is taken."""
+        """End with the run.
+
+        Raise SstError after a long silence, or where no answer is taken.
+        """
         if self.commanded and self.phase == "finished":
             self.done.set()
             return
         if self._sync is None:
             if self._simulator is not None and self._simulator.service_is_ready():
-                self._sync = self._simulator.call_async(GetParameters.Request(names=["sync"]))
+                self._sync = self._simulator.call_async(
+                    GetParameters.Request(names=["sync"])
+                )
         elif self._sync.done():
             values = self._sync.result().values
             if values and values[0].string_value == "lockstep":
-                text = "the simulator runs in lockstep and takes no command without a stamp"
+                text = (
+                    "the simulator runs in lockstep and takes no command without a"
+                    " stamp"
+                )
                 raise SstError(f"stamped = false: {text}: give stamped:=true")
         silent = time.monotonic() - self.heard_s
         if silent > self.parameters.timeout:
@@ -307,8 +341,8 @@ class AnsweringWorker(Worker[A]):
         """Count a message of another robot; say so the first time."""
         if self.foreign_states == 0:
             self.node.get_logger().warning(
-                f"joint_states without {', '.join(ACTUATORS)} are ignored: another robot publishes "
-                f"there, too (its names are {list(state.name)})"
+                f"joint_states without {', '.join(ACTUATORS)} are ignored: another"
+                f" robot publishes there, too (its names are {list(state.name)})"
             )
         self.foreign_states += 1
 
@@ -320,9 +354,9 @@ class AnsweringWorker(Worker[A]):
 def run(words: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
-    The signal handlers of rclpy would cut the connection at once; ours let the worker close. Words
-    are a key of `settings.COMMANDS` and the arguments behind it. The exit status is 0, 1 for a
-    failure, 2 for arguments that are refused.
+    The signal handlers of rclpy would cut the connection at once; ours let the worker
+    close. Words are a key of `settings.COMMANDS` and the arguments behind it. The exit
+    status is 0, 1 for a failure, 2 for arguments that are refused.
     """
     signals.handle()
     command, *given = words
@@ -336,19 +370,25 @@ def run(words: Sequence[str]) -> int:
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
-    except (RuntimeError, ValueError) as error:  # of rcl; some have nothing but the words
+    # of rcl; some have nothing but the words
+    except (RuntimeError, ValueError) as error:
         print(f"{command}: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
     try:
         if not signals.came:
             module = importlib.import_module(f"sst_ros.nodes.{command}")
             worker = getattr(module, settings.COMMANDS[command][0])()
-            for line in settings.unused_files(ros, worker.node.get_fully_qualified_name()):
+            for line in settings.unused_files(
+                ros, worker.node.get_fully_qualified_name()
+            ):
                 worker.node.get_logger().warning(line)
             spin(worker)
     except (SstError, ParameterException) as error:
         text = str(error)
-        print(text if text.startswith(f"{command}: ") else f"{command}: {text}", file=sys.stderr)
+        print(
+            text if text.startswith(f"{command}: ") else f"{command}: {text}",
+            file=sys.stderr,
+        )
         return 1
     finally:
         with _bound_time():
@@ -361,9 +401,9 @@ def run(words: Sequence[str]) -> int:
 def _bound_time() -> Iterator[None]:
     """End the process, with a traceback and status 1, where the middleware hangs for ten seconds.
 
-    Fast DDS 3.2 deadlocks now and then when another node leaves (eProsima/Fast-DDS issue 6502), and
-    rclpy holds the interpreter's lock while it gives up a node: neither another thread nor a signal
-    could end it from Python.
+    Fast DDS 3.2 deadlocks now and then when another node leaves (eProsima/Fast-DDS
+    issue 6502), and rclpy holds the interpreter's lock while it gives up a node:
+    neither another thread nor a signal could end it from Python.
     """
     faulthandler.dump_traceback_later(_CLEAN_UP_S, exit=True, file=_STDERR)
     try:
@@ -373,9 +413,12 @@ def _bound_time() -> Iterator[None]:
 
 
 def spin(worker: Worker[Any]) -> None:
-    """Run a worker until it is done or asked to end, or a callback raises; then close it.
+    """Run a worker until it is done or asked to end, or a callback raises.
 
-    The executor has a thread, which sleeps until there is work: signals would not wake it.
+    Then close it.
+
+    The executor has a thread, which sleeps until there is work: signals would not wake
+    it.
     """
     node, ends, errors = worker.node, threading.Event(), list[BaseException]()
     executor = SingleThreadedExecutor(context=node.context)
@@ -406,7 +449,8 @@ def spin(worker: Worker[Any]) -> None:
             worker.close()
         finally:
             with _bound_time():
-                # What was published is received first, if that takes no longer than this.
+                # What was published is received first, if that takes no longer than
+                # this.
                 deadline = time.monotonic() + _ACKNOWLEDGE_S
                 for publisher in node.publishers:
                     left = max(0.0, deadline - time.monotonic())
@@ -417,17 +461,19 @@ def spin(worker: Worker[Any]) -> None:
 
 
 def configure_middleware() -> None:
-    """Select our profile of Fast DDS, unless the user has selected one. Before `rclpy.init`.
+    """Select our profile of Fast DDS, unless the user has selected one.
 
-    By default a reliable writer asks its readers every 3 s what has arrived, and then removes 1500
-    samples at once while the publisher waits: one to three milliseconds, hence missed ticks. Five
-    times a second it takes a fifteenth of that; more often it would cost a thread that wakes for
-    each topic.
+    Before `rclpy.init`.
 
-    By default a reliable writer also wakes its thread for events after each message and reader, to
-    ignore requests for it for a time of zero: half of what publishing costs. With 50 ms (the
-    element's name is spelt as Fast DDS spells it) the thread wakes 20 times a second; a message
-    that was lost is repeated that much later.
+    By default a reliable writer asks its readers every 3 s what has arrived, and then
+    removes 1500 samples at once while the publisher waits: one to three milliseconds,
+    hence missed ticks. Five times a second it takes a fifteenth of that; more often it
+    would cost a thread that wakes for each topic.
+
+    By default a reliable writer also wakes its thread for events after each message and
+    reader, to ignore requests for it for a time of zero: half of what publishing costs.
+    With 50 ms (the element's name is spelt as Fast DDS spells it) the thread wakes 20
+    times a second; a message that was lost is repeated that much later.
 
     Other middleware ignores the profile.
     """

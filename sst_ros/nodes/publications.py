@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the simulator publishes: numbers of a state as messages, and the topics they go to.
 
-Messages are bytes, which `Publisher.publish` takes: CDR, little-endian (OMG DDS-XTypes, XCDR1).
-Their layout is made once, afterwards only numbers are written: to convert a message object each
-time costs three times as much as the rest of publishing it (docs/nodes.md has the figures).
+Messages are bytes, which `Publisher.publish` takes: CDR, little-endian (OMG DDS-XTypes,
+XCDR1). Their layout is made once, afterwards only numbers are written: to convert a
+message object each time costs three times as much as the rest of publishing it
+(docs/nodes.md has the figures).
 
-Publishing happens in the thread of the run, after the step, in the slack before the next deadline;
-a topic without subscribers is left out.
-rclpy holds the interpreter's lock while it publishes (measured: 200 publications beside a busy
-thread are never interrupted), so a thread of its own could not work beside the next step; it would
-only add switches between threads.
+Publishing happens in the thread of the run, after the step, in the slack before the
+next deadline; a topic without subscribers is left out. rclpy holds the interpreter's
+lock while it publishes (measured: 200 publications beside a busy thread are never
+interrupted), so a thread of its own could not work beside the next step; it would only
+add switches between threads.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, ZERO, State, Vector3
 
 LOG_NS = 50_000_000
-"""Torques are published once for about this time: with each sample they would take 16 us of the 180
-of a wake."""
+"""Torques are published once for about this time: with each sample they would take 16
+us of the 180 of a wake.
+"""
 _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
@@ -51,8 +53,9 @@ _AT_REST = (0.0,) * len(JOINTS)
 _PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATORS))
 
 Numbers = tuple[Sequence[float], Sequence[float], Sequence[float]]
-"""Of a state: quaternion (x, y, z, w); nine angles [rad], then nine rates [rad/s], by kind and leg;
-torques of the actuators [N m]."""
+"""Of a state: quaternion (x, y, z, w); nine angles [rad], then nine rates [rad/s], by
+kind and leg; torques of the actuators [N m].
+"""
 Message = Callable[[bytes, Numbers], bytes]
 """Makes a message of the bytes of a stamp and the numbers of a state."""
 
@@ -70,8 +73,9 @@ def clock_message(nanoseconds: int) -> bytes:
 def _layout(*fields: str | int, align: int = 8) -> bytes:
     """Return what stands between the stamp of a header and doubles that follow the fields.
 
-    A string is its length with the closing zero, its characters, zero; an int is the length of a
-    sequence. Numbers lie at multiples of their size, counted from the end of the encapsulation.
+    A string is its length with the closing zero, its characters, zero; an int is the
+    length of a sequence. Numbers lie at multiples of their size, counted from the end
+    of the encapsulation.
     """
     data = bytearray(_STAMP.size)
     for field in fields:
@@ -84,12 +88,14 @@ def _layout(*fields: str | int, align: int = 8) -> bytes:
     return bytes(data[_STAMP.size :]) + bytes(-len(data) % align)
 
 
-def state_messages(frame_id: str = "", base_frame: str = BASE_FRAME) -> tuple[Message, ...]:
+def state_messages(
+    frame_id: str = "", base_frame: str = BASE_FRAME
+) -> tuple[Message, ...]:
     """Return what makes the messages joint_states, orientation and euler_zyz.
 
-    The frame_id is that of joint_states, whose effort is the torque over the step that ended; the
-    others are in the base frame. Each is one call of a struct: field by field takes 1.7 times as
-    long.
+    The frame_id is that of joint_states, whose effort is the torque over the step that
+    ended; the others are in the base frame. Each is one call of a struct: field by
+    field takes 1.7 times as long.
     """
     count = len(JOINTS)
     names, base = _layout(frame_id, count, *JOINTS, count), _layout(base_frame)
@@ -97,7 +103,11 @@ def state_messages(frame_id: str = "", base_frame: str = BASE_FRAME) -> tuple[Me
     more = f"I4x{count}d"  # a sequence: its length, padding, the numbers
     pack_joints, pack_quaternion, pack_angles = (
         struct.Struct(stamped + form).pack
-        for form in (f"{len(names)}s{count}d{more}{more}", f"{len(base)}s4d", f"{len(base)}s3d")
+        for form in (
+            f"{len(names)}s{count}d{more}{more}",
+            f"{len(base)}s4d",
+            f"{len(base)}s3d",
+        )
     )
 
     def joint_states(at: bytes, numbers: Numbers) -> bytes:
@@ -143,19 +153,29 @@ class Measurements:
 
     def restart(self) -> None:
         """Begin anew at the first sample of a run: the same seed gives the same noise."""
-        channel, seed = self._given.channel or ControlChannel(), self._given.measurement_seed
+        channel, seed = (
+            self._given.channel or ControlChannel(),
+            self._given.measurement_seed,
+        )
         self._random = np.random.default_rng(seed)
         kinds = range(len(JOINTS) // 3)  # gamma, mu, beta
         self._angles = [ChannelState(channel, (seed, kind)) for kind in kinds]
-        self._rates = [ChannelState(channel, 0) for kind in kinds]  # only late, as the angles
+        self._rates = [
+            ChannelState(channel, 0) for kind in kinds
+        ]  # only late, as the angles
 
     def message(self, at: bytes, numbers: Numbers) -> bytes:
         """Return the message of a sample."""
         quaternion, joints, torque = numbers
         found: list[list[float]] = [[], []]
-        for kind, (angles, rates) in enumerate(zip(self._angles, self._rates, strict=True)):
+        for kind, (angles, rates) in enumerate(
+            zip(self._angles, self._rates, strict=True)
+        ):
             first = 3 * kind
-            triples = triple(joints[first : first + 3]), triple(joints[9 + first : 12 + first])
+            triples = (
+                triple(joints[first : first + 3]),
+                triple(joints[9 + first : 12 + first]),
+            )
             measured = angles.measure(*triples)
             found[0] += angles.transmit(measured.gamma)
             found[1] += rates.transmit(measured.gamma_dot)
@@ -168,7 +188,8 @@ class Measurements:
 class TorqueLog:
     """applied_torques: torque and moment of every tick since the last publication.
 
-    Point i holds over tick i; its time is the end of that tick, relative to the header's stamp.
+    Point i holds over tick i; its time is the end of that tick, relative to the
+    header's stamp.
     """
 
     def __init__(
@@ -177,8 +198,8 @@ class TorqueLog:
         self._base_frame = base_frame
         self._names = (*ACTUATORS, *(MOMENTS if moments else ()))
         self._period_ns, self._moments = period_ns, moments
-        # Each point begins with no positions, velocities and accelerations and the length of a row;
-        # the first beginning is part of what stands before the points.
+        # Each point begins with no positions, velocities and accelerations and the
+        # length of a row; the first beginning is part of what stands before the points.
         self._begin = 0, 0, 0, len(self._names)
         self._point = struct.Struct(f"<{len(self._names)}d2i{len(self._begin)}I")
         self.clear()
@@ -198,7 +219,10 @@ class TorqueLog:
         """Return the message of the ticks logged since stamp_ns and clear the log."""
         named = self._base_frame, len(self._names), *self._names, len(self)
         head = _layout(*named, *self._begin) if self._rows else _layout(*named, align=1)
-        ends = (divmod(tick * self._period_ns, NANOSECONDS) for tick in range(1, len(self) + 1))
+        ends = (
+            divmod(tick * self._period_ns, NANOSECONDS)
+            for tick in range(1, len(self) + 1)
+        )
         points = b"".join(
             self._point.pack(*row, *end, *self._begin)
             for row, end in zip(self._rows, ends, strict=True)
@@ -221,7 +245,9 @@ class SimulatorTopics:
         history = _HISTORY_S * given.publish_rate * (given.real_time_factor or _FAST)
         depth = round(min(max(history, _LEAST_DEPTH), _MOST_DEPTH))
         shown = ("joint_states", "orientation", "euler_zyz", "applied_torques")
-        *self._shown, self._torques = (own[name].publisher(node, depth) for name in shown)
+        *self._shown, self._torques = (
+            own[name].publisher(node, depth) for name in shown
+        )
         self._samples = state_messages("", given.base_frame)
         self._idles = state_messages(IDLE_FRAME_ID, given.base_frame)
         self._measured: Measurements | None = None
@@ -240,7 +266,9 @@ class SimulatorTopics:
             own["robot_description"].publisher(node).publish(String(data=urdf(scene)))
         self.diagnostics = own["diagnostics"].publisher(node)
         made = {publisher.topic_name: publisher for publisher in node.publishers}
-        names = [node.resolve_topic_name(name) for name in given.wait_for_subscribers if name]
+        names = [
+            node.resolve_topic_name(name) for name in given.wait_for_subscribers if name
+        ]
         unknown = [name for name in names if name not in made]
         allowed = f"must be topics that the node publishes: {', '.join(sorted(made))}"
         follows = self._clock is not None and follows_clock(node)
@@ -266,7 +294,9 @@ class SimulatorTopics:
 
     def missing_subscribers(self) -> list[str]:
         """Return the topics of wait_for_subscribers that have no subscriber."""
-        return [one.topic_name for one in self._awaited if not one.get_subscription_count()]
+        return [
+            one.topic_name for one in self._awaited if not one.get_subscription_count()
+        ]
 
     @property
     def unread(self) -> bool:
@@ -283,7 +313,8 @@ class SimulatorTopics:
         logged = len(self._log)
         if self._measured is not None and not logged:  # the first sample of a run
             self._measured.restart()
-        self._count_subscribers(topics.COUNT_NS if logged else 0)  # the first of a run goes to all
+        # the first of a run goes to all
+        self._count_subscribers(topics.COUNT_NS if logged else 0)
         y, joints, torque = simulation.sample
         numbers = y[:4], joints, torque
         if self._clock is not None:
@@ -303,15 +334,18 @@ class SimulatorTopics:
             self._torques.publish(self._log.take(self._log_from_ns))
         self._log.clear()
 
-    def idle(self, state: State, stamp_ns: int, *, at_rest: bool, moves: bool = False) -> None:
+    def idle(
+        self, state: State, stamp_ns: int, *, at_rest: bool, moves: bool = False
+    ) -> None:
         """Publish a state that is no sample; `at_rest` with zero rates and efforts.
 
-        joint_states has this stamp and IDLE_FRAME_ID, the other topics the stamp zero; where it
-        `moves`, our clock goes on to the stamp.
+        joint_states has this stamp and IDLE_FRAME_ID, the other topics the stamp zero;
+        where it `moves`, our clock goes on to the stamp.
         """
         if self._clock is not None:
             self._time_ns = stamp_ns if moves else self._time_ns
-            self._clock.publish(clock_message(self._time_ns))  # again, for late subscribers
+            # again, for late subscribers
+            self._clock.publish(clock_message(self._time_ns))
         self.flush()
         self._torques.publish(self._log.take(0))
         joints, torque = sum(state.joints, ()), state.torque
@@ -342,4 +376,6 @@ class SimulatorTopics:
 
     def _messages(self, of: Sequence[Message]) -> list[tuple[Publisher[Any], Message]]:
         """Messages of a state whose topics have subscribers."""
-        return [pair for pair in zip(self._shown, of, strict=True) if pair[0] in self._read]
+        return [
+            pair for pair in zip(self._shown, of, strict=True) if pair[0] in self._read
+        ]

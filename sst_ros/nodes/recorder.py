@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder: topics into a rosbag2 in MCAP, without a ROS installation.
 
-Messages are never decoded: the serialized bytes go from DDS to the bag. They are taken in batches
-from the subscriptions: 1850 messages a second cost 7 % of a core by this and 27 % by callbacks of
-an executor, measured in two processes at once.
+Messages are never decoded: the serialized bytes go from DDS to the bag. They are taken
+in batches
+from the subscriptions: 1850 messages a second cost 7 % of a core by this and 27 % by
+callbacks of an executor, measured in two processes at once.
 """
 
 from __future__ import annotations
@@ -36,11 +37,14 @@ _LOG_PERIOD_S = 5.0
 _OF_A_RUN = ": run"  # end of the name of a simulator's status in /diagnostics
 
 
-def own_topics(requested: Iterable[str], default: Iterable[str]) -> dict[str, topics.Endpoint]:
+def own_topics(
+    requested: Iterable[str], default: Iterable[str]
+) -> dict[str, topics.Endpoint]:
     """Return the topics of our nodes, by their full names.
 
-    The nodes are those whose private topics are requested (NODE/scene, NODE/reference, ...), and
-    those of these full names: a last word such as `commands` alone says nothing.
+    The nodes are those whose private topics are requested (NODE/scene, NODE/reference,
+    ...), and those of these full names: a last word such as `commands` alone says
+    nothing.
     """
     tables = (topics.CONTROLLER, topics.SIMULATOR)
     nodes = set(default)
@@ -48,7 +52,11 @@ def own_topics(requested: Iterable[str], default: Iterable[str]) -> dict[str, to
         node, _, word = topic.rpartition("/")
         for table in tables:
             one = table.get(word)
-            if one is not None and one.use == topics.PUBLISHES and one.name.startswith("~"):
+            if (
+                one is not None
+                and one.use == topics.PUBLISHES
+                and one.name.startswith("~")
+            ):
                 nodes.add(node)
     return {
         one.at(node): one
@@ -72,9 +80,10 @@ def _is_of_simulator(message: Any) -> bool:
 class RecordedTopic:
     """A topic that is recorded; the connection is where its messages go in the bag.
 
-    A gap in the sequence numbers is a loss where it is `counted`: a latched topic, of which only
-    the last message matters, and /diagnostics may have gaps. It is `heard` with its first message,
-    of a topic that is `shared` with other robots with the first of a simulator.
+    A gap in the sequence numbers is a loss where it is `counted`: a latched topic, of
+    which only the last message matters, and /diagnostics may have gaps. It is `heard`
+    with its first message, of a topic that is `shared` with other robots with the first
+    of a simulator.
     """
 
     subscription: Subscription[Any]
@@ -87,12 +96,20 @@ class RecordedTopic:
     _last: dict[bytes, int] = field(default_factory=dict)
 
     def count(self, data: bytes, info: dict[str, Any]) -> None:
-        """Count a message; sequence numbers are those of its publisher, None on some middleware."""
+        """Count a message.
+
+        Sequence numbers are those of its publisher, None on some middleware.
+        """
         self.messages += 1
         if not self.heard:
             kind = self.subscription.msg_type
-            self.heard = not self.shared or _is_of_simulator(deserialize_message(data, kind))
-        number, publisher = info.get("publication_sequence_number"), info.get("publisher_gid")
+            self.heard = not self.shared or _is_of_simulator(
+                deserialize_message(data, kind)
+            )
+        number, publisher = (
+            info.get("publication_sequence_number"),
+            info.get("publisher_gid"),
+        )
         if self.counted and number and publisher:
             last = self._last.get(publisher["data"], number - 1)
             self.lost += max(0, number - last - 1)
@@ -105,11 +122,17 @@ class Recorder(Worker[RecorderParameters]):
     def __init__(self) -> None:
         super().__init__("sst_recorder", RecorderParameters)
         given = self.parameters
-        self._requested = {self.node.resolve_topic_name(topic) for topic in given.topics if topic}
+        self._requested = {
+            self.node.resolve_topic_name(topic) for topic in given.topics if topic
+        }
         default = (f"sst_{command}" for command in ("simulator", "inverse_dynamics"))
-        self._own = own_topics(self._requested, map(self.node.resolve_topic_name, default))
+        self._own = own_topics(
+            self._requested, map(self.node.resolve_topic_name, default)
+        )
         self._foreign = self._requested - self._own.keys()
-        sampled = {topic for topic, one in self._own.items() if one.name in topics.SAMPLED}
+        sampled = {
+            topic for topic, one in self._own.items() if one.name in topics.SAMPLED
+        }
         self._required = self._requested & sampled
         self._recorded: dict[str, RecordedTopic] = {}
         self._unknown: set[str] = set()
@@ -123,7 +146,10 @@ class Recorder(Worker[RecorderParameters]):
         every(self.node, _TAKE_PERIOD_S, self._take)
 
     def close(self) -> None:
-        """Take what has arrived and close the bag; name topics without messages, or some lost."""
+        """Take what has arrived and close the bag.
+
+        Name topics without messages, or some lost.
+        """
         self._take()
         if self._failure is not None:
             raise self._failure
@@ -131,26 +157,36 @@ class Recorder(Worker[RecorderParameters]):
         heard = [topic for topic in self._recorded.values() if topic.messages]
         text = f"{self._bag.messages} messages of {len(heard)} topics recorded"
         self.node.get_logger().info(text)
-        lost = [f"{one.lost} of {name}" for name, one in self._recorded.items() if one.lost]
+        lost = [
+            f"{one.lost} of {name}" for name, one in self._recorded.items() if one.lost
+        ]
         faults = [f"no message of {_join(self._missing())}"] if self._missing() else []
         faults += [f"lost messages: {_join(lost)}"] if lost else []
         if faults:
-            raise SstError(f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})")
+            raise SstError(
+                f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})"
+            )
 
     def _missing(self) -> set[str]:
         heard = {topic for topic, recorded in self._recorded.items() if recorded.heard}
         return (self._required | self._foreign) - heard
 
     def _look(self) -> None:
-        """Subscribe to requested topics as they appear; print once that all of them are recorded.
+        """Subscribe to requested topics as they appear.
 
-        Discovery finds the topics of a node one after the other: none may be new in the last look.
-        Commands come last: a player may wait for their subscribers, and then expects that the run
-        is recorded. So they are subscribed to when the simulator's own topics have been heard.
+        Print once that all of them are recorded.
+
+        Discovery finds the topics of a node one after the other: none may be new in the
+        last look. Commands come last: a player may wait for their subscribers, and then
+        expects that the run is recorded. So they are subscribed to when the simulator's
+        own topics have been heard.
         """
         silent, new = self._missing() & self._required, False
         for topic, types in self.node.get_topic_names_and_types():
-            if topic in self._requested and topic not in self._recorded.keys() | self._unknown:
+            if (
+                topic in self._requested
+                and topic not in self._recorded.keys() | self._unknown
+            ):
                 new = True
                 own = self._own.get(topic)
                 own = own if own and own.type_name in types else None
@@ -159,7 +195,10 @@ class Recorder(Worker[RecorderParameters]):
         if self._ready:
             return
         waiting = silent | (self._foreign - self._recorded.keys())
-        text, log = f"waiting for {_join(waiting or self._requested)}", self.node.get_logger()
+        text, log = (
+            f"waiting for {_join(waiting or self._requested)}",
+            self.node.get_logger(),
+        )
         if self._recorded and not (new or waiting):
             self._ready = True
             print(f"ready: {len(self._recorded)} topics", flush=True)
@@ -169,18 +208,27 @@ class Recorder(Worker[RecorderParameters]):
         else:
             log.info(text, throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
 
-    def _subscribe(self, topic: str, type_name: str, own: topics.Endpoint | None) -> None:
-        if not self._bag.knows(type_name):  # a name that others chose must not get to the import
+    def _subscribe(
+        self, topic: str, type_name: str, own: topics.Endpoint | None
+    ) -> None:
+        # a name that others chose must not get to the import
+        if not self._bag.knows(type_name):
             text = f"{topic} is not recorded: its type {type_name} is unknown"
             self.node.get_logger().error(text)
             self._unknown.add(topic)
             return
-        offers = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
+        offers = [
+            info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)
+        ]
         offers = [own.qos()] if own else offers
         if not offers:
             return
-        # That which all publishers can serve; of a topic of ours whatever discovery has found.
-        durability, reliability = DurabilityPolicy.VOLATILE, ReliabilityPolicy.BEST_EFFORT
+        # That which all publishers can serve; of a topic of ours whatever discovery has
+        # found.
+        durability, reliability = (
+            DurabilityPolicy.VOLATILE,
+            ReliabilityPolicy.BEST_EFFORT,
+        )
         if all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offers):
             durability = DurabilityPolicy.TRANSIENT_LOCAL
         if all(one.reliability == ReliabilityPolicy.RELIABLE for one in offers):

@@ -7,14 +7,17 @@ import signal
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 came: set[int] = set()
-"""Signals that ask the node to end; no lock, on which the handler of a second would wait."""
+"""Signals that ask the node to end.
+
+No lock, on which the handler of a second would wait.
+"""
 
 
 def handle() -> None:
     """Have signals end the node in order, also while it starts.
 
-    A SIGINT that the executables have blocked until now is delivered; a SIGHUP that is ignored, as
-    by nohup, stays so.
+    A SIGINT that the executables have blocked until now is delivered; a SIGHUP that is
+    ignored, as by nohup, stays so.
     """
     for number in _NUMBERS:
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services and the action of simulation_interfaces 2.x, where that package is installed.
 
-The same state machine as that of ~/pause, ~/step and ~/reset answers. STOPPED is a run at its
-initial state that is paused. The numbers are those of the package's messages.
+The same state machine as that of ~/pause, ~/step and ~/reset answers. STOPPED is a run
+at its initial state that is paused. The numbers are those of the package's messages.
 
-The entity `star` is the manipulator. It turns about O, the origin of base_link. Its orientation and
-angular velocity determine the angles and rates of all joints, so to set them is to set the state of
-the joints.
+The entity `star` is the manipulator. It turns about O, the origin of base_link. Its
+orientation and angular velocity determine the angles and rates of all joints, so to set
+them is to set the state of the joints.
 """
 
 from __future__ import annotations
@@ -35,13 +35,15 @@ UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 INVALID_POSE = 101
 
 _UNIT = 1e-3  # largest deviation of a quaternion's length from 1; it is normalised
-_SAME = 1e-6  # largest angle between an orientation and the assembly at its actuator angles [rad]
+# largest angle between an orientation and the assembly at its actuator angles [rad]
+_SAME = 1e-6
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
 ALREADY_THERE, INCORRECT_TRANSITION = 101, 103
 SCOPE_TIME, SCOPE_STATE, SCOPE_SPAWNED, SCOPE_ALL = 1, 2, 4, 255
 FEATURES = (10, 11, 20, 22, 24, 25, 26, 31, 32, 33)
-"""Get and set the state of an entity, reset, reset of the state, get and set the state of the
-simulation, pause, one step, many steps, many steps by an action."""
+"""Get and set the state of an entity, reset, reset of the state, get and set the state
+of the simulation, pause, one step, many steps, many steps by an action.
+"""
 SERVICES = (
     *("get_entities", "get_entities_states", "get_entity_state", "set_entity_state"),
     *("get_simulation_state", "set_simulation_state", "get_simulator_features"),
@@ -55,28 +57,41 @@ _TYPES = (
     "simulation_interfaces/msg/EntityState",
 )
 INFORMATION = (
-    "sst_ros: the entity `star` has the state of the joints, which joint_states publishes and "
-    "~/set_state takes; ROS time continues over a reset"
+    "sst_ros: the entity `star` has the state of the joints, which joint_states"
+    " publishes and ~/set_state takes; ROS time continues over a reset"
 )
 
 
-def offer(node: Node, loop: RunLoop, leave: Callable[[], None], base_frame: str) -> None:
-    """Create the services and the action if the package is installed; `leave` ends the node."""
+def offer(
+    node: Node, loop: RunLoop, leave: Callable[[], None], base_frame: str
+) -> None:
+    """Create the services and the action if the package is installed.
+
+    `leave` ends the node.
+    """
     types = topics.optional_types(node, _TYPES)
     if types is None:
         return
     answers = SimulationInterfaces(loop, leave, base_frame, types)
     qos = topics.SERVICE_QOS
     for name, kind in _KINDS.items():
-        node.create_service(types[kind], f"~/{name}", getattr(answers, name), qos_profile=qos)
-    topics.ActionGoal.serve(node, types["SimulateSteps"], "~/simulate_steps", answers.begin_steps)
+        node.create_service(
+            types[kind], f"~/{name}", getattr(answers, name), qos_profile=qos
+        )
+    topics.ActionGoal.serve(
+        node, types["SimulateSteps"], "~/simulate_steps", answers.begin_steps
+    )
 
 
 class SimulationInterfaces:
     """Answers the services; each takes a request and fills a response."""
 
     def __init__(
-        self, loop: RunLoop, leave: Callable[[], None], base_frame: str, types: dict[str, Any]
+        self,
+        loop: RunLoop,
+        leave: Callable[[], None],
+        base_frame: str,
+        types: dict[str, Any],
     ) -> None:
         self._loop, self._leave, self._base_frame = loop, leave, base_frame
         self._types = types
@@ -89,14 +104,20 @@ class SimulationInterfaces:
         return response
 
     def get_simulation_state(self, _: Any, response: Any) -> Any:
-        """Return the state of the simulation; there is none for a fault, which is a failure."""
+        """Return the state of the simulation.
+
+        There is none for a fault, which is a failure.
+        """
         response.state.state = self._state()
         if self._loop.phase is Phase.FAULT:
             return answer(response, FAILED, f"fault: {self._loop.fault}")
         return answer(response, OK)
 
     def set_simulation_state(self, request: Any, response: Any) -> Any:
-        """Change the state of the simulation; out of a fault it can be stopped, or quit."""
+        """Change the state of the simulation.
+
+        Out of a fault it can be stopped, or quit.
+        """
         requested = request.state.state
         if self._loop.phase is Phase.FAULT and requested in (PLAYING, PAUSED):
             text = f"fault, reset or stop first: {self._loop.fault}"
@@ -118,7 +139,9 @@ class SimulationInterfaces:
         if requested == QUITTING:
             self._leave()
             return answer(response, OK)
-        return answer(response, UNSUPPORTED, "the scene is loaded at the start and stays")
+        return answer(
+            response, UNSUPPORTED, "the scene is loaded at the start and stays"
+        )
 
     def reset_simulation(self, request: Any, response: Any) -> Any:
         """Reset; there is nothing spawned, and ROS time is never reset."""
@@ -135,14 +158,18 @@ class SimulationInterfaces:
 
     def spawn_entity(self, request: Any, response: Any) -> Any:
         """Refuse, by the name of what was to be spawned."""
-        text = f"{request.name or 'nothing'} is not spawned: the scene has one manipulator"
+        text = (
+            f"{request.name or 'nothing'} is not spawned: the scene has one manipulator"
+        )
         return answer(response, UNSUPPORTED, text)
 
     def get_entities(self, request: Any, response: Any) -> Any:
         """List the star, where the filter matches its name."""
         filters = request.filters
         if len(filters.categories) or len(filters.tags.tags) or filters.bounds.type:
-            return answer(response, UNSUPPORTED, "the one entity is filtered by its name only")
+            return answer(
+                response, UNSUPPORTED, "the one entity is filtered by its name only"
+            )
         try:
             found = re.search(filters.filter, NAME) is not None
         except re.error as error:
@@ -165,12 +192,21 @@ class SimulationInterfaces:
         return answer(response, OK)
 
     def set_entity_state(self, request: Any, response: Any) -> Any:
-        """Set the state of a run that waits or is paused; the acceleration is ignored."""
+        """Set the state of a run that waits or is paused.
+
+        The acceleration is ignored.
+        """
         if unknown := _refuse_other(request, response):
             return unknown
-        frame, pose, twist = request.state.header.frame_id, request.state.pose, request.state.twist
+        frame, pose, twist = (
+            request.state.header.frame_id,
+            request.state.pose,
+            request.state.twist,
+        )
         if frame not in ("", "world", self._base_frame):
-            return answer(response, FAILED, f"frame_id {frame!r} must be {self._base_frame}")
+            return answer(
+                response, FAILED, f"frame_id {frame!r} must be {self._base_frame}"
+            )
         now, refusal = self._loop.simulation.state, INVALID_POSE
         quaternion, rate = now.quaternion, _turn(now.quaternion, now.body_rate)
         try:
@@ -180,16 +216,22 @@ class SimulationInterfaces:
                     raise ValueError(f"orientation has length {length:.6g}, must be 1")
                 quaternion = tuple(part / length for part in given)
                 if any(_numbers(pose.position, "xyz")):
-                    raise ValueError("position must be zero: the star turns about the origin")
+                    raise ValueError(
+                        "position must be zero: the star turns about the origin"
+                    )
             if getattr(request, "set_twist", True):
                 refusal = FAILED
                 rate = _numbers(twist.angular, "xyz")
                 if any(_numbers(twist.linear, "xyz")):
-                    raise ValueError("linear velocity must be zero: the star turns about O")
+                    raise ValueError(
+                        "linear velocity must be zero: the star turns about O"
+                    )
             refusal = INVALID_POSE
             joints = self._actuators(quaternion, rate)
         except (ValueError, AssemblyError, ArithmeticError) as error:
-            return answer(response, refusal, str(error) or "the manipulator is singular there")
+            return answer(
+                response, refusal, str(error) or "the manipulator is singular there"
+            )
         return self._ask(response, partial(self._loop.set_state, *joints))
 
     def begin_steps(self, handle: Any) -> None:
@@ -215,7 +257,9 @@ class SimulationInterfaces:
         goal = topics.ActionGoal(handle)
         threading.Thread(target=run, daemon=True).start()
 
-    def _actuators(self, quaternion: Quaternion, rate: Vector3) -> tuple[Vector3, Vector3]:
+    def _actuators(
+        self, quaternion: Quaternion, rate: Vector3
+    ) -> tuple[Vector3, Vector3]:
         """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
 
         At a serial singularity an ArithmeticError is raised.
@@ -255,7 +299,11 @@ def answer(response: Any, code: int, text: str = "") -> Any:
 
 def answer_with(response: Any, reply: Reply) -> Any:
     """Fill the result of a response from a reply of the run, and return the response."""
-    return answer(response, OK) if reply.success else answer(response, FAILED, reply.message)
+    return (
+        answer(response, OK)
+        if reply.success
+        else answer(response, FAILED, reply.message)
+    )
 
 
 def _refuse_other(request: Any, response: Any) -> Any:

@@ -32,7 +32,10 @@ _DELAY_S = 5.0
 """Delay of the compiler: the first seconds of a real-time run have the processor alone."""
 _END_S = 0.5  # wait for the thread of the run, where a step does not end
 FOLLOWED_STEP_NS = 200_000_000
-"""Steps of a followed clock up to this length are simulated; longer ones are dropped time."""
+"""Steps of a followed clock up to this length are simulated.
+
+Longer ones are dropped time.
+"""
 _LONGEST_WAIT_S = 0.05
 _STANDSTILL_S = 1.0  # of a followed clock, which is reported
 
@@ -68,7 +71,9 @@ class Simulator(Worker[SimulatorParameters]):
         self._loop = RunLoop(simulated, build, parts)
         self._diagnostics = RunDiagnostics(self._loop)
         serve(self.node, self._loop)
-        simulation_interfaces.offer(self.node, self._loop, self.done.set, given.base_frame)
+        simulation_interfaces.offer(
+            self.node, self._loop, self.done.set, given.base_frame
+        )
         every(self.node, 1.0, self._report)
         self._read_gauges()
         self._loop.post(processes.quiet)  # once the code of all methods is loaded
@@ -76,7 +81,10 @@ class Simulator(Worker[SimulatorParameters]):
         self._thread.start()
 
     def close(self) -> None:
-        """End the run, publish the last diagnostics; raise the reason where the run has failed."""
+        """End the run, publish the last diagnostics.
+
+        Raise the reason where the run has failed.
+        """
         self._loop.stop()
         self.done.set()
         self._thread.join(_END_S)
@@ -106,19 +114,29 @@ class Simulator(Worker[SimulatorParameters]):
         self._pacer.change(self.parameters.real_time_factor)
 
     def _schedule(self) -> None:
-        """Real-time scheduling for a run that sleeps; without deadlines it would starve others.
+        """Real-time scheduling for a run that sleeps.
+
+        Without deadlines it would starve others.
 
         The machine may sleep as it likes where no deadlines are kept.
         """
-        given, thread, shown = self.parameters, self._thread.native_id, self._diagnostics
+        given, thread, shown = (
+            self.parameters,
+            self._thread.native_id,
+            self._diagnostics,
+        )
         if thread is None or not self._thread.is_alive():
             return
         paced, running = given.real_time_factor > 0.0, self._loop.phase is Phase.RUNNING
         try:
-            scheduling = processes.schedule(given.realtime_priority if paced else 0, thread)
+            scheduling = processes.schedule(
+                given.realtime_priority if paced else 0, thread
+            )
         except ProcessLookupError:  # it has ended since
             return
-        latency = self._latency.request(given.cpu_dma_latency if paced and running else -1)
+        latency = self._latency.request(
+            given.cpu_dma_latency if paced and running else -1
+        )
         granted = {"scheduling": scheduling, "cpu_dma_latency": latency}
         for what in (key for key in granted if granted[key] != shown.granted[key]):
             self.node.get_logger().info(f"{what}: {granted[what]}")
@@ -131,19 +149,31 @@ class Simulator(Worker[SimulatorParameters]):
         """Publish the diagnostics, log what is new, request gauges for the next time."""
         self._schedule()  # the threads that have begun since: of callbacks and of DDS
         named = self.node.resolve_topic_name
-        commands = [named(topics.SIMULATOR[name].name) for name in ("commands", "commands_stamped")]
-        values = self._diagnostics.values(sum(map(self.node.count_publishers, commands)))
-        level, text, news = self._diagnostics.status(values, [*self._warnings(commands)])
+        commands = [
+            named(topics.SIMULATOR[name].name)
+            for name in ("commands", "commands_stamped")
+        ]
+        values = self._diagnostics.values(
+            sum(map(self.node.count_publishers, commands))
+        )
+        level, text, news = self._diagnostics.status(
+            values, [*self._warnings(commands)]
+        )
         for line in news:
             self.node.get_logger().warning(line)
-        self._topics.diagnostics.publish(topics.diagnostics(self.node, "run", level, text, values))
+        self._topics.diagnostics.publish(
+            topics.diagnostics(self.node, "run", level, text, values)
+        )
         gc.collect()  # the garbage since `quiet`
         if self._loop.phase is not Phase.FINISHED:
             self._loop.post(self._read_gauges)
 
     def _warnings(self, commands: Sequence[str]) -> Iterator[str]:
         """Conditions of the graph that keep a run from what its user expects."""
-        own, clocks = self.node.get_fully_qualified_name(), topics.publishers(self.node, "/clock")
+        own, clocks = (
+            self.node.get_fully_qualified_name(),
+            topics.publishers(self.node, "/clock"),
+        )
         rivals = [name for name in clocks if name != own]
         if rivals and self.parameters.publish_clock:
             yield f"/clock is also published by {', '.join(rivals)}"
@@ -153,18 +183,29 @@ class Simulator(Worker[SimulatorParameters]):
             yield from topics.other_types(self.node, topics.SIMULATOR[name])
         for topic in commands:
             for name in topics.publishers(self.node, topic, best_effort=True):
-                yield f"{topic} of {name} is best effort and not received: publish it reliably"
+                yield (
+                    f"{topic} of {name} is best effort and not received: publish it"
+                    " reliably"
+                )
         named = self.node.resolve_topic_name
-        for name in topics.publishers(self.node, named(topics.SIMULATOR["joint_states"].name)):
+        for name in topics.publishers(
+            self.node, named(topics.SIMULATOR["joint_states"].name)
+        ):
             if name != own and self.node.count_publishers(f"{name}/phase"):
-                yield f"{name} publishes the same joint_states: give each simulator a namespace"
+                yield (
+                    f"{name} publishes the same joint_states: give each simulator a"
+                    " namespace"
+                )
         # Not by the names of the graph: a node that has ended may stay there.
         if self.node.count_publishers(f"{own}/phase") > 1:
             yield f"another node is named {own}, too"
 
 
 def _lockstep_duration(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the scene's duration as a default; faults of the scene are reported later."""
+    """Return the scene's duration as a default.
+
+    Faults of the scene are reported later.
+    """
     if given.get("sync") != "lockstep":
         return {}
     try:
@@ -175,7 +216,10 @@ def _lockstep_duration(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def serve(node: Node, loop: RunLoop) -> None:
-    """Offer the services and the topic by which a run is controlled; the run loop decides."""
+    """Offer the services and the topic by which a run is controlled.
+
+    The run loop decides.
+    """
 
     def answer(request: Any, response: Any, act: Callable[[Any], Reply]) -> Any:
         response.success, response.message = loop.ask(lambda: act(request))
@@ -202,7 +246,9 @@ def serve(node: Node, loop: RunLoop) -> None:
         "reset": lambda _: loop.reset(),
     }.items():
         one, qos = topics.SIMULATOR[name], topics.SERVICE_QOS
-        node.create_service(one.kind, one.name, partial(answer, act=act), qos_profile=qos)
+        node.create_service(
+            one.kind, one.name, partial(answer, act=act), qos_profile=qos
+        )
     topics.subscribe(node, topics.SIMULATOR, set_state=set_state)
 
 
@@ -215,8 +261,12 @@ class FollowedClock(SteadyTime):
         self._moved_s = time.monotonic()  # the steady time of the last move
         self._jumps: list[float] = []  # back [s], of which no warning was given yet
         least = Duration(nanoseconds=1)
-        threshold = JumpThreshold(min_forward=least, min_backward=Duration(nanoseconds=-1))
-        self._handle = self._clock.create_jump_callback(threshold, post_callback=self._take_move)
+        threshold = JumpThreshold(
+            min_forward=least, min_backward=Duration(nanoseconds=-1)
+        )
+        self._handle = self._clock.create_jump_callback(
+            threshold, post_callback=self._take_move
+        )
 
     def now_ns(self) -> int:
         """Return the time [ns]; 0 before the first /clock."""
@@ -234,7 +284,10 @@ class FollowedClock(SteadyTime):
         elif time.monotonic() - self._moved_s > _STANDSTILL_S:
             yield "/clock stands still: the run waits for it"
         while self._jumps:
-            yield f"/clock jumped back by {self._jumps.pop(0):.9g} s; stamps of the run go on"
+            yield (
+                f"/clock jumped back by {self._jumps.pop(0):.9g} s; stamps of the run"
+                " go on"
+            )
 
     def _take_move(self, jump: TimeJump) -> None:
         moved_s = jump.delta.nanoseconds / NANOSECONDS

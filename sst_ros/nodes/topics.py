@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics, services and actions of the nodes: one table that they, the docs and the policies follow.
 
-Who is at the other end of a topic, subscriptions whose owner takes the messages when he needs them,
-and goals of actions that end later than they are accepted.
+Who is at the other end of a topic, subscriptions whose owner takes the messages when he
+needs them, and goals of actions that end later than they are accepted.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ from sst_ros.runtime.torque_input import MOST_WAITING
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 EXECUTES = "executes"
 
-# Use, name, type; how many messages are kept for slow readers, 0 for two seconds of them; `latched`
-# where the last one is kept for late joiners. Then what it carries, and the condition under which
-# it exists. In names ~ stands for the name of the node, {simulator} for the parameter.
+# Use, name, type; how many messages are kept for slow readers, 0 for two seconds of
+# them; `latched` where the last one is kept for late joiners. Then what it carries, and
+# the condition under which it exists. In names ~ stands for the name of the node,
+# {simulator} for the parameter.
 _TABLE = """
 [simulator]
 publishes joint_states sensor_msgs/msg/JointState 0
@@ -137,11 +138,14 @@ calls {simulator}/reset std_srvs/srv/Trigger
 """
 
 SERVICE_QOS = QoSProfile(depth=1000)
-"""Of services and of our clients: with ten, the default, the eleventh request that waits displaces
-the first, and so does the eleventh reply. All clients of a service receive all of its replies."""
+"""Of services and of our clients: with ten, the default, the eleventh request that
+waits displaces the first, and so does the eleventh reply. All clients of a service
+receive all of its replies.
+"""
 COUNT_NS = 20_000_000
-"""A run counts the other ends of its topics this often, not at each tick: to count the subscribers
-of four topics takes as long as a tick."""
+"""A run counts the other ends of its topics this often, not at each tick: to count the
+subscribers of four topics takes as long as a tick.
+"""
 UNNAMED = "a node whose name is not known yet"
 
 
@@ -166,18 +170,26 @@ class Endpoint(NamedTuple):
         name = self.name.replace("~", node)
         return name if name.startswith("/") else f"{node.rpartition('/')[0]}/{name}"
 
-    def publisher(self, node: Node, depth: int = 10, *, simulator: str = "") -> Publisher[Any]:
+    def publisher(
+        self, node: Node, depth: int = 10, *, simulator: str = ""
+    ) -> Publisher[Any]:
         """Create its publisher; the depth is for a topic that has none of its own."""
         topic = self.name.format(simulator=simulator)
         return node.create_publisher(self.kind, topic, self.qos(depth))
 
     def qos(self, depth: int = 10) -> QoSProfile:
         """Return its QoS; the depth is for a topic that has none of its own."""
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE
+        durability = (
+            DurabilityPolicy.TRANSIENT_LOCAL
+            if self.latched
+            else DurabilityPolicy.VOLATILE
+        )
         return QoSProfile(depth=self.depth or depth, durability=durability)
 
 
-_ROW = re.compile(r"(\w+) (\S+) (\S+) ?(\w*)( latched)?\n((?:    (?!if ).*\n)*)(?:    if (.*)\n)?")
+_ROW = re.compile(
+    r"(\w+) (\S+) (\S+) ?(\w*)( latched)?\n((?:    (?!if ).*\n)*)(?:    if (.*)\n)?"
+)
 
 
 def _read(table: str) -> dict[str, dict[str, Endpoint]]:
@@ -196,7 +208,9 @@ def _read(table: str) -> dict[str, dict[str, Endpoint]]:
 NODES = _read(_TABLE)
 SIMULATOR, PLAYER = NODES["simulator"], NODES["torque_player"]
 CONTROLLER, VIEWER = NODES["inverse_dynamics"], NODES["viewer"]
-SAMPLED = tuple(one.name for one in SIMULATOR.values() if one.use == PUBLISHES and not one.when)
+SAMPLED = tuple(
+    one.name for one in SIMULATOR.values() if one.use == PUBLISHES and not one.when
+)
 """Topics that a simulator publishes in every run."""
 
 
@@ -209,8 +223,8 @@ def message_type(type_name: str) -> Any:
 def optional_types(node: Node, type_names: Sequence[str]) -> dict[str, Any] | None:
     """Import the types of an optional package, by the last part of their names.
 
-    None is returned where the package is not installed, and with a warning where its installation
-    is incomplete: a type is missing, or cannot be used by this middleware.
+    None is returned where the package is not installed, and with a warning where its
+    installation is incomplete: a type is missing, or cannot be used by this middleware.
     """
     package = type_names[0].partition("/")[0]
     if importlib.util.find_spec(package) is None:
@@ -223,13 +237,18 @@ def optional_types(node: Node, type_names: Sequence[str]) -> dict[str, Any] | No
             kinds[type_name.rpartition("/")[2]] = kind
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        node.get_logger().warning(f"{package} is installed but incomplete, not used ({reason})")
+        node.get_logger().warning(
+            f"{package} is installed but incomplete, not used ({reason})"
+        )
         return None
     return kinds
 
 
 def subscribe(
-    node: Node, own: dict[str, Endpoint], simulator: str = "", **callbacks: Callable[[Any], None]
+    node: Node,
+    own: dict[str, Endpoint],
+    simulator: str = "",
+    **callbacks: Callable[[Any], None],
 ) -> None:
     """Create the subscriptions of a node to topics of its own table, by the names there."""
     for name, callback in callbacks.items():
@@ -242,7 +261,8 @@ def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str
     return [
         _name_of(info)
         for info in node.get_publishers_info_by_topic(topic)
-        if not best_effort or info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        if not best_effort
+        or info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     ]
 
 
@@ -267,7 +287,10 @@ def other_types(node: Node, topic: Endpoint, *, simulator: str = "") -> list[str
 def diagnostics(
     node: Node, what: str, level: int, text: str, values: dict[str, Any]
 ) -> DiagnosticArray:
-    """Build a DiagnosticArray of one status of a node; the level is 0, 1 or 2 for an error."""
+    """Build a DiagnosticArray of one status of a node.
+
+    The level is 0, 1 or 2 for an error.
+    """
     status = DiagnosticStatus(level=bytes([level]), message=text)
     name = node.get_fully_qualified_name()
     status.name, status.hardware_id = f"{name}: {what}", name
@@ -278,10 +301,13 @@ def diagnostics(
 
 
 class NeverSpun(MutuallyExclusiveCallbackGroup):
-    """Keeps subscriptions out of the executor, and their events; their owner takes the messages.
+    """Keeps subscriptions out of the executor, and their events.
 
-    An executor wakes a thread for each message, which costs far more than taking it. In a wait for
-    an event of a subscription of Fast DDS, each message that has not been taken ends the wait.
+    Their owner takes the messages.
+
+    An executor wakes a thread for each message, which costs far more than taking it. In
+    a wait for an event of a subscription of Fast DDS, each message that has not been
+    taken ends the wait.
     """
 
     def can_execute(self, entity: object) -> bool:
@@ -296,7 +322,9 @@ def take(subscription: Subscription[Any]) -> tuple[bytes, dict[str, Any]] | None
     """
     handle: Any = subscription.handle
     with handle:
-        one: tuple[bytes, dict[str, Any]] | None = handle.take_message(subscription.msg_type, True)
+        one: tuple[bytes, dict[str, Any]] | None = handle.take_message(
+            subscription.msg_type, True
+        )
     return one
 
 
@@ -308,7 +336,11 @@ class Reader:
 
     def __init__(self, node: Node, topic: Endpoint) -> None:
         self._subscription = node.create_subscription(
-            topic.kind, topic.name, lambda _: None, topic.depth, callback_group=NeverSpun()
+            topic.kind,
+            topic.name,
+            lambda _: None,
+            topic.depth,
+            callback_group=NeverSpun(),
         )
         self._next: tuple[Any, int] | None = None
         self._count_ns = 0.0
@@ -318,9 +350,9 @@ class Reader:
     def read(self, until_ns: float) -> Sequence[Any]:
         """Return the next messages that arrived until this monotonic time [ns].
 
-        They are MOST_WAITING at most. A topic without publishers is looked at every 20 ms, because
-        a look costs 5 us in a run that wakes for each sample, with cold caches; at once where the
-        time is infinite.
+        They are MOST_WAITING at most. A topic without publishers is looked at every 20
+        ms, because a look costs 5 us in a run that wakes for each sample, with cold
+        caches; at once where the time is infinite.
         """
         if self._count_ns <= until_ns < math.inf:
             self._count_ns = until_ns + COUNT_NS
@@ -357,12 +389,17 @@ class ActionGoal:
         handle.execute(self._wait)
 
     @staticmethod
-    def serve(node: Node, kind: Any, name: str, begin: Callable[[Any], None], **more: Any) -> None:
+    def serve(
+        node: Node, kind: Any, name: str, begin: Callable[[Any], None], **more: Any
+    ) -> None:
         """Serve an action whose goals `begin` makes, from handles of rclpy."""
-        from rclpy.action.server import ActionServer, CancelResponse  # most nodes have no action
+        # most nodes have no action
+        from rclpy.action.server import ActionServer, CancelResponse
 
         given = {"cancel_callback": lambda _: CancelResponse.ACCEPT, **more}
-        ActionServer(node, kind, name, lambda _: None, handle_accepted_callback=begin, **given)
+        ActionServer(
+            node, kind, name, lambda _: None, handle_accepted_callback=begin, **given
+        )
 
     async def _wait(self, _: Any) -> Any:
         return await self._result

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The torque player: answers every joint state with the torque of the hold that begins there.
 
-A torque is held until the next sample. That of the hold's middle makes the motion second order in
-the period, that of its start first order only.
+A torque is held until the next sample. That of the hold's middle makes the motion
+second order in the period, that of its start first order only.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
             self.send(self._hold(elapsed_ns))
         else:
             self.send(ZERO)
-            self.node.get_logger().info(f"the profile of {self._duration:g} s is played")
+            self.node.get_logger().info(
+                f"the profile of {self._duration:g} s is played"
+            )
             self.done.set()
 
     def _hold(self, elapsed_ns: int) -> Vector3:
@@ -61,9 +63,9 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
             return
         self._warned = True
         self.node.get_logger().warning(
-            f"two samples are {apart_ns / NANOSECONDS:g} s apart, not 1 / rate = "
-            f"{period_ns / NANOSECONDS:g} s: torques are not those of the middle of the hold;"
-            " give rate = publish_rate of the simulator, or hold:=start"
+            f"two samples are {apart_ns / NANOSECONDS:g} s apart, not 1 / rate ="
+            f" {period_ns / NANOSECONDS:g} s: torques are not those of the middle of"
+            " the hold; give rate = publish_rate of the simulator, or hold:=start"
         )
 
 

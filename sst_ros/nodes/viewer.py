@@ -30,7 +30,8 @@ from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 
 _REPLY_S = 5.0
-_REPEAT_S = 0.05  # period of manual commands; the simulator drops commands older than half a second
+# period of manual commands; the simulator drops commands older than half a second
+_REPEAT_S = 0.05
 _LOOK_S = 0.5
 _QUEUE = topics.VIEWER["joint_states"].depth
 
@@ -50,7 +51,9 @@ class Viewer(Worker[ViewerParameters]):
         self._commands: Publisher[Float64MultiArray] | None = None
         self._clients: dict[str, Client[Any, Any]] = {
             name: self.node.create_client(
-                one.kind, one.name.format(simulator=given.simulator), qos_profile=topics.SERVICE_QOS
+                one.kind,
+                one.name.format(simulator=given.simulator),
+                qos_profile=topics.SERVICE_QOS,
             )
             for name, one in topics.VIEWER.items()
             if one.use == topics.CALLS
@@ -83,7 +86,9 @@ class Viewer(Worker[ViewerParameters]):
         client = self._clients[request if paused is None else "pause"]
         if not client.service_is_ready():
             return False, f"no service {client.srv_name}: is the simulator running?"
-        given: Any = Trigger.Request() if paused is None else SetBool.Request(data=paused)
+        given: Any = (
+            Trigger.Request() if paused is None else SetBool.Request(data=paused)
+        )
         future, answered = client.call_async(given), threading.Event()
         future.add_done_callback(lambda _: answered.set())
         if not answered.wait(_REPLY_S):
@@ -108,16 +113,23 @@ class Viewer(Worker[ViewerParameters]):
         stamp_ns = nanoseconds(message.header.stamp)
         if not is_idle(stamp_ns, message.header.frame_id):
             self._start_ns, self._time_ns = self._start_ns or stamp_ns, stamp_ns
-        time = (self._time_ns - self._start_ns) / NANOSECONDS if self._start_ns else None
+        time = (
+            (self._time_ns - self._start_ns) / NANOSECONDS if self._start_ns else None
+        )
         q, v = message.position, message.velocity
-        self._states.append(ViewState(time, q[:3], q[3:6], q[6:9], v[:3], message.effort[:3]))
+        self._states.append(
+            ViewState(time, q[:3], q[3:6], q[6:9], v[:3], message.effort[:3])
+        )
 
     def _take_scene(self, message: String) -> None:
         with contextlib.suppress(InputError):  # a scene of another version
-            self.scene = yaml_document.read(Scene, message.data, self.parameters.simulator)
+            self.scene = yaml_document.read(
+                Scene, message.data, self.parameters.simulator
+            )
 
     def _take_phase(self, message: String) -> None:
-        if message.data == "waiting" and self._phase:  # the first that is heard is no news
+        # the first that is heard is no news
+        if message.data == "waiting" and self._phase:
             self._start_ns = 0
         self._phase = message.data
 
@@ -133,7 +145,9 @@ class Viewer(Worker[ViewerParameters]):
         """Look for another node that publishes commands, and leave the run to it."""
         own, names = self.node.get_fully_qualified_name(), list[str]()
         for topic in ("commands", "commands_stamped"):
-            names += topics.publishers(self.node, f"{self.parameters.simulator}/{topic}")
+            names += topics.publishers(
+                self.node, f"{self.parameters.simulator}/{topic}"
+            )
         self._controller = next((name for name in names if name != own), "")
         if self._controller:
             self._driving = False
@@ -148,5 +162,7 @@ class Viewer(Worker[ViewerParameters]):
         if self._driving:
             if self._commands is None:
                 simulator = self.parameters.simulator
-                self._commands = topics.VIEWER["commands"].publisher(self.node, simulator=simulator)
+                self._commands = topics.VIEWER["commands"].publisher(
+                    self.node, simulator=simulator
+                )
             self._commands.publish(Float64MultiArray(data=array("d", self._torque)))

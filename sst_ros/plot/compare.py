@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several runs in one picture, and the differences between them.
 
-Runs are laid on each other by the time since the start of each, in whole nanoseconds; only samples
-that both have are compared, nothing is interpolated.
+Runs are laid on each other by the time since the start of each, in whole nanoseconds;
+only samples that both have are compared, nothing is interpolated.
 """
 
 from __future__ import annotations
@@ -16,7 +16,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sst_ros.errors import refuse_unless
-from sst_ros.host.figures import DEGREES, LINES, SMALLEST_SHOWN, hide_zeros, legend, styled
+from sst_ros.host.figures import (
+    DEGREES,
+    LINES,
+    SMALLEST_SHOWN,
+    hide_zeros,
+    legend,
+    styled,
+)
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.plot import pictures, workspace
 from sst_ros.plot.pictures import KINDS, Picture, draw_legs, tick_torques
@@ -30,23 +37,36 @@ Drawn: TypeAlias = "Sequence[tuple[Signals, str, dict[str, Any]]]"
 """Runs with their names and styles."""
 
 
-def _overlay(quantity: str, label: str, scale: float = 1.0) -> Callable[[Drawn], Figure]:
+def _overlay(
+    quantity: str, label: str, scale: float = 1.0
+) -> Callable[[Drawn], Figure]:
     """Return what draws a quantity of the legs of all runs, and below how far they are apart."""
 
     def draw(runs: Drawn) -> Figure:
-        legs = [(name, run.seconds(), scale * run.legs(quantity), look) for run, name, look in runs]
+        legs = [
+            (name, run.seconds(), scale * run.legs(quantity), look)
+            for run, name, look in runs
+        ]
         below = f"largest difference\nfrom the first {label.partition(' ')[2]}"
         figure, first = draw_legs(label, legs, below), runs[0][0]
         axes = figure.axes[-1]
         axes.set_yticks([])  # none until a run differs
         for run, name, look in runs[1:]:
             here, there = _common(first, run)
-            apart = scale * np.abs(run.legs(quantity)[there] - first.legs(quantity)[here])
+            apart = scale * np.abs(
+                run.legs(quantity)[there] - first.legs(quantity)[here]
+            )
             largest = hide_zeros(apart.max(axis=1, initial=0.0))
             if differs := bool(np.isfinite(largest).any()):
                 axes.set_yscale("log")
             same = len(there) and bool((apart <= SMALLEST_SHOWN).all())
-            said = "" if differs else ": no difference" if same else ": no samples in common"
+            said = (
+                ""
+                if differs
+                else ": no difference"
+                if same
+                else ": no samples in common"
+            )
             axes.plot(run.seconds()[there], largest, label=name + said, **look)
         legend(axes)
         return figure
@@ -55,7 +75,9 @@ def _overlay(quantity: str, label: str, scale: float = 1.0) -> Callable[[Drawn],
 
 
 def _torques(runs: Drawn) -> Figure:
-    return draw_legs("τ [N m]", [(name, *tick_torques(run), look) for run, name, look in runs])
+    return draw_legs(
+        "τ [N m]", [(name, *tick_torques(run), look) for run, name, look in runs]
+    )
 
 
 def _sphere(runs: Drawn) -> Figure:
@@ -65,10 +87,19 @@ def _sphere(runs: Drawn) -> Figure:
     return workspace.draw_paths(scene, paths)
 
 
-JOINTS, ERROR, TICKS, TURN = "joint_states", "tracking_error", "applied_torques", "orientation"
+JOINTS, ERROR, TICKS, TURN = (
+    "joint_states",
+    "tracking_error",
+    "applied_torques",
+    "orientation",
+)
 PICTURES = {
-    "gamma": Picture("Actuator angles", (JOINTS,), _overlay("gamma", "γ [deg]", DEGREES)),
-    "gamma_dot": Picture("Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇ [rad/s]")),
+    "gamma": Picture(
+        "Actuator angles", (JOINTS,), _overlay("gamma", "γ [deg]", DEGREES)
+    ),
+    "gamma_dot": Picture(
+        "Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇ [rad/s]")
+    ),
     "tracking_error": Picture(
         "Desired less measured angles", (ERROR,), _overlay("gamma_error", "Δγ [rad]")
     ),
@@ -93,7 +124,9 @@ def draw_comparison(
         title, needs, make = PICTURES[name]
         all_runs = list(zip(runs, labels(runs), LINES, strict=False))
         drawn = [each for each in all_runs if not set(needs) & set(each[0].missing)]
-        if left := [label for run, label, _ in all_runs if set(needs) & set(run.missing)]:
+        if left := [
+            label for run, label, _ in all_runs if set(needs) & set(run.missing)
+        ]:
             missing[name] = f"without {', '.join(left)}: no {' or '.join(needs)} there"
         if len(drawn) > 1 and drawn[0][0] is runs[0]:
             paths += pictures.save(make(drawn), title, out, f"compare_{name}")
@@ -105,10 +138,10 @@ def draw_comparison(
 def differences(runs: Sequence[Signals]) -> DataFrame:
     """Compare each run with the first one, at the stamps that both have.
 
-    A row of the table is a joint of a run, by its label, or the star, whose difference is the angle
-    between the orientations: largest difference of the angle and root of its mean square [rad],
-    and the same of the rate [rad/s]; samples in common, of how many. What cannot be compared is
-    nan.
+    A row of the table is a joint of a run, by its label, or the star, whose difference
+    is the angle between the orientations: largest difference of the angle and root of
+    its mean square [rad], and the same of the rate [rad/s]; samples in common, of how
+    many. What cannot be compared is nan.
     """
     from pandas import DataFrame, Series, concat
 
@@ -121,7 +154,9 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
         angles, rates = (DataFrame(columns=joints, dtype=float) for _ in range(2))
         if JOINTS not in absent:
             angles, rates = (
-                DataFrame(run.take(*names)[there] - first.take(*names)[here], columns=joints)
+                DataFrame(
+                    run.take(*names)[there] - first.take(*names)[here], columns=joints
+                )
                 for names in (joints, rated)
             )
         turn = Series(dtype=float)
@@ -163,8 +198,8 @@ def labels(runs: Sequence[Signals]) -> list[str]:
 def difference_text(runs: Sequence[Signals]) -> str:
     """Write the differences as text, a table for each run."""
     said = [
-        f"Differences from {labels(runs)[0]}, at samples that both have at the same time since "
-        "the start of each run\n(whole nanoseconds, nothing interpolated)"
+        f"Differences from {labels(runs)[0]}, at samples that both have at the same"
+        " time since the start of each run\n(whole nanoseconds, nothing interpolated)"
     ]
     for label, table in differences(runs).groupby(level="run", sort=False):
         samples, of = table.pop("samples").iloc[0], table.pop("of").iloc[0]

@@ -34,7 +34,13 @@ QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
 NUMBERS = {
     "example1": {"position_of_E": 8, "psi": 9},
-    "example2": {"path_of_E": 10, "position_of_E": 11, "theta": 12, "phi": 13, "psi": 14},
+    "example2": {
+        "path_of_E": 10,
+        "position_of_E": 11,
+        "theta": 12,
+        "phi": 13,
+        "psi": 14,
+    },
 }
 """Number of a picture in the paper, by the name of the scene."""
 ASSUMPTION = "assumed inertias: the paper's are lost"
@@ -61,7 +67,9 @@ Curves: TypeAlias = "tuple[str, Sequence[str], Callable[[Signals], Array]]"
 def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], Figure]:
     """Return what draws panels one above the other."""
     return lambda run, _: figures.draw_panels(
-        run.seconds(), [(label, names, values(run)) for label, names, values in panels], height
+        run.seconds(),
+        [(label, names, values(run)) for label, names, values in panels],
+        height,
     )
 
 
@@ -70,20 +78,27 @@ def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
     return label, leg_names(letter), lambda run: scale * run.legs(quantity)
 
 
-def joints(letters: Mapping[str, str], unit: str, scale: float = 1.0) -> Callable[..., Figure]:
+def joints(
+    letters: Mapping[str, str], unit: str, scale: float = 1.0
+) -> Callable[..., Figure]:
     """Return what draws quantities of the joints of the legs, by their letters.
 
-    Where the true ones are recorded, they are the lines, and dots behind them what was measured.
+    Where the true ones are recorded, they are the lines, and dots behind them what was
+    measured.
     """
 
     def draw(run: Signals, _: Scene) -> Figure:
         seconds, recorded = run.seconds(), TRUE_JOINT_STATES.key not in run.missing
-        figure, panels = stack([f"{letter} [{unit}]" for letter in letters.values()], 2.6)
+        figure, panels = stack(
+            [f"{letter} [{unit}]" for letter in letters.values()], 2.6
+        )
         for axes, (name, letter) in zip(panels, letters.items(), strict=True):
             if recorded:
                 label: str | None = "measured"
                 for column in scale * run.legs(name).T:
-                    axes.plot(seconds, column, ".", color=GREY, markersize=2, label=label)
+                    axes.plot(
+                        seconds, column, ".", color=GREY, markersize=2, label=label
+                    )
                     label = None
             figures.lines(axes, seconds, scale * run.true_legs(name), leg_names(letter))
         return figure
@@ -92,7 +107,9 @@ def joints(letters: Mapping[str, str], unit: str, scale: float = 1.0) -> Callabl
 
 
 def draw_legs(
-    label: str, series: Sequence[tuple[str, Array, Array, Mapping[str, Any]]], *below: str
+    label: str,
+    series: Sequence[tuple[str, Array, Array, Mapping[str, Any]]],
+    *below: str,
 ) -> Figure:
     """Draw series of a name, times [s] (n,), values (n, 3) and a style: a panel for each leg.
 
@@ -121,7 +138,10 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
     number = NUMBERS.get(scene or "", {}).get(name)
     if number is None:
         return name, title
-    return f"fig{number:02d}_{name}", f"{title}\nFig. {number} of the paper; {ASSUMPTION}"
+    return (
+        f"fig{number:02d}_{name}",
+        f"{title}\nFig. {number} of the paper; {ASSUMPTION}",
+    )
 
 
 def zyz_degrees(quaternion: Array, which: int) -> Array:
@@ -135,7 +155,9 @@ def zyz_degrees(quaternion: Array, which: int) -> Array:
 def _position(run: Signals, scene: Scene) -> Figure:
     """Draw the coordinates of E over time."""
     values = position_of_e(scene, run.take(*QUATERNION))
-    return figures.draw_panels(run.seconds(), [(POSITION, "xyz", values)], 3.2, LEAST_POSITION_M)
+    return figures.draw_panels(
+        run.seconds(), [(POSITION, "xyz", values)], 3.2, LEAST_POSITION_M
+    )
 
 
 def _angle(run: Signals, _: Scene | None, which: int) -> Figure:
@@ -154,12 +176,19 @@ def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
     geometry = Geometry.of(scene)
     base, star = scene.base.radius, scene.star.radius
     outline = np.concatenate(workspace.sides(geometry, 40))
-    axes.plot(*(base * outline).T, color=GREY, linewidth=1.6, label="base triangle P₁P₂P₃")
+    axes.plot(
+        *(base * outline).T, color=GREY, linewidth=1.6, label="base triangle P₁P₂P₃"
+    )
     if star != base:
-        image = {"linewidth": 0.9, "linestyle": ":", "label": "its image on the sphere of E"}
+        image = {
+            "linewidth": 0.9,
+            "linestyle": ":",
+            "label": "its image on the sphere of E",
+        }
         axes.plot(*(star * outline).T, color=GREY, **image)
     middle = geometry.v.sum(axis=0) / np.linalg.norm(geometry.v.sum(axis=0))
-    inside = geometry.v + 0.22 * (middle - geometry.v)  # outside are the numbers of the axes
+    # outside are the numbers of the axes
+    inside = geometry.v + 0.22 * (middle - geometry.v)
     for name, point in zip(leg_names("P"), base * inside, strict=True):
         axes.text(*point, name, ha="center", va="center")
     drawn = [position_of_e(scene, each).T for each in paths.values()]
@@ -169,9 +198,14 @@ def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.zaxis.set_rotate_label(False)  # by itself it stands on its head
     axes.set_zlabel("z [m]", rotation=90.0)
-    axes.set_box_aspect(np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1))
+    axes.set_box_aspect(
+        np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
+    )
     x, y, z = middle
-    height, azimuth = np.degrees(np.arctan2(z, np.hypot(x, y))), np.degrees(np.arctan2(y, x))
+    height, azimuth = (
+        np.degrees(np.arctan2(z, np.hypot(x, y))),
+        np.degrees(np.arctan2(y, x)),
+    )
     axes.view_init(elev=height - 8.0, azim=azimuth + 8.0)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], prune="both"))
@@ -188,8 +222,13 @@ def _tracking(run: Signals, _: Scene) -> Figure:
     """Draw the desired angle of each actuator, and the measured one over it."""
     seconds, below = run.seconds(), {"color": GREY, "linewidth": 3.2}
     above = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
-    desired, measured = (DEGREES * run.legs(name) for name in ("gamma_desired", "gamma"))
-    series = [("desired", seconds, desired, below), ("measured", seconds, measured, above)]
+    desired, measured = (
+        DEGREES * run.legs(name) for name in ("gamma_desired", "gamma")
+    )
+    series = [
+        ("desired", seconds, desired, below),
+        ("measured", seconds, measured, above),
+    ]
     if TRUE_JOINT_STATES.key not in run.missing:
         looks = {"color": VERMILION, "linewidth": 0.9, "linestyle": ":"}
         series.append(("true", seconds, DEGREES * run.true_legs("gamma"), looks))
@@ -203,11 +242,18 @@ def _torques(run: Signals, _: Scene) -> Figure:
     """
     seconds, torque = tick_torques(run)
     series = [("applied", seconds, torque, {"color": BLUE, "linewidth": 3.0})]
-    table = next((name for name in ("commands_stamped", "commands") if name in run.tables), None)
+    table = next(
+        (name for name in ("commands_stamped", "commands") if name in run.tables), None
+    )
     if table is not None:
         at, values = run.seconds(table), run.legs("tau", table)
         inside = (at >= seconds[0]) & (at <= seconds[-1])
-        dots = {"color": VERMILION, "linestyle": "none", "marker": ".", "markersize": 1.5}
+        dots = {
+            "color": VERMILION,
+            "linestyle": "none",
+            "marker": ".",
+            "markersize": 1.5,
+        }
         if inside.any():
             series.append(("commanded", at[inside], values[inside], dots))
     return draw_legs("τ [N m]", series)
@@ -229,27 +275,36 @@ def tick_torques(run: Signals) -> tuple[Array, Array]:
     seconds = np.stack([start, end], axis=1).ravel() / NANOSECONDS
     torques = np.repeat(torque, 2, axis=0)
     gaps = 2 * (np.flatnonzero(start[1:] != end[:-1]) + 1)
-    return np.insert(seconds, gaps, seconds[gaps]), np.insert(torques, gaps, np.nan, axis=0)
+    return np.insert(seconds, gaps, seconds[gaps]), np.insert(
+        torques, gaps, np.nan, axis=0
+    )
 
 
 def energies(run: Signals, scene: Scene) -> tuple[Array, Array]:
-    """Kinetic and potential energy at each sample [J], shape (n,); nan where it was lost."""
+    """Kinetic and potential energy at each sample [J], shape (n,).
+
+    Nan where it was lost.
+    """
     quaternion = run.take(*QUATERNION)
     rates = [run.true_legs(name) for name in ("gamma_dot", "mu_dot", "beta_dot")]
     turned = body_rates(Geometry.of(scene), quaternion, *rates)
     model, state = model_of(scene), (*quaternion.T, *turned.T)
     kinetic = np.asarray(kinetic_energy(model, state))
-    return kinetic, potential_energy(model, state) + 0.0 * kinetic  # a number where it is constant
+    # a number where it is constant
+    return kinetic, potential_energy(model, state) + 0.0 * kinetic
 
 
 def work(run: Signals) -> Array:
     """Work of each actuator from the first sample to each [J], shape (n, 3).
 
-    A torque that is held over a tick does work by the angle of that tick. Angles at the ends of
-    ticks between samples are those of the cubic through angles and rates of both; where ticks are
-    lost the work is nan from there on.
+    A torque that is held over a tick does work by the angle of that tick. Angles at the
+    ends of ticks between samples are those of the cubic through angles and rates of
+    both; where ticks are lost the work is nan from there on.
     """
-    time, gamma, rate = run.time_ns("samples"), *map(run.true_legs, ("gamma", "gamma_dot"))
+    time, gamma, rate = (
+        run.time_ns("samples"),
+        *map(run.true_legs, ("gamma", "gamma_dot")),
+    )
     start, end, torque = _ticks(run)
     known = np.isfinite(gamma).all(axis=1) & np.isfinite(rate).all(axis=1)
     if np.count_nonzero(known) < 2:
@@ -274,7 +329,11 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     raised = potential - potential[first].sum()
     done = work(run).sum(axis=1)
     gained = kinetic - kinetic[first].sum() + raised
-    shown = {"kinetic": kinetic, "potential, gained": raised, "work of the actuators": done}
+    shown = {
+        "kinetic": kinetic,
+        "potential, gained": raised,
+        "work of the actuators": done,
+    }
     if not np.nanmax(np.abs(raised), initial=0.0):
         del shown["potential, gained"]  # no gravity, no springs
     panels = (
@@ -289,12 +348,16 @@ def _energy(run: Signals, scene: Scene) -> Figure:
 def _margins(run: Signals, scene: Scene) -> Figure:
     """Draw the distance of each leg to the nearest limit of its joints."""
     geometry = Geometry.of(scene)
-    figure, panels = stack(["to an end of the stroke [deg]", "to a limit of β [deg]"], 2.6)
+    figure, panels = stack(
+        ["to an end of the stroke [deg]", "to a limit of β [deg]"], 2.6
+    )
     most = {"gamma": geometry.arc, "beta": geometry.beta_max}
     for axes, (name, limit) in zip(panels, most.items(), strict=True):
         angles = run.true_legs(name)
         left = np.minimum(angles, limit - angles)
-        figures.lines(axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)])
+        figures.lines(
+            axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)]
+        )
         axes.axhline(0.0, color="black", linewidth=0.8)
     return figure
 
@@ -315,7 +378,12 @@ def _power(run: Signals) -> Array:
     return run.true_legs("tau") * run.true_legs("gamma_dot")
 
 
-JOINTS, ORIENTATION, TICKS, S = "joint_states", "orientation", "applied_torques", SCENE.key
+JOINTS, ORIENTATION, TICKS, S = (
+    "joint_states",
+    "orientation",
+    "applied_torques",
+    SCENE.key,
+)
 ERROR, REFERENCE = "tracking_error", "reference"
 KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
 _ERRORS = curves(  # as the controller received them
@@ -323,7 +391,8 @@ _ERRORS = curves(  # as the controller received them
     legs("γ̇ desired − γ̇ [rad/s]", "gamma_dot_error", "γ̇"),
 )
 _CONTROL = curves(
-    legs("feedforward [N m]", "tau_feedforward", "τ"), legs("feedback [N m]", "tau_feedback", "τ")
+    legs("feedforward [N m]", "tau_feedforward", "τ"),
+    legs("feedback [N m]", "tau_feedback", "τ"),
 )
 _POWERS = curves(
     ("power τₖ γ̇ₖ [W]", ACTUATORS, _power),
@@ -337,11 +406,15 @@ PICTURES = {
     "position_of_E": Picture("Position of point E", (ORIENTATION, S), _position),
     **{
         name: Picture(f"The angle {letter}", (ORIENTATION,), partial(_angle, which=k))
-        for k, (name, letter) in enumerate(zip(("theta", "phi", "psi"), ZYZ, strict=True))
+        for k, (name, letter) in enumerate(
+            zip(("theta", "phi", "psi"), ZYZ, strict=True)
+        )
     },
     "tracking": Picture("Desired and measured angles", (JOINTS, REFERENCE), _tracking),
     "tracking_error": Picture("Tracking error", (ERROR,), _ERRORS),
-    "control_torques": Picture("Torques of the controller", (REFERENCE, ERROR), _CONTROL),
+    "control_torques": Picture(
+        "Torques of the controller", (REFERENCE, ERROR), _CONTROL
+    ),
     "torques": Picture("Torques", (TICKS,), _torques),
     "power": Picture("Power of the actuators", (JOINTS,), _POWERS),
     "work": Picture("Work of the actuators", (JOINTS, TICKS), _WORK),
@@ -359,8 +432,9 @@ def draw_run(
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the pictures of a run, those that `only` names or all, into the folder `out`.
 
-    Returns the paths written, and for each picture that could not be drawn what is missing. Raises
-    InputError where a name is none of PICTURES, or `out` cannot be written.
+    Returns the paths written, and for each picture that could not be drawn what is
+    missing. Raises InputError where a name is none of PICTURES, or `out` cannot be
+    written.
     """
     paths: list[Path] = []
     missing: dict[str, str] = {}
@@ -387,7 +461,10 @@ def save(
 
 
 def known(only: Sequence[str], names: Iterable[str]) -> list[str]:
-    """Return the names that are asked for, all where none is; raises InputError for another."""
+    """Return the names that are asked for, all where none is.
+
+    Raises InputError for another.
+    """
     allowed = "must be one of " + ", ".join(names)
     refuse_unless("plot", *(("only", name, name in names, allowed) for name in only))
     return list(only or names)

@@ -27,7 +27,8 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap
 from sst_ros.scene.scene import Scene
 
-CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)  # levels of cond J; above all are the same
+# levels of cond J; above all are the same
+CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)
 _ALARM = "#d1182b"
 
 
@@ -37,10 +38,14 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
 
     Each map is a row of pictures, with a title if there are any.
     """
-    fits = all(isinstance(one, OrientationMap) for one in charts) and isinstance(titles, Sequence)
+    fits = all(isinstance(one, OrientationMap) for one in charts) and isinstance(
+        titles, Sequence
+    )
     fits = fits and len(charts) > 0 and len(titles) in (0, len(charts))
     allowed = "must be maps of `workspace`, and a title for each or none"
-    refuse_unless("plot_workspace", ("charts, titles", (*charts, titles), fits, allowed))
+    refuse_unless(
+        "plot_workspace", ("charts, titles", (*charts, titles), fits, allowed)
+    )
     figure = Figure(figsize=(13.5, 4.3 * len(charts)))
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
     names = titles or ["E on the base triangle"] * len(charts)
@@ -52,7 +57,9 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
         share = f"E reaches {100 * reach:.0f} % of the triangle"
         worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
         least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
-        row.suptitle(f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK)
+        row.suptitle(
+            f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK
+        )
         turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
         margin = np.degrees(chart.best_margin)
         left, axes, right = row.subplots(1, 3)
@@ -83,7 +90,12 @@ def triangles(chart: OrientationMap) -> NDArray[np.intp]:
 
 
 def _panel(
-    axes: Axes, chart: OrientationMap, faces: NDArray[np.intp], values: Array, *, condition: bool
+    axes: Axes,
+    chart: OrientationMap,
+    faces: NDArray[np.intp],
+    values: Array,
+    *,
+    condition: bool,
 ) -> None:
     """Draw values (n,): angles [deg], or cond J: logarithmic, from 1, and the least is the best."""
     x, y = project(chart.geometry, chart.s)
@@ -92,10 +104,16 @@ def _panel(
     inside = known[faces].all(axis=1)
     if inside.any():
         goal = float(np.nanmin(values) if condition else np.nanmax(values))
-        levels: Any = CONDITIONS if condition else MaxNLocator(10).tick_values(0.0, goal)
+        levels: Any = (
+            CONDITIONS if condition else MaxNLocator(10).tick_values(0.0, goal)
+        )
         looks: Looks = {"cmap": "viridis", "levels": levels}
         if condition:
-            looks |= {"cmap": "magma_r", "norm": LogNorm(1.0, CONDITIONS[-1]), "extend": "max"}
+            looks |= {
+                "cmap": "magma_r",
+                "norm": LogNorm(1.0, CONDITIONS[-1]),
+                "extend": "max",
+            }
         mesh = Triangulation(x, y, faces, mask=~inside)
         filled = axes.tricontourf(mesh, np.where(known, values, goal), **looks)
         bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, ticks=levels)
@@ -106,10 +124,17 @@ def _panel(
         # On a plateau the place that is farthest from the limits.
         near = np.abs(values - goal) <= 0.01 * abs(goal)
         best = int(np.nanargmax(np.where(near, chart.best_margin, np.nan)))
-        axes.plot(x[best], y[best], "*", markersize=13, color="white", markeredgecolor=INK)
+        axes.plot(
+            x[best], y[best], "*", markersize=13, color="white", markeredgecolor=INK
+        )
         text = f"least {goal:.2f}" if condition else f"most {goal:.0f}°"
         box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
-        beside: Looks = {"textcoords": "offset points", "fontsize": 9, "ha": "center", "bbox": box}
+        beside: Looks = {
+            "textcoords": "offset points",
+            "fontsize": 9,
+            "ha": "center",
+            "bbox": box,
+        }
         axes.annotate(text, (x[best], y[best]), (0, 8), color=INK, **beside)
     draw_triangle(axes, chart.geometry)
 
@@ -118,7 +143,9 @@ def sides(geometry: Geometry, points: int) -> Array:
     """Points on the three sides of the base triangle on the unit sphere, shape (3, points, 3)."""
     angle = np.multiply.outer(geometry.arc, np.linspace(0.0, 1.0, points))[:, :, None]
     across = np.cross(geometry.w, geometry.v)
-    return np.asarray(np.cos(angle) * geometry.v[:, None] + np.sin(angle) * across[:, None])
+    return np.asarray(
+        np.cos(angle) * geometry.v[:, None] + np.sin(angle) * across[:, None]
+    )
 
 
 def draw_triangle(axes: Axes, geometry: Geometry) -> None:
@@ -162,7 +189,9 @@ def draw_paths(scene: Scene, paths: Sequence[tuple[str, Array, Looks]]) -> Figur
     """
     figure, chart = Figure(figsize=(7.2, 5.6)), _map(scene)
     axes = figure.subplots()
-    _panel(axes, chart, triangles(chart), np.degrees(chart.best_margin), condition=False)
+    _panel(
+        axes, chart, triangles(chart), np.degrees(chart.best_margin), condition=False
+    )
     for name, s, looks in paths:
         x, y = project(chart.geometry, s)
         axes.plot(x, y, color="white", linewidth=4.0, zorder=1.9)  # seen on each colour

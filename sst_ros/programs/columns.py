@@ -35,7 +35,9 @@ class ArrayFunction:
             row[:] = result
 
     def bind(
-        self, inputs: Sequence[NDArray[np.float64]], outputs: Sequence[NDArray[np.float64]]
+        self,
+        inputs: Sequence[NDArray[np.float64]],
+        outputs: Sequence[NDArray[np.float64]],
     ) -> Callable[..., None]:
         """Return a function of the shared inputs alone, for these rows."""
         return lambda *shared: self(shared, inputs, outputs)
@@ -45,8 +47,13 @@ ColumnFunction = Any
 """A `RowFunction` or an `ArrayFunction`."""
 
 
-def compile_columns(programs: Mapping[str, Program], shared: int) -> dict[str, ColumnFunction]:
-    """Compile programs for rows of arrays; their first `shared` inputs all columns share."""
+def compile_columns(
+    programs: Mapping[str, Program], shared: int
+) -> dict[str, ColumnFunction]:
+    """Compile programs for rows of arrays.
+
+    Their first `shared` inputs all columns share.
+    """
     if llvm.llvmlite_version() is None:
         return {name: ArrayFunction(program) for name, program in programs.items()}
     module = llvm.write_module(programs, rows=[*programs], shared=shared)

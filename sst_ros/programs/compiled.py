@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Programs as functions of floats: machine code where llvmlite is installed, else plain Python.
 
-Both have the same bits. Neither raises an error where a number has no value: it is nan then.
+Both have the same bits. Neither raises an error where a number has no value: it is nan
+then.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ Array: TypeAlias = NDArray[np.float64]
 RowsFunction: TypeAlias = Callable[[Array], Array]
 
 
-def compile_functions(programs: Mapping[str, Program], names: Sequence[str]) -> dict[str, Function]:
+def compile_functions(
+    programs: Mapping[str, Program], names: Sequence[str]
+) -> dict[str, Function]:
     """Turn programs that call each other into functions of floats.
 
     Args:
@@ -42,15 +45,17 @@ def compile_functions(programs: Mapping[str, Program], names: Sequence[str]) -> 
 def compile_rows(programs: Mapping[str, Program], name: str) -> RowsFunction:
     """Turn a program, which may call others, into a function of rows of inputs.
 
-    It takes an array of shape (n, inputs) and returns one of shape (n, outputs), a row of which has
-    the bits of the function of floats.
+    It takes an array of shape (n, inputs) and returns one of shape (n, outputs), a row
+    of which has the bits of the function of floats.
     """
     if llvmlite_version() is None:
         function = compile_functions(programs, (name,))[name]
         outputs = len(programs[name].outputs)
 
         def evaluate(rows: Array) -> Array:
-            return np.array([function(*row) for row in rows.tolist()]).reshape(-1, outputs)
+            return np.array([function(*row) for row in rows.tolist()]).reshape(
+                -1, outputs
+            )
 
         return evaluate
     columns = RowFunction(write_module(programs, rows=(name,)), name)

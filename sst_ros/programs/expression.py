@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Straight-line programs out of ordinary functions: what a scene does not have vanishes.
 
-A function is run once on expressions instead of numbers. Constants fold, products with zero and
-sums with zero disappear, equal subexpressions are computed once, and what no output needs is
-dropped. What is left is a list of operations: it can be counted, differentiated, and written as
-the source of one flat Python function, for the interpreter or for a compiler.
+A function is run once on expressions instead of numbers. Constants fold, products with
+zero and sums with zero disappear, equal subexpressions are computed once, and what no
+output needs is dropped. What is left is a list of operations: it can be counted,
+differentiated, and written as the source of one flat Python function, for the
+interpreter or for a compiler.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from sst_ros.scene.schema import Place, leaves, rebuild
 Value = Any  # an Expression, a Number or a float
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
-    name: getattr(math, name) for name in ("sqrt", "tanh", "exp", "log", "sin", "cos", "atan2")
+    name: getattr(math, name)
+    for name in ("sqrt", "tanh", "exp", "log", "sin", "cos", "atan2")
 }
 _TEMPLATES = {
     "add": "{} + {}",
@@ -67,7 +69,10 @@ _SLOPES: dict[str, Callable[..., Value]] = {
     "max": lambda here, x, y, dx, dy: here.apply("select", y - x, dy, dx),
     "select": lambda here, c, x, y, dc, dx, dy: here.apply("select", c, dx, dy),
 }
-"""Slopes of here = f(x, y), whose arguments have the slopes dx and dy; of f(x) without dx."""
+"""Slopes of here = f(x, y), whose arguments have the slopes dx and dy.
+
+Of f(x) without dx.
+"""
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,9 @@ class Routine:
     def __call__(self, *arguments: Value) -> tuple[Value, ...]:
         """Note a call in the graph of the arguments, of which one at least is an expression."""
         if len(arguments) != self.inputs:
-            raise TypeError(f"{self.name} takes {self.inputs} numbers, not {len(arguments)}")
+            raise TypeError(
+                f"{self.name} takes {self.inputs} numbers, not {len(arguments)}"
+            )
         graph = next(x.graph for x in arguments if isinstance(x, Expression))
         call = graph.node(self, *arguments)
         return tuple(graph.node("part", call, float(k)) for k in range(self.outputs))
@@ -102,7 +109,10 @@ class Graph:
 
     def node(self, op: Operation, *args: Value) -> Expression:
         """Return the expression op(args), an old one where there is one."""
-        keys = [("n", a.index) if isinstance(a, Expression) else ("c", _origin(a)) for a in args]
+        keys = [
+            ("n", a.index) if isinstance(a, Expression) else ("c", _origin(a))
+            for a in args
+        ]
         key = (op, *(sorted(keys) if op in ("add", "mul") else keys))
         if key not in self._known:
             self._known[key] = Expression(self, len(self.nodes))
@@ -113,7 +123,8 @@ class Graph:
 class Expression:
     """A number that is not known yet; arithmetic on it is noted in its graph.
 
-    One that `is_present` counts as nonzero: scenarios differ in it, so that its term is there.
+    One that `is_present` counts as nonzero: scenarios differ in it, so that its term is
+    there.
     """
 
     __slots__ = ("graph", "index", "is_present")
@@ -141,7 +152,9 @@ class Expression:
         if _is(other, 0.0):
             return self
         theirs = _drop_minus(other)
-        return self + theirs if theirs is not None else self.graph.node("sub", self, other)
+        return (
+            self + theirs if theirs is not None else self.graph.node("sub", self, other)
+        )
 
     def __rsub__(self, other: Value) -> Value:
         return -self if _is(other, 0.0) else self.graph.node("sub", other, self)
@@ -156,7 +169,11 @@ class Expression:
             return mine * theirs
         if mine is not None:
             return -(mine * other) if isinstance(other, Expression) else mine * -other
-        return -(self * theirs) if theirs is not None else self.graph.node("mul", self, other)
+        return (
+            -(self * theirs)
+            if theirs is not None
+            else self.graph.node("mul", self, other)
+        )
 
     __rmul__ = __mul__
 
@@ -164,7 +181,9 @@ class Expression:
         if _is(other, 1.0) or _is(other, -1.0):
             return self * other
         mine = _drop_minus(self)
-        return -(mine / other) if mine is not None else self.graph.node("div", self, other)
+        return (
+            -(mine / other) if mine is not None else self.graph.node("div", self, other)
+        )
 
     def __rtruediv__(self, other: Value) -> Value:
         return 0.0 if _is(other, 0.0) else self.graph.node("div", other, self)
@@ -175,7 +194,9 @@ class Expression:
 
     def __bool__(self) -> bool:
         if not self.is_present:
-            raise TypeError("a traced number has no truth value: branch on constants only")
+            raise TypeError(
+                "a traced number has no truth value: branch on constants only"
+            )
         return True
 
     def apply(self, op: str, *args: Value) -> Value:
@@ -189,7 +210,9 @@ def mark_present(value: Any) -> Any:
     return Expression(value.graph, value.index, is_present=True) if is_traced else value
 
 
-def _folds(op: str) -> tuple[Callable[[Number, Value], Value], Callable[[Number, Value], Value]]:
+def _folds(
+    op: str,
+) -> tuple[Callable[[Number, Value], Value], Callable[[Number, Value], Value]]:
     """Return an operator of numbers and its reflected form."""
     return lambda x, other: x.fold(op, x, other), lambda x, other: x.fold(op, other, x)
 
@@ -197,9 +220,9 @@ def _folds(op: str) -> tuple[Callable[[Number, Value], Value], Callable[[Number,
 class Number(float):
     """A constant that another scene of the same structure may have another value of.
 
-    Arithmetic folds it as any float, but it never counts as 0 or 1, and it is the same as another
-    one only if both come from the same numbers by the same operations: so what is traced depends on
-    no value. `origin` says where it comes from.
+    Arithmetic folds it as any float, but it never counts as 0 or 1, and it is the same
+    as another one only if both come from the same numbers by the same operations: so
+    what is traced depends on no value. `origin` says where it comes from.
     """
 
     origin: Any
@@ -256,8 +279,12 @@ def number_constants(value: Any, origin: Place = ()) -> Any:
 
     Its sections become objects that are not checked.
     """
-    numbers = {place: x for place, x in leaves(value).items() if abs(x) not in (0.0, 1.0)}
-    return rebuild(value, {place: Number(x, (*origin, *place)) for place, x in numbers.items()})
+    numbers = {
+        place: x for place, x in leaves(value).items() if abs(x) not in (0.0, 1.0)
+    }
+    return rebuild(
+        value, {place: Number(x, (*origin, *place)) for place, x in numbers.items()}
+    )
 
 
 @dataclass(frozen=True)
@@ -265,41 +292,51 @@ class Program:
     """A straight-line program."""
 
     inputs: tuple[str, ...]  #: names of the inputs
-    #: (op, operands) in order; an operand is a float, or an int: the number of an input or, from
-    #: len(inputs) on, of a step; "part" takes a call and the place of one of its results
+    # : (op, operands) in order; an operand is a float, or an int: the number of an
+    # input or, from
+    # : len(inputs) on, of a step; "part" takes a call and the place of one of its
+    # results
     steps: tuple[tuple[Operation, tuple[float | int, ...]], ...]
     outputs: tuple[float | int, ...]  #: operands that are the results
 
     @property
     def operations(self) -> Counter[str]:
         """How often each operation is done, that of routines not counted."""
-        return Counter(op for op, _ in self.steps if isinstance(op, str) and op != "part")
+        return Counter(
+            op for op, _ in self.steps if isinstance(op, str) and op != "part"
+        )
 
     @property
     def routines(self) -> tuple[Routine, ...]:
         """The routines that are called, each once."""
-        return tuple(dict.fromkeys(op for op, _ in self.steps if isinstance(op, Routine)))
+        return tuple(
+            dict.fromkeys(op for op, _ in self.steps if isinstance(op, Routine))
+        )
 
     def prune(self, outputs: Sequence[float | int]) -> Program:
         """Return the program of some outputs alone, without the steps that none of them needs."""
         inputs, needed = len(self.inputs), {x for x in outputs if isinstance(x, int)}
         for number in reversed(range(inputs, inputs + len(self.steps))):
             if number in needed:
-                needed.update(x for x in self.steps[number - inputs][1] if isinstance(x, int))
+                needed.update(
+                    x for x in self.steps[number - inputs][1] if isinstance(x, int)
+                )
         kept = sorted(number for number in needed if number >= inputs)
         return self._part(self.inputs, range(inputs), kept, outputs)
 
     def hoist(self, shared: int) -> tuple[Program, Program]:
         """Return what depends on the first `shared` inputs alone, and all the rest.
 
-        The results of the first program are the first inputs of the second one, in place
-        of those that are shared. Calls of routines are part of the second one.
+        The results of the first program are the first inputs of the second one, in
+        place of those that are shared. Calls of routines are part of the second one.
         """
         inputs = len(self.inputs)
         is_late = [number >= shared for number in range(inputs)]
         for op, given in self.steps:
             calls = isinstance(op, Routine) or op == "part"
-            is_late.append(calls or any(is_late[x] for x in given if isinstance(x, int)))
+            is_late.append(
+                calls or any(is_late[x] for x in given if isinstance(x, int))
+            )
         numbers = range(inputs, inputs + len(self.steps))
         before = [number for number in numbers if not is_late[number]]
         after = [number for number in numbers if is_late[number]]
@@ -352,9 +389,12 @@ class Program:
         names: Sequence[str] = (),
         templates: Mapping[str, str] = _TEMPLATES,
     ) -> tuple[list[str], list[str], list[str]]:
-        """Lines v0 = .., v1 = .., a step each, that depend on no `late` input; the others; outputs.
+        """Lines v0 = .., v1 = .., a step each, that depend on no `late` input.
 
-        With `slots` numbers have the names of their slots; inputs may have other `names`.
+        The others; outputs.
+
+        With `slots` numbers have the names of their slots; inputs may have other
+        `names`.
         """
         words = [*(names or self.inputs), *(f"v{i}" for i in range(len(self.steps)))]
         is_late = [number in late for number in range(len(self.inputs))]
@@ -403,7 +443,9 @@ class Slots:
 
     def reads(self, lines: Sequence[str]) -> list[str]:
         """Lines that read what other lines name."""
-        used = {int(found) for line in lines for found in re.findall(r"\bc(\d+)\b", line)}
+        used = {
+            int(found) for line in lines for found in re.findall(r"\bc(\d+)\b", line)
+        }
         return [f"c{slot} = p[{slot}]" for slot in sorted(used)]
 
 
@@ -415,8 +457,8 @@ def trace(
 ) -> Program:
     """Run `function` on one expression per input and return what it does, then df/dx for x in `by`.
 
-    With `along` the last outputs are the derivative along one direction, which is given by further
-    inputs, d_x for each x in `along`. Derivatives are exact.
+    With `along` the last outputs are the derivative along one direction, which is given
+    by further inputs, d_x for each x in `along`. Derivatives are exact.
     """
     graph = Graph()
     names = (*inputs, *(f"d_{name}" for name in along))
@@ -426,27 +468,36 @@ def trace(
     if along:
         directions.append({name: symbols[f"d_{name}"] for name in along})
     results, nodes = list(outputs), graph.nodes[:]
-    for direction in directions:  # forward mode: what a node makes of the slopes of its arguments
+    # forward mode: what a node makes of the slopes of its arguments
+    for direction in directions:
         slopes: list[Value] = []
         for index, (op, args) in enumerate(nodes):
             d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
             here = Expression(graph, index)
             if isinstance(op, Routine):
-                raise TypeError(f"the program {op.name} is called: it has no derivative here")
+                raise TypeError(
+                    f"the program {op.name} is called: it has no derivative here"
+                )
             if op == "input":
                 slopes.append(direction.get(args[0], 0.0))
             elif len(args) > 1:
                 slopes.append(_SLOPES[op](here, *args, *d))
             else:
-                slopes.append(0.0 if _is(d[0], 0.0) else _SLOPES[op](here, *args) * d[0])
-        results += [slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs]
+                slopes.append(
+                    0.0 if _is(d[0], 0.0) else _SLOPES[op](here, *args) * d[0]
+                )
+        results += [
+            slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs
+        ]
 
     def operand(value: Value) -> float | int:
         if isinstance(value, Expression):
             return value.index
         return value if isinstance(value, Number) else float(value)
 
-    steps = tuple((op, tuple(map(operand, args))) for op, args in graph.nodes[len(names) :])
+    steps = tuple(
+        (op, tuple(map(operand, args))) for op, args in graph.nodes[len(names) :]
+    )
     return Program(names, steps, ()).prune([operand(result) for result in results])
 
 
@@ -463,7 +514,9 @@ def compile_program(
     return function
 
 
-def compile_for_arrays(program: Program, *, exact: bool = False) -> Callable[..., tuple[Any, ...]]:
+def compile_for_arrays(
+    program: Program, *, exact: bool = False
+) -> Callable[..., tuple[Any, ...]]:
     """Turn a program into a function of NumPy arrays, element by element.
 
     NumPy's own sine and others may differ from libm's in the last bit: `exact` takes

@@ -29,7 +29,10 @@ from numpy.typing import NDArray
 from sst_ros.programs.expression import FUNCTIONS, Number, Program, Routine, Slots
 
 LANES = 8
-"""Columns at a time, at most; a number of columns that is a multiple of it fits all machines."""
+"""Columns at a time, at most.
+
+A number of columns that is a multiple of it fits all machines.
+"""
 
 _NARROW_LANES = 4
 """Columns at a time without AVX-512. A register then has four doubles, and with eight
@@ -65,8 +68,8 @@ class Module(NamedTuple):
         """Return a program as a function of floats, which returns its results as a list."""
         program = self.programs[name]
         code = compile_text(self.text)
-        # A call takes microseconds: to hand the interpreter's lock to another thread and
-        # wait for it again would take longer, up to a thousand times.
+        # A call takes microseconds: to hand the interpreter's lock to another thread
+        # and wait for it again would take longer, up to a thousand times.
         signature = ctypes.PYFUNCTYPE(None, _BYTES, _BYTES, ctypes.c_void_p)
         call = signature(code.address(name))
         call.code = code  # type: ignore[attr-defined]  # lives as long as the function
@@ -141,7 +144,9 @@ class RowFunction:
                 row[whole:end] = result[:count]
 
     def bind(
-        self, inputs: Sequence[NDArray[np.float64]], outputs: Sequence[NDArray[np.float64]]
+        self,
+        inputs: Sequence[NDArray[np.float64]],
+        outputs: Sequence[NDArray[np.float64]],
     ) -> Callable[..., None]:
         """Return a function of the shared inputs alone, for rows of a multiple of `LANES`.
 
@@ -168,7 +173,9 @@ class RowFunction:
         if len(inputs) != self.rows or len(outputs) != self.outputs:
             raise ValueError("as many rows as the program has inputs and outputs")
 
-    def _run(self, count: int, scalars: NDArray[np.float64], ins: Any, outs: Any) -> None:
+    def _run(
+        self, count: int, scalars: NDArray[np.float64], ins: Any, outs: Any
+    ) -> None:
         self._call(count, scalars.ctypes.data, self._numbers.ctypes.data, ins, outs)
 
 
@@ -212,7 +219,9 @@ def write_module(
         # What only shared inputs go into is computed once, not in each lane.
         before, body = programs[name].hoist(shared)
         parts.append(_write_function(_before(name), before, slots, width=1))
-        parts.append(_write_function(_body(name), body, slots, width=lanes, inline=True))
+        parts.append(
+            _write_function(_body(name), body, slots, width=lanes, inline=True)
+        )
         parts.append(_write_loop(name, len(before.outputs), body, shared, lanes))
     return Module("\n".join(parts), dict(programs), tuple(slots.values))
 
@@ -330,7 +339,9 @@ class _Writer:
             return self._words[operand]
         return _constant(operand, self._width)
 
-    def write_step(self, result: str, op: str | Routine, operands: Sequence[float | int]) -> None:
+    def write_step(
+        self, result: str, op: str | Routine, operands: Sequence[float | int]
+    ) -> None:
         """Write one operation of a program."""
         if isinstance(op, Routine):
             self._write_call(result, op, operands)
@@ -390,18 +401,23 @@ class _Writer:
             numbers = []
             for k, word in enumerate(words):
                 numbers.append(f"{result}.{lane}.{k}")
-                self._put(numbers[-1], f"extractelement {self._kind} {word}, i32 {lane}")
+                self._put(
+                    numbers[-1], f"extractelement {self._kind} {word}, i32 {lane}"
+                )
             arguments = ", ".join(f"double {number}" for number in numbers)
             self._put(f"{result}.{lane}", f"call double @{name}({arguments})")
             last = lane == self._width - 1
             filled = result if last else f"{result}.{lane}.v"
             self._put(
                 filled,
-                f"insertelement {self._kind} {vector}, double {result}.{lane}, i32 {lane}",
+                f"insertelement {self._kind} {vector}, double {result}.{lane}, i32"
+                f" {lane}",
             )
             vector = filled
 
-    def _write_call(self, result: str, routine: Routine, operands: Sequence[float | int]) -> None:
+    def _write_call(
+        self, result: str, routine: Routine, operands: Sequence[float | int]
+    ) -> None:
         """Call another program of the module; its arrays are on the stack."""
         arguments = self._new_array(f"{result}.x", routine.inputs)
         results = self._new_array(f"{result}.o", routine.outputs)
@@ -410,7 +426,9 @@ class _Writer:
             self.store(self.word(operand), arguments, place)
         name = _function_name(routine.name, self._width)
         array = _pointer(self._kind)
-        self.lines.append(f"  call void {name}({array} {arguments}, double* %p, {array} {results})")
+        self.lines.append(
+            f"  call void {name}({array} {arguments}, double* %p, {array} {results})"
+        )
 
     def _new_array(self, name: str, size: int) -> str:
         self.first_lines.append(f"  {name} = alloca {self._kind}, i32 {size}, align 32")
@@ -431,9 +449,14 @@ class _Writer:
     def _load(self, result: str, kind: str, array: str, place: int) -> list[str]:
         lines: list[str] = []
         address = self._address(lines, array, place, kind)
-        return [*lines, f"  {result} = load {kind}, {_pointer(kind)} {address}, align 8"]
+        return [
+            *lines,
+            f"  {result} = load {kind}, {_pointer(kind)} {address}, align 8",
+        ]
 
-    def _address(self, lines: list[str], array: str, place: int, kind: str | None = None) -> str:
+    def _address(
+        self, lines: list[str], array: str, place: int, kind: str | None = None
+    ) -> str:
         address = f"%q{self._places}"
         self._places += 1
         kind = kind or self._kind
@@ -443,7 +466,10 @@ class _Writer:
 
 def _element(result: str, kind: str, array: str, place: int | str) -> str:
     """Line that takes the address of an element of an array."""
-    return f"  {result} = getelementptr inbounds {kind}, {_pointer(kind)} {array}, i64 {place}"
+    return (
+        f"  {result} = getelementptr inbounds {kind}, {_pointer(kind)} {array}, i64"
+        f" {place}"
+    )
 
 
 def _splat(result: str, scalar: str, width: int) -> list[str]:
@@ -451,12 +477,16 @@ def _splat(result: str, scalar: str, width: int) -> list[str]:
     kind = _type_of(width)
     return [
         f"  {result}.1 = insertelement {kind} undef, double {scalar}, i32 0",
-        f"  {result} = shufflevector {kind} {result}.1, {kind} undef, "
-        f"<{width} x i32> zeroinitializer",
+        (
+            f"  {result} = shufflevector {kind} {result}.1, {kind} undef, "
+            f"<{width} x i32> zeroinitializer"
+        ),
     ]
 
 
-def _write_loop(name: str, early: int, program: Program, shared: int, lanes: int) -> str:
+def _write_loop(
+    name: str, early: int, program: Program, shared: int, lanes: int
+) -> str:
     """Write the loop over columns: `void name_rows(n, shared, numbers, ins, outs)`.
 
     `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes. The
@@ -465,13 +495,18 @@ def _write_loop(name: str, early: int, program: Program, shared: int, lanes: int
     kind, count = _type_of(lanes), len(program.inputs)
     array = _pointer(kind)
     lines = [
-        f"define void @{row_name(name, shared)}"
-        "(i64 %n, double* %s, double* %p, double** %ins, double** %outs) {",
+        (
+            f"define void @{row_name(name, shared)}"
+            "(i64 %n, double* %s, double* %p, double** %ins, double** %outs) {"
+        ),
         "entry:",
         f"  %x = alloca {kind}, i32 {count}, align 32",
         f"  %o = alloca {kind}, i32 {len(program.outputs)}, align 32",
         f"  %e = alloca double, i32 {early}, align 32",
-        f"  call void {_function_name(_before(name), 1)}(double* %s, double* %p, double* %e)",
+        (
+            f"  call void {_function_name(_before(name), 1)}(double* %s, double* %p,"
+            " double* %e)"
+        ),
     ]
     for i in range(early):
         lines.append(_element(f"%e{i}.a", "double", "%e", i))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Balls of Arb: numbers of documents, outward rounding to floats and to text, and a lock.
 
-A number of a document stands for the decimal number that is written and for the double that it is
-read as: its ball holds both. A number that Python code gives stands for the double and for the
-shortest decimal number that is read as it.
+A number of a document stands for the decimal number that is written and for the double
+that it is read as: its ball holds both. A number that Python code gives stands for the
+double and for the shortest decimal number that is read as it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from sst_ros.errors import InputError, Problem, require
 
 _flint = require("flint")
 arb, arb_mat, arb_poly, arb_series, ctx = (
-    getattr(_flint, name) for name in ("arb", "arb_mat", "arb_poly", "arb_series", "ctx")
+    getattr(_flint, name)
+    for name in ("arb", "arb_mat", "arb_poly", "arb_series", "ctx")
 )
 
 PRECISION = 128  # bits of all balls
@@ -32,12 +33,14 @@ _LOCK = threading.RLock()
 def precision() -> Iterator[None]:
     """Compute with PRECISION bits and long series, one thread at a time.
 
-    Raises InputError where the processor does not round to nearest: the arithmetic of Python
-    between the balls is specified for that alone.
+    Raises InputError where the processor does not round to nearest: the arithmetic of
+    Python between the balls is specified for that alone.
     """
     one, tiny = 1.0, 2.0**-53
     if one + tiny != one or one - 0.75 * tiny == one or -one - tiny != -one:
-        problem = Problem("rounding mode", "not to nearest", "must be that of IEEE 754's default")
+        problem = Problem(
+            "rounding mode", "not to nearest", "must be that of IEEE 754's default"
+        )
         raise InputError("certify", [problem])
     with _LOCK:
         before = ctx.prec, ctx.cap
@@ -51,7 +54,8 @@ def precision() -> Iterator[None]:
 def number_ball(number: float, text: str | None = None) -> Any:
     """Return a ball of a number as it is read and as it is written.
 
-    Reading rounds to nearest, so the two are half a unit in the last place apart at most.
+    Reading rounds to nearest, so the two are half a unit in the last place apart at
+    most.
     """
     if Decimal(text or repr(number)) == Decimal(number):
         return arb(number)

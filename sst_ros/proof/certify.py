@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """certify(): how far the motion of a scene can be from the one that `simulate` gives, proven.
 
-A number of a scene stands for what is written and for the double that is read, or for anything in
-a range that is given. What is made from them (unit vectors, shifted inertias, the posture at the
-start) is enclosed. The room: `balls` has Arb's numbers and their rounding, `scene_balls` the
-numbers of a scene, `enclosure` the theorem of a step; this file makes a motion of steps.
+A number of a scene stands for what is written and for the double that is read, or for
+anything in a range that is given. What is made from them (unit vectors, shifted
+inertias, the posture at the start) is enclosed. The room: `balls` has Arb's numbers and
+their rounding, `scene_balls` the numbers of a scene, `enclosure` the theorem of a step;
+this file makes a motion of steps.
 """
 
 from __future__ import annotations
@@ -50,12 +51,18 @@ from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Reg
 from sst_ros.proof.scene_balls import Parts, SceneBalls, WrittenDocument, range_balls
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Place
-from sst_ros.scene.torque_profile import FunctionTorque, LostTorque, SineTorque, TorqueProfile
+from sst_ros.scene.torque_profile import (
+    FunctionTorque,
+    LostTorque,
+    SineTorque,
+    TorqueProfile,
+)
 from sst_ros.simulation.simulate import TorqueInput, simulate
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, Explained
 
-Span = tuple[float, float, int]  # begin, end, sign of a number in between; 0 where not known
+# begin, end, sign of a number in between; 0 where not known
+Span = tuple[float, float, int]
 PARALLEL = "parallel singularity, det J2 = 0"
 LIMIT_ORDER = 6  # of expansions whose signs say where limits are
 SPLITS = 200  # of a step, most of them near a limit
@@ -65,12 +72,16 @@ _UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 AT_START = "the posture at the start is not proven to be the only one near"
 MOST_PARTS = 10_000  # of the box of ranges
 ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
-NARROWER = 8  # proofs by which the width of ranges is looked for that would do, each by half
+# proofs by which the width of ranges is looked for that would do, each by half
+NARROWER = 8
 JOINT_COUNT = 18  # angles and rates of the joints
 
 
 class BallEquations:
-    """The motion of a scene on balls; the state has the numbers that are ranges at the end."""
+    """The motion of a scene on balls.
+
+    The state has the numbers that are ranges at the end.
+    """
 
     def __init__(
         self, scene: Scene, profile: TorqueProfile | None, ranges: Mapping[Place, Any]
@@ -81,22 +92,29 @@ class BallEquations:
         self.inputs = (*self.state, *self.balls.inputs)
 
     def start(self) -> Region:
-        """Enclose the start by Krawczyk's test; Refused: it is not proven to be the only one.
+        """Enclose the start by Krawczyk's test.
 
-        Unknown are a small turn from the orientation that `simulate` begins with, and the body
-        rate; the set keeps how they depend on gamma, gamma_dot and the numbers that are ranges.
+        Refused: it is not proven to be the only one.
+
+        Unknown are a small turn from the orientation that `simulate` begins with, and
+        the body rate; the set keeps how they depend on gamma, gamma_dot and the numbers
+        that are ranges.
         """
         x, y, z, w, *rate = start_of(self.scene)[:7]
 
         def equations(parts: Parts, *inputs: Any) -> list[Any]:
-            turn, body_rate, angles, rates = (inputs[k : k + 3] for k in range(0, 12, 3))
+            turn, body_rate, angles, rates = (
+                inputs[k : k + 3] for k in range(0, 12, 3)
+            )
             q = quaternion_product((x, y, z, w), (turn[0], turn[1], turn[2], 1.0))
             legs = list(kernel.leg_motions(parts.model, (*q, *body_rate)))
             gaps = []
             for leg, angle in zip(legs, angles, strict=True):
                 sine, cosine = kernel.direction_of(leg, 0)
                 gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
-            return gaps + [leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)]
+            return gaps + [
+                leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)
+            ]
 
         unknown, initial = (*TURN, *RATE), (*ANGLES, *ANGLE_RATES)
         by = (*unknown, *initial, *self.balls.inputs)
@@ -109,12 +127,17 @@ class BallEquations:
         size, n = len(self.state), len(self.inputs)
         slopes = [[arb(0)] * n for _ in range(n)]
         rest = [arb(0)] * n
-        places = [*range(len(initial)), *range(size, n)]  # of what is given, among the columns
+        # of what is given, among the columns
+        places = [*range(len(initial)), *range(size, n)]
         for i in range(4):
             parts = [arb(columns[k][i]) for k in range(3)]
-            rest[i] = sum((abs(x) * r for x, r in zip(parts, root.rest[:3], strict=True)), arb(0))
+            rest[i] = sum(
+                (abs(x) * r for x, r in zip(parts, root.rest[:3], strict=True)), arb(0)
+            )
             for j, place in enumerate(places):
-                slopes[i][place] = sum((parts[k] * root.slopes[k, j] for k in range(3)), arb(0))
+                slopes[i][place] = sum(
+                    (parts[k] * root.slopes[k, j] for k in range(3)), arb(0)
+                )
         for i in range(3):
             rest[4 + i] = root.rest[3 + i]
             for j, place in enumerate(places):
@@ -123,7 +146,12 @@ class BallEquations:
             slopes[place][place] = arb(1)
         turned = quaternion_product((x, y, z, w), (*root.middle[:3], arb(1)))
         lagged = [arb(0)] * (size - len(MOTION))
-        centre = [*turned, *root.middle[3:], *lagged, *(arb(x.mid()) for x in given[6:])]
+        centre = [
+            *turned,
+            *root.middle[3:],
+            *lagged,
+            *(arb(x.mid()) for x in given[6:]),
+        ]
         radii = [arb(0)] * n
         for ball, place in zip(given, places, strict=True):
             radii[place] = ball.rad()
@@ -143,11 +171,16 @@ class BallEquations:
         limit = getattr(parts.scene.actuators, "torque_limit", None)
         if limit is None:
             return torques
-        return [limit - gm.positive(2.0 * limit - gm.positive(x + limit)) for x in torques]
+        return [
+            limit - gm.positive(2.0 * limit - gm.positive(x + limit)) for x in torques
+        ]
 
     @cached_property
     def derivatives(self) -> tuple[Function, Function]:
-        """The derivative of time, state, commands and varied numbers; it with the Jacobian."""
+        """The derivative of time, state, commands and varied numbers.
+
+        It with the Jacobian.
+        """
         size = len(self.state)
 
         def derivative(parts: Parts, time: Any, *given: Any) -> Any:
@@ -188,7 +221,9 @@ class BallEquations:
         def angles_and_rates(parts: Parts, *y: Any) -> list[Any]:
             return [x for row in kernel.joints(parts.model, y) for x in row]
 
-        return self.balls.compile(angles_and_rates, MOTION, (*MOTION, *self.balls.inputs))
+        return self.balls.compile(
+            angles_and_rates, MOTION, (*MOTION, *self.balls.inputs)
+        )
 
     @cached_property
     def stops(self) -> list[Limit]:
@@ -200,7 +235,9 @@ class BallEquations:
     @cached_property
     def stop_names(self) -> set[str]:
         """Names of the limits at which the motion ends."""
-        return {limit.reason for limit in limits_of(self.scene, Geometry.of(self.scene))}
+        return {
+            limit.reason for limit in limits_of(self.scene, Geometry.of(self.scene))
+        }
 
     @cached_property
     def limit_names(self) -> list[str]:
@@ -208,7 +245,9 @@ class BallEquations:
         names = [*(limit.reason for limit in self.stops), PARALLEL]
         if self.scene.stroke.at_end == "elastic":
             names += [
-                f"contact of gamma_{leg} at {end}" for leg in (1, 2, 3) for end in ("0", "arc")
+                f"contact of gamma_{leg} at {end}"
+                for leg in (1, 2, 3)
+                for end in ("0", "arc")
             ]
         if self.scene.torque_limit is not None:
             names += [f"torque_{leg} at its limit" for leg in (1, 2, 3)]
@@ -222,7 +261,9 @@ class BallEquations:
         def distances(parts: Parts, time: Any, *given: Any) -> list[Any]:
             legs = list(kernel.leg_motions(parts.model, given))
             first, second, third = (leg.g for leg in legs)
-            angles = [kernel.joint_angle(leg, kind) for kind in range(3) for leg in legs]
+            angles = [
+                kernel.joint_angle(leg, kind) for kind in range(3) for leg in legs
+            ]
             ends = {0: parts.axes.arc, 2: [parts.axes.beta_max] * 3}
             values = []
             for limit in self.stops:
@@ -249,19 +290,23 @@ class Root(NamedTuple):
     rest: list[Any]
 
 
-def krawczyk(run: Function, near: Sequence[float], given: Sequence[Any], reason: str) -> Root:
+def krawczyk(
+    run: Function, near: Sequence[float], given: Sequence[Any], reason: str
+) -> Root:
     """Enclose the root of equations near some numbers, for all that is given as balls.
 
-    `run` returns the values of the equations at unknowns and givens, then their derivatives by
-    each. Raises Refused, with the reason, where the root is not proven to exist and to be the only
-    one in a box.
+    `run` returns the values of the equations at unknowns and givens, then their
+    derivatives by each. Raises Refused, with the reason, where the root is not proven
+    to exist and to be the only one in a box.
     """
     n, middles = len(near), [x.mid() for x in given]
     off = column([x - middle for x, middle in zip(given, middles, strict=True)])
 
     def at(unknown: Any, parameters: Sequence[Any]) -> tuple[Any, Any, Any]:
         flat = [arb(x) for x in run(*entries(unknown), *parameters)]
-        rows = [[flat[n * (j + 1) + i] for j in range(n + len(given))] for i in range(n)]
+        rows = [
+            [flat[n * (j + 1) + i] for j in range(n + len(given))] for i in range(n)
+        ]
         by_unknown = arb_mat([row[:n] for row in rows])
         return column(flat[:n]), by_unknown, arb_mat([row[n:] for row in rows])
 
@@ -270,19 +315,24 @@ def krawczyk(run: Function, near: Sequence[float], given: Sequence[Any], reason:
         values, slopes, _ = at(middle, middles)
         inverse = slopes.mid().inv().mid()
         middle = (middle - inverse * values).mid()
-    values = at(middle, middles)[0] + at(middle, given)[2] * off  # for all that is given
+    # for all that is given
+    values = at(middle, middles)[0] + at(middle, given)[2] * off
     step = inverse * values
     least = arb(2) ** (8 - PRECISION)
     radii = [(2 * x + least).upper() for x in entries(magnitude(step))]
     box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
     _, slopes, by_given = at(box, given)
     image = entries(middle - step - (inverse * slopes - 1) * (box - middle))
-    if not all(b.contains_interior(x) for b, x in zip(entries(box), image, strict=True)):
+    if not all(
+        b.contains_interior(x) for b, x in zip(entries(box), image, strict=True)
+    ):
         raise Refused(reason)
     back = slopes.inv()
     linear = -1 * (back * by_given)
     kept = linear.mid()
-    rest = magnitude(back * at(middle, middles)[0]) + magnitude(linear - kept) * magnitude(off)
+    rest = magnitude(back * at(middle, middles)[0]) + magnitude(
+        linear - kept
+    ) * magnitude(off)
     return Root(entries(middle), kept, entries(rest))
 
 
@@ -293,7 +343,8 @@ class Row(NamedTuple):
     quaternion: list[float]
     angle: float  # of the true orientation to `quaternion`, at most [rad]
     distance: float  # of the true orientation to that of `simulate`, at most [rad]
-    values: list[tuple[float, float]]  # body rates, angles and rates of joints; their bounds
+    # body rates, angles and rates of joints; their bounds
+    values: list[tuple[float, float]]
 
 
 class Follower:
@@ -316,7 +367,9 @@ class Follower:
         """Largest angle [rad]; inf without a row."""
         return max((row.angle for row in self.rows), default=math.inf)
 
-    def follow(self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar) -> None:
+    def follow(
+        self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar
+    ) -> None:
         """Prove step by step from one break in time to the next, as far as that goes."""
         order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
         try:
@@ -353,7 +406,8 @@ class Follower:
     def _row(self, step: Advance, time: float) -> Row:
         p, e = step.at(time)
         size = len(self._equations.state)
-        known = [*range(len(MOTION)), *range(size, len(p))]  # of the state, without a lag
+        # of the state, without a lag
+        known = [*range(len(MOTION)), *range(size, len(p))]
         centre = [p[i] for i in known]
         values = [*zip(p[4:7], e[4:7], strict=True)]
         try:
@@ -369,7 +423,10 @@ class Follower:
             half = JOINT_COUNT // 2
             values += [(0, arb.pi())] * half + [(0, arb("inf"))] * half
         floats = [float(x) for x, _ in values]
-        pairs = [(x, upper(abs(ball - x) + r)) for x, (ball, r) in zip(floats, values, strict=True)]
+        pairs = [
+            (x, upper(abs(ball - x) + r))
+            for x, (ball, r) in zip(floats, values, strict=True)
+        ]
         length, wrong = norm(p[:4]), norm(e[:4]) / norm(p[:4])
         quaternion = [float(x / length) for x in p[:4]]
         other = self._trajectory.quaternion[len(self.rows)].tolist()
@@ -388,7 +445,9 @@ def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
             break
         centre = rows_at[0].quaternion
         turns = [_turn([arb(x) for x in row.quaternion], centre) for row in rows_at]
-        angles = [upper(turn + row.angle) for turn, row in zip(turns, rows_at, strict=True)]
+        angles = [
+            upper(turn + row.angle) for turn, row in zip(turns, rows_at, strict=True)
+        ]
         values = []
         for pairs in zip(*(row.values for row in rows_at), strict=True):
             ball = between(pairs[0][0], pairs[0][0])
@@ -399,31 +458,33 @@ def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
         rows.append(Row(rows_at[0].time, centre, max(angles), distance, values))
     if len(parts) == 1:
         rows = first.rows
-    spans = {name: sorted(x for part in parts for x in part.signs[name]) for name in first.signs}
+    spans = {
+        name: sorted(x for part in parts for x in part.signs[name])
+        for name in first.signs
+    }
     return rows, spans
 
 
 class ProvenMotion(Explained):
     """What is proven of a motion at the instants of a table.
 
-    Attributes:
-        scene: what moves.
-        columns: by name, shape (n,): t [s], none later than `until`; quaternion_x to _w, an
-            orientation, and angle [rad], how far the true one can be from it; body_rate_x to _z
-            [rad/s] and gamma_1 to beta_dot_3 [rad, rad/s], each with NAME_bound; distance [rad],
-            the most between the true orientation and that of `simulate`.
-        until: time to which the motion is proven to exist and to be within the bounds [s].
-        reason: why it ends there; "" where that is the duration.
-        limits: for each limit of the mechanism the spans of time [s] in which the motion may be on
-            it; at all other times until `until` it is proven not to be. Contacts with elastic stops
-            and torques at their limit are among them: they begin and end in these spans.
-        trajectory: what `simulate` gives.
-        bound: what the angle was to be at most [rad].
-        steps: number of steps of the proof.
-
+    Attributes: scene: what moves. columns: by name, shape (n,): t [s], none later than
+        `until`; quaternion_x to _w, an orientation, and angle [rad], how far the true
+        one can be from it; body_rate_x to _z [rad/s] and gamma_1 to beta_dot_3 [rad,
+        rad/s], each with NAME_bound; distance [rad], the most between the true
+        orientation and that of `simulate`. until: time to which the motion is proven to
+        exist and to be within the bounds [s]. reason: why it ends there; "" where that
+        is the duration. limits: for each limit of the mechanism the spans of time [s]
+        in which the motion may be on it; at all other times until `until` it is proven
+        not to be. Contacts with elastic stops and torques at their limit are among
+        them: they begin and end in these spans. trajectory: what `simulate` gives.
+        bound: what the angle was to be at most [rad]. steps: number of steps of the
+        proof.
     """
 
-    def __init__(self, parts: Sequence[Follower], bound: float, trajectory: Trajectory) -> None:
+    def __init__(
+        self, parts: Sequence[Follower], bound: float, trajectory: Trajectory
+    ) -> None:
         self.scene, self.bound, self.trajectory = trajectory.scene, bound, trajectory
         shortest = min(parts, key=lambda part: part.until)
         failed = [part for part in parts if not part.is_whole]
@@ -451,13 +512,23 @@ class ProvenMotion(Explained):
 
     @property
     def largest(self) -> float:
-        """Largest angle between true orientation and that of the table [rad]; inf without one."""
-        return float(np.max(self.columns["angle"], initial=0.0 if len(self) else math.inf))
+        """Largest angle between true orientation and that of the table [rad].
+
+        Inf without one.
+        """
+        return float(
+            np.max(self.columns["angle"], initial=0.0 if len(self) else math.inf)
+        )
 
     @property
     def error(self) -> float:
-        """Largest distance of `simulate` from the true motion [rad]; inf without one."""
-        return float(np.max(self.columns["distance"], initial=0.0 if len(self) else math.inf))
+        """Largest distance of `simulate` from the true motion [rad].
+
+        Inf without one.
+        """
+        return float(
+            np.max(self.columns["distance"], initial=0.0 if len(self) else math.inf)
+        )
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -486,7 +557,8 @@ class ProvenMotion(Explained):
             estimate = self.trajectory.error_estimate
             facts["orientation"] = f"within {write_up(self.largest)} rad of the table"
             facts["error of simulate"] = (
-                f"not above {write_up(self.error)} rad; its estimate is {estimate:.2g} rad"
+                f"not above {write_up(self.error)} rad; its estimate is"
+                f" {estimate:.2g} rad"
             )
             facts["limits"] = met or "no limit is reached and no singularity is passed"
         return facts | {"steps": self.steps}
@@ -507,7 +579,10 @@ def _unknown_spans(known: Sequence[Span], until: float) -> list[tuple[float, flo
 
 def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
     """Angle of the rotation between quaternions, as a ball [rad]."""
-    pairs = [(x / norm(a), arb(y) / norm(list(map(arb, b)))) for x, y in zip(a, b, strict=True)]
+    pairs = [
+        (x / norm(a), arb(y) / norm(list(map(arb, b))))
+        for x, y in zip(a, b, strict=True)
+    ]
     chords = (norm([x - sign * y for x, y in pairs]) for sign in (1, -1))
     return 4 * (min(chords, key=float) / 2).asin()
 
@@ -537,10 +612,14 @@ def split_ranges(ranges: Mapping[Place, Any], parts: int) -> list[dict[Place, An
     boxes = [dict(ranges)]
     while len(boxes) < parts:
         box = boxes.pop(0)
-        widest = max(box, key=lambda place: float(box[place].rad() / ranges[place].rad()))
+        widest = max(
+            box, key=lambda place: float(box[place].rad() / ranges[place].rad())
+        )
         middle, quarter = box[widest].mid(), box[widest].rad() / 2
         for centre in (middle - quarter, middle + quarter):
-            boxes.append(box | {widest: arb(centre.mid(), (quarter + centre.rad()).upper())})
+            boxes.append(
+                box | {widest: arb(centre.mid(), (quarter + centre.rad()).upper())}
+            )
     return boxes
 
 
@@ -560,14 +639,19 @@ class ProofTask(NamedTuple):
         tolerance = 1e-6 * self.bound
         for _ in range(ATTEMPTS):
             follower = Follower(equations, self.trajectory)
-            follower.follow(self.breaks, tolerance, self.max_steps, Bar(label, self.progress))
+            follower.follow(
+                self.breaks, tolerance, self.max_steps, Bar(label, self.progress)
+            )
             if follower.largest <= self.bound or ranges or follower.largest == math.inf:
                 break
             tolerance *= 0.1 * self.bound / follower.largest
         return follower
 
     def prove_part(self, ranges: Mapping[Place, Any]) -> Follower:
-        """Prove the motion for all numbers of ranges; where they are too wide, say what is not."""
+        """Prove the motion for all numbers of ranges.
+
+        Where they are too wide, say what is not.
+        """
         follower = self.prove(ranges)
         if not ranges or not follower.reason or follower.steps >= self.max_steps:
             return follower
@@ -576,9 +660,13 @@ class ProofTask(NamedTuple):
             return follower  # a limit that ends the motion without a range, too
         for halvings in range(1, NARROWER + 1):
             share = 0.5**halvings
-            narrow = {place: arb(x.mid(), x.rad() * share) for place, x in ranges.items()}
+            narrow = {
+                place: arb(x.mid(), x.rad() * share) for place, x in ranges.items()
+            }
             if self.prove(narrow, "narrower").is_whole:
-                advice = f"{share:g} of their width would do, or split={2**halvings} or more"
+                advice = (
+                    f"{share:g} of their width would do, or split={2**halvings} or more"
+                )
                 break
         else:
             advice = f"{share:g} of their width would not do either"
@@ -601,26 +689,23 @@ def certify(
 ) -> ProvenMotion:
     """Enclose the true motion of a scene, and bound the error of `simulate`, with proof.
 
-    A number of the scene stands for what is written and for the double that is read, or for all
-    of a range; rounding is outward. The proof passes contacts and torques at their limit. It ends
-    where the motion meets an end of the scene, or where no step is proven: `until` and `reason`
-    say so. One proof runs at a time, whatever the threads.
+    A number of the scene stands for what is written and for the double that is read, or
+    for all of a range; rounding is outward. The proof passes contacts and torques at
+    their limit. It ends where the motion meets an end of the scene, or where no step is
+    proven: `until` and `reason` say so. One proof runs at a time, whatever the threads.
 
-    Args:
-        scene: as `simulate` takes it.
-        torque: as `simulate` takes it, but for functions.
-        duration: as `simulate` takes it.
-        bound: angle [rad] within which the orientation is to be proven; steps are chosen for it.
-        ranges: how far numbers of the document may be from those given, by key, as in
-            {"star.inertia.zz": 5e-4, "star.alpha_deg": (119.0, 121.0), "star.mass": "digits"}: a
-            half-width, an interval, or half a unit of the last digit that the document has. Keys
-            may name all numbers that act on the motion, those of its geometry, limits and torques
-            included; others are refused.
-        split: number of parts that the box of ranges is split into; what holds for all of them is
-            returned.
-        max_steps: number of steps after which the proof of a part ends, some 20 ms each.
-        progress: draw a bar on a terminal.
-        options: of `simulate`, as initial, method, tolerance, and t_eval, the times of the table.
+    Args: scene: as `simulate` takes it. torque: as `simulate` takes it, but for
+        functions. duration: as `simulate` takes it. bound: angle [rad] within which the
+        orientation is to be proven; steps are chosen for it. ranges: how far numbers of
+        the document may be from those given, by key, as in {"star.inertia.zz": 5e-4,
+        "star.alpha_deg": (119.0, 121.0), "star.mass": "digits"}: a half-width, an
+        interval, or half a unit of the last digit that the document has. Keys may name
+        all numbers that act on the motion, those of its geometry, limits and torques
+        included; others are refused. split: number of parts that the box of ranges is
+        split into; what holds for all of them is returned. max_steps: number of steps
+        after which the proof of a part ends, some 20 ms each. progress: draw a bar on a
+        terminal. options: of `simulate`, as initial, method, tolerance, and t_eval, the
+        times of the table.
 
     Raises:
         InputError: an argument is not allowed; names it and the allowed values.
@@ -629,8 +714,14 @@ def certify(
 
     """
     trajectory = simulate(scene, torque, duration, **options)
-    given, profile, end = trajectory.scene, trajectory.law, duration or trajectory.scene.duration
-    is_known = profile is not None and not isinstance(profile, (FunctionTorque, LostTorque))
+    given, profile, end = (
+        trajectory.scene,
+        trajectory.law,
+        duration or trajectory.scene.duration,
+    )
+    is_known = profile is not None and not isinstance(
+        profile, (FunctionTorque, LostTorque)
+    )
     refuse_unless(
         "certify",
         ("torque", torque, is_known, "must be numbers, sines, a table or polynomials"),

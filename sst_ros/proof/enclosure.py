@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Enclosures of the solution of y' = f(t, y), step by step, in ball arithmetic.
 
-In a step p is a polynomial, d = p' - f(t, p) its defect, and e = y - p. With J between p and y
+In a step p is a polynomial, d = p' - f(t, p) its defect, and e = y - p. With J between
+p and y
 
     e' = J(s) e - d,    so    e(s) = V(s) e(0) + w(s),    w' = J w + (J V - V') e(0) - d,
 
-where the polynomial matrix V is nearly a fundamental matrix. The logarithmic norm of J bounds w.
-All holds while e stays inside of a box, which is checked afterwards: what e cannot leave, it never
-leaves. Sets are e(0) = C a + B b with boxes a, what the motion began with, and b, all later errors.
-B follows V; where it becomes skew its axes are made orthogonal (Lohner 1987). p, V, B, the norm and
-the steps may be any numbers: they are found in whatever arithmetic, and then taken as exact. All
-that is proven is computed in Arb's balls, whose rounding is outward.
+where the polynomial matrix V is nearly a fundamental matrix. The logarithmic norm of J
+bounds w. All holds while e stays inside of a box, which is checked afterwards: what e
+cannot leave, it never leaves. Sets are e(0) = C a + B b with boxes a, what the motion
+began with, and b, all later errors. B follows V; where it becomes skew its axes are
+made orthogonal (Lohner 1987). p, V, B, the norm and the steps may be any numbers: they
+are found in whatever arithmetic, and then taken as exact. All that is proven is
+computed in Arb's balls, whose rounding is outward.
 """
 
 from __future__ import annotations
@@ -48,17 +50,21 @@ CUT = "an angle may pass pi, where that of the model jumps"
 UNBOUNDED = "a number is not bounded: a singularity may be near"
 LEAST = 1e-9  # of a step, relative to the whole time: the proof ends
 TIGHT = 1.1  # room of a tube around what a step was proven to reach
-LOSS = 1e-4  # of a set in a step, relative to it: more is tried to be avoided by shorter steps
+# of a set in a step, relative to it: more is tried to be avoided by shorter steps
+LOSS = 1e-4
 KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
 KINK_STEPS = 400  # steps across one kink before the proof ends
-KINK_LOSS = 0.02  # of a set in a step across a kink, below which the next is twice as long
+# of a set in a step across a kink, below which the next is twice as long
+KINK_LOSS = 0.02
 HALVINGS = 30  # of the time in which a kink is looked for
 
 
 class Refused(ArithmeticError):
     """A step is not proven: how much shorter, or in what wider tube, it may be."""
 
-    def __init__(self, reason: str, shorter: float = 0.5, wider: list[Any] | None = None) -> None:
+    def __init__(
+        self, reason: str, shorter: float = 0.5, wider: list[Any] | None = None
+    ) -> None:
         super().__init__(reason)
         self.shorter, self.wider = shorter, wider
 
@@ -90,7 +96,9 @@ def _atan2(y: Any, x: Any) -> Any:
     if not isinstance(y, arb_series) and not isinstance(x, arb_series):
         return angle
     y, x = arb_series(y), arb_series(x)
-    return ((y.derivative() * x - x.derivative() * y) / (x * x + y * y)).integral() + angle
+    return (
+        (y.derivative() * x - x.derivative() * y) / (x * x + y * y)
+    ).integral() + angle
 
 
 class _Kink:
@@ -102,7 +110,11 @@ class _Kink:
     def __mul__(self, other: Any) -> Any:
         numbers = other.coeffs() if isinstance(other, arb_series) else [other]
         # A ball around zero is neither == 0 nor != 0.
-        return arb(0) if all(not isinstance(x, _Kink) and x == 0 for x in numbers) else self
+        return (
+            arb(0)
+            if all(not isinstance(x, _Kink) and x == 0 for x in numbers)
+            else self
+        )
 
     __rmul__ = __mul__
 
@@ -116,14 +128,16 @@ class _Kink:
 class _KinkWatch:
     """What decides on which side of a kink a number is in a span of time.
 
-    Its value anywhere in the span is that in the middle and its derivative times the time from
-    there (the mean value theorem), which is narrower than its value in interval arithmetic. So the
-    values in the middle are noted in the order in which a program computes them, then read again.
+    Its value anywhere in the span is that in the middle and its derivative times the
+    time from there (the mean value theorem), which is narrower than its value in
+    interval arithmetic. So the values in the middle are noted in the order in which a
+    program computes them, then read again.
     """
 
     def __init__(self) -> None:
         self._middles: list[Any] = []
-        self._reach: Any = None  # largest time from the middle, where the values are read
+        # largest time from the middle, where the values are read
+        self._reach: Any = None
         self._next = 0
 
     @contextlib.contextmanager
@@ -147,7 +161,11 @@ class _KinkWatch:
             return value
         middle = self._middles[self._next] if self._next < len(self._middles) else value
         self._next += 1
-        if isinstance(value, _Kink) or isinstance(middle, _Kink) or not isinstance(x, arb_series):
+        if (
+            isinstance(value, _Kink)
+            or isinstance(middle, _Kink)
+            or not isinstance(x, arb_series)
+        ):
             return value
         if x.prec < 2 or isinstance(slope := x[1], _Kink):
             return value
@@ -169,8 +187,8 @@ def _side(x: Any) -> int | None:
 def _is_constant(x: Any) -> bool:
     """Whether a number does not change in time: no series has another coefficient.
 
-    About the middle of a span these coefficients prove nothing of its ends; but whatever is
-    enclosed is also expanded about all of the span, where they do.
+    About the middle of a span these coefficients prove nothing of its ends; but
+    whatever is enclosed is also expanded about all of the span, where they do.
     """
     if not isinstance(x, arb_series):
         return not isinstance(x, _Kink)
@@ -178,7 +196,10 @@ def _is_constant(x: Any) -> bool:
 
 
 def _step(x: Any) -> Any:
-    """Return the slope of max(x, 0); on both sides of the kink it is any number from 0 to 1."""
+    """Return the slope of max(x, 0).
+
+    On both sides of the kink it is any number from 0 to 1.
+    """
     side = _side(x)
     if side is None:
         return between(0, 1) if _is_constant(x) else _Kink()
@@ -186,14 +207,19 @@ def _step(x: Any) -> Any:
 
 
 def cut(x: Any, _zero: float = 0.0) -> Any:
-    """Return x where x > 0 and 0 elsewhere; of a number on both sides, all that may be."""
+    """Return x where x > 0 and 0 elsewhere.
+
+    Of a number on both sides, all that may be.
+    """
     side = _side(x)
     if side is not None:
         return x * side
     return arb(_first(x)).max(arb(0)) if _is_constant(x) else _Kink()
 
 
-_ON_BALLS: dict[str, Callable[..., Any]] = {name: methodcaller(name) for name in FUNCTIONS}
+_ON_BALLS: dict[str, Callable[..., Any]] = {
+    name: methodcaller(name) for name in FUNCTIONS
+}
 _ON_BALLS |= {"tanh": _tanh, "atan2": _atan2, "max": cut, "step": _step}
 
 
@@ -203,7 +229,10 @@ def compile_on_balls(program: Program, constants: Sequence[Any]) -> Function:
     before, after, results = program.split(range(count))
     names = _ON_BALLS | dict(zip(program.inputs[count:], constants, strict=True))
     before, after = (
-        [re.sub(r"\(1\.0 if (.+) > 0\.0 else 0\.0\)", r"step(\1)", line) for line in lines]
+        [
+            re.sub(r"\(1\.0 if (.+) > 0\.0 else 0\.0\)", r"step(\1)", line)
+            for line in lines
+        ]
         for lines in (before, after)
     )
     exec("\n".join(before), names)
@@ -224,7 +253,9 @@ def _coefficients(x: Any, size: int) -> list[Any]:
     if not isinstance(x, arb_series):
         return [arb(x), *[arb(0)] * (size - 1)]
     if x.prec < size:
-        raise Refused("a series is shorter than asked: another thread uses python-flint")
+        raise Refused(
+            "a series is shorter than asked: another thread uses python-flint"
+        )
     known = x.coeffs()
     return [*known, *[arb(0)] * size][:size]
 
@@ -253,7 +284,14 @@ class Region(NamedTuple):
         """Return the region of all that lies in balls."""
         n = len(balls)
         one, zero = arb_mat(n, n, [0] * (n * n)) + 1, column([0] * n)
-        return cls(time, [x.mid() for x in balls], one, column([x.rad() for x in balls]), one, zero)
+        return cls(
+            time,
+            [x.mid() for x in balls],
+            one,
+            column([x.rad() for x in balls]),
+            one,
+            zero,
+        )
 
     @classmethod
     def linear(
@@ -269,7 +307,9 @@ class Region(NamedTuple):
         n, exact = len(centre), c.mid()
         one = arb_mat(n, n, [0] * (n * n)) + 1
         widths = column([arb(x).upper() for x in a])
-        more = column([x.rad() for x in centre]) + column([arb(x).abs_upper() for x in rest])
+        more = column([x.rad() for x in centre]) + column(
+            [arb(x).abs_upper() for x in rest]
+        )
         b = magnitude(magnitude(c - exact) * widths + more)
         return cls(time, [x.mid() for x in centre], exact, widths, one, b, fixed)
 
@@ -308,9 +348,13 @@ class Advance(NamedTuple):
         """Return p at a time [s], and bounds of the numbers of by e."""
         s = arb(time) - arb(self.begin.time)
         w = magnitude(by * self.v[0]) * self.w
-        return [p(s) for p in self.p], entries(magnitude(self.begin.spread(by * self.flow(s)) + w))
+        return [p(s) for p in self.p], entries(
+            magnitude(self.begin.spread(by * self.flow(s)) + w)
+        )
 
-    def expand(self, function: Function, where: Any, size: int, tube: Sequence[Any]) -> list[Any]:
+    def expand(
+        self, function: Function, where: Any, size: int, tube: Sequence[Any]
+    ) -> list[Any]:
         """Coefficients below `size` of a function of t and y = p + e at s = where, e in `tube`."""
         rows = (p(arb_poly([where, 1])) + e for p, e in zip(self.p, tube, strict=True))
         time = arb_series([arb(self.begin.time) + where, 1], size)
@@ -332,8 +376,8 @@ class Advance(NamedTuple):
     ) -> list[list[Any]]:
         """Coefficients of polynomials about the middle of a span that enclose a function in it.
 
-        The last one is what it is anywhere in the span: Lagrange's remainder. The span counts from
-        the begin of the step [s], and is all of it by default.
+        The last one is what it is anywhere in the span: Lagrange's remainder. The span
+        counts from the begin of the step [s], and is all of it by default.
         """
         begin, end = span or (arb(0), self.length)
         if order == 0:
@@ -357,21 +401,31 @@ def shift(coefficients: Sequence[Any], by: Any) -> list[Any]:
     """Return the coefficients of a polynomial about another point."""
     every = range(len(coefficients))
     return [
-        sum((coefficients[j] * (math.comb(j, k) * by ** (j - k)) for j in every[k + 1 :]), c)
+        sum(
+            (
+                coefficients[j] * (math.comb(j, k) * by ** (j - k))
+                for j in every[k + 1 :]
+            ),
+            c,
+        )
         for k, c in enumerate(coefficients)
     ]
 
 
-def approximate(f: Function, jacobian: Function, at: Region, order: int) -> list[list[Any]]:
+def approximate(
+    f: Function, jacobian: Function, at: Region, order: int
+) -> list[list[Any]]:
     """Return the coefficients of p.
 
-    A series f(t, p) gives the next coefficient of p, and nearly those that follow: what they add
-    to it is linear, by the Jacobian on what was known.
+    A series f(t, p) gives the next coefficient of p, and nearly those that follow: what
+    they add to it is linear, by the Jacobian on what was known.
     """
     n, p, j = len(at.centre), [[x] for x in at.centre], list[Any]()
 
     def run(function: Function, size: int) -> list[list[Any]]:
-        found = function(arb_series([at.time, 1], size), *(arb_series(row, size) for row in p))
+        found = function(
+            arb_series([at.time, 1], size), *(arb_series(row, size) for row in p)
+        )
         return [_coefficients(x, size) for x in found]
 
     while (known := len(p[0])) <= order:
@@ -405,7 +459,8 @@ def bound_defect(f: Function, step: Advance, order: int) -> list[list[Any]]:
         slope = p.derivative()
         slopes = slope(about_middle) if order else [slope(between(0, step.length))]
         d.append([(x - slopes[k]).abs_upper() for k, x in enumerate(row)])
-    if not all(x.is_finite() for row in d for x in row):  # max() of Python would skip a nan
+    # max() of Python would skip a nan
+    if not all(x.is_finite() for row in d for x in row):
         raise Refused(UNBOUNDED)
     return d
 
@@ -421,8 +476,9 @@ def prove(
 ) -> Advance:
     """Prove a step with e in its tube, or raise Refused; `order` is that of p.
 
-    Across a kink no derivative by time exists: f and J are enclosed by their values alone, with
-    each slope between those of both sides (the mean value theorem of Lipschitz functions).
+    Across a kink no derivative by time exists: f and J are enclosed by their values
+    alone, with each slope between those of both sides (the mean value theorem of
+    Lipschitz functions).
     """
     n = len(step.p)
     j_order, v_order = (0, KINK_V_ORDER) if across_kink else (J_ORDER, V_ORDER)
@@ -458,7 +514,8 @@ def _measure_defect(
 ) -> Advance:
     """Note the integral of the last term of the defect; Refused: it is too large.
 
-    The terms below it are what the balls of numbers bring, which shorter steps do not lessen.
+    The terms below it are what the balls of numbers bring, which shorter steps do not
+    lessen.
     """
     size = len(d[0])
     last = max(float(row[-1] * step.length**size / size) for row in d)
@@ -502,7 +559,10 @@ def _values_of(j: Sequence[Any], half: Any) -> Any:
 
 
 def _check_tube(step: Advance, tolerance: float) -> Advance:
-    """Return a step with the tube that is reached; Refused: the error may leave its tube."""
+    """Return a step with the tube that is reached.
+
+    Refused: the error may leave its tube.
+    """
     s = between(0, step.length)
     reached = entries(step.begin.spread(step.flow(s)) + step.w)
     pairs = list(zip(reached, step.tube, strict=True))[: step.begin.moving]
@@ -534,18 +594,23 @@ def region_at_end(step: Advance) -> Region:
     h, here = step.length, step.begin
     flow, reached = step.flow(h), [p(h) for p in step.p]
     moved, c = flow * here.axes, flow * here.c
-    error = magnitude(c - c.mid()) * here.a + step.w + column([x.rad() for x in reached])
+    error = (
+        magnitude(c - c.mid()) * here.a + step.w + column([x.rad() for x in reached])
+    )
     axes = fit_axes(moved, here.b, [float(x) for x in step.weights])
     back = axes.inv()
     b = magnitude(magnitude(back * moved) * here.b + magnitude(back) * error)
-    return Region(step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b, here.fixed)
+    return Region(
+        step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b, here.fixed
+    )
 
 
 def _loss(step: Advance) -> float:
     """Return how much of the set at the end of a step is new, in the norm of the step."""
     sizes = [entries(x) for x in (step.w, step.begin.spread(step.flow(step.length)))]
     new, known = (
-        max(float(x / weight) for x, weight in zip(row, step.weights, strict=True)) for row in sizes
+        max(float(x / weight) for x, weight in zip(row, step.weights, strict=True))
+        for row in sizes
     )
     return new / known if known else 0.0
 
@@ -600,7 +665,8 @@ class ProvenSteps:
         self._tolerance, self._order = tolerance, order
         self._span = end - here.time
         self._room, self._factor = 3, 0.4  # of a tube; of a step by its longest
-        self._usual, self._most = self._span, math.inf  # steps: the last, the longest next
+        # steps: the last, the longest next
+        self._usual, self._most = self._span, math.inf
         self._cruise = self._span  # last step before a kink was near
         self.kinks: list[tuple[float, float]] = []  # spans of time across kinks [s]
 
@@ -616,11 +682,18 @@ class ProvenSteps:
             self._here = region_at_end(step)
 
     def _smooth_step(self) -> Advance:
-        """Prove a step of Taylor series; KinkMet where one lies ahead within KINK_STEP."""
+        """Prove a step of Taylor series.
+
+        KinkMet where one lies ahead within KINK_STEP.
+        """
         here, tolerance, order = self._here, self._tolerance, self._order
         p = approximate(self._f, self._jacobian, here, order)
-        sizes = [(k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)]
-        longest = min([(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=self._usual)
+        sizes = [
+            (k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)
+        ]
+        longest = min(
+            [(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=self._usual
+        )
         wanted, tries = self._factor * longest, 0
         h = min(wanted, 4.0 * self._usual, self._most)
         is_free = h == wanted or self._most < math.inf  # no kink has made it short
@@ -645,7 +718,12 @@ class ProvenSteps:
                     tube, tries = why.wider, tries + 1
                     self._room = min(2 * self._room, 100)
                     continue
-                h, tries, self._most, self._room = why.shorter * (target - here.time), 0, 0.0, 3
+                h, tries, self._most, self._room = (
+                    why.shorter * (target - here.time),
+                    0,
+                    0.0,
+                    3,
+                )
                 tube = _tube(here, self._room, tolerance)
                 if h < LEAST * self._span or here.time + h == here.time:
                     raise why from None
@@ -655,14 +733,17 @@ class ProvenSteps:
     def _less_lossy(self, step: Advance) -> Advance:
         """Return a step, or a shorter one if it widens the set by much less.
 
-        In a stiff contact the Jacobian turns within a step, and its series is what widens.
+        In a stiff contact the Jacobian turns within a step, and its series is what
+        widens.
         """
         loss = _loss(step)
         if loss > LOSS + 10.0 * self._tolerance:
             moving = [TIGHT * x for x in step.tube[: step.begin.moving]]
             tight = step._replace(tube=[*moving, *step.tube[step.begin.moving :]])
             try:
-                step = prove(self._f, self._jacobian, tight, self._order, self._tolerance)
+                step = prove(
+                    self._f, self._jacobian, tight, self._order, self._tolerance
+                )
                 loss = _loss(step)
             except (ArithmeticError, ValueError):
                 pass
@@ -671,7 +752,9 @@ class ProvenSteps:
             tube = _tube(step.begin, 3, self._tolerance)
             shorter = step._replace(end=step.begin.time + h, tube=tube)
             try:
-                shorter = prove(self._f, self._jacobian, shorter, self._order, self._tolerance)
+                shorter = prove(
+                    self._f, self._jacobian, shorter, self._order, self._tolerance
+                )
             except (ArithmeticError, ValueError):
                 return step
             before, loss = loss, _loss(shorter)
@@ -680,7 +763,9 @@ class ProvenSteps:
             step = shorter
         return step
 
-    def _plan(self, taken: float, longest: float, defect: float, *, is_free: bool) -> None:
+    def _plan(
+        self, taken: float, longest: float, defect: float, *, is_free: bool
+    ) -> None:
         """Choose what the next step is made from."""
         if self._here.time + taken >= self._end:
             return
@@ -690,7 +775,9 @@ class ProvenSteps:
         if not is_free:
             return
         self._cruise = self._usual
-        ratio = (0.5 * self._tolerance / defect) ** (1.0 / self._order) if defect else 1.3
+        ratio = (
+            (0.5 * self._tolerance / defect) ** (1.0 / self._order) if defect else 1.3
+        )
         self._factor = taken / longest * min(max(ratio, 0.7), 1.3)
 
     def _clear_length(self, step: Advance) -> float:
@@ -744,15 +831,24 @@ class ProvenSteps:
             half = (arb(target) - arb(here.time)) / 2
             time, first = arb(here.time), self._f(arb(here.time), *here.centre)
             middle = [
-                x + half * arb(slope).mid() for x, slope in zip(here.centre, first, strict=True)
+                x + half * arb(slope).mid()
+                for x, slope in zip(here.centre, first, strict=True)
             ]
             slopes = self._f(time + half, *middle)
-            p = [arb_poly([x, arb(s).mid()]) for x, s in zip(here.centre, slopes, strict=True)]
+            p = [
+                arb_poly([x, arb(s).mid()])
+                for x, s in zip(here.centre, slopes, strict=True)
+            ]
             line = Advance(here, target, p, _tube(here, 3, self._tolerance))
             for _ in range(4):
                 try:
                     return prove(
-                        self._f, self._jacobian, line, 1, self._tolerance, across_kink=True
+                        self._f,
+                        self._jacobian,
+                        line,
+                        1,
+                        self._tolerance,
+                        across_kink=True,
                     )
                 except Refused as why:
                     if why.wider is None:
@@ -763,7 +859,12 @@ class ProvenSteps:
 
 
 def enclose(
-    f: Function, jacobian: Function, here: Region, end: float, tolerance: float, order: int
+    f: Function,
+    jacobian: Function,
+    here: Region,
+    end: float,
+    tolerance: float,
+    order: int,
 ) -> Iterator[Advance]:
     """Yield the steps of a `ProvenSteps`."""
     yield from ProvenSteps(f, jacobian, here, end, tolerance, order)

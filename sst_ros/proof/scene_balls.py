@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of a scene in balls, from the document on, and functions of them as programs.
 
-Reading a scene converts some of it in floats: arcs to directions, an inertia about the centre of
-mass to one about O, a restitution to a damping. Here these conversions are made again, in balls,
-from what the document says. What no range touches is computed once; what a range touches becomes
-part of the programs, so that one number of the document is the same number wherever it acts.
+Reading a scene converts some of it in floats: arcs to directions, an inertia about the
+centre of mass to one about O, a restitution to a damping. Here these conversions are
+made again, in balls, from what the document says. What no range touches is computed
+once; what a range touches becomes part of the programs, so that one number of the
+document is the same number wherever it acts.
 """
 
 from __future__ import annotations
@@ -40,7 +41,10 @@ Range = float | tuple[float, float] | str
 
 DEGREE: Place = ("degree",)  # place of pi / 180 among the constants
 DAMPING: Place = ("stroke", "damping")
-RESTITUTION: tuple[Place, Place] = (("stroke", "restitution"), ("stroke", "impact_rate"))
+RESTITUTION: tuple[Place, Place] = (
+    ("stroke", "restitution"),
+    ("stroke", "impact_rate"),
+)
 _NO_EFFECT: dict[Place, str] = {
     ("base", "radius"): "does not act on the motion",
     ("star", "radius"): "does not act on the motion",
@@ -106,7 +110,8 @@ def _unconvert(part: Any, place: Place, texts: dict[Place, str]) -> Any:
         _collect_texts(written, (*place, name), texts)
     fields = vars(part) | converted_of(part)
     return build_unchecked(
-        type(part), {name: _unconvert(x, (*place, name), texts) for name, x in fields.items()}
+        type(part),
+        {name: _unconvert(x, (*place, name), texts) for name, x in fields.items()},
     )
 
 
@@ -171,7 +176,9 @@ def _axes_of(scene: Any, degree: Any) -> Axes:
     e = [(0.0, 1.0, 0.0)]
     for angle in (alpha_12, alpha_12 + alpha_23):
         e.append((-gm.sin(angle), gm.cos(angle), 0.0))
-    return Axes(tuple(v), tuple(w), tuple(e), tuple(arcs), degree * scene.workspace.beta_max_deg)
+    return Axes(
+        tuple(v), tuple(w), tuple(e), tuple(arcs), degree * scene.workspace.beta_max_deg
+    )
 
 
 def damping_ball(restitution: Any, impact_rate: Any) -> Any:
@@ -203,25 +210,40 @@ def _langevin_bound(y: Any, side: int) -> Any:
 
 
 def range_balls(
-    document: WrittenDocument, ranges: Mapping[str, Range], *, own_torque: bool, origin: str
+    document: WrittenDocument,
+    ranges: Mapping[str, Range],
+    *,
+    own_torque: bool,
+    origin: str,
 ) -> dict[Place, Any]:
     """Return the ball of each number that is a range.
 
-    Raises InputError where a key names no number that acts on the motion, or a range is none.
+    Raises InputError where a key names no number that acts on the motion, or a range is
+    none.
     """
     balls: dict[Place, Any] = {}
     numbers = leaves(document.scene)
     for key, width in ranges.items():
         try:
-            fields = [place for place, _, _ in find_fields(document.scene, key, components=True)]
+            fields = [
+                place
+                for place, _, _ in find_fields(document.scene, key, components=True)
+            ]
         except ValueError as error:
             raise refusal(origin, "ranges", key, str(error)) from None
-        places = [p for p in numbers if any(p[: len(field)] == field for field in fields)]
-        refuse_unless(origin, ("ranges", key, bool(places), "must name numbers that the scene has"))
+        places = [
+            p for p in numbers if any(p[: len(field)] == field for field in fields)
+        ]
+        refuse_unless(
+            origin,
+            ("ranges", key, bool(places), "must name numbers that the scene has"),
+        )
         for place in places:
             _refuse_no_effect(key, place, own_torque=own_torque, origin=origin)
         for place, ball in _balls_of(key, width, places, document, origin):
-            refuse_unless(origin, ("ranges", key, place not in balls, "names a number twice"))
+            refuse_unless(
+                origin, ("ranges", key, place not in balls, "names a number twice")
+            )
             balls[place] = ball
     return balls
 
@@ -230,11 +252,17 @@ def _refuse_no_effect(key: str, place: Place, *, own_torque: bool, origin: str) 
     for idle, reason in _NO_EFFECT.items():
         refuse_unless(origin, ("ranges", key, place[: len(idle)] != idle, reason))
     replaced = place[0] == "torque" and not own_torque
-    refuse_unless(origin, ("ranges", key, not replaced, "is replaced by the argument `torque`"))
+    refuse_unless(
+        origin, ("ranges", key, not replaced, "is replaced by the argument `torque`")
+    )
 
 
 def _balls_of(
-    key: str, width: Range, places: Sequence[Place], document: WrittenDocument, origin: str
+    key: str,
+    width: Range,
+    places: Sequence[Place],
+    document: WrittenDocument,
+    origin: str,
 ) -> Iterator[tuple[Place, Any]]:
     numbers, name = leaves(document.scene), f"ranges[{key}]"
     if width == "digits":
@@ -243,12 +271,19 @@ def _balls_of(
         refuse_unless(origin, (name, width, bool(written), allowed))
         for place in written:
             text = document.texts[place]
-            yield place, number_ball(numbers[place], text) + arb(0, half_unit(text).upper())
+            yield (
+                place,
+                number_ball(numbers[place], text) + arb(0, half_unit(text).upper()),
+            )
         return
     allowed = 'must be a half-width >= 0, an interval (low, high), or "digits"'
     if isinstance(width, (tuple, list)):
-        is_interval = len(width) == 2 and all(isinstance(x, (int, float)) for x in width)
-        refuse_unless(origin, (name, width, is_interval and width[0] <= width[1], allowed))
+        is_interval = len(width) == 2 and all(
+            isinstance(x, (int, float)) for x in width
+        )
+        refuse_unless(
+            origin, (name, width, is_interval and width[0] <= width[1], allowed)
+        )
         low, high = map(float, width)
         for place in places:
             inside = low <= numbers[place] <= high
@@ -257,7 +292,9 @@ def _balls_of(
             yield place, between(arb(low), arb(high)).union(number_ball(numbers[place]))
         return
     is_number = isinstance(width, (int, float)) and not isinstance(width, bool)
-    refuse_unless(origin, (name, width, is_number and 0.0 <= float(width) < 1e300, allowed))
+    refuse_unless(
+        origin, (name, width, is_number and 0.0 <= float(width) < 1e300, allowed)
+    )
     for place in places:
         digits = document.texts.get(place)
         yield place, number_ball(numbers[place], digits) + arb(0, float(width))
@@ -266,7 +303,8 @@ def _balls_of(
 class SceneBalls:
     """A scene in balls, and functions of it as programs.
 
-    The numbers that are ranges, `varied`, are inputs of the programs; those of the start are not.
+    The numbers that are ranges, `varied`, are inputs of the programs; those of the
+    start are not.
 
     Args:
         scene: what moves.
@@ -283,7 +321,9 @@ class SceneBalls:
         texts = dict(document.texts)
         if isinstance(profile, SineTorque) and profile != scene.torque:
             written = rebuild(written, {("torque",): profile})
-            texts = {place: text for place, text in texts.items() if place[0] != "torque"}
+            texts = {
+                place: text for place, text in texts.items() if place[0] != "torque"
+            }
         balls: dict[Place, Any] = {}
         for place, number in leaves(written).items():
             balls[place] = number_ball(number, texts.get(place))
@@ -299,7 +339,9 @@ class SceneBalls:
         self.inputs = tuple(f"p{i}" for i in range(len(varied)))
         self._document = written
         present = (p for p, x in balls.items() if p in varied or not x.is_zero())
-        self._symbols: dict[Place, Any] = {p: balls[p] for p in present if p[0] != "initial"}
+        self._symbols: dict[Place, Any] = {
+            p: balls[p] for p in present if p[0] != "initial"
+        }
         self._symbols[DEGREE] = arb.pi() / 180
         self._settled = self._convert_in_balls()
 
@@ -313,7 +355,10 @@ class SceneBalls:
         return [self.balls["initial", name, k] for k in range(3)]
 
     def _convert_in_balls(self) -> dict[Place, Any]:
-        """Convert in balls; return what no range touches: balls, or floats where exactly 0, +-1."""
+        """Convert in balls.
+
+        Return what no range touches: balls, or floats where exactly 0, +-1.
+        """
         places: list[Place] = []
         names = [*self.inputs, *(f"c{i}" for i in range(len(self._symbols)))]
 
@@ -334,7 +379,10 @@ class SceneBalls:
         return settled
 
     def _convert(self, symbols: Sequence[Any]) -> Derived:
-        """Convert the document; its symbols are the varied numbers, then the constants."""
+        """Convert the document.
+
+        Its symbols are the varied numbers, then the constants.
+        """
         count = len(self.inputs)
         numbers = dict(zip(self._symbols, symbols[count:], strict=False))
         numbers |= zip(self.varied, symbols[:count], strict=True)
@@ -342,27 +390,40 @@ class SceneBalls:
         return convert(rebuild(self._document, marked), numbers[DEGREE])
 
     def compile(
-        self, function: Callable[..., Any], inputs: Sequence[str], by: Sequence[str] = ()
+        self,
+        function: Callable[..., Any],
+        inputs: Sequence[str],
+        by: Sequence[str] = (),
     ) -> enclosure.Function:
         """Compile function(parts, *inputs), whose `Parts` depend on the inputs `self.inputs`.
 
-        The compiled function has the inputs, then the varied numbers; with `by` it returns the
-        derivatives by these inputs, too.
+        The compiled function has the inputs, then the varied numbers; with `by` it
+        returns the derivatives by these inputs, too.
         """
-        constants = {place: x for place, x in self._settled.items() if not isinstance(x, float)}
-        folded = {place: x for place, x in self._settled.items() if isinstance(x, float)}
+        constants = {
+            place: x for place, x in self._settled.items() if not isinstance(x, float)
+        }
+        folded = {
+            place: x for place, x in self._settled.items() if isinstance(x, float)
+        }
         size, count = len(inputs), len(self.inputs)
         names = [f"c{i}" for i in range(len(self._symbols))]
         derived_names = [f"d{i}" for i in range(len(constants))]
 
         def traced(*values: Any) -> Any:
             given, symbols = values[:size], values[size : size + count + len(names)]
-            known = dict(zip(constants, values[size + count + len(names) :], strict=True))
+            known = dict(
+                zip(constants, values[size + count + len(names) :], strict=True)
+            )
             marked = {place: mark_present(x) for place, x in (known | folded).items()}
             derived = rebuild(self._convert(symbols), marked)
             model = kernel.model_of(derived.scene, derived.axes)
-            present = {p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)}
-            return function(Parts(rebuild(model, present), derived.axes, derived.scene), *given)
+            present = {
+                p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)
+            }
+            return function(
+                Parts(rebuild(model, present), derived.axes, derived.scene), *given
+            )
 
         program = trace(traced, (*inputs, *self.inputs, *names, *derived_names), by)
         balls = [*self._symbols.values(), *constants.values()]

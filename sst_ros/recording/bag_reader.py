@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a rosbag2 recording in one pass; every fault of it becomes an InputError.
+"""The messages of a rosbag2 recording in one pass.
+
+Every fault of it becomes an InputError.
 
 mcap reads MCAP and checks each chunk by its CRC-32; rosbags knows the types of the
 messages. A database is read as such: rosbags refuses one with an action, whose
-definitions rosbag2 leaves empty, and none is needed here. What mcap leaves to its caller
-is here: the checksums of the index (summary) and of the data section, messages outside
-of chunks, the number of messages, and to go on behind a damaged chunk, which needs the
-place of the next one from the index, or a damaged chunk whose length is whole.
+definitions rosbag2 leaves empty, and none is needed here. What mcap leaves to its
+caller is here: the checksums of the index (summary) and of the data section, messages
+outside of chunks, the number of messages, and to go on behind a damaged chunk, which
+needs the place of the next one from the index, or a damaged chunk whose length is
+whole.
 """
 
 from __future__ import annotations
@@ -63,9 +66,9 @@ RawMessage: TypeAlias = tuple[str, str, int, bytes]
 class Topic:
     """A topic of a run: the last part of its name, its message type, and whose it is.
 
-    The owner is SIMULATOR for a topic of the simulator's node, NAMESPACE for one that lies
-    beside the node, CONTROLLER for one of another node there, EVERYBODY for one whose name
-    is the same for all.
+    The owner is SIMULATOR for a topic of the simulator's node, NAMESPACE for one that
+    lies beside the node, CONTROLLER for one of another node there, EVERYBODY for one
+    whose name is the same for all.
     """
 
     key: str
@@ -79,7 +82,11 @@ class Topic:
 
     def may_be(self, name: str) -> bool:
         """Return whether some run may have it by this full name."""
-        return name == self.ending if self.owner == EVERYBODY else name.endswith(self.ending)
+        return (
+            name == self.ending
+            if self.owner == EVERYBODY
+            else name.endswith(self.ending)
+        )
 
 
 class Received(NamedTuple):
@@ -92,23 +99,29 @@ class Received(NamedTuple):
 
 
 class Bag:
-    """A recording, MCAP or sqlite3, a folder or a single file; refused where there is none.
+    """A recording, MCAP or sqlite3, a folder or a single file.
 
-    Topics that are not requested are skipped. With `damaged`, what is intact of a damaged
-    recording is read instead of refusing it. Attributes are complete when `messages` is
-    exhausted, `topics` when they have been selected.
+    Refused where there is none.
+
+    Topics that are not requested are skipped. With `damaged`, what is intact of a
+    damaged recording is read instead of refusing it. Attributes are complete when
+    `messages` is exhausted, `topics` when they have been selected.
     """
 
-    def __init__(self, path: Path, requested: Sequence[Topic], *, damaged: bool = False) -> None:
+    def __init__(
+        self, path: Path, requested: Sequence[Topic], *, damaged: bool = False
+    ) -> None:
         if not os.path.exists(path):  # noqa: PTH110  # Path's raises where a name is too long
             raise refusal(path, "bag", str(path), "does not exist")
         if not (path.is_dir() or path.is_file()):
             raise refusal(path, "bag", str(path), "must be a folder or a file")
         self.path = path
         self.channels: dict[str, str] = {}  # type of each topic of the recording
-        self.candidates: dict[str, Topic] = {}  # what they may be of a run, by full name
+        # what they may be of a run, by full name
+        self.candidates: dict[str, Topic] = {}
         self.topics: dict[str, str] = {}  # full names of the topics of the run, by key
-        self.damage: tuple[str, ...] = ()  # what is damaged or lost, a line for each part
+        # what is damaged or lost, a line for each part
+        self.damage: tuple[str, ...] = ()
         self.unverified = 0  # chunks without a checksum
         self._requested, self._damaged = requested, damaged
         self._unreadable: dict[str, InputError] = {}
@@ -116,8 +129,8 @@ class Bag:
     def messages(self) -> Iterator[Received]:
         """Yield the messages of topics that some run may have, as the file has them.
 
-        Raises InputError where the recording is damaged, which is known at the end at the
-        latest, and where it is empty.
+        Raises InputError where the recording is damaged, which is known at the end at
+        the latest, and where it is empty.
         """
         store = message_types()
         for name, message_type, received_ns, data in self._stored():
@@ -142,7 +155,10 @@ class Bag:
                 raise self._unreadable[name]
 
     def _stored(self) -> Iterator[RawMessage]:
-        """Yield the messages of all files; of a database those of requested topics alone."""
+        """Yield the messages of all files.
+
+        Of a database those of requested topics alone.
+        """
         files, declared = self._files()
         counts = Counter[str]()
         self._empty = True
@@ -151,7 +167,9 @@ class Bag:
                 try:
                     file, kind = _prepare(path, Path(folder))
                     read = self._read_mcap if kind == "mcap" else self._read_database
-                    for name, message_type, received_ns, data in read(file, Path(folder)):
+                    for name, message_type, received_ns, data in read(
+                        file, Path(folder)
+                    ):
                         if data[:4] == _ZSTD_MAGIC:  # compressed message by message
                             data = _decompress_message(data)
                         counts[name] += 1
@@ -162,7 +180,9 @@ class Bag:
         if self._empty and not counts:
             raise refusal(self.path, "messages", 0, "the recording is empty")
 
-    def _compare_counts(self, declared: Mapping[str, int], counts: Counter[str]) -> None:
+    def _compare_counts(
+        self, declared: Mapping[str, int], counts: Counter[str]
+    ) -> None:
         """Note where the recording has other numbers of messages than it says of itself."""
         lines = [
             f"{name}: {counts[name]} messages of {number} that metadata.yaml counts"
@@ -176,8 +196,8 @@ class Bag:
     def _files(self) -> tuple[list[Path], dict[str, int]]:
         """Return the files in their order, and how many messages of each topic they hold.
 
-        Without metadata.yaml, which a killed recorder has not written, they are those that
-        are there, and nothing says how much they hold.
+        Without metadata.yaml, which a killed recorder has not written, they are those
+        that are there, and nothing says how much they hold.
         """
         if not self.path.is_dir():
             return [self.path], {}
@@ -186,25 +206,40 @@ class Bag:
         try:
             found = read_values(read_file(text), "metadata.yaml")
             found = found["rosbag2_bagfile_information"]
-            files = [self.path / PurePath(name).name for name in found["relative_file_paths"]]
+            files = [
+                self.path / PurePath(name).name for name in found["relative_file_paths"]
+            ]
             for one in found.get("topics_with_message_count") or ():
                 name = str(one["topic_metadata"]["name"])
                 counts[name] = counts.get(name, 0) + int(one["message_count"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, InputError) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            InputError,
+        ) as error:
             if not self._damaged and (text.exists() or not self._listed()):
                 reason = str(error).removeprefix("metadata.yaml: ")
                 raise self._not_whole(f"metadata.yaml: {reason}") from None
-        if not (files and all(map(Path.exists, files))) and (self._damaged or not files):
+        if not (files and all(map(Path.exists, files))) and (
+            self._damaged or not files
+        ):
             files = self._listed()
         return files, counts
 
     def _listed(self) -> list[Path]:
         """List the files of one recording in the folder, in the order of their numbers."""
-        parts = [(match, path) for path in self.path.iterdir() if (match := _name(path))]
+        parts = [
+            (match, path) for path in self.path.iterdir() if (match := _name(path))
+        ]
         kinds = {(match[1], match[3]) for match, _ in parts}
         if len(kinds) > 1:
             names = ", ".join(sorted(path.name for _, path in parts))
-            allowed = "are files of several recordings, without metadata.yaml: name one file"
+            allowed = (
+                "are files of several recordings, without metadata.yaml: name one file"
+            )
             raise refusal(self.path, "bag", names, allowed)
         return [path for _, path in sorted(parts, key=lambda one: int(one[0][2] or 0))]
 
@@ -235,13 +270,21 @@ class Bag:
                 address = (own / path.name).absolute().as_uri()
             with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
                 topics = database.execute("SELECT id, name, type FROM topics")
-                chosen = {key: channel for key, *channel in topics if self._candidate(*channel)}
-                rows = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
+                chosen = {
+                    key: channel
+                    for key, *channel in topics
+                    if self._candidate(*channel)
+                }
+                rows = (
+                    "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
+                )
                 rows += f"({','.join('?' * len(chosen))}) ORDER BY timestamp"
                 for key, received_ns, data in database.execute(rows, [*chosen]):
                     yield *chosen[key], int(received_ns), data
                     count += 1
-                some = database.execute("SELECT EXISTS (SELECT 1 FROM messages)").fetchone()
+                some = database.execute(
+                    "SELECT EXISTS (SELECT 1 FROM messages)"
+                ).fetchone()
                 self._empty = self._empty and not some[0]
         except (sqlite3.Error, ValueError, TypeError) as error:
             raise self._not_whole(error, f" after {count} messages") from None
@@ -256,9 +299,15 @@ class Bag:
                     self.candidates[name] = topic
         return self.candidates.get(name)
 
-    def _not_whole(self, reason: object, where: str = "", advice: str = "") -> InputError:
+    def _not_whole(
+        self, reason: object, where: str = "", advice: str = ""
+    ) -> InputError:
         sqlite = ".db3" in self.path.suffixes or any(self.path.glob("*.db3*"))
-        by = "sqlite3 FILE .recover | sqlite3 NEW" if sqlite else "python -m sst_ros recover BAG"
+        by = (
+            "sqlite3 FILE .recover | sqlite3 NEW"
+            if sqlite
+            else "python -m sst_ros recover BAG"
+        )
         allowed = (
             "must be a whole rosbag2 recording, MCAP or sqlite3; "
             f"reading failed{where}: {_one_line(reason)}; "
@@ -289,7 +338,8 @@ class McapFile:
         self.damage: list[Damage] = []
         self.cut = False  # the file ends before its index does
         self.unverified = 0  # chunks without a checksum
-        self.count = self.lost = 0  # messages that were read, and that are known to be lost
+        # messages that were read, and that are known to be lost
+        self.count = self.lost = 0
         self._origin_ns = 0
         self._schemas: dict[int, str] = {}
 
@@ -299,7 +349,9 @@ class McapFile:
         for one in self.damage:
             line = f"{self.path.name}, byte {one.offset}: {one.reason}"
             if one.end_ns:  # seconds after the first message
-                first, last = ((ns - self._origin_ns) / 1e9 for ns in (one.begin_ns, one.end_ns))
+                first, last = (
+                    (ns - self._origin_ns) / 1e9 for ns in (one.begin_ns, one.end_ns)
+                )
                 line += f" ({first:.3f} s to {last:.3f} s)"
             lines.append(line)
         if self.cut:
@@ -309,7 +361,10 @@ class McapFile:
         return lines
 
     def messages(self) -> Iterator[RawMessage]:
-        """Yield all messages that are intact, those outside of chunks last; may raise OSError."""
+        """Yield all messages that are intact, those outside of chunks last.
+
+        May raise OSError.
+        """
         with self.path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
@@ -380,7 +435,10 @@ class McapFile:
             return ()
 
     def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
-        """Return the records of the index and where it begins; none where it is not intact."""
+        """Return the records of the index and where it begins.
+
+        None where it is not intact.
+        """
         footer_at = file.seek(0, io.SEEK_END) - FOOTER_SIZE - len(MCAP0_MAGIC)
         file.seek(max(footer_at, 0))
         end = file.read()
@@ -389,12 +447,18 @@ class McapFile:
             return [], 0
         try:
             footer = next(_records(end))
-            if not isinstance(footer, records.Footer) or footer.summary_start > footer_at:
+            if (
+                not isinstance(footer, records.Footer)
+                or footer.summary_start > footer_at
+            ):
                 raise ValueError("index with wrong position")
             begin = footer.summary_start or footer_at
             file.seek(begin)
             content = file.read()
-            if footer.summary_crc not in (0, zlib.crc32(content[: -4 - len(MCAP0_MAGIC)])):
+            if footer.summary_crc not in (
+                0,
+                zlib.crc32(content[: -4 - len(MCAP0_MAGIC)]),
+            ):
                 raise ValueError("index with wrong checksum")
             index = list(_records(content))
             chunks = [one for one in index if isinstance(one, ChunkIndex)]
@@ -405,7 +469,9 @@ class McapFile:
             self.damage.append(Damage(footer_at, _one_line(error)))
             return [], 0
 
-    def _read_at(self, file: IO[bytes], chunks: Sequence[ChunkIndex]) -> Iterator[McapRecord]:
+    def _read_at(
+        self, file: IO[bytes], chunks: Sequence[ChunkIndex]
+    ) -> Iterator[McapRecord]:
         """Yield the records in each chunk, where the index says that it begins."""
         for one in chunks:
             begin = file.seek(one.chunk_start_offset)
@@ -426,15 +492,22 @@ class McapFile:
             if isinstance(record, records.DataEnd):
                 return
             if isinstance(record, Chunk):
-                place = Damage(offset, "", record.message_start_time, record.message_end_time)
+                place = Damage(
+                    offset, "", record.message_start_time, record.message_end_time
+                )
                 yield from self._open(iter([record]), place)
             else:
                 yield record
         if not self.cut:
             self.damage.append(Damage(offset, "unreadable bytes"))
 
-    def _open(self, stored: Iterator[McapRecord], place: Damage) -> Sequence[McapRecord]:
-        """Return the records in a chunk that comes next; none, and note it, if it is damaged."""
+    def _open(
+        self, stored: Iterator[McapRecord], place: Damage
+    ) -> Sequence[McapRecord]:
+        """Return the records in a chunk that comes next.
+
+        None, and note it, if it is damaged.
+        """
         self._origin_ns = self._origin_ns or place.begin_ns
         try:
             chunk = next(stored)
@@ -462,8 +535,13 @@ class McapFile:
             self.damage.append(Damage(begin, "data section with wrong checksum"))
 
 
-def _records(source: bytes | IO[bytes], *, chunks: bool = False) -> Iterator[McapRecord]:
-    """Yield the records of a file from here on, or of bytes; chunks whole, or what is in them."""
+def _records(
+    source: bytes | IO[bytes], *, chunks: bool = False
+) -> Iterator[McapRecord]:
+    """Yield the records of a file from here on, or of bytes.
+
+    Chunks whole, or what is in them.
+    """
     file = io.BytesIO(source) if isinstance(source, bytes) else source
     return StreamReader(file, skip_magic=True, emit_chunks=chunks).records
 

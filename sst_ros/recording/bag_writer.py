@@ -20,13 +20,18 @@ from sst_ros.recording.bag_reader import McapFile, message_types
 
 FLUSH_PERIOD_S = 1.0  # a process that is killed loses the messages of this time at most
 _CHUNK_BYTES = 512 * 1024
-"""Bounds what the writer holds when a flush comes late. Without a bound a recorder that was held
-up for some seconds kept 1 to 4 MB more from then on; below 512 KiB nothing more is gained, and the
-index grows, 0.7 to 1.2 kB a chunk, which stays in memory to the end."""
+"""Bounds what the writer holds when a flush comes late. Without a bound a recorder that
+was held up for some seconds kept 1 to 4 MB more from then on; below 512 KiB nothing
+more is gained, and the index grows, 0.7 to 1.2 kB a chunk, which stays in memory to the
+end.
+"""
 
 
 class RecordingAborted(SstError):
-    """The recording could not be written any further; what is in it can be recovered."""
+    """The recording could not be written any further.
+
+    What is in it can be recovered.
+    """
 
 
 class _McapStorage:
@@ -44,7 +49,9 @@ class _McapStorage:
 
     def add_msgtype(self, connection: Connection) -> None:
         definition = connection.msgdef
-        encoding = "ros2msg" if definition.format == MessageDefinitionFormat.MSG else "ros2idl"
+        encoding = (
+            "ros2msg" if definition.format == MessageDefinitionFormat.MSG else "ros2idl"
+        )
         named = connection.msgtype, encoding, definition.data.encode()
         self._schemas[connection.msgtype] = self._writer.register_schema(*named)
 
@@ -53,8 +60,12 @@ class _McapStorage:
         named = connection.topic, "cdr", self._schemas[connection.msgtype], offered
         self._channels[connection.id] = self._writer.register_channel(*named)
 
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        self._writer.add_message(self._channels[connection.id], timestamp, bytes(data), timestamp)
+    def write(
+        self, connection: Connection, timestamp: int, data: bytes | memoryview
+    ) -> None:
+        self._writer.add_message(
+            self._channels[connection.id], timestamp, bytes(data), timestamp
+        )
 
     def flush(self) -> None:
         self._writer.flush()
@@ -71,11 +82,11 @@ class _McapStorage:
 class BagWriter(Writer):
     """Writes messages; once a second all of them go to the file.
 
-    A recording gets its index when it is closed. If that does not happen (kill -9, a full disk, a
-    power cut) the messages that were flushed are in its .mcap file, and `recover` makes a
-    whole recording of them. After that, and after `close`, `write`, `save` and `close` do nothing.
-    Raises InputError where the folder exists or cannot be made, and from any method
-    RecordingAborted when the file cannot be written.
+    A recording gets its index when it is closed. If that does not happen (kill -9, a
+    full disk, a power cut) the messages that were flushed are in its .mcap file, and
+    `recover` makes a whole recording of them. After that, and after `close`, `write`,
+    `save` and `close` do nothing. Raises InputError where the folder exists or cannot
+    be made, and from any method RecordingAborted when the file cannot be written.
     """
 
     STORAGE_PLUGINS = {StoragePlugin.MCAP: _McapStorage}  # noqa: RUF012  # as in its base
@@ -85,7 +96,9 @@ class BagWriter(Writer):
         given = "output", str(path), "must be a new folder"
         with refuse_errors("recorder", *given, WriterError, OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            super().__init__(path, version=self.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+            super().__init__(
+                path, version=self.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP
+            )
             self.open()
 
     @property
@@ -97,20 +110,27 @@ class BagWriter(Writer):
         """Return whether messages of a type can be written."""
         return message_type in self._typestore.types
 
-    def connect(self, topic: str, message_type: str, offered: Sequence[Qos] = ()) -> Connection:
+    def connect(
+        self, topic: str, message_type: str, offered: Sequence[Qos] = ()
+    ) -> Connection:
         """Add a topic; each only once."""
         return self.add_connection(
             topic, message_type, typestore=self._typestore, offered_qos_profiles=offered
         )
 
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+    def write(
+        self, connection: Connection, timestamp: int, data: bytes | memoryview
+    ) -> None:
         """Add a serialized message, received at a time [ns]."""
         self._try(super().write, connection, timestamp, data)
 
     def save(self) -> None:
         """Write all messages to the file, if that was a second ago."""
         now = time.monotonic()
-        if isinstance(self.storage, _McapStorage) and now - self._flushed >= FLUSH_PERIOD_S:
+        if (
+            isinstance(self.storage, _McapStorage)
+            and now - self._flushed >= FLUSH_PERIOD_S
+        ):
             self._flushed = now
             self._try(self.storage.flush)
 
@@ -126,8 +146,9 @@ class BagWriter(Writer):
             with contextlib.suppress(OSError):
                 self.abort()
             raise RecordingAborted(
-                f"{self.path} is cut: {error}. Recording stopped after {self.messages} messages; "
-                f"recover those that were written by: python -m sst_ros recover {self.path}"
+                f"{self.path} is cut: {error}. Recording stopped after {self.messages}"
+                " messages; recover those that were written by: python -m sst_ros"
+                f" recover {self.path}"
             ) from None
 
 
@@ -144,8 +165,9 @@ class Recovered(NamedTuple):
 def recover(path: Path, out: Path | None = None) -> Recovered:
     """Write the intact messages of a recording, a folder with one .mcap file or the file, anew.
 
-    The new folder is `path` with _recovered behind by default. Raises InputError where there is no
-    such file, it cannot be read or holds nothing, or where the new folder exists.
+    The new folder is `path` with _recovered behind by default. Raises InputError where
+    there is no such file, it cannot be read or holds nothing, or where the new folder
+    exists.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if len(files) != 1:
@@ -166,8 +188,17 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
                 connections[topic, kind] = writer.connect(topic, kind)
             writer.write(connections[topic, kind], received_ns, data)
     if writer is None:
-        raise refusal(path, "bag", files[0].name, "holds no message, or is no MCAP file")
-    with refuse_errors(str(target), "bag", str(target), "cannot be written", WriterError):
+        raise refusal(
+            path, "bag", files[0].name, "holds no message, or is no MCAP file"
+        )
+    with refuse_errors(
+        str(target), "bag", str(target), "cannot be written", WriterError
+    ):
         writer.close()
-    damage = [*file.describe(), *([f"{unknown} messages of unknown types"] if unknown else [])]
-    return Recovered(target, writer.messages, file.lost + unknown, file.cut, tuple(damage))
+    damage = [
+        *file.describe(),
+        *([f"{unknown} messages of unknown types"] if unknown else []),
+    ]
+    return Recovered(
+        target, writer.messages, file.lost + unknown, file.cut, tuple(damage)
+    )

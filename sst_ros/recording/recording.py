@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a recording holds of a run: all its topics as tables, and a whole run as arrays.
 
-Numbers have the bits of the recording. `read_signals` reads any recording in which some topic of a
-run is found; what it lacks is left out and named. `read` makes a `Recording` of it, which refuses
-what is not a whole run.
+Numbers have the bits of the recording. `read_signals` reads any recording in which some
+topic of a run is found; what it lacks is left out and named. `read` makes a `Recording`
+of it, which refuses what is not a whole run.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ ESSENTIAL = (topics.JOINT_STATES, topics.ORIENTATION, topics.TICKS, topics.SCENE
 """Topics without which a recording is not that of a run."""
 OPTIONAL = (topics.EULER, topics.DIAGNOSTICS, topics.COMMANDS)
 MEASURED_APART = 1e-9
-"""Angle [rad] by which joint_states are off the orientation where they are not the motion
-itself: those of a simulator agree to rounding."""
+"""Angle [rad] by which joint_states are off the orientation where they are not the
+motion itself: those of a simulator agree to rounding.
+"""
 MEASURED_SHARE = 0.1  # of the samples that must be, as single ones are faults
 
 
@@ -67,7 +68,8 @@ class Signals:
     bag: Bag  #: the recording: its path, topics, damage
     scene: Scene | None  #: what was simulated; None where it was not recorded
     start_ns: int  #: stamp of the start of the run [ns]
-    topic_series: dict[str, Series]  #: rows of each topic, none if not recorded, by its key
+    # : rows of each topic, none if not recorded, by its key
+    topic_series: dict[str, Series]
     idle_states: int  #: number of joint states that are no samples of the run
     foreign_states: int  #: number of joint states of other robots on the same topic
     statuses: tuple[Status, ...]  #: diagnostics, in order of reception
@@ -82,7 +84,9 @@ class Signals:
         """
         found = {}
         for name, listed in topics.TABLES.items():
-            parts = [one for table in listed if len(one := self.topic_series[table.key])]
+            parts = [
+                one for table in listed if len(one := self.topic_series[table.key])
+            ]
             if len(parts) == 1:
                 found[name] = parts[0]
             elif parts:
@@ -90,7 +94,9 @@ class Signals:
                 received = np.zeros(len(stamps), dtype=np.int64)
                 for part in parts:
                     at = np.searchsorted(stamps, part.stamp_ns)
-                    received[at] = np.where(received[at] > 0, received[at], part.received_ns)
+                    received[at] = np.where(
+                        received[at] > 0, received[at], part.received_ns
+                    )
                 columns = tuple(column for part in parts for column in part.columns)
                 values = np.hstack([part.at(stamps) for part in parts])
                 found[name] = Series(columns, stamps, received, values)
@@ -105,8 +111,8 @@ class Signals:
     def statuses_of(self, part: str, key: str) -> list[Status]:
         """Diagnostics of a part of the node that publishes a topic: other nodes send theirs, too.
 
-        All of that part where none has the name of the node, as in a bag that was played under
-        another name and recorded again.
+        All of that part where none has the name of the node, as in a bag that was
+        played under another name and recorded again.
         """
         name = f"{self.bag.topics.get(key, '').rpartition('/')[0]}: {part}"
         named = [one for one in self.statuses if one.name.endswith(f": {part}")]
@@ -139,9 +145,12 @@ class Signals:
         return self.legs(f"true_{name}" if recorded else name)
 
     def table(self, name: str = "samples") -> pd.DataFrame:
-        """Return a table as pandas, indexed by `time_ns`; `attrs` describes each column.
+        """Return a table as pandas, indexed by `time_ns`.
 
-        Columns in ns are whole numbers. Raises InputError where the recording has no such table.
+        `attrs` describes each column.
+
+        Columns in ns are whole numbers. Raises InputError where the recording has no
+        such table.
         """
         if name not in self.tables:
             allowed = "must be one of those in the bag: " + ", ".join(self.tables)
@@ -206,10 +215,10 @@ def read_signals(
 ) -> Signals:
     """Read a run from a rosbag2 recording, MCAP or sqlite3, in one pass.
 
-    With `damaged`, what is intact of a damaged recording; `Signals.bag.damage` names the
-    rest. The `namespace` is that of the simulator, where several runs are recorded. Raises
-    InputError where there is no recording, it is damaged, it has nothing of a run, or of
-    several runs none is named.
+    With `damaged`, what is intact of a damaged recording; `Signals.bag.damage` names
+    the rest. The `namespace` is that of the simulator, where several runs are recorded.
+    Raises InputError where there is no recording, it is damaged, it has nothing of a
+    run, or of several runs none is named.
     """
     path, tables = Path(path), {table.key: table for table in topics.TOPIC_TABLES}
     requested = [*tables.values(), topics.SCENE, topics.DIAGNOSTICS]
@@ -226,8 +235,11 @@ def read_signals(
     for key, one in of_run.items():
         if one.fault is not None:
             raise refusal(path, key, *one.fault.args) from None
-        if one.foreign and key != topics.JOINT_STATES.key:  # which others publish on, too
-            raise refusal(path, key, one.foreign, "messages have none of the robot's joints")
+        # which others publish on, too
+        if one.foreign and key != topics.JOINT_STATES.key:
+            raise refusal(
+                path, key, one.foreign, "messages have none of the robot's joints"
+            )
     nothing = _Heard(None)
     found = {}
     for key, table in tables.items():
@@ -239,7 +251,9 @@ def read_signals(
         raise refusal(path, "topics", listed, f"must have at least one of {endings}")
     scenes = of_run.get(topics.SCENE.key, nothing).scenes
     if len(scenes) > 1:
-        raise refusal(path, topics.SCENE.key, len(scenes), "the recording must hold one scene")
+        raise refusal(
+            path, topics.SCENE.key, len(scenes), "the recording must hold one scene"
+        )
     stamped = [found[table.key] for table in topics.STAMPED if len(found[table.key])]
     starts = [int(series.stamp_ns[0]) for series in stamped]
     firsts = [int(series.received_ns[0]) for series in found.values() if len(series)]
@@ -274,7 +288,8 @@ class JointSamples(NamedTuple):
     gamma_dot: Array  # rates [rad/s], shape (n, 3)
     mu_dot: Array
     beta_dot: Array
-    effort: Array  # actuator torques of the tick that ends at the sample [N m], shape (n, 3)
+    # actuator torques of the tick that ends at the sample [N m], shape (n, 3)
+    effort: Array
 
     @classmethod
     def of(cls, series: Series, start_ns: int) -> JointSamples:
@@ -290,7 +305,8 @@ class Ticks:
     start_ns: Integers  # relative to the start of the run, shape (m,)
     end_ns: Integers
     torque: Array  # of the actuators, held over the tick [N m], shape (m, 3)
-    moment: Array | None = None  # external moment on the star in {B} [N m], where recorded
+    # external moment on the star in {B} [N m], where recorded
+    moment: Array | None = None
 
     @property
     def period_ns(self) -> int:
@@ -304,57 +320,58 @@ class Ticks:
 
 
 class Recording(Explained, ReadOnly):
-    """A run from all tables of its bag. Samples are in order of time; rows belong to samples.
+    """A run from all tables of its bag. Samples are in order of time.
+
+    Rows belong to samples.
 
     Raises InputError, which names the fault, where they are not those of a whole run.
 
-    Attributes:
-        path: where the bag is.
-        scene: what was simulated.
-        start_ns: stamp of the start of the run [ns]; all other times but `received_ns` are
-            relative to it.
-        time_ns, received_ns: instant of each sample, and when the recorder got it by its own
-            clock [ns], shape (n,).
-        measured: the samples of joint_states, as the robot's sensors gave them.
-        gamma: joint angles of the actuators [rad], shape (n, 3): the true ones where they are
-            recorded (true_joint_states), else those measured; so all that follow.
-        mu: joint angles of the carriages.
-        beta: joint angles of the star.
-        gamma_dot: joint rates of the actuators [rad/s], shape (n, 3).
-        mu_dot: joint rates of the carriages.
-        beta_dot: joint rates of the star.
-        effort: actuator torques of the tick that ends at the sample [N m], shape (n, 3).
-        quaternion: orientation of {E} in {B}, (x, y, z, w), shape (n, 4); nan where it was lost.
-        euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where they were lost.
-        ticks: applied torques.
-        idle_states: number of joint states that are no samples, which are not in the arrays.
-        foreign_states: number of joint states of other robots, which are not either.
-        commands: recorded commands of both topics in order of their reception: `received_ns` and
-            `stamp_ns`, that of the sample which is answered, 0 where commands have none [ns],
-            shape (c,); `torque` [N m], shape (c, 3).
-        reports: diagnostics of the simulator's run: when received [ns], text by key.
-        diagnostics: the last of them; may be empty.
-        missing: keys of the topics that are not in the recording.
-        signals: those given.
-        table: `Signals.table`, a table as pandas by its name: samples (the default), ticks,
-            commands, commands_stamped or external_moment.
-
+    Attributes: path: where the bag is. scene: what was simulated. start_ns: stamp of
+        the start of the run [ns]; all other times but `received_ns` are relative to it.
+        time_ns, received_ns: instant of each sample, and when the recorder got it by
+        its own clock [ns], shape (n,). measured: the samples of joint_states, as the
+        robot's sensors gave them. gamma: joint angles of the actuators [rad], shape (n,
+        3): the true ones where they are recorded (true_joint_states), else those
+        measured; so all that follow. mu: joint angles of the carriages. beta: joint
+        angles of the star. gamma_dot: joint rates of the actuators [rad/s], shape (n,
+        3). mu_dot: joint rates of the carriages. beta_dot: joint rates of the star.
+        effort: actuator torques of the tick that ends at the sample [N m], shape (n,
+        3). quaternion: orientation of {E} in {B}, (x, y, z, w), shape (n, 4); nan where
+        it was lost. euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where
+        they were lost. ticks: applied torques. idle_states: number of joint states that
+        are no samples, which are not in the arrays. foreign_states: number of joint
+        states of other robots, which are not either. commands: recorded commands of
+        both topics in order of their reception: `received_ns` and `stamp_ns`, that of
+        the sample which is answered, 0 where commands have none [ns], shape (c,);
+        `torque` [N m], shape (c, 3). reports: diagnostics of the simulator's run: when
+        received [ns], text by key. diagnostics: the last of them; may be empty.
+        missing: keys of the topics that are not in the recording. signals: those given.
+        table: `Signals.table`, a table as pandas by its name: samples (the default),
+        ticks, commands, commands_stamped or external_moment.
     """
 
     def __init__(self, found: Signals) -> None:
         if not isinstance(found, Signals):
-            raise refusal(Path(), "found", found, "must be `Signals`, of `read_signals`")
+            raise refusal(
+                Path(), "found", found, "must be `Signals`, of `read_signals`"
+            )
         self.signals, self.path, self.table = found, found.bag.path, found.table
         absent = found.absent
-        if problems := [absent[topic.key] for topic in ESSENTIAL if topic.key in absent]:
+        if problems := [
+            absent[topic.key] for topic in ESSENTIAL if topic.key in absent
+        ]:
             raise InputError(str(self.path), problems)
         if found.scene is None:
-            raise refusal(self.path, topics.SCENE.key, 0, "the recording must hold one scene")
+            raise refusal(
+                self.path, topics.SCENE.key, 0, "the recording must hold one scene"
+            )
         self.scene, self.idle_states = found.scene, found.idle_states
         self.foreign_states = found.foreign_states
         self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
         runs = found.statuses_of("run", topics.SCENE.key)
-        self.reports = tuple((one.received_ns, one.values) for one in runs if "phase" in one.values)
+        self.reports = tuple(
+            (one.received_ns, one.values) for one in runs if "phase" in one.values
+        )
         self.diagnostics: dict[str, str] = self.reports[-1][1] if self.reports else {}
         joints, truth, orientation, euler, ticks = (
             _finite_rows(found, table)
@@ -367,12 +384,17 @@ class Recording(Explained, ReadOnly):
             )
         )
         if len(joints) < 2:
-            allowed = f"a run has two samples or more ({found.idle_states} lie before its start)"
+            allowed = (
+                f"a run has two samples or more ({found.idle_states} lie before its"
+                " start)"
+            )
             if fault := self.diagnostics.get("fault"):
                 allowed += f"; the simulator reports: {fault}"
             raise refusal(self.path, "joint_states", len(joints), allowed)
         if not len(ticks):
-            raise refusal(self.path, "applied_torques", 0, "the run has no recorded torque")
+            raise refusal(
+                self.path, "applied_torques", 0, "the run has no recorded torque"
+            )
         shown = truth if len(truth) >= 2 else joints
         self.start_ns = min(int(shown.stamp_ns[0]), int(ticks.stamp_ns[0]))
         self.measured = JointSamples.of(joints, self.start_ns)
@@ -382,7 +404,8 @@ class Recording(Explained, ReadOnly):
         self.euler = euler.at(shown.stamp_ns)
         with np.errstate(over="ignore"):  # too long is refused just below
             length = np.sqrt(np.einsum("ij,ij->i", self.quaternion, self.quaternion))
-        wrong = length[np.abs(length - 1.0) > 1e-6]  # nan compares False: lost is not wrong
+        # nan compares False: lost is not wrong
+        wrong = length[np.abs(length - 1.0) > 1e-6]
         if len(wrong):
             allowed = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), allowed)
@@ -390,15 +413,25 @@ class Recording(Explained, ReadOnly):
         end_ns = begin_ns + ticks.values[:, 0].astype(np.int64)
         overlap = ticks.stamp_ns[1:][begin_ns[1:] < end_ns[:-1]]
         if len(overlap):
-            allowed = f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
+            allowed = (
+                f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
+            )
             raise refusal(self.path, topics.TICKS.key, int(overlap[0]), allowed)
         moment = ticks.values[:, 4:]
         known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
         self.ticks = Ticks(begin_ns, end_ns, ticks.torque, moment if known else None)
-        parts = [found.topic_series[one.key] for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)]
-        order = np.argsort(np.concatenate([part.received_ns for part in parts]), kind="stable")
+        parts = [
+            found.topic_series[one.key]
+            for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)
+        ]
+        order = np.argsort(
+            np.concatenate([part.received_ns for part in parts]), kind="stable"
+        )
         names = ("stamp_ns", "received_ns", "values")
-        columns = (np.concatenate([getattr(part, name) for part in parts])[order] for name in names)
+        columns = (
+            np.concatenate([getattr(part, name) for part in parts])[order]
+            for name in names
+        )
         self.commands = Series(topics.COMMANDS.columns, *columns)
         self._freeze()
 
@@ -414,20 +447,26 @@ class Recording(Explained, ReadOnly):
 
     @cached_property
     def motion(self) -> JointSamples | None:
-        """The samples of the true motion; None where only what was measured of it is recorded.
+        """The samples of the true motion.
 
-        That is where joint_states are not those of the recorded orientation: they have noise,
-        a delay or the steps of encoders. A few samples that are not are faults of the
-        simulator, and are seen as such.
+        None where only what was measured of it is recorded.
+
+        That is where joint_states are not those of the recorded orientation: they have
+        noise, a delay or the steps of encoders. A few samples that are not are faults
+        of the simulator, and are seen as such.
         """
         if self._truth is not None:
             return self._truth
         shown = self._shown_joints
         angles = np.abs(np.angle(np.exp(1j * (self.measured.gamma - shown[:, :3]))))
-        rates = np.hstack([self.measured.gamma_dot, self.measured.mu_dot, self.measured.beta_dot])
+        rates = np.hstack(
+            [self.measured.gamma_dot, self.measured.mu_dot, self.measured.beta_dot]
+        )
         # Those of a body that turns: nine rates of three numbers.
         size = 1.0 + np.abs(rates).max(axis=1, initial=0.0)
-        off = np.maximum(angles.max(axis=1), np.abs(rates - shown[:, 3:]).max(axis=1) / size)
+        off = np.maximum(
+            angles.max(axis=1), np.abs(rates - shown[:, 3:]).max(axis=1) / size
+        )
         known = np.isfinite(off)
         apart = known.any() and np.mean(off[known] > MEASURED_APART) > MEASURED_SHARE
         return None if apart else self.measured
@@ -439,18 +478,24 @@ class Recording(Explained, ReadOnly):
         with np.errstate(all="ignore"):
             found = kernel.joints(model, tuple(self.states[:, :7].T))
         rows = *found.gamma, *found.gamma_dot, *found.mu_dot, *found.beta_dot
-        return np.stack([np.broadcast_to(row, self.time_ns.shape) for row in rows], axis=1)
+        return np.stack(
+            [np.broadcast_to(row, self.time_ns.shape) for row in rows], axis=1
+        )
 
     @cached_property
     def exact_gamma(self) -> Array:
-        """Angles of the actuators in the recorded orientations [rad], (n, 3); nan where lost."""
+        """Angles of the actuators in the recorded orientations [rad], (n, 3).
+
+        Nan where lost.
+        """
         return freeze(self._shown_joints[:, :3])
 
     @cached_property
     def measured_error(self) -> Array:
         """How far measured angles are from the true ones [rad], shape (m, 3), by leg.
 
-        The true ones are those recorded, else those of the orientation; nan where neither is.
+        The true ones are those recorded, else those of the orientation; nan where
+        neither is.
         """
         truth = self.exact_gamma if self._truth is None else self._truth.gamma
         at = places(self.time_ns, self.measured.time_ns)
@@ -467,7 +512,8 @@ class Recording(Explained, ReadOnly):
     def effort_difference(self) -> Array:
         """Largest difference of a sample's effort and the torque of the tick that ends at it.
 
-        [N m], shape (n,); nan where that tick is not recorded. Where actuators lag it is the lag.
+        [N m], shape (n,); nan where that tick is not recorded. Where actuators lag it
+        is the lag.
         """
         at = places(self.ticks.end_ns, self.time_ns)
         largest = np.abs(self.effort - self.ticks.torque[at]).max(axis=1)
@@ -478,9 +524,13 @@ class Recording(Explained, ReadOnly):
         return {
             "path": self.path,
             "scene": self.scene.name,
-            "samples": f"{len(self.time_ns)}, one in {self.period_ns / NANOSECONDS:g} s",
+            "samples": (
+                f"{len(self.time_ns)}, one in {self.period_ns / NANOSECONDS:g} s"
+            ),
             "time [s]": (self.seconds[0], self.seconds[-1]),
-            "ticks": f"{len(ticks.end_ns)} of {ticks.period_ns / 1e9:g} s; {ticks.gaps} gaps",
+            "ticks": (
+                f"{len(ticks.end_ns)} of {ticks.period_ns / 1e9:g} s; {ticks.gaps} gaps"
+            ),
             "commands": len(self.commands),
             "ended": reported.get("fault") or reported.get("phase") or "not reported",
             "missing": self.missing or "nothing",
@@ -507,9 +557,9 @@ class Recording(Explained, ReadOnly):
     def trajectory(self) -> Trajectory:
         """The run as a `Trajectory`; samples whose orientation was lost are left out.
 
-        Between samples `Trajectory.at` integrates under the recorded torques; where samples and
-        torques are lost there is a gap. Its error estimate, method and message are those that the
-        simulator reported.
+        Between samples `Trajectory.at` integrates under the recorded torques; where
+        samples and torques are lost there is a gap. Its error estimate, method and
+        message are those that the simulator reported.
         """
         known, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
         joints = np.hstack([getattr(self, name) for name in JOINTS])
@@ -519,8 +569,14 @@ class Recording(Explained, ReadOnly):
         fault = reported.get("fault", "")
         gaps = self._find_gaps(self.time_ns[known])
         lost = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
-        inside = [any(begin <= one < end for begin, end in gaps) for one in lost.tolist()]
-        law = TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque) if all(inside) else None
+        inside = [
+            any(begin <= one < end for begin, end in gaps) for one in lost.tolist()
+        ]
+        law = (
+            TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque)
+            if all(inside)
+            else None
+        )
         return Trajectory(
             self.scene,
             self.seconds[known],
@@ -539,12 +595,15 @@ class Recording(Explained, ReadOnly):
     def _find_gaps(self, time_ns: Integers) -> list[tuple[int, int]]:
         """Find the spans [ns] between these samples of which some torques are lost, too.
 
-        A span of one period is none: the torque of its last tick is the effort of its sample.
+        A span of one period is none: the torque of its last tick is the effort of its
+            sample.
         """
         begin, end = time_ns[:-1], time_ns[1:]
         edges = np.stack([self.ticks.start_ns, self.ticks.end_ns], axis=1).ravel()
         length = self.ticks.end_ns - self.ticks.start_ns
-        known_ns = np.append(0, np.cumsum(np.stack([length, 0 * length], axis=1).ravel()))[:-1]
+        known_ns = np.append(
+            0, np.cumsum(np.stack([length, 0 * length], axis=1).ravel())
+        )[:-1]
         held = np.diff(np.interp(time_ns, edges, known_ns))
         longer = end - begin > 1.5 * self.period_ns
         lost = longer & (held < (end - begin) - 0.5)
@@ -565,8 +624,8 @@ def _finite_rows(found: Signals, table: TopicTable) -> Series:
     ]
     if absent and table in (topics.JOINT_STATES, topics.TRUE_JOINT_STATES):
         allowed = (
-            "must have these: a whole run has angles and rates of all nine joints, and efforts "
-            "of the actuators; `export` writes what there is"
+            "must have these: a whole run has angles and rates of all nine joints, and"
+            " efforts of the actuators; `export` writes what there is"
         )
         raise refusal(found.bag.path, table.key, f"no {_shorten(absent)}", allowed)
     bad = ~finite.all(axis=1)
@@ -578,7 +637,9 @@ def _shorten(quantities: list[str]) -> str:
     """Write quantities, as in "mu_1, mu_2, mu_3, tau_1", with all three of a kind as one."""
     text = ", ".join(quantities)
     for kind in dict.fromkeys(name.rpartition("_")[0] for name in quantities):
-        text = text.replace(", ".join(f"{kind}_{leg}" for leg in (1, 2, 3)), f"{kind}_1..3")
+        text = text.replace(
+            ", ".join(f"{kind}_{leg}" for leg in (1, 2, 3)), f"{kind}_1..3"
+        )
     return text
 
 
@@ -588,18 +649,17 @@ def _usual(lengths_ns: Integers) -> int:
     return int(values[np.argmax(counts)])
 
 
-def read(path: str | Path, *, damaged: bool = False, namespace: str | None = None) -> Recording:
+def read(
+    path: str | Path, *, damaged: bool = False, namespace: str | None = None
+) -> Recording:
     """Read a rosbag2 recording of a run, MCAP or sqlite3, a folder or its file.
 
-    Args:
-        path: of the recording.
-        damaged: read what is intact of a damaged one; `signals.bag.damage` names the rest.
-        namespace: of the simulator, as "/left", where the recording has several runs.
+    Args: path: of the recording. damaged: read what is intact of a damaged one;
+        `signals.bag.damage` names the rest. namespace: of the simulator, as "/left",
+        where the recording has several runs.
 
-    Raises:
-        InputError: it is no recording of a run, or a damaged one, or it has several runs and
-            none is named.
-
+    Raises: InputError: it is no recording of a run, or a damaged one, or it has several
+        runs and none is named.
     """
     if not isinstance(path, (str, Path)):
         raise refusal(Path(), "path", path, "must be a path")
@@ -614,9 +674,13 @@ def read_run_motion(bag: str | Path) -> Trajectory:
     """Read the motion of a run, to be done again: two or more samples that have an orientation."""
     motion = read(bag).trajectory
     if len(motion) < 2:
-        raise refusal(Path(bag), "orientation", len(motion), "two samples or more must have one")
+        raise refusal(
+            Path(bag), "orientation", len(motion), "two samples or more must have one"
+        )
     for begin, end in motion.gaps.tolist():
-        allowed = f"must be of one motion: nothing is recorded from {begin:g} to {end:g} s"
+        allowed = (
+            f"must be of one motion: nothing is recorded from {begin:g} to {end:g} s"
+        )
         raise refusal(Path(bag), "orientation", len(motion), allowed)
     return motion
 
@@ -629,18 +693,25 @@ def export(
     force: bool = False,
     namespace: str | None = None,
 ) -> list[Path]:
-    """Write each table of a recording, as csv or parquet, into a folder; return the paths.
+    """Write each table of a recording, as csv or parquet, into a folder.
 
-    The folder is made if it is not there; `force` replaces earlier files; the `namespace` is
-    that of `read_signals`. Raises InputError where
-    the recording cannot be read, `out` cannot be written or is not empty, and MissingDependency.
+    Return the paths.
+
+    The folder is made if it is not there; `force` replaces earlier files; the
+    `namespace` is that of `read_signals`. Raises InputError where the recording cannot
+    be read, `out` cannot be written or is not empty, and MissingDependency.
     """
     require_free(out, "export", force=force)
     run = read_signals(bag, namespace=namespace)
     paths = [out / f"{name}.{form}" for name in run.tables]
     with write_into(out, "export"):
         for (name, series), path in zip(run.tables.items(), paths, strict=True):
-            table, columns = run.table(name).reset_index(), (*topics.TIMES, *series.columns)
-            about = {one.name: {"unit": one.unit, "description": one.text} for one in columns}
+            table, columns = (
+                run.table(name).reset_index(),
+                (*topics.TIMES, *series.columns),
+            )
+            about = {
+                one.name: {"unit": one.unit, "description": one.text} for one in columns
+            }
             write_table({key: table[key].to_numpy() for key in table}, path, about)
     return paths

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics of a run, the numbers in their messages, and the tables that these become.
 
-Columns bear their units. A recording that lacks a topic lacks its columns, and nothing else.
+Columns bear their units. A recording that lacks a topic lacks its columns, and nothing
+else.
 
 A recording may hold more than one robot, and topics of others whose names end alike:
-`/joint_state_broadcaster/joint_states`, the commands of another controller. The simulator
-publishes its scene, so that the name of this topic names its node; its other topics are
-named after the node, `joint_states` lies in the namespace of the node, and so do the
-controllers that follow a reference.
+`/joint_state_broadcaster/joint_states`, the commands of another controller. The
+simulator publishes its scene, so that the name of this topic names its node; its other
+topics are named after the node, `joint_states` lies in the namespace of the node, and
+so do the controllers that follow a reference.
 """
 
 from __future__ import annotations
@@ -40,7 +41,10 @@ KINDS = ("gamma", "mu", "beta")
 
 Integers: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = list[tuple[int, Sequence[float]]]
-"""Stamps [ns], 0 for none, and the numbers of one message; none for what is no part of a run."""
+"""Stamps [ns], 0 for none, and the numbers of one message.
+
+None for what is no part of a run.
+"""
 
 
 class Column(NamedTuple):
@@ -60,7 +64,9 @@ class Column(NamedTuple):
     @property
     def text(self) -> str:
         """What it is, its unit, its topic."""
-        return f"{self.what} [{self.unit}]" + (f", from {self.topic}" if self.topic else "")
+        return f"{self.what} [{self.unit}]" + (
+            f", from {self.topic}" if self.topic else ""
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +89,10 @@ class Series:
     """Rows of one table: of one topic, or of all topics at the stamps of samples."""
 
     columns: tuple[Column, ...]  #: what the numbers are
-    stamp_ns: Integers  #: stamps of the messages [ns], shape (n,); 0 where they have none
-    received_ns: Integers  #: by the recorder's clock [ns], shape (n,); 0 where it failed
+    # : stamps of the messages [ns], shape (n,); 0 where they have none
+    stamp_ns: Integers
+    # : by the recorder's clock [ns], shape (n,); 0 where it failed
+    received_ns: Integers
     values: Array  #: shape (n, number of columns); nan where a message was lost
 
     def __len__(self) -> int:
@@ -116,11 +124,13 @@ def places(among_ns: Integers, times_ns: Integers) -> Integers:
     return np.where(among_ns[at] == times_ns, at, -1)
 
 
-def sort_rows(table: TopicTable, times: array[int], numbers: array[float], path: Path) -> Series:
+def sort_rows(
+    table: TopicTable, times: array[int], numbers: array[float], path: Path
+) -> Series:
     """Return the rows of a topic in order of time, one at each stamp.
 
-    Their times are pairs of stamp and reception [ns]; their numbers follow each other, too. Raises
-    InputError where one recording, at this path, has two rows at a stamp.
+    Their times are pairs of stamp and reception [ns]; their numbers follow each other,
+    too. Raises InputError where one recording, at this path, has two rows at a stamp.
     """
     columns, at = table.columns, np.frombuffer(times, dtype=np.int64).reshape(-1, 2)
     values = np.frombuffer(numbers, dtype=float).reshape(len(at), len(columns))
@@ -132,7 +142,9 @@ def sort_rows(table: TopicTable, times: array[int], numbers: array[float], path:
             first = order[np.searchsorted(stamps, at[again, 0])]
             again = again[~(values[again] == values[first]).all(axis=1)]
         if len(again):
-            allowed = f"stamp {at[again[0], 0]} ns comes twice; record one simulator a bag"
+            allowed = (
+                f"stamp {at[again[0], 0]} ns comes twice; record one simulator a bag"
+            )
             raise refusal(path, table.key, len(again), allowed)
     if not np.array_equal(order, np.arange(len(at))):  # most need no copy
         at, values = at[order], values[order]
@@ -145,8 +157,8 @@ def sort_rows(table: TopicTable, times: array[int], numbers: array[float], path:
 def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
     """Read positions, velocities and the efforts of actuators of a JointState message.
 
-    What it does not have is nan: drivers leave out velocities, efforts and passive joints. A
-    message without any of the joints is none of this robot.
+    What it does not have is nan: drivers leave out velocities, efforts and passive
+    joints. A message without any of the joints is none of this robot.
     """
     stamp = nanoseconds(message.header.stamp)
     if is_idle(stamp, message.header.frame_id):
@@ -169,7 +181,10 @@ def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
 
 
 def _take_known(part: Sequence[float], at: Sequence[int]) -> list[float]:
-    """Take numbers by their places, which are negative for what is not there; then nan."""
+    """Take numbers by their places, which are negative for what is not there.
+
+    Then nan.
+    """
     return [float(part[k]) if k >= 0 and len(part) else np.nan for k in at]
 
 
@@ -184,7 +199,10 @@ def _find_joints(
 
 
 def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
-    """Read the parts of a vector or quaternion; where `stamped`, of messages with a stamp only."""
+    """Read the parts of a vector or quaternion.
+
+    Where `stamped`, of messages with a stamp only.
+    """
     parts = attrgetter(*(f"{vector}.{name}" for name in names))
     return partial(_read_parts, parts, stamped)
 
@@ -194,7 +212,9 @@ def _read_command(message: Any) -> Rows:
     return [(0, message.data.tolist())] if len(message.data) == 3 else []
 
 
-def _read_parts(parts: Callable[[Any], Sequence[float]], stamped: bool, message: Any) -> Rows:
+def _read_parts(
+    parts: Callable[[Any], Sequence[float]], stamped: bool, message: Any
+) -> Rows:
     stamp = nanoseconds(message.header.stamp)
     return [(stamp, parts(message))] if stamp or not stamped else []
 
@@ -211,7 +231,9 @@ def _read_ticks(message: Any) -> Rows:
     for point in message.points:
         effort = point.effort.tolist()
         if len(effort) != len(names):
-            raise InvalidMessage(effort, f"must be a torque for each actuator (stamp {start} ns)")
+            raise InvalidMessage(
+                effort, f"must be a torque for each actuator (stamp {start} ns)"
+            )
         begin, end = end, start + nanoseconds(point.time_from_start)
         if end <= begin:
             allowed = f"ticks must have a length; one at stamp {begin} ns has none"
@@ -246,8 +268,13 @@ def _table(
     *parts: tuple[Sequence[str], str, str],
     owner: str = SIMULATOR,
 ) -> TopicTable:
-    """Make the table of a topic by its key and owner; a part is columns, their unit and what."""
-    columns = [Column(name, unit, what, key) for names, unit, what in parts for name in names]
+    """Make the table of a topic by its key and owner.
+
+    A part is columns, their unit and what.
+    """
+    columns = [
+        Column(name, unit, what, key) for names, unit, what in parts for name in names
+    ]
     return TopicTable(key, message_type, owner, columns=tuple(columns), rows=rows)
 
 
@@ -317,7 +344,9 @@ COMMANDS = _table(
     _read_command,
     _COMMANDED,
 )
-STAMPED_COMMANDS = _table("commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED)
+STAMPED_COMMANDS = _table(
+    "commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED
+)
 MOMENT = _table(
     "external_moment",
     "geometry_msgs/msg/WrenchStamped",
@@ -329,7 +358,14 @@ SCENE = Topic("scene", "std_msgs/msg/String")
 DIAGNOSTICS = Topic("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", EVERYBODY)
 
 TABLES: dict[str, tuple[TopicTable, ...]] = {
-    "samples": (JOINT_STATES, TRUE_JOINT_STATES, ORIENTATION, EULER, REFERENCE, TRACKING_ERROR),
+    "samples": (
+        JOINT_STATES,
+        TRUE_JOINT_STATES,
+        ORIENTATION,
+        EULER,
+        REFERENCE,
+        TRACKING_ERROR,
+    ),
     "ticks": (TICKS,),
     "commands": (COMMANDS,),
     "commands_stamped": (STAMPED_COMMANDS,),
@@ -337,13 +373,20 @@ TABLES: dict[str, tuple[TopicTable, ...]] = {
 }
 """The tables of a run, and the topics in each: samples have a row at each stamp of their topics."""
 
-STAMPED = (*TABLES["samples"], TICKS)  # topics whose rows are ordered by stamps, one at each
+# topics whose rows are ordered by stamps, one at each
+STAMPED = (*TABLES["samples"], TICKS)
 TOPIC_TABLES = tuple(table for tables in TABLES.values() for table in tables)
 
 TIMES = (
-    Column("time", "ns", "time since the start of the run; of reception where there is no stamp"),
+    Column(
+        "time",
+        "ns",
+        "time since the start of the run; of reception where there is no stamp",
+    ),
     Column("stamp", "ns", "stamp of the message, 0 for none"),
-    Column("received", "ns", "when the recorder got it, by its clock; 0 where it did not"),
+    Column(
+        "received", "ns", "when the recorder got it, by its clock; 0 where it did not"
+    ),
 )
 """The first columns of every table, whole numbers; all others are doubles."""
 
@@ -364,19 +407,23 @@ class RunTopics(NamedTuple):
         return _parent(name.partition(":")[0]) in self.others
 
 
-def select_topics(bag: Bag, heard: Collection[str], namespace: str | None = None) -> RunTopics:
+def select_topics(
+    bag: Bag, heard: Collection[str], namespace: str | None = None
+) -> RunTopics:
     """Return the topics of the run in a namespace, by default of the only one.
 
-    `heard` are the topics that have messages of this robot. Raises InputError where there is
-    no run in the namespace, or none is given and there are several, or where two nodes
-    publish what only one can.
+    `heard` are the topics that have messages of this robot. Raises InputError where
+    there is no run in the namespace, or none is given and there are several, or where
+    two nodes publish what only one can.
     """
     nodes = _find_simulators(bag.candidates)
     spaces = {_parent(node) for node in nodes} or _find_namespaces(bag.candidates)
     chosen = _choose_namespace(bag, spaces, namespace)
     here = sorted(node for node in nodes if _parent(node) == chosen)
     if len(here) > 1:
-        allowed = "are of several simulators in one namespace; record one simulator a bag"
+        allowed = (
+            "are of several simulators in one namespace; record one simulator a bag"
+        )
         raise refusal(bag.path, SCENE.key, ", ".join(here), allowed)
     node = here[0] if here else None
     names = dict[str, str]()
@@ -394,7 +441,9 @@ def select_topics(bag: Bag, heard: Collection[str], namespace: str | None = None
     return RunTopics(chosen, node, names, frozenset({*spaces} - {chosen}))
 
 
-def find_absent(bag: Bag, requested: Collection[Topic], run: RunTopics) -> dict[str, Problem]:
+def find_absent(
+    bag: Bag, requested: Collection[Topic], run: RunTopics
+) -> dict[str, Problem]:
     """Return why a requested topic of a run is missing, by its key."""
     found = {}
     for topic in (one for one in requested if one.key not in run.names):
@@ -402,7 +451,10 @@ def find_absent(bag: Bag, requested: Collection[Topic], run: RunTopics) -> dict[
         typed = [f"{name} ({bag.channels[name]})" for name in others]
         allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
         if any(name in bag.candidates for name in others):
-            typed, where = others, run.node if topic.owner == SIMULATOR else run.namespace
+            typed, where = (
+                others,
+                run.node if topic.owner == SIMULATOR else run.namespace,
+            )
             allowed = f"no such topic is of {where}, whose scene is recorded; record it"
         found[topic.key] = Problem(topic.key, ", ".join(typed) or None, allowed)
     return found
@@ -414,24 +466,34 @@ def _choose_namespace(bag: Bag, spaces: Collection[str], namespace: str | None) 
     if namespace is not None:
         asked = "/" + namespace.strip("/")
         if asked not in spaces:
-            allowed = f"must be one in which a run is recorded: {listed or 'there is none'}"
+            allowed = (
+                f"must be one in which a run is recorded: {listed or 'there is none'}"
+            )
             raise refusal(bag.path, "namespace", namespace, allowed)
         return asked
     if len(spaces) > 1:
-        allowed = f"must be one of {listed}: the recording has a run in each (--namespace)"
+        allowed = (
+            f"must be one of {listed}: the recording has a run in each (--namespace)"
+        )
         raise refusal(bag.path, "namespace", None, allowed)
     return next(iter(spaces), "/")
 
 
 def _find_simulators(candidates: Mapping[str, Topic]) -> list[str]:
-    """Full names of the nodes that publish a scene; without one, those with other topics."""
+    """Full names of the nodes that publish a scene.
+
+    Without one, those with other topics.
+    """
     topics: dict[str, set[str]] = {}
     for name, topic in candidates.items():
         if topic.owner == SIMULATOR:
             topics.setdefault(_parent(name), set()).add(topic.key)
-    publishing = {node: keys & PUBLISHED for node, keys in topics.items() if keys & PUBLISHED}
+    publishing = {
+        node: keys & PUBLISHED for node, keys in topics.items() if keys & PUBLISHED
+    }
     with_scene = {node: keys for node, keys in publishing.items() if SCENE.key in keys}
-    # Another node may publish a text of the name `scene`, but nothing else of a simulator.
+    # Another node may publish a text of the name `scene`, but nothing else of a
+    # simulator.
     sure = [node for node, keys in with_scene.items() if len(keys) > 1]
     return sure or [*with_scene] or [*publishing] or [*topics]
 
@@ -439,7 +501,11 @@ def _find_simulators(candidates: Mapping[str, Topic]) -> list[str]:
 def _find_namespaces(candidates: Mapping[str, Topic]) -> set[str]:
     """Namespaces of runs of which no topic of the simulator's node is recorded."""
     beside = {_parent(n) for n, topic in candidates.items() if topic.owner == NAMESPACE}
-    below = {_parent(_parent(n)) for n, topic in candidates.items() if topic.owner == CONTROLLER}
+    below = {
+        _parent(_parent(n))
+        for n, topic in candidates.items()
+        if topic.owner == CONTROLLER
+    }
     return beside or below
 
 
@@ -459,7 +525,9 @@ def _find_controllers(
     most = max(map(len, chosen.values()), default=0)
     best = {node: found for node, found in chosen.items() if len(found) == most}
     if len(best) > 1:
-        allowed = "are of several controllers of this robot; record one controller a bag"
+        allowed = (
+            "are of several controllers of this robot; record one controller a bag"
+        )
         problem = Problem("reference", ", ".join(sorted(best)), allowed)
         raise InputError(str(bag.path), [problem])
     return next(iter(best.values()), {})

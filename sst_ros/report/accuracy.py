@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work-precision study: error and computing time of every method and setting on a scene.
 
-Each method has settings from coarse to fine. Fixed steps use no error estimate. Tolerances go to
-`Simulation`, whose estimate of the global error is counted and timed with it. The report shows the
-studies on the terminal, in files, and as one page.
+Each method has settings from coarse to fine. Fixed steps use no error estimate.
+Tolerances go to `Simulation`, whose estimate of the global error is counted and timed
+with it. The report shows the studies on the terminal, in files, and as one page.
 """
 
 from __future__ import annotations
@@ -43,13 +43,19 @@ FIXED, TOLERANCE = "fixed steps", "tolerance"
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 _TOLERANCES = tuple(10.0**-n for n in range(4, 14))
 TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
-"""Orientation errors for which the fastest setting is named [rad]; TARGET is in titles."""
+"""Orientation errors for which the fastest setting is named [rad].
 
-ABOVE_REFERENCE = 100.0  # errors are reported if they are so many times the reference's own
+TARGET is in titles.
+"""
+
+# errors are reported if they are so many times the reference's own
+ABOVE_REFERENCE = 100.0
 USELESS = 0.1  # an orientation error above this [rad] is a failure
 ROUNDING = 2e-14  # finer steps are not expected to give less than this [rad]
-LONGEST_RUN_S = 0.4  # no finer settings are tried after a run that took longer than this [s]
-LEAST_SETTINGS = 3  # are tried even where they take longer: a busy machine must not empty the grid
+# no finer settings are tried after a run that took longer than this [s]
+LONGEST_RUN_S = 0.4
+# are tried even where they take longer: a busy machine must not empty the grid
+LEAST_SETTINGS = 3
 
 ERROR = "largest_orientation_rad"
 ERRORS = [
@@ -57,10 +63,20 @@ ERRORS = [
     for when in ("final", "largest")
     for quantity in ("orientation_rad", "gamma_rad", "gamma_dot_rad_per_s")
 ]
-COLUMNS = ("scene", "method", "kind", "setting", "evaluations", "wall_min_s", *ERRORS, "failure")
-"""Columns of the solver grid. `setting` is the length of the steps [s] or the tolerance;
-`evaluations` has rejected steps in it, and is empty where they are not counted; errors are empty
-for a failure, and `failure` for a success."""
+COLUMNS = (
+    "scene",
+    "method",
+    "kind",
+    "setting",
+    "evaluations",
+    "wall_min_s",
+    *ERRORS,
+    "failure",
+)
+"""Columns of the solver grid. `setting` is the length of the steps [s] or the
+tolerance; `evaluations` has rejected steps in it, and is empty where they are not
+counted; errors are empty for a failure, and `failure` for a success.
+"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +87,8 @@ class WorkPrecision:
     seconds: float  # time span [s]
     ends: str  # why it ends before the scene's duration; empty where it does not
     reference: ReferenceSolution
-    rows: DataFrame  # the solver grid, columns as in COLUMNS; settings from coarse to fine
+    # the solver grid, columns as in COLUMNS; settings from coarse to fine
+    rows: DataFrame
     advice: StepAdvice  # as `scene show` prints it
     measured: float | None
     """Error of `simulate` with that advice [rad]; None where a limit stops it."""
@@ -94,8 +111,9 @@ class WorkPrecision:
     def best(self, target: float) -> Series[Any] | None:
         """Return the fastest setting with an orientation error of at most `target` [rad].
 
-        A setting counts only if at least one finer setting of its method was tried and every one
-        of them is as good: a coarse setting whose errors happen to cancel is no recommendation.
+        A setting counts only if at least one finer setting of its method was tried and
+        every one of them is as good: a coarse setting whose errors happen to cancel is
+        no recommendation.
         """
         good: list[Any] = []
         if self.rests:
@@ -109,7 +127,9 @@ class WorkPrecision:
     @cached_property
     def fastest(self) -> dict[float, Series[Any]]:
         """The fastest setting for each of TARGETS that has one and is not below the floor."""
-        found = {target: self.best(target) for target in TARGETS if target >= self.floor}
+        found = {
+            target: self.best(target) for target in TARGETS if target >= self.floor
+        }
         return {target: row for target, row in found.items() if row is not None}
 
 
@@ -124,7 +144,10 @@ def study_scene(scene: Scene, *, shown: bool = False) -> WorkPrecision:
     # One after another: computing times are those of a core that is free.
     results = run_many(refine, grid, label=f"{scene.name:<16}" * shown)
     rows = [row for _, refined in results for row in refined]
-    motion, measured = simulate(scene, duration=problem.seconds, t_eval=problem.times), None
+    motion, measured = (
+        simulate(scene, duration=problem.seconds, t_eval=problem.times),
+        None,
+    )
     if len(motion) > problem.count:  # else a limit stops it before
         states = np.hstack([motion.quaternion, motion.body_rate])
         measured = problem.errors(states, truth.states)[1].orientation
@@ -143,8 +166,8 @@ def study_scene(scene: Scene, *, shown: bool = False) -> WorkPrecision:
 def proven_error(*given: Any, **options: Any) -> str:
     """Return the proven bound of the error of `simulate` as a cell of a table.
 
-    It takes what `certify` takes. Where the proof ends early the time is named, where nothing is
-    proven there is a dash, and both have a reason.
+    It takes what `certify` takes. Where the proof ends early the time is named, where
+    nothing is proven there is a dash, and both have a reason.
     """
     try:
         # They need python-flint, which others do not.
@@ -156,7 +179,9 @@ def proven_error(*given: Any, **options: Any) -> str:
         return f"-: {str(refused).splitlines()[0]}"
     if math.isinf(proven.error):
         return f"-: {proven.reason}"
-    until = f" to {write_down(proven.until, 4)} s: {proven.reason}" if proven.reason else ""
+    until = (
+        f" to {write_down(proven.until, 4)} s: {proven.reason}" if proven.reason else ""
+    )
     return f"{write_up(proven.error)} rad{until}"
 
 
@@ -179,7 +204,9 @@ def list_settings(problem: InitialValueProblem) -> Iterator[Iterator[SolverSetti
             yield _list_tolerances(problem, method.name)
 
 
-def _list_steps(problem: InitialValueProblem, method: Method) -> Iterator[SolverSetting]:
+def _list_steps(
+    problem: InitialValueProblem, method: Method
+) -> Iterator[SolverSetting]:
     machine, drive = steps_of(problem.system, method), Drive(tuple(problem.drive))
     for steps in _STEPS_PER_INTERVAL:
         h, start = problem.interval / steps, list(problem.start)
@@ -188,14 +215,18 @@ def _list_steps(problem: InitialValueProblem, method: Method) -> Iterator[Solver
         yield SolverSetting(method.name, FIXED, h, solve, timed)
 
 
-def _list_tolerances(problem: InitialValueProblem, method: str) -> Iterator[SolverSetting]:
+def _list_tolerances(
+    problem: InitialValueProblem, method: str
+) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
         run = partial(problem.run_simulation, problem.simulation(method, tolerance))
         yield SolverSetting(method, TOLERANCE, tolerance, run, run)
 
 
 def _refine(
-    settings: Iterator[SolverSetting], problem: InitialValueProblem, truth: ReferenceSolution
+    settings: Iterator[SolverSetting],
+    problem: InitialValueProblem,
+    truth: ReferenceSolution,
 ) -> list[dict[str, Any]]:
     """Go from coarse to fine until a run takes long or two errors lie below the floor."""
     rows, below = list[dict[str, Any]](), 0
@@ -203,7 +234,9 @@ def _refine(
     for setting in settings:
         rows.append(row := _measure(setting, problem, truth))
         below += row.get(ERROR, math.inf) < floor
-        if (row["wall_min_s"] > LONGEST_RUN_S and len(rows) >= LEAST_SETTINGS) or below > 1:
+        if (
+            row["wall_min_s"] > LONGEST_RUN_S and len(rows) >= LEAST_SETTINGS
+        ) or below > 1:
             break
     return rows
 
@@ -212,7 +245,9 @@ def _measure(
     setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
 ) -> dict[str, Any]:
     """Run one setting: its row of the grid."""
-    row: dict[str, Any] = dict(zip(("method", "kind", "setting"), setting[:3], strict=True))
+    row: dict[str, Any] = dict(
+        zip(("method", "kind", "setting"), setting[:3], strict=True)
+    )
     row |= {"evaluations": None, "wall_min_s": 0.0, "failure": ""}
     with np.errstate(all="ignore"):
         try:
@@ -225,7 +260,9 @@ def _measure(
             if not np.isfinite(states[:, :7]).all():
                 raise ArithmeticError("not finite")
             final, largest = problem.errors(states, truth.states)
-            if not largest.orientation <= USELESS or not math.isfinite(largest.gamma_dot):
+            if not largest.orientation <= USELESS or not math.isfinite(
+                largest.gamma_dot
+            ):
                 raise ArithmeticError(f"off by {largest.orientation:.1g} rad")
             row |= dict(zip(ERRORS, (*final, *largest), strict=True))
         except (SstError, ArithmeticError, ValueError) as error:
@@ -234,10 +271,12 @@ def _measure(
 
 
 def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision]:
-    """Study scenes one after another; print each, and write all finished results into `out`.
+    """Study scenes one after another.
 
-    Files: accuracy.csv, .json, .md, and accuracy_SCENE.png. Raises SstError where a scene is
-    refused or cannot start, or `out` cannot be written.
+    Print each, and write all finished results into `out`.
+
+    Files: accuracy.csv, .json, .md, and accuracy_SCENE.png. Raises SstError where a
+    scene is refused or cannot start, or `out` cannot be written.
     """
     studies: list[WorkPrecision] = []
     for each in [scenes.load(name) for name in names]:
@@ -245,8 +284,14 @@ def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision
         studies.append(study)
         print(accuracy_text(study), flush=True)
         rows = [row for one in studies for row in records(one.rows)]
-        files = {".csv": data_frame(rows), ".json": {"rows": rows}, ".md": accuracy_page(studies)}
-        drawn = {} if study.rests else {f"accuracy_{each.name}.png": draw_accuracy(study)}
+        files = {
+            ".csv": data_frame(rows),
+            ".json": {"rows": rows},
+            ".md": accuracy_page(studies),
+        }
+        drawn = (
+            {} if study.rests else {f"accuracy_{each.name}.png": draw_accuracy(study)}
+        )
         publish(out, "accuracy", {**files, **drawn})
     return studies
 
@@ -255,12 +300,20 @@ def name_fastest(study: WorkPrecision) -> str:
     """Return the fastest setting for TARGET as a sentence."""
     best = study.best(TARGET)
     if study.rests:
-        return "It rests: it has no torques of its own, a controller drives it along its motion."
+        return (
+            "It rests: it has no torques of its own, a controller drives it along its"
+            " motion."
+        )
     if best is not None:
         return f"{TARGET:.0e} rad over {study.seconds:g} s: {_setting(best)}."
     least = study.rows[ERROR].astype(float).min()
-    reached = f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
-    return f"No setting that was tried reaches {TARGET:.0e} rad with every finer one; {reached}."
+    reached = (
+        f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
+    )
+    return (
+        f"No setting that was tried reaches {TARGET:.0e} rad with every finer one;"
+        f" {reached}."
+    )
 
 
 def _setting(row: Series[Any]) -> str:
@@ -271,8 +324,12 @@ def _setting(row: Series[Any]) -> str:
 
 def accuracy_text(study: WorkPrecision) -> str:
     """Format a study for the terminal: its part of the page, and the grid."""
-    shown = study.rows.drop(columns=["scene", "final_gamma_rad", "final_gamma_dot_rad_per_s"])
-    shown["failure"] = [f"FAILED: {why[:40]}" if why else "" for why in study.rows.failure]
+    shown = study.rows.drop(
+        columns=["scene", "final_gamma_rad", "final_gamma_dot_rad_per_s"]
+    )
+    shown["failure"] = [
+        f"FAILED: {why[:40]}" if why else "" for why in study.rows.failure
+    ]
     grid = shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
     return accuracy_page([study], whole=False) + f"\n{grid}\n"
 
@@ -292,14 +349,20 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
     rows, floor = study.rows, study.floor
     figure = Figure(figsize=(10.5, 6.2))
     axes = figure.subplots()
-    axes.set(xscale="log", yscale="log", ylabel="largest error of the orientation [rad]")
+    axes.set(
+        xscale="log", yscale="log", ylabel="largest error of the orientation [rad]"
+    )
     axes.set_xlabel(f"wall time for {study.seconds:g} s of motion [ms]")
     drawn = rows[(rows[ERROR] >= floor) & (rows[ERROR] > 0.0)]
     for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
         colour, marker = MARKERS[name]
-        hollow: Looks = {} if kind == FIXED else {"markerfacecolor": "white", "linestyle": "--"}
+        hollow: Looks = (
+            {} if kind == FIXED else {"markerfacecolor": "white", "linestyle": "--"}
+        )
         looks: Looks = {"color": colour, "marker": marker, "markersize": 6.5, **hollow}
-        axes.plot(1e3 * group.wall_min_s, group[ERROR], label=f"{name}, {kind}", **looks)
+        axes.plot(
+            1e3 * group.wall_min_s, group[ERROR], label=f"{name}, {kind}", **looks
+        )
     errors = drawn[ERROR].astype(float) if len(drawn) else np.array([1e-3, 1.0])
     low = 10.0 ** math.floor(math.log10(errors.min()) - 0.7)
     axes.set_ylim(low, 10.0 ** math.ceil(math.log10(errors.max()) + 0.01))
@@ -316,6 +379,8 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
     axes.yaxis.set_minor_formatter(NullFormatter())
     if axes.get_legend_handles_labels()[0]:  # none where every setting failed
         figure.legend(fontsize=8, frameon=False, loc="outside right center")
-    figure.suptitle(f"{study.scene}: error against wall time\n{name_fastest(study)}", fontsize=12)
+    figure.suptitle(
+        f"{study.scene}: error against wall time\n{name_fastest(study)}", fontsize=12
+    )
     note(figure, f"Reference: {study.reference.how}. {provenance()}", 145)
     return figure

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene as an initial value problem, and its reference solution, with the error of that.
 
-Torques are continuous functions of time, not held over control periods: zero where the scene has
-none. The span ends at the first limit that stops the run. DOP853 solves in extended precision, by
-the code that is generated for it: what the methods solve, to the last bit. Its steps are halved
-until the solution stops changing; its own error is twice the last change. Elastic stops and torque
-limits have kinks; there, and where no step is short enough, `Simulation` is the reference.
+Torques are continuous functions of time, not held over control periods: zero where the
+scene has none. The span ends at the first limit that stops the run. DOP853 solves in
+extended precision, by the code that is generated for it: what the methods solve, to the
+last bit. Its steps are halved until the solution stops changing; its own error is twice
+the last change. Elastic stops and torque limits have kinks; there, and where no step is
+short enough, `Simulation` is the reference.
 """
 
 from __future__ import annotations
@@ -45,10 +46,14 @@ _MOST_STEPS = 25_000  # in extended precision: half a minute's work
 INTERVALS = 20  # solutions are compared at this many instants or more
 
 EXACT = replace(
-    DOP853, b=(*DOP853.b[:-1], float(1 - sum(map(Fraction, DOP853.b[:-1])))), error=(), damping=()
+    DOP853,
+    b=(*DOP853.b[:-1], float(1 - sum(map(Fraction, DOP853.b[:-1])))),
+    error=(),
+    damping=(),
 )
-"""DOP853 without error estimates. As doubles its weights do not quite add up to 1, which no step
-size would show; here they do, exactly."""
+"""DOP853 without error estimates. As doubles its weights do not quite add up to 1,
+which no step size would show; here they do, exactly.
+"""
 
 
 class StateError(NamedTuple):
@@ -62,9 +67,9 @@ class StateError(NamedTuple):
 class InitialValueProblem:
     """A scene as an initial value problem.
 
-    Raises AssemblyError where the initial gamma has no unique admissible assembly, InputError where
-    the scene cannot start, or stops at once. Solutions are compared at instants `interval_ns`
-    apart, by default at INTERVALS of them or more.
+    Raises AssemblyError where the initial gamma has no unique admissible assembly,
+    InputError where the scene cannot start, or stops at once. Solutions are compared at
+    instants `interval_ns` apart, by default at INTERVALS of them or more.
     """
 
     def __init__(self, scene: Scene, interval_ns: int | None = None) -> None:
@@ -73,38 +78,53 @@ class InitialValueProblem:
         self.system = ODE(self.dynamics, scene.torque, work=True)
         self.drive = (0.0,) * len(self.system.drive)  # its inputs
         start = initial_state(scene, Geometry.of(scene))
-        self.start = (*start, *(0.0,) * (len(self.system.state) - len(start)))  # at time zero
+        # at time zero
+        self.start = (*start, *(0.0,) * (len(self.system.state) - len(start)))
         largest = max(map(abs, scene.torque.amplitude)) if scene.torque else 0.0
         self.clamped = scene.torque_limit is not None and largest > scene.torque_limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"
         motion = simulate(scene, duration=scene.duration or WHOLE_RUN_S)
         whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
-        self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""  # before the duration
+        # before the duration
+        self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
         lasts = whole * NANOSECONDS >= 1000 * INTERVALS
-        allowed = f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
+        allowed = (
+            f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
+        )
         refuse_unless(scene.name, ("initial", whole, lasts, allowed))
         # Instants of comparison lie 1, 2 or 5 times a power of ten apart.
-        whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)  # may be a little less than it is called
+        # may be a little less than it is called
+        whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)
         lengths = (f * 10**n for n in range(18) for f in (1, 2, 5))
-        self.interval_ns = interval_ns or max(x for x in lengths if x * INTERVALS <= whole_ns)
+        self.interval_ns = interval_ns or max(
+            x for x in lengths if x * INTERVALS <= whole_ns
+        )
         self.interval = self.interval_ns / NANOSECONDS  # [s]
         self.count = math.floor(whole_ns / self.interval_ns)
-        self.times: Array = self.interval_ns * np.arange(self.count + 1) / NANOSECONDS  # [s]
+        # [s]
+        self.times: Array = self.interval_ns * np.arange(self.count + 1) / NANOSECONDS
         self.seconds = float(self.times[-1])
 
     def errors(
         self, solution: Array | LongArray, reference: LongArray
     ) -> tuple[StateError, StateError]:
-        """Distances of states (m, 7 or more) at the end, and the largest; nan where unknown."""
+        """Distances of states (m, 7 or more) at the end, and the largest.
+
+        Nan where unknown.
+        """
         angle = angle_between(solution[:, :4], reference[:, :4]).astype(float)
         joints = np.abs(self.joints(solution) - self.joints(reference)).max(axis=1)
         found = np.vstack([angle, joints])
-        return StateError(*found[:, -1].tolist()), StateError(*found.max(axis=1).tolist())
+        return StateError(*found[:, -1].tolist()), StateError(
+            *found.max(axis=1).tolist()
+        )
 
     def joints(self, solution: Array | LongArray) -> Array:
         """Angles gamma [rad] and rates gamma_dot [rad/s] of states (m, 7 or more), (2, 3, m)."""
         with np.errstate(all="ignore"):
-            found = kernel.joints(self.dynamics.model, tuple(solution[:, :7].astype(float).T))
+            found = kernel.joints(
+                self.dynamics.model, tuple(solution[:, :7].astype(float).T)
+            )
         return np.array([found.gamma, found.gamma_dot])
 
     def run_steps(self, method: MethodSteps, steps: int) -> Run:
@@ -121,7 +141,9 @@ class InitialValueProblem:
 
     def simulation(self, method: str, tolerance: float) -> Simulation:
         """Return a simulation whose steps may take long."""
-        return Simulation(self.scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET)
+        return Simulation(
+            self.scene, method, tolerance=tolerance, step_budget=WHOLE_MOTION_BUDGET
+        )
 
     def run_simulation(self, simulation: Simulation) -> Run:
         """Begin a simulation again and run it; raises RunStopped at a limit."""
@@ -142,7 +164,10 @@ class ReferenceSolution(NamedTuple):
 
 
 def solve_reference(problem: InitialValueProblem) -> ReferenceSolution:
-    """Solve a problem as accurately as possible; raises RunStopped where no step resolves it."""
+    """Solve a problem as accurately as possible.
+
+    Raises RunStopped where no step resolves it.
+    """
     found = None if problem.kinked else _halve_steps(problem)
     if found is not None:
         rough, fine, steps = found
@@ -150,25 +175,32 @@ def solve_reference(problem: InitialValueProblem) -> ReferenceSolution:
         how = f"DOP853, {problem.interval / steps:.3g} s steps, {numbers}"
     else:
         rough, fine = (
-            problem.run_simulation(problem.simulation("dop853", tolerance))[0].astype(np.longdouble)
+            problem.run_simulation(problem.simulation("dop853", tolerance))[0].astype(
+                np.longdouble
+            )
             for tolerance in (1e-13, 1e-14)
         )
         how = "Simulation, dop853, tolerance 1e-14"
     # Twice the difference of two solutions, but not less than doubles resolve.
     change = problem.errors(rough, fine)[1]
     least = 1e-17, *(2.3e-16 * np.abs(problem.joints(fine)).max(axis=(1, 2))).tolist()
-    own = StateError(*(max(2.0 * x, floor) for x, floor in zip(change, least, strict=True)))
+    own = StateError(
+        *(max(2.0 * x, floor) for x, floor in zip(change, least, strict=True))
+    )
     return ReferenceSolution(fine, own, how)
 
 
-def _halve_steps(problem: InitialValueProblem) -> tuple[LongArray, LongArray, int] | None:
+def _halve_steps(
+    problem: InitialValueProblem,
+) -> tuple[LongArray, LongArray, int] | None:
     """Halve the steps until the solution stops changing: the last two, and steps an interval.
 
     None where so many steps as are allowed do not suffice.
     """
     steps, change = 1, math.inf
     before = after = run_extended(problem, 1)
-    most = max(_MOST_STEPS, 4 * problem.count)  # all of them together; halved at least once
+    # all of them together; halved at least once
+    most = max(_MOST_STEPS, 4 * problem.count)
     while 4 * steps * problem.count <= most and not change < 1e-17:
         before, last, steps = after, change, 2 * steps
         after = run_extended(problem, steps)
@@ -192,7 +224,8 @@ def exact_derivative(problem: InitialValueProblem) -> Derivative:
 def run_extended(problem: InitialValueProblem, steps: int) -> LongArray:
     """States at the instants, in long doubles, with `steps` steps of EXACT an interval.
 
-    The quaternion is kept at length 1. A row of nan stands where there is no finite state.
+    The quaternion is kept at length 1. A row of nan stands where there is no finite
+    state.
     """
     derivative, number = exact_derivative(problem), np.longdouble
     result = np.full((problem.count + 1, len(problem.start)), np.nan, dtype=number)

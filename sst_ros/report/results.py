@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 WHOLE_RUN_S = 1.0  # length of a run [s] where the scene names no duration
 
 
-def data_frame(rows: Iterable[Mapping[str, Any]], names: Iterable[str] | None = None) -> DataFrame:
+def data_frame(
+    rows: Iterable[Mapping[str, Any]], names: Iterable[str] | None = None
+) -> DataFrame:
     """Return a DataFrame of rows; what is unknown stays None."""
     listed, names = list(rows), names and list(names)
     frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
@@ -52,9 +54,14 @@ def largest(values: Array) -> float | None:
 
 def markdown(frame: DataFrame) -> str:
     """Return a table of texts as Markdown."""
-    lines = ["| " + " | ".join(map(str, frame.columns)) + " |", "| --- " * len(frame.columns) + "|"]
+    lines = [
+        "| " + " | ".join(map(str, frame.columns)) + " |",
+        "| --- " * len(frame.columns) + "|",
+    ]
     cells = frame.astype(object).where(frame.notna(), "-")
-    lines += ["| " + " | ".join(map(str, row)) + " |" for row in cells.itertuples(index=False)]
+    lines += [
+        "| " + " | ".join(map(str, row)) + " |" for row in cells.itertuples(index=False)
+    ]
     return "\n".join(lines)
 
 
@@ -74,8 +81,8 @@ def render(template: str | Path, **values: Any) -> str:
 def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
     """Write files of a report into `out`: tables, documents (JSON), pages and figures.
 
-    The name of a file that begins with a point follows that of the report. Raises InputError, which
-    names the report, where `out` cannot be written.
+    The name of a file that begins with a point follows that of the report. Raises
+    InputError, which names the report, where `out` cannot be written.
     """
     with write_into(out, name):
         for file, content in files.items():
@@ -98,8 +105,9 @@ def provenance(made: Mapping[str, Any] | None = None) -> str:
     made = made or made_on()
     compiler = f"llvmlite {made['llvmlite']}" if made["llvmlite"] else "plain Python"
     return (
-        f"sst_ros {made['sst_ros']}, Python {made['python']}, {compiler}, NumPy {made['numpy']}, "
-        f"{made['processor']}, {made['processors']} cores, {made['platform']}, {made['date']}"
+        f"sst_ros {made['sst_ros']}, Python {made['python']}, {compiler}, NumPy"
+        f" {made['numpy']}, {made['processor']}, {made['processors']} cores,"
+        f" {made['platform']}, {made['date']}"
     )
 
 
@@ -113,7 +121,9 @@ def made_on() -> dict[str, Any]:
         "processor": processor(),
         "platform": platform.platform(),
         "processors": os.cpu_count(),
-        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+        "date": (
+            datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+        ),
     }
 
 

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report of one recorded run, from its bag alone: numbers, page and pictures.
 
-The numbers are one flat mapping, units in the names, nothing that is not finite; what a recording
-does not contain is None, never a guess.
+The numbers are one flat mapping, units in the names, nothing that is not finite; what a
+recording does not contain is None, never a guess.
 
-Periods are between the receptions of consecutive samples by the recorder, so that they hold the
-jitter of simulator, transport and recorder together. A command is paired with the first tick that
-applies its values. Two delays are measured:
+Periods are between the receptions of consecutive samples by the recorder, so that they
+hold the jitter of simulator, transport and recorder together. A command is paired with
+the first tick that applies its values. Two delays are measured:
 
-- By the recorder's clock, from the reception of the command to the step. The simulator begins the
-  step of a tick when the tick ends, with the newest command that it has; when that was is read from
-  the receptions of the samples, at the tick's end between two of them. This holds at any pace and
-  with any clock in the stamps, and includes the transport of the samples to the recorder.
-- By stamps, from that of a command, which is that of the sample it answers, to the beginning of the
-  tick: simulated time between what was measured and what was done about it.
+- By the recorder's clock, from the reception of the command to the step. The simulator
+  begins the step of a tick when the tick ends, with the newest command that it has;
+  when that was is read from the receptions of the samples, at the tick's end between
+  two of them. This holds at any pace and with any clock in the stamps, and includes the
+  transport of the samples to the recorder.
+- By stamps, from that of a command, which is that of the sample it answers, to the
+  beginning of the tick: simulated time between what was measured and what was done
+  about it.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 
 PAGE, HTML = "page.png", "page.html"
 
-ERROR_LIMIT_RAD = 1e-9  # of the integration, where the tolerance of the run was not recorded
+# of the integration, where the tolerance of the run was not recorded
+ERROR_LIMIT_RAD = 1e-9
 
 REPORTED = (
     *("ticks_missed", "ticks", "step_mean_us"),
@@ -54,25 +57,36 @@ REPORTED = (
 )
 """Numbers of the diagnostics that are shown over the run."""
 
-STATISTICS = {"min": "min", "mean": "mean", "99%": "p99", "99.9%": "p99_9", "max": "max"}
+STATISTICS = {
+    "min": "min",
+    "mean": "mean",
+    "99%": "p99",
+    "99.9%": "p99_9",
+    "max": "max",
+}
 """What is shown of periods and delays, as pandas and as the summary name it."""
 
 
 class Timing(NamedTuple):
     """Timing of a recording by its clocks."""
 
-    period_us: Array  # between receptions of samples that follow each other [us], shape (p,)
+    # between receptions of samples that follow each other [us], shape (p,)
+    period_us: Array
     lost_s: Array  # times of lost samples [s], shape (l,)
     gaps_s: Array  # times at which a tick does not begin where the one before ended [s]
-    pace: Series[float]  # simulated time per time on the recorder's clock, over time [s]
+    # simulated time per time on the recorder's clock, over time [s]
+    pace: Series[float]
     reported: DataFrame
-    """A row for each of the simulator's reports: time_s of the run, and the numbers of REPORTED,
-    nan where one was not reported."""
+    """A row for each of the simulator's reports: time_s of the run, and the numbers of
+    REPORTED, nan where one was not reported.
+    """
     commands: DataFrame
-    """A row for each command that was followed: time_s, when the tick begins that applied it;
-    received_us, from its reception to the step; stamped_us, from its stamp to the beginning of the
-    tick, nan where it has none; tick, its number."""
-    numbers: dict[str, Any]  # all in all: flat, units in the names, None for what is not known
+    """A row for each command that was followed: time_s, when the tick begins that
+    applied it; received_us, from its reception to the step; stamped_us, from its stamp
+    to the beginning of the tick, nan where it has none; tick, its number.
+    """
+    # all in all: flat, units in the names, None for what is not known
+    numbers: dict[str, Any]
     missing: list[str]  # what is not known, and why
 
 
@@ -92,32 +106,50 @@ def evaluate_run(run: Recording) -> RunEvaluation:
     with ThreadPoolExecutor(1) as pool:
         beside = pool.submit(reference.ideal, run)
         integration, ideal = reference.integration(run), beside.result()
-    numbers = _count(run, measured) | summarise(run, integration, ideal) | measured.numbers
+    numbers = (
+        _count(run, measured) | summarise(run, integration, ideal) | measured.numbers
+    )
     given = {"run": run, "integration": integration, "ideal": ideal, "s": numbers}
-    said = render("run.txt", part="findings", begins=reference.begins(run), **given).splitlines()
+    said = render(
+        "run.txt", part="findings", begins=reference.begins(run), **given
+    ).splitlines()
     notes = [line.removeprefix("Note: ") for line in said if line.startswith("Note: ")]
-    wrong = [line for line in said if not line.startswith("Note: ")]  # in order of weight
-    summary = {"verdict": "WARNING" if wrong else "OK", "reasons": wrong, "notes": notes} | numbers
+    wrong = [
+        line for line in said if not line.startswith("Note: ")
+    ]  # in order of weight
+    summary = {
+        "verdict": "WARNING" if wrong else "OK",
+        "reasons": wrong,
+        "notes": notes,
+    } | numbers
     return RunEvaluation(measured, integration, ideal, summary)
 
 
 def write_run_report(
     bag: Path, out: Path, *, damaged: bool = False, namespace: str | None = None
 ) -> dict[str, Any]:
-    """Evaluate a recorded run; write summary.json, the page and the pictures into `out`.
+    """Evaluate a recorded run.
 
-    Of a `damaged` recording what is intact is evaluated; the `namespace` is that of `read_bag`. The
-    summary is returned; `summary_text` makes a short text of it, `summary_table` the whole. Raises
-    InputError where the bag is no whole recording of a run, or `out` cannot be written.
+    Write summary.json, the page and the pictures into `out`.
+
+    Of a `damaged` recording what is intact is evaluated; the `namespace` is that of
+    `read_bag`. The summary is returned; `summary_text` makes a short text of it,
+    `summary_table` the whole. Raises InputError where the bag is no whole recording of
+    a run, or `out` cannot be written.
     """
     run = recording.read(bag, damaged=damaged, namespace=namespace)
     with write_into(out, "report"):
         found = evaluate_run(run)
         drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
         title = f"Error against run time, {run.scene.name}"
-        drawn += pictures.save(draw_errors(run.seconds, found), title, out, "error", ["png"])
+        drawn += pictures.save(
+            draw_errors(run.seconds, found), title, out, "error", ["png"]
+        )
         figures.save_figure(draw_overview(run, found), out / PAGE)
-        result = found.summary | {"pictures": [path.name for path in drawn], "page": [PAGE, HTML]}
+        result = found.summary | {
+            "pictures": [path.name for path in drawn],
+            "page": [PAGE, HTML],
+        }
         given = {"s": result, "table": summary_table(result), "overview": out / PAGE}
         page = render("run.html", pictures=drawn, **given)
         publish(out, "report", {HTML: page, "summary.json": result})
@@ -134,7 +166,9 @@ def summary_table(summary: dict[str, Any]) -> str:
     return render("run.txt", part="table", s=summary)
 
 
-def summarise(run: Recording, integration: Comparison, ideal: Comparison | None) -> dict[str, Any]:
+def summarise(
+    run: Recording, integration: Comparison, ideal: Comparison | None
+) -> dict[str, Any]:
     """Collect the figures of what was computed anew: errors, energy, tracking, efforts."""
     tracked = tracking.of(run)
     found, off = tracked and tracked.metrics, largest(run.effort_difference)
@@ -145,13 +179,18 @@ def summarise(run: Recording, integration: Comparison, ideal: Comparison | None)
         "integration_reference_error": integration.own,
     }
     if ideal:
-        compared |= {"ideal_difference": ideal.error, "ideal_reference_error": ideal.own}
+        compared |= {
+            "ideal_difference": ideal.error,
+            "ideal_reference_error": ideal.own,
+        }
     return {
         "torque_peak_N_m": np.abs(run.ticks.torque).max(axis=0).tolist(),
         "tracking_error_rms_rad": found and found.rms.tolist(),
         "tracking_error_max_rad": found and found.largest.tolist(),
         "settling_time_s": found and found.settling,
-        "motion_of": "joint_states" if not measured else run.motion and "true_joint_states",
+        "motion_of": "joint_states"
+        if not measured
+        else run.motion and "true_joint_states",
         "measurement_error_max_rad": largest(apart),
         "measurement_error_rms_rad": largest(np.sqrt(np.nanmean(apart**2, axis=0)))
         if np.isfinite(apart).any()
@@ -181,7 +220,13 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
     # Diagnostics that end before the run does know of fewer samples than the bag holds.
     lost = max(between, (published or 0) - recorded)
     whole = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
-    times = ("simulated_time_s", "wall_time_s", "real_time_factor", "step_mean_us", "step_max_us")
+    times = (
+        "simulated_time_s",
+        "wall_time_s",
+        "real_time_factor",
+        "step_mean_us",
+        "step_max_us",
+    )
     return {
         "scene": run.scene.name,
         "bag": str(run.path),
@@ -219,19 +264,25 @@ def measure_timing(recording: Recording) -> Timing:
     spacing, period, missing = np.diff(time), recording.period_ns, list[str]()
     period_us = np.diff(received_ns)[spacing == period] / 1e3
     if np.any(period_us < 0.0):
-        missing.append("receptions are not in the order of the samples: periods are as recorded")
+        missing.append(
+            "receptions are not in the order of the samples: periods are as recorded"
+        )
     lost_ns = [
         time[row] + period * np.arange(1, round(spacing[row] / period))
         for row in np.flatnonzero(spacing > period).tolist()
     ]
     # Simulated time per received time, over pieces of the run.
-    rows = np.unique(np.linspace(0, len(time) - 1, min(61, len(time))).round().astype(int))
+    rows = np.unique(
+        np.linspace(0, len(time) - 1, min(61, len(time))).round().astype(int)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         pace = np.diff(time[rows]) / np.diff(received_ns[rows])
     middle = 0.5 * (time[rows][1:] + time[rows][:-1]) / NANOSECONDS
     good = np.isfinite(pace) & (pace > 0.0)
     if not recording.diagnostics:
-        missing.append("no diagnostics: missed ticks and samples published are not known")
+        missing.append(
+            "no diagnostics: missed ticks and samples published are not known"
+        )
     commands = pair_commands(recording)
     if not len(recording.commands.torque):
         missing.append("no commands are recorded: their latency is not known")
@@ -240,17 +291,25 @@ def measure_timing(recording: Recording) -> Timing:
     first = int(received_ns[0])
     reports = [values for _, values in recording.reports]
     reported = pd.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
-    at, since = [when_ns - first for when_ns, _ in recording.reports], received_ns - first
+    at, since = (
+        [when_ns - first for when_ns, _ in recording.reports],
+        received_ns - first,
+    )
     reported.insert(0, "time_s", np.interp(at, since.astype(float), recording.seconds))
     delays = {
         "period": pd.Series(period_us, dtype=float),
         "command_latency": commands.received_us,
         "command_stamp_to_tick": commands.stamped_us,
     }
-    numbers = {"commands_followed": len(commands), **_measure_answers(recording, commands)}
+    numbers = {
+        "commands_followed": len(commands),
+        **_measure_answers(recording, commands),
+    }
     for name, values in delays.items():
         described = values.describe([0.99, 0.999]).dropna()
-        numbers |= {f"{name}_{word}_us": described.get(key) for key, word in STATISTICS.items()}
+        numbers |= {
+            f"{name}_{word}_us": described.get(key) for key, word in STATISTICS.items()
+        }
     return Timing(
         period_us=period_us,
         lost_s=np.concatenate([np.empty(0), *lost_ns]) / NANOSECONDS,
@@ -266,13 +325,15 @@ def measure_timing(recording: Recording) -> Timing:
 def pair_commands(recording: Recording) -> DataFrame:
     """Pair commands with ticks, by their values: `Timing.commands`.
 
-    Each has the first tick of its values from its reception on, or from a tick before it: the
-    recorder may have received it a little later than the simulator.
+    Each has the first tick of its values from its reception on, or from a tick before
+    it: the recorder may have received it a little later than the simulator.
     """
     legs, commands, ticks = ["1", "2", "3"], recording.commands, recording.ticks
     limit = recording.scene.torque_limit
     most = np.inf if limit is None else limit
-    asked, applied = (np.clip(each.torque, -most, most) + 0.0 for each in (commands, ticks))
+    asked, applied = (
+        np.clip(each.torque, -most, most) + 0.0 for each in (commands, ticks)
+    )
     new, changed = _changes(asked), _changes(applied)
     # When the steps of ticks began, interpolated between the receptions of samples.
     first = recording.received_ns[0]
@@ -284,14 +345,24 @@ def pair_commands(recording: Recording) -> DataFrame:
     right = right.assign(tick=changed, ns=step_ns[changed])
     left, right = (table.sort_values("ns", kind="stable") for table in (left, right))
     found = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
-    # Commands are in order of reception: the last of those that share a tick is the one it took.
-    found = found.dropna(subset="tick").sort_values("command").drop_duplicates("tick", keep="last")
+    # Commands are in order of reception: the last of those that share a tick is the one
+    # it took.
+    found = (
+        found.dropna(subset="tick")
+        .sort_values("command")
+        .drop_duplicates("tick", keep="last")
+    )
     command, tick = (found[name].to_numpy(dtype=int) for name in ("command", "tick"))
     stamps, begins = commands.stamp_ns[command], ticks.start_ns[tick]
     age = (begins + recording.start_ns - stamps) / 1e3
     received = (step_ns[tick] - commands.received_ns[command]) / 1e3
     stamped, seconds = np.where(stamps > 0, age, np.nan), begins / NANOSECONDS
-    columns = {"time_s": seconds, "received_us": received, "stamped_us": stamped, "tick": tick}
+    columns = {
+        "time_s": seconds,
+        "received_us": received,
+        "stamped_us": stamped,
+        "tick": tick,
+    }
     return pd.DataFrame(columns)
 
 
@@ -300,16 +371,21 @@ def _changes(torque: Array) -> NDArray[np.intp]:
     return np.flatnonzero((np.diff(torque, axis=0, prepend=np.nan) != 0.0).any(axis=1))
 
 
-def _measure_answers(recording: Recording, paired: DataFrame) -> dict[str, float | None]:
+def _measure_answers(
+    recording: Recording, paired: DataFrame
+) -> dict[str, float | None]:
     """Share of samples that a command answered, and the mean age [s] of the command of a tick."""
     commands, start_ns = recording.commands, recording.ticks.start_ns
     share = age = None
-    if len(paired) > 1:  # a torque that is commanded once and for all answers no samples
+    # a torque that is commanded once and for all answers no samples
+    if len(paired) > 1:
         seen = recording.measured  # what a controller receives
         if commands.stamp_ns.any():
             answered = np.isin(seen.time_ns + recording.start_ns, commands.stamp_ns)
         else:
-            counts = np.searchsorted(commands.received_ns, seen.received_ns, side="left")
+            counts = np.searchsorted(
+                commands.received_ns, seen.received_ns, side="left"
+            )
             answered = np.append(np.diff(counts), 0) > 0
         # The last sample is the end of the run, which nothing answers.
         share = 100.0 * float(np.mean(answered[:-1]))
@@ -338,10 +414,18 @@ def _draw_comparison(axes: Axes, seconds: Array, comparison: Comparison) -> None
     least = figures.SMALLEST_SHOWN
     floor = np.fmax(comparison.own.max(axis=1), least)
     axes.fill_between(
-        seconds, least, floor, color=GREY, alpha=0.3, linewidth=0.0, label="error of the reference"
+        seconds,
+        least,
+        floor,
+        color=GREY,
+        alpha=0.3,
+        linewidth=0.0,
+        label="error of the reference",
     )
     names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
-    for values, name, looks in zip(comparison.error.to_numpy().T, names, LINES, strict=False):
+    for values, name, looks in zip(
+        comparison.error.to_numpy().T, names, LINES, strict=False
+    ):
         axes.plot(seconds, hide_zeros(values), label=name, **looks)
     axes.set_yscale("log")
     axes.set_ylim(bottom=least)
@@ -365,7 +449,9 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
         return axes
 
     errors = found.integration.error
-    axes = panel("Integration error, against the same torques", errors, "largest difference")
+    axes = panel(
+        "Integration error, against the same torques", errors, "largest difference"
+    )
     _draw_comparison(axes, seconds, found.integration)
     axes = panel("Energy residual", found.integration.energy, "energy residual [J]")
     axes.plot(seconds, found.integration.energy, color=BLUE, linewidth=1.4)
@@ -388,7 +474,9 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
         axes.plot(times, np.full(len(times), height), mark, label=name, **foot)
     axes.legend(fontsize=8, loc="best", ncol=3)
     label = "deviation from the nominal period [µs]"
-    axes = panel("Period between received samples", measured.period_us, "samples", label)
+    axes = panel(
+        "Period between received samples", measured.period_us, "samples", label
+    )
     axes.hist(measured.period_us - run.period_ns / 1e3, bins=80, color=BLUE, log=True)
     axes.set_ylim(bottom=0.5)
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -398,10 +486,13 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     axes.plot(commands.time_s, commands.received_us, ".", color=BLUE, markersize=3)
     axes.axhline(0.0, color=GREY, linewidth=0.9, linestyle="--")
     used = (1e-6 * reported.ticks * reported.step_mean_us).to_numpy()
-    # Reports come once a second: between them, and from the start, the steps cost the same.
+    # Reports come once a second: between them, and from the start, the steps cost the
+    # same.
     at = np.interp(seconds, [0.0, *reported.time_s], [0.0, *used])
     so_far = np.fmax.accumulate(errors.orientation.to_numpy())
-    curves = {"integration error": (at if len(used) else np.full(len(at), np.nan), so_far)}
+    curves = {
+        "integration error": (at if len(used) else np.full(len(at), np.nan), so_far)
+    }
     for name, column in (
         ("its estimate by the simulator", "error_estimate"),
         ("hold error if torques are those of the start", "hold_error_start"),
@@ -416,6 +507,8 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
         marker = "" if name == "integration error" else "o"
         axes.plot(1e3 * times, hide_zeros(values), label=name, marker=marker, **looks)
     axes.legend(fontsize=8, loc="best")
-    figure.suptitle(f"Run of {run.scene.name}: {seconds[-1]:g} s, {len(seconds)} samples")
+    figure.suptitle(
+        f"Run of {run.scene.name}: {seconds[-1]:g} s, {len(seconds)} samples"
+    )
     figures.note(figure, provenance(found.summary["report"]), 200)
     return figure

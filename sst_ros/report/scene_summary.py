@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Summary of a scene: what it consists of, what each term costs, advice for its step.
 
-The advice, also that of the accuracy and stability reports, is the run of `simulate` with the
-method "auto" itself: they cannot disagree with it.
+The advice, also that of the accuracy and stability reports, is the run of `simulate`
+with the method "auto" itself: they cannot disagree with it.
 
-Applied to y' = lambda y with steps h, a method multiplies y by its stability function R(z),
-z = h lambda; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2 and
-IV.3). The eigenvalues lambda are those of the linearised dynamics.
+Applied to y' = lambda y with steps h, a method multiplies y by its stability function
+R(z), z = h lambda; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II,
+sections IV.2 and IV.3). The eigenvalues lambda are those of the linearised dynamics.
 """
 
 from __future__ import annotations
@@ -58,11 +58,15 @@ def summary(scene: Scene) -> str:
 
 
 def without(scene: Scene, term: str) -> Scene:
-    """Return a scene without one of TERMS; gravity goes with the last links that it acts on."""
+    """Return a scene without one of TERMS.
+
+    Gravity goes with the last links that it acts on.
+    """
     key, links = TERMS[term], term.endswith("links")
     whole: dict[str, Any] = {key.partition(".")[0]: [{}] if links else None}
     for change in (whole if links else {key: None}, whole):
-        with contextlib.suppress(InputError):  # a kind of stops without its own, or gravity
+        # a kind of stops without its own, or gravity
+        with contextlib.suppress(InputError):
             document = replace_values(scene, change)
             return build(Scene, drop_idle(Scene, document), scene.name)
     return scene.with_values({**whole, "gravity": None})
@@ -89,8 +93,10 @@ def costs(scene: Scene) -> list[Cost]:
 
 
 LONGEST_S = 10.0  # the advice is for a run of the scene's duration, but not of more [s]
-TOLERANCE = 1e-9  # error of the orientation that it is for [rad]: the default of `simulate`
-GROWTH = 1e-6  # abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i
+# error of the orientation that it is for [rad]: the default of `simulate`
+TOLERANCE = 1e-9
+# abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i
+GROWTH = 1e-6
 
 
 class StepAdvice(NamedTuple):
@@ -111,25 +117,34 @@ def step_advice(scene: Scene) -> StepAdvice:
         return StepAdvice(f"none, the scene cannot start: {error}")
     text = f"for an error of {TOLERANCE:g} rad over {seconds:g} s: {motion.method}"
     text += f"; its steps have {motion.step:.2g} s on average"
-    limit, fastest = largest_stable_step(DORMAND_PRINCE, rates), float(np.abs(rates).max())
+    limit, fastest = (
+        largest_stable_step(DORMAND_PRINCE, rates),
+        float(np.abs(rates).max()),
+    )
     text += f". The fastest rate at the start is {fastest:.3g} 1/s"
     if math.isfinite(limit):
-        text += f": steps of {DORMAND_PRINCE.name} above {limit:.2g} s would be unstable"
+        text += (
+            f": steps of {DORMAND_PRINCE.name} above {limit:.2g} s would be unstable"
+        )
     return StepAdvice(text, motion.method, motion.step)
 
 
 def eigenvalues(
-    scene: Scene, state: Sequence[float] | None = None, torque: Sequence[float] = (0.0, 0.0, 0.0)
+    scene: Scene,
+    state: Sequence[float] | None = None,
+    torque: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> NDArray[np.complex128]:
     """Eigenvalues of the linearised dynamics [1/s], shape (7,) or (10,).
 
-    They are of a state - quaternion, body rate [rad/s], lagged torques - by default the start, and
-    of the torque that acts there [N m], shape (3,).
+    They are of a state - quaternion, body rate [rad/s], lagged torques - by default the
+    start, and of the torque that acts there [N m], shape (3,).
     """
     ode = recent_ode(Dynamics.of(scene))
     y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
     lagged, moment = (0.0,) * (len(ode.state) - len(y)), (0.0,) * (len(ode.drive) - 3)
-    return np.asarray(ode.eigenvalues(0.0, (*y, *lagged), (*torque, *moment)), dtype=complex)
+    return np.asarray(
+        ode.eigenvalues(0.0, (*y, *lagged), (*torque, *moment)), dtype=complex
+    )
 
 
 def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
@@ -143,11 +158,18 @@ def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
     if not len(values):
         return math.inf
     steps = np.geomspace(1e-2, 1e3, 5001) / np.abs(values).max()
-    stable = np.abs(stability_function(method, np.outer(steps, values))).max(axis=1) < 1 + GROWTH
-    return math.inf if stable.all() else float(steps[max(int(np.argmin(stable)) - 1, 0)])
+    stable = (
+        np.abs(stability_function(method, np.outer(steps, values))).max(axis=1)
+        < 1 + GROWTH
+    )
+    return (
+        math.inf if stable.all() else float(steps[max(int(np.argmin(stable)) - 1, 0)])
+    )
 
 
-def stability_function(method: Method, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def stability_function(
+    method: Method, z: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
     """Evaluate R(z) of a method from its coefficients, for any shape of z."""
     stages: list[Any] = []
     one = np.ones_like(z)

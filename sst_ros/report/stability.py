@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The stability report of one scene: which steps are stable along its motion, and what it survives.
 
-The eigenvalues of the linearised dynamics along the motion give the longest step in which each
-method is stable. Then the scene is run as it is and with other numbers: ten times the torque, ten
-times the rates, a hundred times the stiffness and the friction, from poses at its limits and beside
-its nearest singularity. Each run has to end with a value within its error estimate, which a run for
-a hundredth of the tolerance checks, or with a limit or an error that names the reason.
+The eigenvalues of the linearised dynamics along the motion give the longest step in
+which each method is stable. Then the scene is run as it is and with other numbers: ten
+times the torque, ten times the rates, a hundred times the stiffness and the friction,
+from poses at its limits and beside its nearest singularity. Each run has to end with a
+value within its error estimate, which a run for a hundredth of the tolerance checks, or
+with a limit or an error that names the reason.
 """
 
 from __future__ import annotations
@@ -29,9 +30,21 @@ from sst_ros.host.figures import BLUE, MARKERS, VERMILION, legend, note, styled
 from sst_ros.host.many_runs import run_many
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
-from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import (
+    Geometry,
+    angle_between,
+    quaternion_of,
+    rotation_matrix,
+)
 from sst_ros.report import scene_summary as advised
-from sst_ros.report.results import WHOLE_RUN_S, data_frame, provenance, publish, records, render
+from sst_ros.report.results import (
+    WHOLE_RUN_S,
+    data_frame,
+    provenance,
+    publish,
+    records,
+    render,
+)
 from sst_ros.scene.scene import Scene, with_initial
 from sst_ros.scene.schema import key_of, leaves
 from sst_ros.simulation.simulate import simulate
@@ -40,9 +53,11 @@ from sst_ros.state import Array
 
 INSTANTS = 50  # at which the motion is linearised
 FINER, FACTOR, ROUNDING = 1e-2, 10.0, 1e-13
-"""A run is checked by one for FINER times the tolerance. Its estimate holds if the true error is at
-most FACTOR times as large, or ROUNDING [rad]."""
-TURNS = 181  # of the star about each axis, up to pi: limits and singularities lie between them
+"""A run is checked by one for FINER times the tolerance. Its estimate holds if the true
+error is at most FACTOR times as large, or ROUNDING [rad].
+"""
+# of the star about each axis, up to pi: limits and singularities lie between them
+TURNS = 181
 SPIN = 1.0  # angular velocity with which a run goes from a limit into it [rad/s]
 BESIDE = 1e-3  # angle between a singular pose and the start beside it [rad]
 
@@ -55,15 +70,18 @@ class StabilityReport(NamedTuple):
 
     scene: str
     steps: DataFrame
-    """A row an instant: t_s, decay and oscillation, the largest -Re and abs(Im) of the eigenvalues
-    [1/s], and the longest stable step of each method [s], inf for every one."""
+    """A row an instant: t_s, decay and oscillation, the largest -Re and abs(Im) of the
+    eigenvalues [1/s], and the longest stable step of each method [s], inf for every
+    one.
+    """
     advice: str
     runs: DataFrame
-    """A row each. name, change: of the row, and what is other than in the scene. passed: it ended
-    with a value within its estimate, or with a named reason; None where the scene has nothing to
-    change. result: in words. method: what `auto` took. error, estimate: distance of the orientation
-    at the end from a finer run, and what the run estimated [rad], nan if unknown. wall_s: computing
-    time of both runs [s]."""
+    """A row each. name, change: of the row, and what is other than in the scene.
+    passed: it ended with a value within its estimate, or with a named reason; None
+    where the scene has nothing to change. result: in words. method: what `auto` took.
+    error, estimate: distance of the orientation at the end from a finer run, and what
+    the run estimated [rad], nan if unknown. wall_s: computing time of both runs [s].
+    """
 
     @property
     def passed(self) -> bool:
@@ -74,15 +92,26 @@ class StabilityReport(NamedTuple):
 def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
     """Examine a scene, print the report and write stability.csv, .json, .md and .png into `out`.
 
-    `only` names rows of ROWS; by default all. Returns whether no run failed. Raises InputError
-    where a name is unknown or `out` cannot be written, SstError where the scene cannot start.
+    `only` names rows of ROWS; by default all. Returns whether no run failed. Raises
+    InputError where a name is unknown or `out` cannot be written, SstError where the
+    scene cannot start.
     """
     found = examine_stability(scene, only, shown=True)
     said = stability_page(found)
     print(said)
     steps, runs = records(found.steps.replace(math.inf, None)), records(found.runs)
-    document = {"scene": found.scene, "advice": found.advice, "steps": steps, "runs": runs}
-    files = {".csv": found.runs, ".json": document, ".md": said, ".png": draw_stability(found)}
+    document = {
+        "scene": found.scene,
+        "advice": found.advice,
+        "steps": steps,
+        "runs": runs,
+    }
+    files = {
+        ".csv": found.runs,
+        ".json": document,
+        ".md": said,
+        ".png": draw_stability(found),
+    }
     publish(out, "stability", files)
     return found.passed
 
@@ -92,7 +121,9 @@ def examine_stability(
 ) -> StabilityReport:
     """Find the stable steps along the motion of a scene, and run it with other numbers."""
     known = f"must be one of {', '.join(ROWS)}"
-    wrong = (("--only", name, name in ROWS, known + suggestion(name, ROWS)) for name in only)
+    wrong = (
+        ("--only", name, name in ROWS, known + suggestion(name, ROWS)) for name in only
+    )
     refuse_unless("report stability", *wrong)
     chosen = [name for name in ROWS if name in only or not only]
     seconds = min(scene.duration or WHOLE_RUN_S, advised.LONGEST_S)
@@ -100,14 +131,25 @@ def examine_stability(
     motion = simulate(scene, duration=seconds, tolerance=advised.TOLERANCE)
     if shown:
         about = max(1.0, 2.0 * (time.perf_counter() - began)) * len(chosen)
-        print(f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about {about:.0f} s")
+        print(
+            f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about"
+            f" {about:.0f} s"
+        )
     steps = []
     instants = motion.at(np.linspace(motion.t[0], motion.t[-1], INSTANTS))
     states = np.hstack([instants.quaternion, instants.body_rate, instants.torque])
     for t, state in zip(instants.t.tolist(), states.tolist(), strict=True):
-        values = advised.eigenvalues(scene, state if scene.lags else state[:7], state[7:])
-        fastest = {"decay": max(0.0, -values.real.min()), "oscillation": abs(values.imag).max()}
-        longest = {name: advised.largest_stable_step(one, values) for name, one in METHODS.items()}
+        values = advised.eigenvalues(
+            scene, state if scene.lags else state[:7], state[7:]
+        )
+        fastest = {
+            "decay": max(0.0, -values.real.min()),
+            "oscillation": abs(values.imag).max(),
+        }
+        longest = {
+            name: advised.largest_stable_step(one, values)
+            for name, one in METHODS.items()
+        }
         steps.append({"t_s": t, **fastest, **longest})
 
     def run(name: str) -> dict[str, Any]:
@@ -122,7 +164,13 @@ def examine_stability(
 
 def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
     """Run a scene at two tolerances, and say how it ended: the last columns of a row."""
-    row = {"passed": None, "result": changed, "method": "", "error": math.nan, "estimate": math.nan}
+    row = {
+        "passed": None,
+        "result": changed,
+        "method": "",
+        "error": math.nan,
+        "estimate": math.nan,
+    }
     began = time.perf_counter()
     try:
         if isinstance(changed, Scene):
@@ -132,15 +180,22 @@ def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
                     for tolerance in (advised.TOLERANCE, FINER * advised.TOLERANCE)
                 )
             at, estimate = min(float(run.t[-1]), float(fine.t[-1])), run.error_estimate
-            error = float(angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine))))
+            error = float(
+                angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine)))
+            )
             # A run that ends where it starts has no estimate.
-            holds = run.status < 0 or bool(error <= np.fmax(FACTOR * estimate, ROUNDING))
+            holds = run.status < 0 or bool(
+                error <= np.fmax(FACTOR * estimate, ROUNDING)
+            )
             same = run.status == fine.status
             result = run.message if same else f"{run.message}; finer: {fine.message}"
             row |= {"passed": same and holds, "result": result, "method": run.method}
             row |= {"error": error, "estimate": estimate}
     except SstError as fault:
-        row |= {"passed": True, "result": f"{type(fault).__name__}: {str(fault).splitlines()[0]}"}
+        row |= {
+            "passed": True,
+            "result": f"{type(fault).__name__}: {str(fault).splitlines()[0]}",
+        }
     return row | {"wall_s": time.perf_counter() - began}
 
 
@@ -149,7 +204,9 @@ def _scale(factor: float, keys: str, absent: str) -> Change:
 
     def change(scene: Scene, _: Trajectory) -> Scene | str:
         numbers = {key_of(place): value for place, value in leaves(scene).items()}
-        found = {key: factor * x for key, x in numbers.items() if re.fullmatch(keys, key)}
+        found = {
+            key: factor * x for key, x in numbers.items() if re.fullmatch(keys, key)
+        }
         return scene.with_values(found) if found else f"the scene has no {absent}"
 
     return change
@@ -173,7 +230,9 @@ def _turn_to(*names: str, spin: float = 0.0, before: float = 0.0) -> Change:
 
     def change(scene: Scene, motion: Trajectory) -> Scene | str:
         found = [_first_zeros(scene, motion, name, before) for name in names]
-        axes, angles, poses = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        axes, angles, poses = (
+            np.concatenate(parts) for parts in zip(*found, strict=True)
+        )
         if not len(angles):
             return "no turn of the star meets it"
         # Where a limit is met as well, or before, that one ends the run.
@@ -195,15 +254,19 @@ def _first_zeros(
 ) -> tuple[Array, Array, Array]:
     """Turn the star from its start about many axes up to where a measure becomes zero.
 
-    Returns axes (n, 3) and angles (n,) [rad] where it does, and the poses (n, 3, 3) there, or by an
-    angle `before` it.
+    Returns axes (n, 3) and angles (n,) [rad] where it does, and the poses (n, 3, 3)
+    there, or by an angle `before` it.
     """
     start = rotation_matrix(motion.quaternion[0])
-    axes = np.array([u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)])
+    axes = np.array(
+        [u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)]
+    )
     axes /= np.linalg.norm(axes, axis=1)[:, None]
 
     def turn(axes: Array, angles: Array) -> Array:
-        return np.asarray(Rotation.from_rotvec(angles[:, None] * axes).as_matrix() @ start)
+        return np.asarray(
+            Rotation.from_rotvec(angles[:, None] * axes).as_matrix() @ start
+        )
 
     def values(axes: Array, angles: Array) -> Array:
         return np.asarray(getattr(_measure(scene, turn(axes, angles)), name))
@@ -224,12 +287,17 @@ def _first_zeros(
 
 def _measure(scene: Scene, rotation: Array) -> workspace.Measures:
     geometry = Geometry.of(scene)
-    return workspace.measures(geometry, kinematics.inverse(geometry, rotation)[0], rotation)
+    return workspace.measures(
+        geometry, kinematics.inverse(geometry, rotation)[0], rotation
+    )
 
 
 ROWS: dict[str, tuple[str, Change]] = {
     "as-it-is": ("nothing", lambda scene, _: scene),
-    "torque": ("ten times the torque", _scale(10.0, r"torque\.amplitude.*", "torques of its own")),
+    "torque": (
+        "ten times the torque",
+        _scale(10.0, r"torque\.amplitude.*", "torques of its own"),
+    ),
     "rates": ("ten times the rates at the start", _faster),
     "stiffness": (
         "a hundred times the stiffness",
@@ -252,7 +320,12 @@ ROWS: dict[str, tuple[str, Change]] = {
 
 def stability_page(found: StabilityReport) -> str:
     """Write the report as Markdown."""
-    given = {"factor": FACTOR, "rounding": ROUNDING, "methods": METHODS, "inf": math.inf}
+    given = {
+        "factor": FACTOR,
+        "rounding": ROUNDING,
+        "methods": METHODS,
+        "inf": math.inf,
+    }
     return render("stability.md", found=found, **given)
 
 
@@ -263,12 +336,19 @@ def draw_stability(found: StabilityReport) -> Figure:
     left, right = figure.subplots(1, 2)
     steps = found.steps.set_index("t_s").replace([math.inf, 0.0], math.nan)
     looks = {"logy": True, "linewidth": 1.8, "xlabel": "time t [s]"}
-    rates, label = steps[["decay", "oscillation"]], "fastest rate of the eigenvalues [1/s]"
-    rates.plot(ax=left, ylabel=label, color=[BLUE, VERMILION], style=["-", "--"], **looks)
+    rates, label = (
+        steps[["decay", "oscillation"]],
+        "fastest rate of the eigenvalues [1/s]",
+    )
+    rates.plot(
+        ax=left, ylabel=label, color=[BLUE, VERMILION], style=["-", "--"], **looks
+    )
     limited = [name for name in METHODS if steps[name].notna().any()]
     colours = [MARKERS[name][0] for name in limited]
     if limited:
-        steps[limited].plot(ax=right, ylabel="longest stable step [s]", color=colours, **looks)
+        steps[limited].plot(
+            ax=right, ylabel="longest stable step [s]", color=colours, **looks
+        )
     free = ", ".join(name for name in METHODS if name not in limited)
     right.plot([], [], " ", label=f"{free}: every step")
     legend(left)

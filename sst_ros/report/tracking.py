@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from sst_ros.control.controller import Track, TrackingMetrics, track_of
 from sst_ros.errors import InputError, SingularConfiguration, refusal
 from sst_ros.mechanism import continuation
-from sst_ros.mechanism.geometry import Geometry, angle_between, quaternion_of, rotation_matrix
+from sst_ros.mechanism.geometry import (
+    Geometry,
+    angle_between,
+    quaternion_of,
+    rotation_matrix,
+)
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
@@ -29,7 +34,10 @@ DRAWN = ("tracking", "tracking_error", "control_torques")
 
 @dataclass(frozen=True)
 class TrackedRun:
-    """A recorded run that followed a reference; rows belong to the samples that have one."""
+    """A recorded run that followed a reference.
+
+    Rows belong to the samples that have one.
+    """
 
     recording: Recording
     track: Track  # reference, tracking error and torques
@@ -40,7 +48,9 @@ class TrackedRun:
         """Metrics; how often a torque was limited is in the last diagnostics of the controller."""
         counts = (
             status.values.get("samples_limited", "")
-            for status in reversed(self.recording.signals.statuses_of("control", REFERENCE.key))
+            for status in reversed(
+                self.recording.signals.statuses_of("control", REFERENCE.key)
+            )
         )
         limited = next((int(count) for count in counts if count.isdecimal()), None)
         return TrackingMetrics(self.track, limited)
@@ -49,7 +59,8 @@ class TrackedRun:
     def orientation_error(self) -> Array:
         """Angle between the orientation and that of the reference [rad], shape (n,).
 
-        The assembly of the run is followed along the reference; nan where it is not known.
+        The assembly of the run is followed along the reference; nan where it is not
+        known.
         """
         run, gamma = self.recording, self.track.gamma
         geometry, measured = Geometry.of(run.scene), run.quaternion[self.rows]
@@ -66,7 +77,8 @@ class TrackedRun:
 def read_tracking(path: Path) -> TrackedRun:
     """Read a rosbag2 recording of a run with the topics of the inverse-dynamics controller.
 
-    Raises InputError where it is no recording of a run that followed a reference, or a damaged one.
+    Raises InputError where it is no recording of a run that followed a reference, or a
+    damaged one.
     """
     run = recording.read(path)
     missing = run.signals.absent
@@ -79,18 +91,25 @@ def read_tracking(path: Path) -> TrackedRun:
 
 
 def of(run: Recording) -> TrackedRun | None:
-    """Return reference and tracking error of a run; None where fewer than two samples have one."""
+    """Return reference and tracking error of a run.
+
+    None where fewer than two samples have one.
+    """
     series = [run.signals.topic_series[key] for key in KEYS]
     at = [places(one.stamp_ns, run.time_ns + run.start_ns) for one in series]
     rows = np.flatnonzero(np.min(at, axis=0) >= 0)
     if len(rows) < 2:
         return None
-    reference, error = (one.values[place[rows]] for one, place in zip(series, at, strict=True))
+    reference, error = (
+        one.values[place[rows]] for one, place in zip(series, at, strict=True)
+    )
     feedforward, feedback, times = reference[:, 6:], error[:, 6:], run.time_ns[rows]
-    # The torque of the tick that begins at a sample; what was lost is what was requested. A sample
-    # after the last tick has none.
+    # The torque of the tick that begins at a sample; what was lost is what was
+    # requested. A sample after the last tick has none.
     tick = places(run.ticks.start_ns, times)
-    torque = np.where((tick >= 0)[:, None], run.ticks.torque[tick], feedforward + feedback)
+    torque = np.where(
+        (tick >= 0)[:, None], run.ticks.torque[tick], feedforward + feedback
+    )
     torque[times >= run.ticks.end_ns[-1]] = 0.0
     seconds = times[:, None] / NANOSECONDS
     columns = seconds, reference[:, :6], error[:, :3], feedforward, feedback, torque
@@ -100,7 +119,8 @@ def of(run: Recording) -> TrackedRun | None:
 def write_tracking_report(bag: Path, out: Path) -> str:
     """Evaluate how a recorded run followed its reference: write table and pictures into `out`.
 
-    The table is returned. Raises InputError as `read_tracking`, or where `out` cannot be written.
+    The table is returned. Raises InputError as `read_tracking`, or where `out` cannot
+    be written.
     """
     tracked = read_tracking(bag)
     title = f"Tracking of {tracked.recording.scene.name}, from {bag}"

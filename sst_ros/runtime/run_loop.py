@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State machine of a run: waiting, running, paused, fault, finished. One thread owns it.
+"""State machine of a run: waiting, running, paused, fault, finished.
 
-Other threads send requests by `ask`. They are served between two samples, in the thread of the run.
-Diagnostics: one status a second, and at the end a table of errors over run time.
+One thread owns it.
+
+Other threads send requests by `ask`. They are served between two samples, in the thread
+of the run. Diagnostics: one status a second, and at the end a table of errors over run
+time.
 """
 
 from __future__ import annotations
@@ -59,16 +62,22 @@ _NOT_DONE = Reply(False, "not done: the run has ended or failed")
 class RunLoop(TickLoop):
     """State machine of one node's run, whose ticks are those of a `TickLoop`."""
 
-    def __init__(self, scene: Scene, build: Callable[[Scene], Simulation], parts: RunParts) -> None:
+    def __init__(
+        self, scene: Scene, build: Callable[[Scene], Simulation], parts: RunParts
+    ) -> None:
         self.phase, self.fault = Phase.WAITING, ""  # why the run stopped, until a reset
         self.failed = False  # the fault ends the node: nothing is left to wait for
         self._build, self._original = build, build(scene)
         super().__init__(self._original, parts)
-        self._requests: deque[tuple[Callable[[], Reply | None], Future[Reply]]] = deque()
+        self._requests: deque[tuple[Callable[[], Reply | None], Future[Reply]]] = (
+            deque()
+        )
         self._missing_since: float | None = time.monotonic()
 
     def ask(self, request: Callable[[], Reply]) -> Reply:
-        """Have a request (`pause`, `reset`, ...) served by the thread of the run; wait for it.
+        """Have a request (`pause`, `reset`, ...) served by the thread of the run.
+
+        Wait for it.
 
         The wait ends early where the run has stopped.
         """
@@ -82,7 +91,10 @@ class RunLoop(TickLoop):
         return pending.result()
 
     def post(self, request: Callable[[], Reply | None]) -> Future[Reply]:
-        """Have a request served, which has succeeded where it gives no reply; do not wait."""
+        """Have a request served, which has succeeded where it gives no reply.
+
+        Do not wait.
+        """
         pending: Future[Reply] = Future()
         self._requests.append((request, pending))
         self.requested.set()
@@ -98,7 +110,9 @@ class RunLoop(TickLoop):
         self._missing_since = time.monotonic()
         self._output.publish_phase(self._status)
         warm, shown = False, -math.inf
-        while not (self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed):
+        while not (
+            self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed
+        ):
             try:
                 if not warm:
                     warm = True
@@ -149,7 +163,10 @@ class RunLoop(TickLoop):
     def step(self, samples: int = 1) -> Reply:
         """Advance a paused run by some samples, with the torques of the last command."""
         if self.phase is not Phase.PAUSED:
-            return Reply(False, f"refused: only a paused run can be stepped, it is {self._status}")
+            return Reply(
+                False,
+                f"refused: only a paused run can be stepped, it is {self._status}",
+            )
         if not self.begun and not self.begin():
             return Reply(False, "refused: there is no time yet on /clock")
         for _ in range(samples):
@@ -168,7 +185,10 @@ class RunLoop(TickLoop):
         return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
 
     def reset(self) -> Reply:
-        """Go back to the scene's initial state; stamps go on, the command is forgotten."""
+        """Go back to the scene's initial state.
+
+        Stamps go on, the command is forgotten.
+        """
         self._original.reset()
         self.fault = ""
         self.restart(self._original)
@@ -180,9 +200,13 @@ class RunLoop(TickLoop):
     def set_state(self, gamma: Vector3, gamma_dot: Vector3) -> Reply:
         """Put a run that waits or is paused into another state [rad], [rad/s]."""
         if self.phase not in (Phase.WAITING, Phase.PAUSED):
-            return Reply(False, f"refused: pause or reset first, the run is {self._status}")
+            return Reply(
+                False, f"refused: pause or reset first, the run is {self._status}"
+            )
         try:
-            self.restart(self._build(with_initial(self._original.scene, (gamma, gamma_dot))))
+            self.restart(
+                self._build(with_initial(self._original.scene, (gamma, gamma_dot)))
+            )
         except SstError as error:
             return Reply(False, f"refused: {error}")
         self.warm_up()
@@ -202,11 +226,20 @@ class RunLoop(TickLoop):
                     pending.set_result(reply)
 
     def _start(self, waits: bool) -> bool:
-        """Start the run, unless it has to wait, also for a command; return whether it runs."""
+        """Start the run, unless it has to wait, also for a command.
+
+        Return whether it runs.
+        """
         if self._missing_since is not None:  # of subscribers that have to be there once
             if missing := self._output.missing_subscribers():
-                if time.monotonic() - self._missing_since > self._run.subscriber_timeout:
-                    reason = f"within {self._run.subscriber_timeout:g} s (wait_for_subscribers)"
+                if (
+                    time.monotonic() - self._missing_since
+                    > self._run.subscriber_timeout
+                ):
+                    reason = (
+                        f"within {self._run.subscriber_timeout:g} s"
+                        " (wait_for_subscribers)"
+                    )
                     self.failed = True
                     raise NoAnswer(f"no subscriber of {', '.join(missing)} {reason}")
                 return False
@@ -250,8 +283,10 @@ _ROWS = 32
 GAUGES = {
     "error_estimate": "estimated error of the orientation [rad]",
     "rate_error_estimate": "estimated error of the body rate [rad/s]",
-    "hold_error_start": "estimated error of the orientation from holding torques [rad], where "
-    "they are those of the start of their hold",
+    "hold_error_start": (
+        "estimated error of the orientation from holding torques [rad], where "
+        "they are those of the start of their hold"
+    ),
     "hold_error_middle": "the same where they are those of its middle",
     "energy_residual_J": "energy less that of the start and the work done since [J]",
     "closure_residual": "largest abs(r_k . t_k), 0 where the loops are closed",
@@ -275,7 +310,9 @@ _COUNTS = {
     "samples_published": "samples of the run published",
     "step_mean_us": "mean time of a step [us]",
     "step_max_us": "longest step [us]",
-    "tick_time_left": "share of a tick's period that its step leaves, mean, at real-time factor 1",
+    "tick_time_left": (
+        "share of a tick's period that its step leaves, mean, at real-time factor 1"
+    ),
     "tick_time_left_least": "the same of the longest step",
     "late_mean_us": "mean lateness of the steps [us]",
     "late_std_us": "standard deviation of it: the jitter of the period [us]",
@@ -294,7 +331,9 @@ _COUNTS = {
     "resets": "times that the run began anew",
     "states_set": "times that a state was set",
     "scheduling": "scheduling of the thread of the run",
-    "cpu_dma_latency": "largest exit latency of idle states that the machine was asked to use",
+    "cpu_dma_latency": (
+        "largest exit latency of idle states that the machine was asked to use"
+    ),
 }
 
 KEYS = {**_COUNTS, **GAUGES, "fault": "reason why the run stopped"}
@@ -310,7 +349,8 @@ class RunDiagnostics:
         self.granted = {"scheduling": "", "cpu_dma_latency": processes.NO_LIMIT}
         self._noted: dict[str, Any] = {}
         self._warned: list[str] = []
-        self._rows: dict[float, tuple[list[object], float, int]] = {}  # by simulated time [s]
+        # by simulated time [s]
+        self._rows: dict[float, tuple[list[object], float, int]] = {}
 
     def values(self, publishers: int) -> dict[str, Any]:
         """Return the value of each key that has one."""
@@ -321,13 +361,32 @@ class RunDiagnostics:
         mean, most = count.step_mean_s, count.step_max_s
         factor = ticks * period / wall if wall else 0.0
         factor_now = new * period / passed if passed > 0 else 0.0
-        dropped = ", ".join(f"{reason} {times}" for reason, times in dict(commands.reasons).items())
+        dropped = ", ".join(
+            f"{reason} {times}" for reason, times in dict(commands.reasons).items()
+        )
         row = (
             *(self._loop.phase.value, ticks, pacer.missed, pacer.overruns, pacer.jumps),
-            *(count.published, 1e6 * mean, 1e6 * most, 1.0 - mean / period, 1.0 - most / period),
+            *(
+                count.published,
+                1e6 * mean,
+                1e6 * most,
+                1.0 - mean / period,
+                1.0 - most / period,
+            ),
             *(*count.lateness_us, factor, factor_now, wall, ticks * period),
-            *(commands.received, commands.dropped, dropped, commands.clamped, commands.timeouts),
-            *("none" if age is None else age, publishers, count.resets, count.states_set),
+            *(
+                commands.received,
+                commands.dropped,
+                dropped,
+                commands.clamped,
+                commands.timeouts,
+            ),
+            *(
+                "none" if age is None else age,
+                publishers,
+                count.resets,
+                count.states_set,
+            ),
             *self.granted.values(),
         )
         values: dict[str, Any] = dict(zip(_COUNTS, row, strict=True))
@@ -340,12 +399,14 @@ class RunDiagnostics:
             self._rows = dict([*self._rows.items()][1::2])
         return values
 
-    def status(self, values: dict[str, Any], warnings: list[str]) -> tuple[int, str, list[str]]:
+    def status(
+        self, values: dict[str, Any], warnings: list[str]
+    ) -> tuple[int, str, list[str]]:
         """Return the level, the status in a few words, and what is new to warn of.
 
-        Values are as `values` has just read them. What the thread of the run counts meanwhile is
-        reported the next time: words and values of one message never contradict each other.
-        Warnings are of the graph.
+        Values are as `values` has just read them. What the thread of the run counts
+        meanwhile is reported the next time: words and values of one message never
+        contradict each other. Warnings are of the graph.
         """
         running, fault = values["phase"] == Phase.RUNNING.value, values["fault"]
         commands = self._loop.parts.torque_input
@@ -375,20 +436,29 @@ class RunDiagnostics:
         text = values["phase"]
         if running and values["command_age_s"] == "none":
             text += ", no command yet: zero torque"
-        return (WARN, f"{text}; {'; '.join(doubts)}", news) if doubts else (OK, text, news)
+        return (
+            (WARN, f"{text}; {'; '.join(doubts)}", news) if doubts else (OK, text, news)
+        )
 
     def table(self) -> Iterator[str]:
         """Yield the lines of the table of error against run time."""
         columns = "{:>12} {:>11} {:>11} {:>11} {:>10} {:>8}"
-        yield columns.format("run time", "error", "energy", "closure", "real-time", "ticks")
+        yield columns.format(
+            "run time", "error", "energy", "closure", "real-time", "ticks"
+        )
         yield columns.format("[s]", "[rad]", "[J]", "[1]", "factor", "missed")
         for seconds, (errors, factor, missed) in self._rows.items():
-            cells = (f"{value:.2e}" if isinstance(value, float) else "-" for value in errors)
+            cells = (
+                f"{value:.2e}" if isinstance(value, float) else "-" for value in errors
+            )
             yield columns.format(f"{seconds:.3f}", *cells, f"{factor:.3f}", missed)
 
 
 def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
-    """Read the gauges in the thread of the run; those without a finite value are left out."""
+    """Read the gauges in the thread of the run.
+
+    Those without a finite value are left out.
+    """
     state, conditioning = simulation.state, simulation.conditioning
     angles = (*state.joints.gamma, *state.joints.mu, *state.joints.beta)
     margins: dict[str, list[float]] = {"gamma": [], "mu": [], "beta": []}
@@ -405,4 +475,6 @@ def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
         simulation.step_budget,
     )
     known = {key: x for key, x in zip(GAUGES, row, strict=True) if x is not None}
-    return {key: x for key, x in known.items() if isinstance(x, str) or math.isfinite(x)}
+    return {
+        key: x for key, x in known.items() if isinstance(x, str) or math.isfinite(x)
+    }

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the nodes: source of descriptors, checks, --help and the tables of the docs.
 
-On the command line every parameter is a plain option, beside ROS arguments. What is wrong with
-those other than the name of a parameter, `rclpy.init` says: --help and a misspelt option need no
-ROS.
+On the command line every parameter is a plain option, beside ROS arguments. What is
+wrong with those other than the name of a parameter, `rclpy.init` says: --help and a
+misspelt option need no ROS.
 """
 
 from __future__ import annotations
@@ -44,40 +44,53 @@ class SimulatorParameters(Section):
     CHANGEABLE: ClassVar = ("real_time_factor", "command_timeout", "lockstep_timeout")
 
     scene: str = entry("scene, by name or by path of a .yaml file", default="example2")
-    rate: int = _whole("steps per second of simulated time, a divisor of 1e9", "Hz", 1000, 1, 10**5)
-    publish_rate: int = _whole(
-        "published samples per second of simulated time, a divisor of rate", "Hz", 500, 1, 100000
+    rate: int = _whole(
+        "steps per second of simulated time, a divisor of 1e9", "Hz", 1000, 1, 10**5
     )
-    wait_for_command: bool = entry("start the run at the first command, not at once", default=False)
+    publish_rate: int = _whole(
+        "published samples per second of simulated time, a divisor of rate",
+        "Hz",
+        500,
+        1,
+        100000,
+    )
+    wait_for_command: bool = entry(
+        "start the run at the first command, not at once", default=False
+    )
     duration: float = _number(
-        "length of the run, after which the node ends; 0 for no end; in lockstep by default the "
-        "duration of the scene",
+        "length of the run, after which the node ends; 0 for no end; in lockstep by"
+        " default the duration of the scene",
         "s",
         default=0.0,
         most=1e9,
     )
     real_time_factor: float = _number(
-        "simulated time per time of the clock, 0.001 to 1000; 0 for as fast as possible",
+        "simulated time per time of the clock, 0.001 to 1000; 0 for as fast as"
+        " possible",
         "1",
         default=1.0,
         most=1000.0,
     )
     publish_clock: bool = entry("publish the simulated time on /clock", default=False)
-    publish_description: bool = entry("publish the scene's URDF on robot_description", default=True)
+    publish_description: bool = entry(
+        "publish the scene's URDF on robot_description", default=True
+    )
     base_frame: str = entry(
-        "frame {B} in headers; with a prefix where robot_state_publisher has it as frame_prefix",
+        "frame {B} in headers; with a prefix where robot_state_publisher has it as"
+        " frame_prefix",
         default=BASE_FRAME,
     )
     wait_for_subscribers: tuple[str, ...] = entry(
-        "topics of the node, such as joint_states or ~/orientation, that must have a subscriber "
-        "before the run starts",
+        "topics of the node, such as joint_states or ~/orientation, that must have a"
+        " subscriber before the run starts",
         default=(),
     )
     subscriber_timeout: float = _number(
         "longest wait for them, after which the node ends with an error", "s", 10.0
     )
     sync: str = choice(
-        "free: run by the clock; lockstep: wait for the command that answers each sample",
+        "free: run by the clock; lockstep: wait for the command that answers each"
+        " sample",
         ("free", "lockstep"),
     )
     lockstep_timeout: float = _number(
@@ -87,8 +100,9 @@ class SimulatorParameters(Section):
         "age at which a command is no longer held (steady clock); 0 for never", "s", 0.5
     )
     partial_commands: bool = entry(
-        "an effort of commands_stamped that is nan means that the actuator is not commanded, as "
-        "ros2_control sends it: zero torque; else such a command is refused",
+        "an effort of commands_stamped that is nan means that the actuator is not"
+        " commanded, as ros2_control sends it: zero torque; else such a command is"
+        " refused",
         default=False,
     )
     integrator: str = choice("method of integration", INTEGRATORS)
@@ -96,45 +110,57 @@ class SimulatorParameters(Section):
         "largest local error of a step of the integrator", "rad, relative", 1e-10
     )
     equations: str = choice(
-        "equations of motion: those in the quaternion and the body rate, or the paper's Eqs. 1 to "
-        "92, which give the same motion by explicit methods in plain Python, about 20 times slower",
+        "equations of motion: those in the quaternion and the body rate, or the paper's"
+        " Eqs. 1 to 92, which give the same motion by explicit methods in plain Python,"
+        " about 20 times slower",
         EQUATIONS,
     )
     encoder_counts: int = _whole(
-        "steps per turn of the encoders that joint_states come from, whose rates are differences "
-        "of angles; 0 for exact angles and rates",
+        "steps per turn of the encoders that joint_states come from, whose rates are"
+        " differences of angles; 0 for exact angles and rates",
         "1",
         default=0,
         least=0,
         most=2**31 - 1,
     )
     angle_noise: float = entry(
-        "standard deviation of noise on the angles of joint_states", "rad", 0.0, least=0.0, most=1.0
+        "standard deviation of noise on the angles of joint_states",
+        "rad",
+        0.0,
+        least=0.0,
+        most=1.0,
     )
     rate_noise: float = _number(
-        "standard deviation of noise on the rates of joint_states", "rad/s", 0.0, most=1e3
+        "standard deviation of noise on the rates of joint_states",
+        "rad/s",
+        0.0,
+        most=1e3,
     )
     measurement_delay: int = _whole(
         "samples by which the angles and rates of joint_states are late", "1", 0, 0, 100
     )
     dropped_samples: float = entry(
-        "share of the samples without joint_states", "1", default=0.0, least=0.0, most=0.99
+        "share of the samples without joint_states",
+        "1",
+        default=0.0,
+        least=0.0,
+        most=0.99,
     )
     measurement_seed: int = _whole(
         "seed of the noise, and of the samples that are dropped", "1", 0, 0, 2**31 - 1
     )
     realtime_priority: int = _whole(
-        "SCHED_FIFO priority of the run's thread where that is permitted, the other threads of the "
-        "node get half of it; 0 for none",
+        "SCHED_FIFO priority of the run's thread where that is permitted, the other"
+        " threads of the node get half of it; 0 for none",
         "1",
         default=20,
         least=0,
         most=99,
     )
     cpu_dma_latency: int = _whole(
-        "largest exit latency of idle states that the machine is asked to use during a run with "
-        "deadlines, where /dev/cpu_dma_latency may be written; with 0 no core sleeps, which wakes "
-        "the run earlier and costs power; -1 for no limit",
+        "largest exit latency of idle states that the machine is asked to use during a"
+        " run with deadlines, where /dev/cpu_dma_latency may be written; with 0 no core"
+        " sleeps, which wakes the run earlier and costs power; -1 for no limit",
         "us",
         default=-1,
         least=-1,
@@ -189,16 +215,23 @@ class AnsweringParameters(Section):
     """Parameters of the nodes that answer joint states with torques."""
 
     rate: int = _whole(
-        "commands per second of simulated time, a divisor of 1e9: publish_rate of the simulator",
+        "commands per second of simulated time, a divisor of 1e9: publish_rate of the"
+        " simulator",
         "Hz",
         default=500,
         least=1,
         most=100000,
     )
     simulator: str = entry("name of the simulator's node", default="sst_simulator")
-    stamped: bool = entry("answer on commands_stamped, which lockstep needs", default=False)
+    stamped: bool = entry(
+        "answer on commands_stamped, which lockstep needs", default=False
+    )
     min_subscribers: int = _whole(
-        "least number of subscribers of the commands, before which none is sent", "1", 1, 1, 100
+        "least number of subscribers of the commands, before which none is sent",
+        "1",
+        1,
+        1,
+        100,
     )
     timeout: float = _number("longest silence of joint_states", "s", 10.0, least=0.1)
 
@@ -217,15 +250,21 @@ class AnsweringParameters(Section):
 class PlayerParameters(AnsweringParameters):
     """Parameters of sst_torque_player."""
 
-    scene: str = entry("scene whose torque is played, by name or by path", default="example2")
+    scene: str = entry(
+        "scene whose torque is played, by name or by path", default="example2"
+    )
     stamped: bool = entry(
-        "answer on commands_stamped, which each simulator takes, one in lockstep no other",
+        "answer on commands_stamped, which each simulator takes, one in lockstep no"
+        " other",
         default=True,
     )
-    csv: str = entry("file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-")
+    csv: str = entry(
+        "file with time, tau_1, tau_2, tau_3 to play instead; - for none", default="-"
+    )
     hold: str = choice(
-        "instant whose torque is held from a sample until the next: the middle of the hold gives "
-        "an error of second order in the period, its start one of first order",
+        "instant whose torque is held from a sample until the next: the middle of the"
+        " hold gives an error of second order in the period, its start one of first"
+        " order",
         ("middle", "start"),
     )
 
@@ -233,27 +272,37 @@ class PlayerParameters(AnsweringParameters):
 class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
     """Parameters of sst_inverse_dynamics: those of the control law and those of the node."""
 
-    scene: str = entry("scene of the controller's model, by name or by path", default="reach")
+    scene: str = entry(
+        "scene of the controller's model, by name or by path", default="reach"
+    )
     motion: str = choice(
-        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory and goals of "
-        "~/follow_joint_trajectory, until it is stopped",
+        "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory"
+        " and goals of ~/follow_joint_trajectory, until it is stopped",
         ("scene", "topic"),
     )
-    hold: float = _number("time for which the end of the scene's motion is held", "s", 0.0)
+    hold: float = _number(
+        "time for which the end of the scene's motion is held", "s", 0.0
+    )
     start_tolerance: float = _positive(
         "largest distance of gamma from the start of the motion", "rad", 0.05
     )
     path_tolerance: float = _number(
-        "largest error of gamma while a goal of ~/follow_joint_trajectory moves" + _OF_A_GOAL,
+        "largest error of gamma while a goal of ~/follow_joint_trajectory moves"
+        + _OF_A_GOAL,
         "rad",
         default=0.0,
     )
-    goal_tolerance: float = _number("largest error of gamma at its end" + _OF_A_GOAL, "rad", 0.0)
+    goal_tolerance: float = _number(
+        "largest error of gamma at its end" + _OF_A_GOAL, "rad", 0.0
+    )
     stopped_velocity_tolerance: float = _number(
         "largest error of the rate of gamma at its end" + _OF_A_GOAL, "rad/s", 0.01
     )
     goal_time_tolerance: float = _number(
-        "longest time after its end until both are met, else it is aborted" + _OF_A_GOAL, "s", 1.0
+        "longest time after its end until both are met, else it is aborted"
+        + _OF_A_GOAL,
+        "s",
+        1.0,
     )
     stop_time: float = _number(
         "time in which a goal that is cancelled or aborted comes to rest, on its path",
@@ -262,7 +311,8 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
         least=0.001,
     )
     wait_for_recorder: bool = entry(
-        "start when ~/reference and ~/tracking_error have subscribers, for a complete recording",
+        "start when ~/reference and ~/tracking_error have subscribers, for a complete"
+        " recording",
         default=False,
     )
 
@@ -275,11 +325,13 @@ def default_topics() -> tuple[str, ...]:
 class RecorderParameters(Section):
     """Parameters of sst_recorder."""
 
-    output: str = entry("folder of the bag, which must not exist; - for a dated name", default="-")
+    output: str = entry(
+        "folder of the bag, which must not exist; - for a dated name", default="-"
+    )
     topics: tuple[str, ...] = entry("topics to record", default=default_topics())
     timeout: float = _number(
-        "longest wait until they are recorded, after which the node ends with an error; 0 for no "
-        "end",
+        "longest wait until they are recorded, after which the node ends with an error;"
+        " 0 for no end",
         "s",
         default=60.0,
     )
@@ -294,11 +346,16 @@ class ViewerParameters(Section):
 
     simulator: str = entry("name of the simulator's node", default="sst_simulator")
     host: str = entry(
-        "address to serve the page at; another than this opens the actuators to all who reach it",
+        "address to serve the page at; another than this opens the actuators to all who"
+        " reach it",
         default="127.0.0.1",
     )
-    port: int = _whole("port of the page; the next free one is taken", "1", 8080, 1024, 65535)
-    open: bool = entry("open the page in a browser, where there is a desktop", default=False)
+    port: int = _whole(
+        "port of the page; the next free one is taken", "1", 8080, 1024, 65535
+    )
+    open: bool = entry(
+        "open the page in a browser, where there is a desktop", default=False
+    )
 
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -317,11 +374,16 @@ COMMANDS: dict[str, tuple[str, type[Section]]] = {
 
 
 def make_parser(command: str) -> argparse.ArgumentParser:
-    """Make the parser of plain options; it leaves words to be checked, so that all are."""
+    """Make the parser of plain options.
+
+    It leaves words to be checked, so that all are.
+    """
     parser = argparse.ArgumentParser(
         prog=command,
         usage="%(prog)s [--PARAMETER VALUE ...] [--ros-args ROS_ARGUMENT ...]",
-        description=f"Node sst_{command}. Parameters, also as `--ros-args -p NAME:=VALUE`:",
+        description=(
+            f"Node sst_{command}. Parameters, also as `--ros-args -p NAME:=VALUE`:"
+        ),
         add_help=False,
         allow_abbrev=False,
         argument_default=argparse.SUPPRESS,
@@ -332,14 +394,17 @@ def make_parser(command: str) -> argparse.ArgumentParser:
         shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
         text = f"{spec.doc}; {spec.describe()}; default: {shown}".replace("%", "%%")
         word = "true" if spec.kind == "flag" else ""  # of an option without a value
-        parser.add_argument(_option(name), nargs="?", const=word, metavar="VALUE", help=text)
+        parser.add_argument(
+            _option(name), nargs="?", const=word, metavar="VALUE", help=text
+        )
     return parser
 
 
 def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
     """Return the words (without the program's name) as ROS arguments.
 
-    An InputError lists every plain option, value and name of a parameter that is refused.
+    An InputError lists every plain option, value and name of a parameter that is
+    refused.
     """
     known, plain, ros = _specs_of(command), list[str](), list[str]()
     here = plain
@@ -351,13 +416,19 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
         else:
             here.append(word)
     # A parameter is an option by its name, too: --publish_rate.
-    dashed = [re.sub("^--[^=]*", lambda m: m[0].replace("_", "-"), word) for word in plain]
+    dashed = [
+        re.sub("^--[^=]*", lambda m: m[0].replace("_", "-"), word) for word in plain
+    ]
     given, unknown = make_parser(command).parse_known_args(dashed)
     named = [re.split("[=:]", word)[0] for word in unknown]
     checks = [unknown_name(word, map(_option, known)) for word in named]
     for flag, rule in pairwise(ros):
         name = rule.partition(":=")[0].rpartition(":")[2]
-        if flag in ("-p", "--param") and name not in known and not name.startswith(FOREIGN):
+        if (
+            flag in ("-p", "--param")
+            and name not in known
+            and not name.startswith(FOREIGN)
+        ):
             checks.append(unknown_name(name, known))
         if flag == "--log-level":
             level = rule.rpartition(":=")[2]
@@ -400,9 +471,14 @@ def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:
         patterns = [*_nodes_of(read_values(text, path))]
         # ** stands for any number of names, * for one.
         forms = [re.escape(one).replace(r"/\*\*", "(/[^/]+)*") for one in patterns]
-        if not any(re.fullmatch(form.replace(r"/\*", "/[^/]+"), node) for form in forms):
+        if not any(
+            re.fullmatch(form.replace(r"/\*", "/[^/]+"), node) for form in forms
+        ):
             names = ", ".join(patterns) or "none"
-            yield f"{path} has no parameters for {node}, only for {names} (/** is any node)"
+            yield (
+                f"{path} has no parameters for {node}, only for {names} (/** is any"
+                " node)"
+            )
 
 
 def _nodes_of(tree: Any, prefix: str = "") -> Iterator[str]:
@@ -429,7 +505,9 @@ def _as_yaml(spec: Spec, word: str) -> str:
         value = _read_list(value)
     text = json.dumps(accept(spec, value), ensure_ascii=False)
     # YAML 1.1 reads 1e-9 as text.
-    return re.sub(r"(?<![\d.])(\d+)e", r"\1.0e", text) if spec.kind == "number" else text
+    return (
+        re.sub(r"(?<![\d.])(\d+)e", r"\1.0e", text) if spec.kind == "number" else text
+    )
 
 
 def _read_list(word: str) -> list[str]:
@@ -439,6 +517,10 @@ def _read_list(word: str) -> list[str]:
         inner = inner[1:-1]
     entries = [entry.strip() for entry in inner.split(",")]
     return [
-        entry[1:-1] if len(entry) > 1 and entry[0] == entry[-1] and entry[0] in "\"'" else entry
+        (
+            entry[1:-1]
+            if len(entry) > 1 and entry[0] == entry[-1] and entry[0] in "\"'"
+            else entry
+        )
         for entry in entries
     ]

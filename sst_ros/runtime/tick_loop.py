@@ -21,7 +21,8 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import ZERO, State, Vector3
 
 _LONGEST_SLEEP_S = 0.05
-_TOGETHER_NS = 2_000_000  # bounds the ticks that one sleep ends in, so that few commands wait
+# bounds the ticks that one sleep ends in, so that few commands wait
+_TOGETHER_NS = 2_000_000
 _POLL_S = 0.001
 IDLE_PERIOD_S = 0.1
 """Period in which the state of a run that does not advance is shown."""
@@ -45,21 +46,30 @@ class SteadyTime:
         return time.monotonic_ns()
 
     def sleep(self, seconds: float) -> None:
-        """Wait for about this time [s]; a clock that derives from this one may return early."""
+        """Wait for about this time [s].
+
+        A clock that derives from this one may return early.
+        """
         time.sleep(seconds)
 
 
 class Pacer:
-    """Deadlines anchor + k period / speed. After an overrun the whole periods in it are dropped.
+    """Deadlines anchor + k period / speed.
 
-    Lateness up to `tolerance_ns` is made up for: the step of a followed clock. With the speed 0,
-    the real-time factor, deadlines have always come.
+    After an overrun the whole periods in it are dropped.
+
+    Lateness up to `tolerance_ns` is made up for: the step of a followed clock. With the
+    speed 0, the real-time factor, deadlines have always come.
     """
 
     def __init__(
         self, period_ns: int, speed: float, source: SteadyTime, tolerance_ns: int = 0
     ) -> None:
-        self._period_ns, self._source, self._tolerance_ns = period_ns, source, tolerance_ns
+        self._period_ns, self._source, self._tolerance_ns = (
+            period_ns,
+            source,
+            tolerance_ns,
+        )
         self._anchor = self._count = self._seen = 0
         self._set(speed)
         self.missed = self.overruns = 0  # ticks dropped, and times that some were
@@ -79,7 +89,8 @@ class Pacer:
     def _set(self, speed: float) -> None:
         self.speed, self._interval = speed, self._period_ns / speed if speed else 0.0
         self.interval_ns = round(self._interval)  # between deadlines; 0 without any
-        # Ticks that one sleep may end in; a clock that is followed does not give the next deadline.
+        # Ticks that one sleep may end in; a clock that is followed does not give the
+        # next deadline.
         several = speed > 0.0 and self._tolerance_ns == 0
         self.together = max(1, int(_TOGETHER_NS // self._interval)) if several else 1
 
@@ -93,7 +104,9 @@ class Pacer:
         return self._anchor + round((self._count + ticks - 1) * self._interval)
 
     def wait(self, interrupted: Callable[[], bool], ticks: int = 1) -> bool:
-        """Wait for the next deadline, or the last of several; False if interrupted before.
+        """Wait for the next deadline, or the last of several.
+
+        False if interrupted before.
 
         That is asked after each sleep, the longest of which is 50 ms.
         """
@@ -125,12 +138,16 @@ class Pacer:
 
 
 class Counters:
-    """Counters of a run: steps, samples published, resets, states set; times of steps."""
+    """Counters of a run: steps, samples published, resets, states set.
+
+    Times of steps.
+    """
 
     def __init__(self) -> None:
         self.ticks = self.published = self.resets = self.states_set = 0
         self._step_total_s = self.step_max_s = 0.0  # the mean of the steps of one call
-        self.ticks_at_once = 1  # that one call may take: one as long as none has been measured
+        # that one call may take: one as long as none has been measured
+        self.ticks_at_once = 1
         self._late_total = self._late_square = self._late_max = 0.0
         self._wall_s = 0.0
         self._resumed: float | None = None
@@ -152,7 +169,9 @@ class Counters:
         self._step_total_s += took_s
         if took_s > self.step_max_s * ticks:
             self.step_max_s = took_s / ticks
-            self.ticks_at_once = int(min(max(1.0, _AT_ONCE_S / self.step_max_s), _TICKS_AT_ONCE))
+            self.ticks_at_once = int(
+                min(max(1.0, _AT_ONCE_S / self.step_max_s), _TICKS_AT_ONCE)
+            )
         late = 1e-3 * late_ns
         self._late_total += late * ticks
         self._late_square += late * late * ticks
@@ -162,7 +181,9 @@ class Counters:
     @property
     def wall_s(self) -> float:
         """Time spent running [s]."""
-        return self._wall_s + (time.monotonic() - self._resumed if self._resumed else 0.0)
+        return self._wall_s + (
+            time.monotonic() - self._resumed if self._resumed else 0.0
+        )
 
     @property
     def step_mean_s(self) -> float:
@@ -172,20 +193,23 @@ class Counters:
     @property
     def lateness_us(self) -> tuple[float, float, float]:
         """Mean, standard deviation and largest lateness of the ticks [us]."""
-        mean, square = (x / max(self.ticks, 1) for x in (self._late_total, self._late_square))
+        mean, square = (
+            x / max(self.ticks, 1) for x in (self._late_total, self._late_square)
+        )
         return mean, math.sqrt(max(square - mean * mean, 0.0)), self._late_max
 
 
 class HeldTorques:
     """Error of the orientation that comes from holding torques, estimated from how they change.
 
-    A torque tau(t_k) held over a period T acts, on average, T / 2 late: the angular acceleration
-    lacks A tau' T / 2, where A turns torques into body accelerations. Integrated twice with the
-    present A, the orientation is off by A (T / 2) times the integral of tau - tau(0). Of the torque
-    of the middle of the hold the second order is left: the rate lacks T^2 tau'' / 24 a period, and
-    the orientation moves T^3 tau' / 12 too little in each of 1 / T periods, together
-    A (T^2 / 24) (tau - tau(0) + t tau'(0)). Both leave out that A changes and that the motion
-    responds to its own error: they are estimates of the size.
+    A torque tau(t_k) held over a period T acts, on average, T / 2 late: the angular
+    acceleration lacks A tau' T / 2, where A turns torques into body accelerations.
+    Integrated twice with the present A, the orientation is off by A (T / 2) times the
+    integral of tau - tau(0). Of the torque of the middle of the hold the second order
+    is left: the rate lacks T^2 tau'' / 24 a period, and the orientation moves T^3 tau'
+    / 12 too little in each of 1 / T periods, together A (T^2 / 24) (tau - tau(0) + t
+    tau'(0)). Both leave out that A changes and that the motion responds to its own
+    error: they are estimates of the size.
     """
 
     def __init__(self) -> None:
@@ -210,7 +234,8 @@ class HeldTorques:
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
         """Estimated errors of the orientation [rad]: torques of the start, and of the middle.
 
-        None where fewer than two torques were held, or where the torques of the actuators lag.
+        None where fewer than two torques were held, or where the torques of the
+        actuators lag.
         """
         if len(self._torques) < 2 or len(simulation.dynamics.state) > 7:
             return None
@@ -221,9 +246,13 @@ class HeldTorques:
         lost = add(axpy(1.0, last, -1.0, first), drift)
         # How much the body acceleration changes by a change of the torques.
         state, dynamics = simulation.state, simulation.dynamics
-        y, rest = (*state.quaternion, *state.body_rate), (0.0,) * (len(dynamics.drive) - 3)
+        y, rest = (
+            (*state.quaternion, *state.body_rate),
+            (0.0,) * (len(dynamics.drive) - 3),
+        )
         without, by_late, by_lost = (
-            dynamics.derivative(*y, *torque, *rest)[4:7] for torque in (ZERO, late, lost)
+            dynamics.derivative(*y, *torque, *rest)[4:7]
+            for torque in (ZERO, late, lost)
         )
         of_start = 0.5 * period * math.dist(by_late, without)
         return of_start, period**2 / 24.0 * math.dist(by_lost, without)
@@ -259,15 +288,17 @@ class TickLoop:
         self._control_ns = run.period_ns * run.ticks_per_sample
         self._idle_step_ns = self._control_ns if run.lockstep and run.own_clock else 0
         self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
-        self._kept: Vector3 | None = None  # in lockstep, an answer whose deadline has not come
+        # in lockstep, an answer whose deadline has not come
+        self._kept: Vector3 | None = None
         self._awaited_since = self._waits_since = time.monotonic()
 
     def warm_up(self) -> None:
         """Load the code of every method, take the first step and go back.
 
-        Later steps take no longer, also where they change the method. To load the code takes a
-        second, and twenty on a machine with many busy processes. Meanwhile the state is shown: who
-        waits for joint_states would take the silence for the end of the simulator.
+        Later steps take no longer, also where they change the method. To load the code
+        takes a second, and twenty on a machine with many busy processes. Meanwhile the
+        state is shown: who waits for joint_states would take the silence for the end of
+        the simulator.
         """
         failures: list[BaseException] = []
 
@@ -292,7 +323,10 @@ class TickLoop:
         self.simulation.reset()
 
     def restart(self, simulation: Simulation) -> None:
-        """Take another simulation, or the same at its start, and show it; stamps go on."""
+        """Take another simulation, or the same at its start, and show it.
+
+        Stamps go on.
+        """
         self.simulation, self.begun, self._tick, self._kept = simulation, False, 0, None
         self._input.clear()
         self.held.clear()
@@ -321,7 +355,10 @@ class TickLoop:
         self._pacer.start()
 
     def stamp_ns(self, state: State) -> int:
-        """ROS time at which a state of the run holds [ns]; before it, of the last idle state."""
+        """ROS time at which a state of the run holds [ns].
+
+        Before it, of the last idle state.
+        """
         return self._start_ns + state.time_ns if self.begun else self._idle_ns
 
     @property
@@ -333,15 +370,13 @@ class TickLoop:
         """Tick to the next sample and publish it; False if it was interrupted before.
 
         Ticks between which nothing changes are one call. With deadlines ticks are done
-        together at the deadline of the last of them, at most 2 ms later than its own; a command
-        acts from the tick on that begins after its arrival. Without deadlines samples that nothing
-        receives are passed over, up to 64 ticks.
+        together at the deadline of the last of them, at most 2 ms later than its own; a
+        command acts from the tick on that begins after its arrival. Without deadlines
+        samples that nothing receives are passed over, up to 64 ticks.
 
-        Raises:
-            RunStopped: the run ends before; the ticks before it are done and logged.
-            NoAnswer: in lockstep no answer came within lockstep_timeout, or within 0.4 s where a
-                paused run is stepped.
-
+        Raises: RunStopped: the run ends before; the ticks before it are done and
+            logged. NoAnswer: in lockstep no answer came within lockstep_timeout, or
+            within 0.4 s where a paused run is stepped.
         """
         if self._lockstep:
             self._kept = self._kept or self._answer(paced)
@@ -354,9 +389,12 @@ class TickLoop:
             if interval_ns:
                 ticks = min(ticks, self._pacer.together)
             elif paced and not self._lockstep and self._output.unread:
-                # Samples behind the one that these ticks lead to, within what is done at once.
+                # Samples behind the one that these ticks lead to, within what is done
+                # at once.
                 if (self._tick + ticks) % self._ticks_per_sample == 0:
-                    most = min(self._last_tick - self._tick, self.counters.ticks_at_once)
+                    most = min(
+                        self._last_tick - self._tick, self.counters.ticks_at_once
+                    )
                     unread = (most - ticks) // self._ticks_per_sample
                 ticks += unread * self._ticks_per_sample
             if paced and not self._pacer.wait(self._is_interrupted, ticks):
@@ -377,12 +415,18 @@ class TickLoop:
                 return False
 
     def _is_interrupted(self) -> bool:
-        late = self.requested.is_set() and time.monotonic() - self._waits_since > _LONGEST_WAIT_S
+        late = (
+            self.requested.is_set()
+            and time.monotonic() - self._waits_since > _LONGEST_WAIT_S
+        )
         return late or self.stopped.is_set()
 
     def publish_rest(self) -> None:
         """Publish what has been done since the last sample, if anything."""
-        if self.begun and self._start_ns + self._tick * self._period_ns != self._stamp_ns:
+        if (
+            self.begun
+            and self._start_ns + self._tick * self._period_ns != self._stamp_ns
+        ):
             with contextlib.suppress(Exception):  # publishing may be what failed
                 self._publish()
         with contextlib.suppress(Exception):
@@ -391,13 +435,15 @@ class TickLoop:
     def show(self, *, fault: bool, waits: bool = False) -> None:
         """Publish the state of a run that does not advance, marked as idle.
 
-        Its stamp is the ROS time at which the state holds: that of the last sample where samples
-        will follow it, else the present time; 0 before the first time of a followed clock. Stamps
-        never go back or repeat; where time stands still they differ by 1 ns, because tf2 warns of
-        transforms that have the stamp of the one before.
+        Its stamp is the ROS time at which the state holds: that of the last sample
+        where samples will follow it, else the present time; 0 before the first time of
+        a followed clock. Stamps never go back or repeat; where time stands still they
+        differ by 1 ns, because tf2 warns of transforms that have the stamp of the one
+        before.
 
-        In lockstep our /clock moves by a control period where the run waits: controllers that are
-        updated by it can become active, and the run begins one update after what a command answers.
+        In lockstep our /clock moves by a control period where the run waits:
+        controllers that are updated by it can become active, and the run begins one
+        update after what a command answers.
         """
         moves = waits and self._idle_step_ns > 0
         later_ns = max(self._stamp_ns, self._idle_ns) + 1

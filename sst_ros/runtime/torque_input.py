@@ -26,8 +26,10 @@ ACTUATORS = JOINTS[:3]
 _SHOWN = 6  # entries of a list in the reason of a refusal
 
 MOST_WAITING = 50
-"""Commands that wait for the next tick, which takes them all and uses the last: a process that is
-held up for 50 ms loses none at 1 kHz, and what a flood costs a tick is bounded."""
+"""Commands that wait for the next tick, which takes them all and uses the last: a
+process that is held up for 50 ms loses none at 1 kHz, and what a flood costs a tick is
+bounded.
+"""
 
 
 Arrivals: TypeAlias = Any
@@ -35,7 +37,10 @@ Arrivals: TypeAlias = Any
 
 
 class MessageRefused(Exception):
-    """A message is not used; `kind` is the reason in a word or two, the text the whole reason."""
+    """A message is not used.
+
+    `kind` is the reason in a word or two, the text the whole reason.
+    """
 
     def __init__(self, kind: str, reason: str) -> None:
         self.kind = kind
@@ -47,20 +52,27 @@ class RunSettings:
     """Numbers of a run, of a node or not; the times may change between two ticks."""
 
     period_ns: int  # of a tick
-    ticks_per_sample: int = 1  # from one published sample to the next: the control period
+    # from one published sample to the next: the control period
+    ticks_per_sample: int = 1
     last_tick: int = sys.maxsize  # after which the run ends, if at all
     lockstep: bool = False  # each sample is answered before the next tick
     waits: bool = False  # a command starts the run
-    own_clock: bool = False  # /clock is ours, and in lockstep goes on before the run, too
+    # /clock is ours, and in lockstep goes on before the run, too
+    own_clock: bool = False
     partial_commands: bool = False  # an effort that is nan means zero torque
     base_frame: str = BASE_FRAME  # {B}, in which external moments are given
-    command_timeout_ns: float = 0.0  # age at which a command is no longer held; 0 for never
-    lockstep_timeout: float = 0.0  # longest wait for the answer to a sample [s]; 0 for no end
+    # age at which a command is no longer held; 0 for never
+    command_timeout_ns: float = 0.0
+    # longest wait for the answer to a sample [s]; 0 for no end
+    lockstep_timeout: float = 0.0
     subscriber_timeout: float = 0.0  # longest wait for subscribers [s]
 
 
 class TorqueInput:
-    """Torque commands of a run. Owned by the thread of the run; others read the counters."""
+    """Torque commands of a run. Owned by the thread of the run.
+
+    Others read the counters.
+    """
 
     def __init__(
         self,
@@ -106,7 +118,11 @@ class TorqueInput:
         if self.stale and self._damping > 0.0:  # the torque depends on the state
             return False
         moments = self._moments
-        if self._commands.waiting or self._stamped.waiting or (moments and moments.waiting):
+        if (
+            self._commands.waiting
+            or self._stamped.waiting
+            or (moments and moments.waiting)
+        ):
             return False
         if self.begun and not self.stale and self._is_old(self._since, until_ns):
             return False
@@ -117,7 +133,10 @@ class TorqueInput:
         self._idle_ns = [(not alone and self._idle_ns[0]) or stamp_ns, stamp_ns]
 
     def starts_run(self) -> bool:
-        """Take the messages that arrived before the run; return whether a command starts it."""
+        """Take the messages that arrived before the run.
+
+        Return whether a command starts it.
+        """
         if self._run.lockstep:
             self.answer(None)
         else:
@@ -141,12 +160,15 @@ class TorqueInput:
     def answer(self, stamp_ns: int | None) -> Vector3 | None:
         """Return the torques that answer the sample of this stamp [N m], None without an answer.
 
-        With None an answer to a state shown before the run is looked for. In a run such answers are
-        ignored, because they may arrive late. In a pause the state of the sample is shown again.
+        With None an answer to a state shown before the run is looked for. In a run such
+        answers are ignored, because they may arrive late. In a pause the state of the
+        sample is shown again.
         """
         found: Vector3 | None = None
         for _ in self._commands.read(math.inf):
-            self._drop(MessageRefused("no stamp", "in lockstep only commands_stamped is used"))
+            self._drop(
+                MessageRefused("no stamp", "in lockstep only commands_stamped is used")
+            )
         now_ns = time.monotonic_ns()
         for message in self._read_stamped(math.inf):
             stamp = nanoseconds(message.header.stamp)
@@ -169,13 +191,22 @@ class TorqueInput:
         self._take_moments(now_ns)
 
     def _read_stamped(self, until_ns: float) -> Iterable[Any]:
-        """Read stamped commands; with partial_commands nan is zero torque, all nan no command."""
+        """Read stamped commands.
+
+        With partial_commands nan is zero torque, all nan no command.
+        """
         found: Sequence[Any] = self._stamped.read(until_ns)
         if not self._run.partial_commands:
             return found
-        given = [one for one in found if not (one.effort and all(map(math.isnan, one.effort)))]
+        given = [
+            one
+            for one in found
+            if not (one.effort and all(map(math.isnan, one.effort)))
+        ]
         for message in given:
-            message.effort = [0.0 if math.isnan(torque) else torque for torque in message.effort]
+            message.effort = [
+                0.0 if math.isnan(torque) else torque for torque in message.effort
+            ]
         return given
 
     def _take_moments(self, now_ns: int) -> None:
@@ -191,15 +222,23 @@ class TorqueInput:
             self.moment = ZERO
 
     def _read_moment(self, message: Any) -> Vector3:
-        """Return the moment in {B} [N m]; without a frame_id it is taken to be in {B}."""
+        """Return the moment in {B} [N m].
+
+        Without a frame_id it is taken to be in {B}.
+        """
         frame_id, base_frame = message.header.frame_id, self._run.base_frame
         if frame_id not in ("", base_frame):
-            reason = f"external_moment has frame_id {frame_id!r}, must be {base_frame!r} or empty"
+            reason = (
+                f"external_moment has frame_id {frame_id!r}, must be {base_frame!r} or"
+                " empty"
+            )
             raise MessageRefused("frame", reason)
         vector = message.wrench.torque
         return three_numbers((vector.x, vector.y, vector.z), "moments [N m]")
 
-    def _accept(self, check: Callable[[Any], Vector3], content: Any, now_ns: int) -> Vector3 | None:
+    def _accept(
+        self, check: Callable[[Any], Vector3], content: Any, now_ns: int
+    ) -> Vector3 | None:
         """Hold the torques of a command; drop one that the check refuses."""
         try:
             torque = check(content)

@@ -14,7 +14,12 @@ from typing import Any
 import numpy as np
 
 from sst_ros.control.actuator_space import Reference, ReferenceMotion, slow_down
-from sst_ros.control.controller import Controller, Measurement, TrackingMetrics, track_of
+from sst_ros.control.controller import (
+    Controller,
+    Measurement,
+    TrackingMetrics,
+    track_of,
+)
 from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference_motions import reference_motion
@@ -30,27 +35,31 @@ from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, ZERO
 
 _FIRST_PERIODS_AHEAD = 25
-"""Control periods that the first check may take where the reference moves; then twice the last."""
+"""Control periods that the first check may take where the reference moves.
+
+Then twice the last.
+"""
 _MOST_CHECKS = 5
-_NUMBERS = 256 * 19  # numbers of samples, 19 each, that are added to the tracking metrics at once
+# numbers of samples, 19 each, that are added to the tracking metrics at once
+_NUMBERS = 256 * 19
 
 
 class Order:
     """A trajectory between its message and its motion.
 
-    Attributes:
-        outcome: a result where the trajectory is accepted, else the SstError that says why not;
-            cancelled where a newer one came before this was checked.
+    Attributes: outcome: a result where the trajectory is accepted, else the SstError
+        that says why not; cancelled where a newer one came before this was checked.
         passed: time of the trajectory at which its motion begins [s].
-
     """
 
     def __init__(self, points: Points, seen: Measurement | None, seen_ns: int) -> None:
         self.points, self.seen, self.seen_ns = points, seen, seen_ns
         self.outcome: Future[None] = Future()
-        self.passed, self.asked, self.asked_ns = 0.0, 0, 0  # checks, and the sample at the last one
+        # checks, and the sample at the last one
+        self.passed, self.asked, self.asked_ns = 0.0, 0, 0
         self.begin: Reference | None = None  # the reference from which it was planned
-        self.begin_ns: int | None = None  # of that; None where it stands still until then
+        # of that; None where it stands still until then
+        self.begin_ns: int | None = None
 
 
 class Stage(Enum):
@@ -66,9 +75,10 @@ class Stage(Enum):
 class TrajectoryFollower:
     """Follows the scene's motion once, or one trajectory after the other.
 
-    A trajectory replaces what is followed, from a reference a little ahead, where it will have been
-    checked by a process beside the control; in lockstep, where the plant waits, at once.
-    Raises InputError, AssemblyError or SingularConfiguration where the scene's motion is refused.
+    A trajectory replaces what is followed, from a reference a little ahead, where it
+    will have been checked by a process beside the control; in lockstep, where the plant
+    waits, at once. Raises InputError, AssemblyError or SingularConfiguration where the
+    scene's motion is refused.
 
     Attributes:
         stage: present stage.
@@ -81,7 +91,11 @@ class TrajectoryFollower:
     """
 
     def __init__(self, model: Scene, settings: ControllerNodeParameters) -> None:
-        self._model, self._settings, self._geometry = model, settings, Geometry.of(model)
+        self._model, self._settings, self._geometry = (
+            model,
+            settings,
+            Geometry.of(model),
+        )
         limit = float(command_limit(settings.torque_limit, model))
         if math.isfinite(limit):  # for the check of motions, too
             self._model = model.with_values({"actuators.torque_limit": limit})
@@ -90,7 +104,8 @@ class TrajectoryFollower:
             self._planned = reference_motion(model, _read_motion)
             check_motion(self._planned, self._model)
         self._plan, self._assistant = partial(plan, self._model), None
-        self._ahead_ns = 0  # from a sample to the instant from which a trajectory is planned
+        # from a sample to the instant from which a trajectory is planned
+        self._ahead_ns = 0
         if settings.motion == "topic" and not settings.stamped:
             self._assistant = Assistant(self._plan)
             self._ahead_ns = _FIRST_PERIODS_AHEAD * settings.period_ns
@@ -115,18 +130,25 @@ class TrajectoryFollower:
         self._last: Command | None = None
         self.order: Order | None = None
         self.finished: TrackingMetrics | None = None
-        self._upcoming: list[tuple[int, ReferenceMotion, Order]] = []  # by the stamps they begin at
+        # by the stamps they begin at
+        self._upcoming: list[tuple[int, ReferenceMotion, Order]] = []
         if self._planned is not None:
             self._prepare(self._planned)
 
     def take(self, message: Any, seen: Measurement | None, seen_ns: int = 0) -> Order:
         """Take a trajectory_msgs/JointTrajectory in place of what is followed now.
 
-        It goes on from the reference that is followed then; before the first sample from where the
-        manipulator was `seen` last, at rest. Where it is refused, nothing changes.
+        It goes on from the reference that is followed then; before the first sample
+        from where the manipulator was `seen` last, at rest. Where it is refused,
+        nothing changes.
         """
-        motion, allowed = self._settings.motion, "must be topic, for trajectories to be taken"
-        refuse_unless("joint_trajectory", ("motion", motion, motion == "topic", allowed))
+        motion, allowed = (
+            self._settings.motion,
+            "must be topic, for trajectories to be taken",
+        )
+        refuse_unless(
+            "joint_trajectory", ("motion", motion, motion == "topic", allowed)
+        )
         order = Order(read_points(message), seen, seen_ns)
         if self._waiting is not None:
             self._waiting.outcome.cancel()
@@ -158,7 +180,11 @@ class TrajectoryFollower:
 
     def _place(self, order: Order) -> tuple[Reference, float]:
         """Find the reference from which to plan, and the time of the trajectory then [s]."""
-        stamp_ns, order.begin_ns, order.asked_ns = order.points.stamp_ns, None, self._last_ns
+        stamp_ns, order.begin_ns, order.asked_ns = (
+            order.points.stamp_ns,
+            None,
+            self._last_ns,
+        )
         now_ns = self._last_ns + self._settings.period_ns
         if self._last is None:
             order.begin, now_ns = self._reference_at_rest(order.seen), order.seen_ns
@@ -176,7 +202,10 @@ class TrajectoryFollower:
         if order.outcome.done():  # by a reset
             return
         if order.asked_ns:
-            took_ns, period_ns = self._last_ns - order.asked_ns, self._settings.period_ns
+            took_ns, period_ns = (
+                self._last_ns - order.asked_ns,
+                self._settings.period_ns,
+            )
             self._ahead_ns = max(2 * (took_ns + period_ns), self._ahead_ns - period_ns)
         if isinstance(result, ReferenceMotion) and self._is_timely(order):
             self._follow(order, result)
@@ -195,7 +224,9 @@ class TrajectoryFollower:
             return True
         if order.begin_ns is None:
             return self._rests() and order.begin == self._motion.at(math.inf)
-        return order.begin_ns >= self._last_ns and order.begin == self._reference_at(order.begin_ns)
+        return order.begin_ns >= self._last_ns and order.begin == self._reference_at(
+            order.begin_ns
+        )
 
     def has(self, order: Order) -> bool:
         """Whether the trajectory is followed, or will be at its stamp."""
@@ -217,7 +248,9 @@ class TrajectoryFollower:
         """Follow a motion from its stamp on, and until then what is followed now."""
         stamp_ns, start = order.points.stamp_ns, motion.at(0.0)
         if self._last is None:
-            self._upcoming = [(stamp_ns, motion, order)] if stamp_ns > order.seen_ns else []
+            self._upcoming = (
+                [(stamp_ns, motion, order)] if stamp_ns > order.seen_ns else []
+            )
             if self._upcoming:
                 self._prepare(ReferenceMotion(lambda _: start, (0.0,)))
             else:
@@ -229,7 +262,10 @@ class TrajectoryFollower:
         order.outcome.set_result(None)
 
     def stop(self) -> None:
-        """Come to rest on the path in `stop_time`, and hold; before the run, forget the motion."""
+        """Come to rest on the path in `stop_time`, and hold.
+
+        Before the run, forget the motion.
+        """
         if self.stage is Stage.READY:
             self.restart()
         elif self._start_ns is not None:
@@ -240,7 +276,10 @@ class TrajectoryFollower:
                 self._begin(motion, self._last_ns)
 
     def preview(self, measured: Measurement) -> Command | None:
-        """Answer a sample before the run; None as long as there is nothing to follow."""
+        """Answer a sample before the run.
+
+        None as long as there is nothing to follow.
+        """
         if self.stage is not Stage.READY:
             return None
         self._refuse_elsewhere(measured)
@@ -251,9 +290,9 @@ class TrajectoryFollower:
     def answer(self, stamp_ns: int, measured: Measurement) -> Command | None:
         """Answer a sample of the run; None where there is nothing to answer.
 
-        The end of the scene's motion is answered with zero torque: then the work is done. An
-        InputError says that the manipulator is not where the motion begins; ControlStopped is the
-        controller's.
+        The end of the scene's motion is answered with zero torque: then the work is
+        done. An InputError says that the manipulator is not where the motion begins;
+        ControlStopped is the controller's.
         """
         if stamp_ns <= self._last_ns or self.stage in (Stage.WAITING, Stage.ENDED):
             return None
@@ -282,7 +321,9 @@ class TrajectoryFollower:
         if passed_ns <= end_ns:
             angles = *command.desired.gamma, *command.desired.gamma_dot, *command.error
             torques = *command.feedforward, *command.feedback, *command.torque
-            self._rows.extend(((stamp_ns - self._record_ns) / NANOSECONDS, *angles, *torques))
+            self._rows.extend(
+                ((stamp_ns - self._record_ns) / NANOSECONDS, *angles, *torques)
+            )
             if len(self._rows) >= _NUMBERS:
                 self._add_rows()
         self.samples += 1
@@ -347,11 +388,14 @@ class TrajectoryFollower:
         begin, tolerance = self._motion.at(0.0).gamma, self._settings.start_tolerance
         near = max(map(abs, axpy(1.0, begin, -1.0, measured.gamma))) <= tolerance
         said = ", ".join(f"{angle:.6f}" for angle in begin)
-        allowed = f"must be within {tolerance:g} rad of ({said}), where the motion begins"
+        allowed = (
+            f"must be within {tolerance:g} rad of ({said}), where the motion begins"
+        )
         refuse_unless("joint_states", ("position", measured.gamma, near, allowed))
 
 
 def _read_motion(bag: str) -> Trajectory:
-    from sst_ros.recording.recording import read_run_motion  # needs rosbags, which others do not
+    # needs rosbags, which others do not
+    from sst_ros.recording.recording import read_run_motion
 
     return read_run_motion(bag)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mechanism of a scene: base triangle, star, links and payload, and the range they move in.
 
-Bodies rotate about the fixed centre O, so every inertia here is about O but the payload's; one that
-a document gives about the centre of mass is shifted when it is read (parallel axes).
-Letters and frames are the paper's: base directions v_k, angles alpha_k between the arcs of the
-moving spherical star (MSS), {E} fixed in the star, {1k} in actuated link k, {2k} in intermediate
-link k.
+Bodies rotate about the fixed centre O, so every inertia here is about O but the
+payload's; one that a document gives about the centre of mass is shifted when it is read
+(parallel axes). Letters and frames are the paper's: base directions v_k, angles alpha_k
+between the arcs of the moving spherical star (MSS), {E} fixed in the star, {1k} in
+actuated link k, {2k} in intermediate link k.
 """
 
 from __future__ import annotations
@@ -29,13 +29,17 @@ SMALLEST_SIDE = 4e-5
 ABOUT_O, ABOUT_CENTRE = "O", "centre_of_mass"
 
 SMALLEST_MOMENT = 1e-18
-"""Moment of inertia [kg m^2] of a microgram at a millimetre; its inverse must not overflow."""
+"""Moment of inertia [kg m^2] of a microgram at a millimetre.
+
+Its inverse must not overflow.
+"""
 
 
 class Inertia(Section):
     """A symmetric inertia tensor, about O for all but the payload.
 
-    Off-diagonal entries are those of the tensor: xy = -sum(m x y), the negative product of inertia.
+    Off-diagonal entries are those of the tensor: xy = -sum(m x y), the negative product
+    of inertia.
     """
 
     xx: float = entry("inertia tensor, xx", "kg m^2")
@@ -53,7 +57,9 @@ class Inertia(Section):
     def rules(self) -> Rules:
         """Refuse what no rigid body has."""
         tensor = entries_of(self)
-        largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
+        largest = (
+            (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
+        )
         definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
         fits = _is_positive([-part for part in tensor], largest)
         least = f"> 0 (positive definite), at least {SMALLEST_MOMENT:g} kg m^2"
@@ -65,16 +71,18 @@ class Inertia(Section):
 class Base(Section):
     """The fixed spherical triangle P1 P2 P3 in {B}, by directions v or by its arcs.
 
-    The arcs 1-2, 2-3, 3-1 say nothing of {B}; then P1 is on its x axis, P2 in its xy plane with
-    y > 0, and P3 above that: v1 = (1, 0, 0), v2 = (cos a12, sin a12, 0), v3 = (cos a31, y, z > 0)
-    with v2 . v3 = cos a23. A scene that is read has these v.
+    The arcs 1-2, 2-3, 3-1 say nothing of {B}; then P1 is on its x axis, P2 in its xy
+    plane with y > 0, and P3 above that: v1 = (1, 0, 0), v2 = (cos a12, sin a12, 0), v3
+    = (cos a31, y, z > 0) with v2 . v3 = cos a23. A scene that is read has these v.
     """
 
     ONE_OF = "v", "arcs_deg"
     CONVERTED = ("v",)
 
     v: tuple[Vector3, Vector3, Vector3] = entry(
-        "directions of P1, P2, P3 seen from O, right-handed, of any length", "1", default=None
+        "directions of P1, P2, P3 seen from O, right-handed, of any length",
+        "1",
+        default=None,
     )
     arcs_deg: Vector3 | None = entry(
         "lengths of the arcs 1-2, 2-3, 3-1, in place of v", "deg", least=1e-6
@@ -88,7 +96,10 @@ class Base(Section):
                 v = _directions_of(*np.radians(arcs).tolist())
                 vars(self).update(v=v, arcs_deg=None)
             else:
-                allowed = "must close: each less than the sum of the others, their sum less than"
+                allowed = (
+                    "must close: each less than the sum of the others, their sum less"
+                    " than"
+                )
                 yield Problem("arcs_deg", arcs, f"{allowed} 360 deg")
 
     def rules(self) -> Rules:
@@ -99,17 +110,34 @@ class Base(Section):
         lengths = np.linalg.norm(v, axis=-1)
         volume = np.linalg.det(v / lengths[..., None])
         flat = (lengths.min(axis=-1) < 1e-6) | ~(abs(volume) >= RELATIVE_ROUNDING)
-        allowed = f"must lie {SMALLEST_SIDE:g} rad apart or more, and not on one great circle"
-        yield flat, "v", self.v, f"P1, P2, P3 {allowed}; no direction may be zero (degenerate)"
+        allowed = (
+            f"must lie {SMALLEST_SIDE:g} rad apart or more, and not on one great circle"
+        )
+        yield (
+            flat,
+            "v",
+            self.v,
+            f"P1, P2, P3 {allowed}; no direction may be zero (degenerate)",
+        )
         handed = "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points"
         yield ~flat & (volume < 0.0), "v", self.v, handed
 
 
-def _directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3, Vector3]:
+def _directions_of(
+    a12: float, a23: float, a31: float
+) -> tuple[Vector3, Vector3, Vector3]:
     """Directions of the corners of a spherical triangle with these arcs [rad], as in `Base`."""
     half = 0.5 * (a12 + a23 + a31)
-    product = math.sin(half) * math.sin(half - a12) * math.sin(half - a23) * math.sin(half - a31)
-    sine, (c12, c23, c31) = math.sin(a12), (math.sin(0.5 * math.pi - a) for a in (a12, a23, a31))
+    product = (
+        math.sin(half)
+        * math.sin(half - a12)
+        * math.sin(half - a23)
+        * math.sin(half - a31)
+    )
+    sine, (c12, c23, c31) = (
+        math.sin(a12),
+        (math.sin(0.5 * math.pi - a) for a in (a12, a23, a31)),
+    )
     return (
         (1.0, 0.0, 0.0),
         (c12, sine, 0.0),
@@ -118,16 +146,24 @@ def _directions_of(a12: float, a23: float, a31: float) -> tuple[Vector3, Vector3
 
 
 class Link(Section):
-    """One rigid link of a leg; without `inertia` it has none, without `mass` no weight."""
+    """One rigid link of a leg.
+
+    Without `inertia` it has none, without `mass` no weight.
+    """
 
     CONVERTED = "inertia", "mass", "centre"
 
     inertia: Inertia | None = entry("inertia of the link in its own frame")
     mass: float = coefficient("mass, for gravity", "kg")
     centre: Vector3 = entry(
-        "centre of mass in the frame of the inertia", "m", default=ZERO, acts_on=("mass",)
+        "centre of mass in the frame of the inertia",
+        "m",
+        default=ZERO,
+        acts_on=("mass",),
     )
-    inertia_about: str = choice("point of the inertia; once read it is O", (ABOUT_O, ABOUT_CENTRE))
+    inertia_about: str = choice(
+        "point of the inertia; once read it is O", (ABOUT_O, ABOUT_CENTRE)
+    )
 
     @property
     def tensor(self) -> Array:
@@ -138,7 +174,9 @@ class Link(Section):
         """Replace an inertia about the centre of mass by that about O."""
         if self.inertia_about == ABOUT_CENTRE:
             if self.mass == 0.0 or self.inertia is None:
-                yield Problem("inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]")
+                yield Problem(
+                    "inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]"
+                )
                 return
             shifted = _inertia_of(shift_inertia(self.inertia, self.mass, self.centre))
             vars(self).update(inertia=shifted, inertia_about=ABOUT_O)
@@ -153,12 +191,16 @@ class Link(Section):
         scale = mass * (x * x + y * y + z * z)
         for part in entries_of(self.inertia):
             scale = np.maximum(scale, abs(part))
-        # Moments about the centre of mass: none exceeds half their sum, but for rounding.
-        fits = _is_positive([-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale)
+        # Moments about the centre of mass: none exceeds half their sum, but for
+        # rounding.
+        fits = _is_positive(
+            [-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale
+        )
         given = np.greater(mass, 0.0) & np.greater(scale, 0.0)
         allowed = (
-            "must fit the inertia about O, which leaves moments about this centre that no body has "
-            f"(inertia_about: {ABOUT_CENTRE} takes one about the centre of mass)"
+            "must fit the inertia about O, which leaves moments about this centre that"
+            f" no body has (inertia_about: {ABOUT_CENTRE} takes one about the centre of"
+            " mass)"
         )
         yield given & ~fits, "centre", self.centre, allowed
 
@@ -167,14 +209,21 @@ class Star(Link):
     """The moving spherical star."""
 
     inertia: Inertia = entry("inertia of the star in {E}")
-    alpha_deg: Vector3 = amount("angles between the planes of arcs 1-2, 2-3, 3-1", "deg")
+    alpha_deg: Vector3 = amount(
+        "angles between the planes of arcs 1-2, 2-3, 3-1", "deg"
+    )
     radius: float = amount("radius of the star's sphere, distance O E", "m")
 
     def rules(self) -> Rules:
         """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
         total = sum(self.alpha_deg)
         open_ = np.greater(abs(total - 360.0), 360.0 * RELATIVE_ROUNDING)
-        yield open_, "alpha_deg", self.alpha_deg, f"must sum to 360 deg; the sum is {total}"
+        yield (
+            open_,
+            "alpha_deg",
+            self.alpha_deg,
+            f"must sum to 360 deg; the sum is {total}",
+        )
         yield from super().rules()
 
 
@@ -203,8 +252,8 @@ class Payload(Section):
 class Stroke(Section):
     """The range of the actuators, 0 < gamma_k < arc P_k P_k+1.
 
-    Elastic stops give the torque stiffness depth (1 + damping rate inwards), never a pull. Their
-    damping is given as such, or by the restitution at one impact rate.
+    Elastic stops give the torque stiffness depth (1 + damping rate inwards), never a
+    pull. Their damping is given as such, or by the restitution at one impact rate.
     """
 
     at_end: str = choice("what happens at its ends", ("stop", "ignore", "elastic"))
@@ -213,9 +262,14 @@ class Stroke(Section):
         "damping: torque = stiffness depth (1 + damping rate inwards)", "s/rad"
     )
     restitution: float | None = entry(
-        "rate after an impact / rate before, in place of damping", "1", least=0.01, most=1.0
+        "rate after an impact / rate before, in place of damping",
+        "1",
+        least=0.01,
+        most=1.0,
     )
-    impact_rate: float | None = amount("rate of the impacts that have this restitution", "rad/s")
+    impact_rate: float | None = amount(
+        "rate of the impacts that have this restitution", "rad/s"
+    )
 
     def rules(self) -> Rules:
         """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
@@ -225,18 +279,33 @@ class Stroke(Section):
         yield (self.stiffness is not None) != elastic, "stiffness", self.stiffness, only
         yield bounces and not elastic, "restitution", self.restitution, only
         both = bounces == (self.impact_rate is not None)
-        yield not both, "impact_rate", self.impact_rate, "is given with restitution, both or none"
+        yield (
+            not both,
+            "impact_rate",
+            self.impact_rate,
+            "is given with restitution, both or none",
+        )
         yield damped & (not elastic), "damping", self.damping, only
-        yield damped & bounces, "damping", self.damping, "give either damping or restitution"
+        yield (
+            damped & bounces,
+            "damping",
+            self.damping,
+            "give either damping or restitution",
+        )
 
 
 class Workspace(Section):
     """Where E may be: on the base triangle, 0 < beta_k <= beta_max."""
 
     beta_max_deg: float = amount(
-        "largest angle between E and the intermediate link", "deg", default=90.0, most=180.0
+        "largest angle between E and the intermediate link",
+        "deg",
+        default=90.0,
+        most=180.0,
     )
-    at_edge: str = choice("what happens at the edge of the workspace", ("stop", "ignore"))
+    at_edge: str = choice(
+        "what happens at the edge of the workspace", ("stop", "ignore")
+    )
 
 
 PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -244,7 +313,10 @@ PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def entries_of(inertia: Inertia | None) -> list[Any]:
-    """Return xx, yy, zz, xy, xz and yz, zero without inertia; they may be columns or symbols."""
+    """Return xx, yy, zz, xy, xz and yz, zero without inertia.
+
+    They may be columns or symbols.
+    """
     return [0.0] * 6 if inertia is None else [*vars(inertia).values()]
 
 
@@ -274,12 +346,16 @@ def _is_positive(entries: Sequence[Any], more: Any) -> Any:
 
 
 @check_kinds
-def arc_inertia(mass: float, radius: float, begin: ArrayLike, end: ArrayLike) -> Inertia:
-    """Inertia about O of a thin, uniform arc of a great circle. Inertias of several arcs add up.
+def arc_inertia(
+    mass: float, radius: float, begin: ArrayLike, end: ArrayLike
+) -> Inertia:
+    """Inertia about O of a thin, uniform arc of a great circle.
 
-    Mass [kg] and radius [m] are those of the arc; `begin` and `end` are directions from O, shape
-    (3,), of any length and less than pi apart. InputError is raised where mass or radius is not
-    positive, or the directions span no arc.
+    Inertias of several arcs add up.
+
+    Mass [kg] and radius [m] are those of the arc; `begin` and `end` are directions from
+    O, shape (3,), of any length and less than pi apart. InputError is raised where mass
+    or radius is not positive, or the directions span no arc.
     """
     first, last = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
     fits = first.shape == last.shape == (3,)

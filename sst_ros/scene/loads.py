@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a scene may have beside its mechanism: loads, actuators, start, a desired motion.
 
-A term that a scene does not name has no operation in its dynamics. Every desired motion begins at
-rest and ends at rest, except a recorded one, which begins and ends as the recording does. A motion
-that names no start begins in the initial pose of the scene.
+A term that a scene does not name has no operation in its dynamics. Every desired motion
+begins at rest and ends at rest, except a recorded one, which begins and ends as the
+recording does. A motion that names no start begins in the initial pose of the scene.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class Moment(Section):
 class Friction(Section):
     """Friction torque of a joint against its rate v.
 
-    viscous v + (coulomb + (static - coulomb) exp(-(v / stribeck)^2)) tanh(v / smoothing)
+    viscous v + (coulomb + (static - coulomb) exp(-(v / stribeck)^2)) tanh(v /
+    smoothing)
     """
 
     EFFECTS = "viscous", "coulomb", "static"
@@ -50,7 +51,10 @@ class Friction(Section):
     viscous: float = coefficient("viscous coefficient", "N m s/rad")
     coulomb: float = coefficient("Coulomb torque", "N m")
     smoothing: float = amount(
-        "rate over which its sign changes", "rad/s", default=1e-2, acts_on=("coulomb", "static")
+        "rate over which its sign changes",
+        "rad/s",
+        default=1e-2,
+        acts_on=("coulomb", "static"),
     )
     static: float = coefficient("breakaway torque (Stribeck); 0 for none", "N m")
     stribeck: float = amount(
@@ -86,8 +90,8 @@ class Spring(Section):
 class Actuators(Section):
     """What stands between a command and the torque of a joint; the same in all legs.
 
-    Commands and limits are torques at the joint, behind the gear. A command is limited first, then
-    it lags.
+    Commands and limits are torques at the joint, behind the gear. A command is limited
+    first, then it lags.
     """
 
     EFFECTS = (
@@ -100,15 +104,19 @@ class Actuators(Section):
         "motor turns per joint turn", "1", default=1.0, acts_on=("rotor_inertia",)
     )
     torque_limit: float | None = amount("largest torque", "N m")
-    time_constant: float | None = amount("time constant of a first-order lag of the torque", "s")
+    time_constant: float | None = amount(
+        "time constant of a first-order lag of the torque", "s"
+    )
     idle_damping: float = coefficient(
-        "torque -idle_damping gamma_dot in place of a command that is too old", "N m s/rad"
+        "torque -idle_damping gamma_dot in place of a command that is too old",
+        "N m s/rad",
     )
     velocity_limit: float | None = amount(
         "largest rate of a desired motion; a simulation does not hold it", "rad/s"
     )
     acceleration_limit: float | None = amount(
-        "largest acceleration of a desired motion; a simulation does not hold it", "rad/s^2"
+        "largest acceleration of a desired motion; a simulation does not hold it",
+        "rad/s^2",
     )
 
 
@@ -118,8 +126,8 @@ class Initial(Section):
     gamma: Vector3 = angles("actuator angles at t = 0")
     gamma_dot: Vector3 = entry("actuator rates at t = 0", "rad/s", default=ZERO)
     orientation: Quaternion | None = entry(
-        "quaternion (x, y, z, w) of {E} in {B}, within 0.1 rad, that selects the assembly mode "
-        "where gamma has several admissible ones",
+        "quaternion (x, y, z, w) of {E} in {B}, within 0.1 rad, that selects the"
+        " assembly mode where gamma has several admissible ones",
         "1",
         nonzero=True,
     )
@@ -139,7 +147,9 @@ class ToOrientation(Section):
     """The star turns about one axis from its initial orientation to another, with minimum jerk."""
 
     orientation: Quaternion = entry(
-        "quaternion (x, y, z, w) of {E} in {B} at the end, of any length", "1", nonzero=True
+        "quaternion (x, y, z, w) of {E} in {B} at the end, of any length",
+        "1",
+        nonzero=True,
     )
     duration: float = _duration()
 
@@ -147,9 +157,9 @@ class ToOrientation(Section):
 class Sweep(Section):
     """Sines of the actuators, gamma_k = centre_k + fading amplitude_k sin(angle_k).
 
-    The angle grows with the frequency, which goes evenly from its first to its last value (a linear
-    chirp). The fading grows from 0 to 1 over `fade` at the beginning, with minimum jerk, and back
-    at the end.
+    The angle grows with the frequency, which goes evenly from its first to its last
+    value (a linear chirp). The fading grows from 0 to 1 over `fade` at the beginning,
+    with minimum jerk, and back at the end.
     """
 
     amplitude: Vector3 = angles("amplitudes")
@@ -171,7 +181,8 @@ class Sweep(Section):
 class Spiral(Section):
     """E winds outwards from where it is: tilt phi, its direction theta, and psi about E.
 
-    R = R(0) Rz(theta) Ry(phi) Rz(psi - theta). All three grow from zero by one minimum jerk.
+    R = R(0) Rz(theta) Ry(phi) Rz(psi - theta). All three grow from zero by one minimum
+    jerk.
     """
 
     phi: float = entry("tilt at the end", "rad", least=0.0, most=3.141592653589793)
@@ -181,7 +192,10 @@ class Spiral(Section):
 
 
 class Waypoint(Section):
-    """Where the actuators are at a time. What is not given is chosen for minimum jerk."""
+    """Where the actuators are at a time.
+
+    What is not given is chosen for minimum jerk.
+    """
 
     time: float = entry("time since the beginning", "s", least=0.0)
     gamma: Vector3 = angles("actuator angles")

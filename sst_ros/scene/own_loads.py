@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads of the user's own, written as formulas in the scene.
 
-A formula is arithmetic on names: no attribute, no index, no call but of a function in FUNCTIONS.
-So a scene from a stranger runs no code of its author, and the scene alone says what acts: in a
-file, in a bag, on each machine of a cluster. `dynamics.own_loads.own_load` writes a Python
-function as formulas.
+A formula is arithmetic on names: no attribute, no index, no call but of a function in
+FUNCTIONS. So a scene from a stranger runs no code of its author, and the scene alone
+says what acts: in a file, in a bag, on each machine of a cluster.
+`dynamics.own_loads.own_load` writes a Python function as formulas.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ ROTATION = tuple(f"R{i}{j}" for i in "123" for j in "123")
 """Entries of R, the orientation of {E} in {B}: R13, R23, R33 is the direction of E."""
 
 ANGLES = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
-OMEGA = tuple(f"omega_{axis}" for axis in "xyz")  # angular velocity of the star in {B} [rad/s]
+OMEGA = tuple(
+    f"omega_{axis}" for axis in "xyz"
+)  # angular velocity of the star in {B} [rad/s]
 BODY_RATE = tuple(f"body_rate_{axis}" for axis in "xyz")  # the same in {E}
 RATES = tuple(name.replace("_", "_dot_") for name in ANGLES)
 
@@ -34,11 +36,15 @@ FUNCTIONS = {
     "sqrt": 1, "exp": 1, "sin": 1, "cos": 1, "tan": 1, "tanh": 1, "abs": 1, "positive": 1,
     "atan2": 2, "min": 2, "max": 2,
 }  # fmt: skip
-"""Number of arguments of each function; positive(x) is x where x > 0 and zero elsewhere."""
+"""Number of arguments of each function.
+
+positive(x) is x where x > 0 and zero elsewhere.
+"""
 
 RESERVED = {"pi", *STATE, *FUNCTIONS}
 LONGEST = 4000  # characters of a formula: the parser of Python recurses
-MOST_PARTS = 4000  # numbers, names and operations of a load: more is no formula, but a program
+# numbers, names and operations of a load: more is no formula, but a program
+MOST_PARTS = 4000
 DEEPEST = 200  # levels of a formula, whose evaluation recurses
 LARGEST_POWER = 8  # a power is written as products
 OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
@@ -61,12 +67,12 @@ class LoadParameter(Section):
 class FormulaLoad(Section):
     """A load by its potential energy, or by its moment on the star.
 
-    A potential acts where its formula says: by the rotation R on the star, by an angle at that
-    joint. Formulas have + - * / **, whole powers up to 8, sqrt, exp, sin, cos, tan, tanh, atan2,
-    abs, min, max, positive and pi. Their names are the parameters, the terms, and of the state
-    R11 to R33 (rows and columns of the rotation of {E} in {B}), gamma_1 to beta_3 [rad], and for a
-    moment omega_x (of the star in {B}), body_rate_x (in {E}) and gamma_dot_1 to beta_dot_3
-    [rad/s].
+    A potential acts where its formula says: by the rotation R on the star, by an angle
+    at that joint. Formulas have + - * / **, whole powers up to 8, sqrt, exp, sin, cos,
+    tan, tanh, atan2, abs, min, max, positive and pi. Their names are the parameters,
+    the terms, and of the state R11 to R33 (rows and columns of the rotation of {E} in
+    {B}), gamma_1 to beta_3 [rad], and for a moment omega_x (of the star in {B}),
+    body_rate_x (in {E}) and gamma_dot_1 to beta_dot_3 [rad/s].
     """
 
     ONE_OF = "potential", "moment"
@@ -77,7 +83,9 @@ class FormulaLoad(Section):
         "intermediate results by name, each of those before it", default=()
     )
     potential: str | None = entry("formula of the potential energy [J]")
-    moment: tuple[str, ...] = entry("three formulas of the moment on the star [N m]", default=())
+    moment: tuple[str, ...] = entry(
+        "three formulas of the moment on the star [N m]", default=()
+    )
     frame: str = choice("axes of the moment: those of {B} or of {E}", ("base", "star"))
 
     @property
@@ -124,7 +132,10 @@ def parse(text: str) -> ast.expr:
 
 @lru_cache(maxsize=256)
 def find_fault(text: str, known: frozenset[str]) -> str:
-    """Say what a formula must be that a text is not; "" where it is one of the known names."""
+    """Say what a formula must be that a text is not.
+
+    "" where it is one of the known names.
+    """
     try:
         tree = parse(text)
     except ValueError as error:
@@ -132,7 +143,9 @@ def find_fault(text: str, known: frozenset[str]) -> str:
     if _measure_depth(tree) > DEEPEST:
         return f"must have at most {DEEPEST} levels: write parts of it as terms"
     called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
-    faults = (_fault_of(node, known) for node in ast.walk(tree) if id(node) not in called)
+    faults = (
+        _fault_of(node, known) for node in ast.walk(tree) if id(node) not in called
+    )
     return next(filter(None, faults), "")
 
 
@@ -162,7 +175,10 @@ def _fault_of(node: ast.AST, known: frozenset[str]) -> str:
             return f"must be of the pose alone: {node.id} is a rate"
         if node.id in FUNCTIONS:
             return f"must give {node.id} its arguments in brackets"
-        return f"must have known names only: {node.id} is neither state, parameter nor term"
+        return (
+            f"must have known names only: {node.id} is neither state, parameter nor"
+            " term"
+        )
     if isinstance(node, ast.Call):
         return _fault_of_call(node)
     return f"must be arithmetic: {type(node).__name__} is not allowed"
@@ -190,7 +206,10 @@ def _fault_of_call(node: ast.Call) -> str:
 
 
 def is_finite(value: object) -> bool:
-    """Whether a constant is a number that has a finite double; text and True are none."""
+    """Whether a constant is a number that has a finite double.
+
+    Text and True are none.
+    """
     if type(value) is not int and type(value) is not float:
         return False
     try:
@@ -200,7 +219,10 @@ def is_finite(value: object) -> bool:
 
 
 def power_of(node: ast.BinOp) -> int | None:
-    """Return the power that a part of a formula raises to; None where it is not allowed."""
+    """Return the power that a part of a formula raises to.
+
+    None where it is not allowed.
+    """
     exponent, sign = node.right, 1
     if isinstance(exponent, ast.UnaryOp) and isinstance(exponent.op, ast.USub):
         exponent, sign = exponent.operand, -1

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is simulated, as one document: bodies, terms, the start, and where each value is from.
 
-`Scenarios` are many of it, whose numbers differ: a row of each array makes a scene, which meets all
-requirements of a document. What has no effect in a row is left out of it, as documents demand: a
-friction whose coefficients are zero there, the gear of a rotor without inertia.
+`Scenarios` are many of it, whose numbers differ: a row of each array makes a scene,
+which meets all requirements of a document. What has no effect in a row is left out of
+it, as documents demand: a friction whose coefficients are zero there, the gear of a
+rotor without inertia.
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ from sst_ros.scene.bodies import Base, Link, Payload, Star, Stroke, Workspace
 from sst_ros.scene.own_loads import FormulaLoad
 from sst_ros.scene.schema import Place, Section, Spec, amount, entry, key_of
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.scene.yaml_document import find_fields, plain, read, replace_values, values_at
+from sst_ros.scene.yaml_document import (
+    find_fields,
+    plain,
+    read,
+    replace_values,
+    values_at,
+)
 from sst_ros.state import Array, Explained, LostMeaning, freeze, real_numbers
 
 LARGEST = 1e9
@@ -50,7 +57,9 @@ class Scene(Explained, Section):
     moment: loads.Moment | None = entry("external moment on the star")
     friction: loads.JointFriction | None = entry("friction in the joints")
     springs: tuple[loads.Spring, ...] = entry("springs at joints", default=())
-    own_loads: tuple[FormulaLoad, ...] = entry("loads of your own, by formulas", default=())
+    own_loads: tuple[FormulaLoad, ...] = entry(
+        "loads of your own, by formulas", default=()
+    )
     actuators: loads.Actuators | None = entry("the actuators")
     stroke: Stroke = entry("range of the actuators", default=Stroke())
     workspace: Workspace = entry("where E may be", default=Workspace())
@@ -67,9 +76,9 @@ class Scene(Explained, Section):
         """Return the scene with other values by key, as in {"star.inertia.zz": 0.3}.
 
         A list without an index means all of its entries: "actuated_links.inertia.xx",
-        "springs[0].rest". A section that the scene does not have is made from the values given;
-        None takes one away. InputError is raised where a key names nothing that a scene has, or the
-        result is refused.
+        "springs[0].rest". A section that the scene does not have is made from the
+        values given; None takes one away. InputError is raised where a key names
+        nothing that a scene has, or the result is refused.
         """
         problems = []
         for key, value in values.items():
@@ -84,7 +93,9 @@ class Scene(Explained, Section):
         try:
             changed = replace_values(self, plain(values))
         except RecursionError:
-            raise InputError(self.name, [Problem("", values, "must not hold itself")]) from None
+            raise InputError(
+                self.name, [Problem("", values, "must not hold itself")]
+            ) from None
         except KeyError as error:
             key, allowed = error.args[0], "names nothing in this scene"
             raise refusal(self.name, str(key), values[key], allowed) from None
@@ -108,7 +119,8 @@ class Scene(Explained, Section):
             "name": self.name,
             "description": self.description,
             "has": present or "nothing but the star",
-            "has not": [term for term in TERMS if term not in present] or "all terms are there",
+            "has not": [term for term in TERMS if term not in present]
+            or "all terms are there",
             "gamma(0) [rad]": self.initial.gamma,
             "gamma_dot(0) [rad/s]": self.initial.gamma_dot,
             "torque": "sines" if self.torque else "none of its own",
@@ -127,7 +139,9 @@ class Scene(Explained, Section):
         reach = np.maximum(self.base.radius, self.star.radius)
         bodies = {"star": self.star}
         for name in LINKS:
-            bodies |= {f"{name}[{k}]": link for k, link in enumerate(getattr(self, name))}
+            bodies |= {
+                f"{name}[{k}]": link for k, link in enumerate(getattr(self, name))
+            }
         mass: Any = 0.0 if self.payload is None else self.payload.mass
         for name, body in bodies.items():
             mass = mass + body.mass
@@ -163,7 +177,9 @@ TERMS = {
 
 def terms(scene: Scene) -> list[str]:
     """Return those of TERMS that a scene has."""
-    return [term for term, key in TERMS.items() if schema.has_effect(values_at(scene, key))]
+    return [
+        term for term, key in TERMS.items() if schema.has_effect(values_at(scene, key))
+    ]
 
 
 def _has_key(cls: type[Section], key: str) -> bool:
@@ -182,8 +198,8 @@ SceneInput: TypeAlias = Scene | Mapping[str, Any] | str | Path
 def scene_of(scene: SceneInput) -> Scene:
     """Return a scene by its path (ends in .yaml) or by the name of one that comes with sst_ros.
 
-    It may also be its document as a dict, or a `Scene`, which is returned as it is. InputError is
-    raised where there is no such scene, or its document is refused.
+    It may also be its document as a dict, or a `Scene`, which is returned as it is.
+    InputError is raised where there is no such scene, or its document is refused.
     """
     if isinstance(scene, Scene):
         return scene
@@ -203,7 +219,9 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
     if initial is None:
         return scene
     if isinstance(initial, Mapping):
-        initial = {key: x for key, x in initial.items() if x is not None}  # as in `Initial`
+        initial = {
+            key: x for key, x in initial.items() if x is not None
+        }  # as in `Initial`
     elif not isinstance(initial, loads.Initial):
         try:
             gamma, gamma_dot = initial
@@ -228,14 +246,17 @@ def text_of(name_or_path: str | Path) -> tuple[str, str]:
         return yaml_document.read_file(path), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         allowed = f"must be a readable .yaml file or one of {', '.join(names())}"
-        reason = getattr(error, "strerror", None) or error  # without the path, which is said
+        # without the path, which is said
+        reason = getattr(error, "strerror", None) or error
         allowed += suggestion(str(name_or_path), names()) if is_name else f" ({reason})"
         raise refusal("scene", "scene", str(name_or_path), allowed) from None
 
 
 def names() -> list[str]:
     """Names of the scenes that come with sst_ros."""
-    return sorted(path.stem for path in (share_directory() / "config" / "scenes").glob("*.yaml"))
+    return sorted(
+        path.stem for path in (share_directory() / "config" / "scenes").glob("*.yaml")
+    )
 
 
 def share_directory() -> Path:
@@ -251,10 +272,11 @@ class Scenarios:
     """Scenarios of a scene by row.
 
     `parameters` are arrays by keys of numbers in the document, as in "star.mass",
-    "springs[0].rest" or "gravity.acceleration": first the row, then what one scene has, so shape
-    (N,), (N, 3) or (N, 3, 3). A list without an index means all of its entries. `rows` has these
-    arrays; the `count` N is None where nothing varies. InputError is raised where a key names no
-    number of the scene, or an array has another shape.
+    "springs[0].rest" or "gravity.acceleration": first the row, then what one scene has,
+    so shape (N,), (N, 3) or (N, 3, 3). A list without an index means all of its
+    entries. `rows` has these arrays; the `count` N is None where nothing varies.
+    InputError is raised where a key names no number of the scene, or an array has
+    another shape.
     """
 
     def __init__(self, scene: Scene, parameters: Mapping[str, ArrayLike]) -> None:
@@ -286,7 +308,9 @@ class Scenarios:
     def _rows_of(self, value: ArrayLike, shape: tuple[int, ...]) -> Array:
         rows = freeze(real_numbers(value))
         if rows.shape != (self.count or max(1, len(np.atleast_1d(rows))), *shape):
-            words = ", ".join(map(str, (self.count or "N", *shape))) + ("" if shape else ",")
+            words = ", ".join(map(str, (self.count or "N", *shape))) + (
+                "" if shape else ","
+            )
             allowed = f"must have the shape ({words}), a row a scenario"
             raise ValueError(f"{allowed}; it has {rows.shape}")
         return rows
@@ -297,7 +321,8 @@ class Scenarios:
         faults = [
             Problem(key, numbers[key], spec.refuse())
             for key, spec in self._specs.items()
-            if schema.has_effect(numbers[key]) and not np.all(spec.allows(self.rows[key][row]))
+            if schema.has_effect(numbers[key])
+            and not np.all(spec.allows(self.rows[key][row]))
         ]
         try:
             if faults:  # though the section that they are in may be left out
@@ -306,12 +331,16 @@ class Scenarios:
             document = plain(schema.rebuild(self.document, values))
             return schema.build(Scene, schema.drop_idle(Scene, document))
         except InputError as error:
-            faults = [replace(one, key=f"scenario {row}: {one.key}") for one in error.problems]
+            faults = [
+                replace(one, key=f"scenario {row}: {one.key}") for one in error.problems
+            ]
             raise InputError(self.document.name, faults) from None
 
     def columns(self) -> Any:
         """Return the scene, unchecked, with columns (N,) for the numbers that vary."""
-        columns = {place: _columns(self.rows[key]) for place, key in self._places.items()}
+        columns = {
+            place: _columns(self.rows[key]) for place, key in self._places.items()
+        }
         return schema.rebuild(self.document, columns)
 
     def faults(self, most: int = 10) -> dict[int, InputError]:
@@ -340,7 +369,9 @@ class Scenarios:
 
     def check(self) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
-        if problems := [one for error in self.faults().values() for one in error.problems]:
+        if problems := [
+            one for error in self.faults().values() for one in error.problems
+        ]:
             raise InputError(self.document.name, problems[:10])
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Documents as trees of frozen dataclasses: every field has a unit and bounds, which are checked.
 
-A class that derives from `Section` is checked whenever it is built, from YAML or from Python.
-Building one gives either the object or one `InputError` with every fault.
+A class that derives from `Section` is checked whenever it is built, from YAML or from
+Python. Building one gives either the object or one `InputError` with every fault.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """What a terminal obeys, and halves of characters."""
 
-TURN = 2.0 * math.pi  # no initial or desired angle of an actuator [rad] is larger: it is in degrees
+# no initial or desired angle of an actuator [rad] is larger: it is in degrees
+TURN = 2.0 * math.pi
 REQUIRED: Any = object()  # default of a field that must be given
 Place = tuple[str | int, ...]  # names and indices of a part of a tree from the root on
 
@@ -70,9 +71,14 @@ class Spec:
     nonzero: bool = False  # nor may the squares be, as of a quaternion with a direction
 
     def allows(self, x: Any) -> Any:
-        """Whether numbers keep the bounds, and directions are not zero; a nan does not."""
+        """Whether numbers keep the bounds, and directions are not zero.
+
+        A nan does not.
+        """
         within = (x > self.above) & (x >= self.least) & (x <= self.most)
-        return within & np.any(x * x, axis=-1, keepdims=True) if self.nonzero else within
+        return (
+            within & np.any(x * x, axis=-1, keepdims=True) if self.nonzero else within
+        )
 
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
@@ -84,7 +90,9 @@ class Spec:
         size = " x ".join(map(str, self.shape))
         what = f"{size} finite numbers" if size else "a finite number"
         ends = (">", self.above), (">=", self.least), ("<=", self.most)
-        bounds = " and".join(f" {sign} {end:g}" for sign, end in ends if math.isfinite(end))
+        bounds = " and".join(
+            f" {sign} {end:g}" for sign, end in ends if math.isfinite(end)
+        )
         row = ", ".join(map(str, ("n", *self.shape))) + "," * (not self.shape)
         counts = " or ".join(map(str, self.lengths)) + " " if self.lengths else ""
         keys = ", ".join(self.section.SPECS) if self.section else ""
@@ -104,14 +112,19 @@ class Spec:
 
 
 def entry(doc: str, unit: str = "", default: Any = REQUIRED, **rules: Any) -> Any:
-    """Declare a field of a section, whose type says what it may hold; None in it is its default.
+    """Declare a field of a section, whose type says what it may hold.
 
-    It may be float, a tuple of as many, or of such; int, bool, str, a section, a tuple of any
-    number of them, or of three, for which one may stand; tuple[tuple[str, str], ...] is a mapping
-    to text, Array has a row of some `shape` for each sample. `rules` has more of what `Spec` says.
+    None in it is its default.
+
+    It may be float, a tuple of as many, or of such; int, bool, str, a section, a tuple
+    of any number of them, or of three, for which one may stand; tuple[tuple[str, str],
+    ...] is a mapping to text, Array has a row of some `shape` for each sample. `rules`
+    has more of what `Spec` says.
     """
     given = MISSING if default is REQUIRED else default
-    return field(default=given, metadata={"spec": Spec("", doc, unit, **rules)}, kw_only=True)
+    return field(
+        default=given, metadata={"spec": Spec("", doc, unit, **rules)}, kw_only=True
+    )
 
 
 angles = partial(entry, unit="rad", least=-TURN, most=TURN)
@@ -159,7 +172,8 @@ class Section:
     """What each field may hold, in order."""
 
     __slots__ = ("_converted", "_texts")
-    _texts: dict[str, Any]  # numbers that were given as text, by field, as in a YAML file
+    # numbers that were given as text, by field, as in a YAML file
+    _texts: dict[str, Any]
     _converted: dict[str, Any]  # fields that `settle` has replaced, as they were given
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
@@ -168,7 +182,9 @@ class Section:
         for name, hint in cls.__annotations__.items():
             declared = vars(cls).get(name)
             if isinstance(declared, Field) and str(hint).endswith("| None"):
-                declared.default = None if declared.default is MISSING else declared.default
+                declared.default = (
+                    None if declared.default is MISSING else declared.default
+                )
         dataclass(frozen=True, repr=not issubclass(cls, Explained))(cls)
         hints, specs = typing.get_type_hints(cls), {}
         for one in fields(cls):
@@ -181,12 +197,16 @@ class Section:
 
     def __post_init__(self) -> None:
         given = ((name, spec, getattr(self, name)) for name, spec in self.SPECS.items())
-        kept = (one for one in given if one[2] is not None or one[1].default is not None)
+        kept = (
+            one for one in given if one[2] is not None or one[1].default is not None
+        )
         try:
             vars(self).update(_freeze_all(kept))
             before = dict(vars(self))
             problems = [*self.settle()] or [*self._find_idle(), *self._find_broken()]
-            changed = {name: x for name, x in before.items() if vars(self)[name] is not x}
+            changed = {
+                name: x for name, x in before.items() if vars(self)[name] is not x
+            }
             self._remember({}, changed)
         except InputError as error:
             problems = [*error.problems]
@@ -199,7 +219,11 @@ class Section:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: fields, and how they were written."""
-        return {**vars(self), "_texts": texts_of(self), "_converted": converted_of(self)}
+        return {
+            **vars(self),
+            "_texts": texts_of(self),
+            "_converted": converted_of(self),
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy."""
@@ -209,7 +233,11 @@ class Section:
 
     def __dir__(self) -> list[str]:
         """Show what a document has, and nothing of how it is checked."""
-        return [name for name in super().__dir__() if name[0] == "_" or name not in vars(Section)]
+        return [
+            name
+            for name in super().__dir__()
+            if name[0] == "_" or name not in vars(Section)
+        ]
 
     def _find_idle(self) -> Iterator[Problem]:
         """Yield what has no effect, and what is not one of several."""
@@ -220,7 +248,9 @@ class Section:
         for name, spec in self.SPECS.items():
             value = getattr(self, name)
             if not _acts(vars(self), spec.acts_on) and value != spec.default:
-                yield Problem(name, value, f"acts on {' or '.join(spec.acts_on)}: give it")
+                yield Problem(
+                    name, value, f"acts on {' or '.join(spec.acts_on)}: give it"
+                )
         chosen = [name for name in self.ONE_OF if getattr(self, name)]
         if self.ONE_OF and len(chosen) != 1:
             yield Problem("", chosen or None, "give one of " + ", ".join(self.ONE_OF))
@@ -280,21 +310,30 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
         raise refusal(origin, "", values, allowed)
     problems = []
     for name in [name for name in values if name not in known]:
-        allowed = f"unknown key; allowed are {', '.join(known)}{suggestion(str(name), known)}"
+        allowed = (
+            f"unknown key; allowed are {', '.join(known)}{suggestion(str(name), known)}"
+        )
         problems.append(Problem(str(name), values[name], allowed))
     for name, spec in known.items():
         if spec.default is REQUIRED and name not in values:
             problems.append(Problem(name, None, "is missing; " + spec.describe()))
     given = {name: value for name, value in values.items() if name in known}
     for name, value in given.items():
-        if known[name].kind == "text" and isinstance(value, (int, float)):  # as in a YAML file
+        # as in a YAML file
+        if known[name].kind == "text" and isinstance(value, (int, float)):
             given[name] = str(value)
     try:
-        frozen = _freeze_all((name, known[name], value) for name, value in given.items())
+        frozen = _freeze_all(
+            (name, known[name], value) for name, value in given.items()
+        )
         if not problems:
             section = cls(**frozen)
-            numbers = {name: x for name, x in given.items() if known[name].kind == "number"}
-            texts_of(section).update((name, x) for name, x in numbers.items() if _has_text(x))
+            numbers = {
+                name: x for name, x in given.items() if known[name].kind == "number"
+            }
+            texts_of(section).update(
+                (name, x) for name, x in numbers.items() if _has_text(x)
+            )
             return section
     except InputError as error:
         problems += error.problems
@@ -305,7 +344,10 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
 
 
 def texts_of(section: Section) -> dict[str, Any]:
-    """Return the numbers of a section that were given as text, by field; lists where they were."""
+    """Return the numbers of a section that were given as text, by field.
+
+    Lists where they were.
+    """
     texts: dict[str, Any] = getattr(section, "_texts", {})
     return texts
 
@@ -333,14 +375,19 @@ def keep_texts(old: Any, new: Any) -> None:
     for name, text in texts_of(old).items():
         if vars(old)[name] == vars(new)[name]:
             texts_of(new).setdefault(name, text)
-    if all(vars(old)[name] == vars(new)[name] for name in old.CONVERTED) and not converted_of(new):
+    if all(
+        vars(old)[name] == vars(new)[name] for name in old.CONVERTED
+    ) and not converted_of(new):
         converted_of(new).update(converted_of(old))
     for name, part in vars(old).items():
         keep_texts(part, vars(new)[name])
 
 
 def _freeze_all(given: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:
-    """Accept values by their keys; InputError lists what is refused, and what in it is."""
+    """Accept values by their keys.
+
+    InputError lists what is refused, and what in it is.
+    """
     found: dict[str, Any] = {}
     problems = []
     for key, spec, value in given:
@@ -362,8 +409,8 @@ def _freeze_all(given: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:
 def accept(spec: Spec, value: Any) -> Any:
     """Return a value in its frozen form.
 
-    ValueError, TypeError or OverflowError is raised where it is refused, InputError where parts of
-    it are, with their keys.
+    ValueError, TypeError or OverflowError is raised where it is refused, InputError
+    where parts of it are, with their keys.
     """
     kind, section = spec.kind, spec.section or Section
     if kind == "samples":
@@ -392,7 +439,11 @@ def accept(spec: Spec, value: Any) -> Any:
             return (*parts.values(),) * times
     if kind == "flag" and isinstance(value, str):
         value = {"true": True, "false": False}.get(value.lower())
-    elif kind == "integer" and isinstance(value, str) and re.fullmatch("[-+]?[0-9]+", value):
+    elif (
+        kind == "integer"
+        and isinstance(value, str)
+        and re.fullmatch("[-+]?[0-9]+", value)
+    ):
         value = int(value)
     fits = {
         "anything": True,
@@ -410,7 +461,9 @@ def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
     if shape:
         if isinstance(value, (str, dict, set)) or len(value) != shape[0]:
             raise ValueError
-        if not isinstance(value, (list, tuple)) and (reason := find_lost_meaning(value)):
+        if not isinstance(value, (list, tuple)) and (
+            reason := find_lost_meaning(value)
+        ):
             raise LostMeaning(reason)
         each = replace(spec, nonzero=False)
         found = tuple(_freeze_numbers(each, entry, shape[1:]) for entry in value)
@@ -446,7 +499,9 @@ def _freeze_text(value: Any) -> str:
 
 def has_effect(value: Any) -> bool:
     """Return whether a value, or any in a list, is given and not zero."""
-    return any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
+    return (
+        any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
+    )
 
 
 def _acts(values: Mapping[str, Any], names: tuple[str, ...]) -> bool:
@@ -455,12 +510,19 @@ def _acts(values: Mapping[str, Any], names: tuple[str, ...]) -> bool:
 
 
 def drop_idle(cls: type[Section] | None, value: Any) -> Any:
-    """Return a document of a section without what has no effect in it; None if nothing has.
+    """Return a document of a section without what has no effect in it.
 
-    A document that says such things is refused, as a friction whose coefficients are zero.
+    None if nothing has.
+
+    A document that says such things is refused, as a friction whose coefficients are
+    zero.
     """
     if isinstance(value, list):
-        return [part for part in (drop_idle(cls, entry) for entry in value) if part is not None]
+        return [
+            part
+            for part in (drop_idle(cls, entry) for entry in value)
+            if part is not None
+        ]
     if cls is None:
         return value
     known = cls.SPECS
@@ -476,8 +538,8 @@ def drop_idle(cls: type[Section] | None, value: Any) -> Any:
 def build_unchecked(cls: type[Section] | None, value: Any) -> Any:
     """Build a section from nested dicts and lists of any values, which are not checked.
 
-    They may be columns or symbols. A number that a section must have and these values have not is
-    zero.
+    They may be columns or symbols. A number that a section must have and these values
+    have not is zero.
     """
     if isinstance(value, list):
         return tuple(build_unchecked(cls, entry) for entry in value)
@@ -498,7 +560,10 @@ def walk(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
 
 
 def _parts_of(tree: Any) -> list[tuple[Any, Any]]:
-    """List the parts of a section or tuple by name or index; there are none of anything else."""
+    """List the parts of a section or tuple by name or index.
+
+    There are none of anything else.
+    """
     if isinstance(tree, tuple):
         return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
     return list(vars(tree).items()) if isinstance(tree, Section) else []
@@ -513,12 +578,20 @@ def rebuild(tree: Any, values: Mapping[Place, Any], place: Place = ()) -> Any:
     """Return a tree with other values at some places; its sections are not checked."""
     if place in values:
         return values[place]
-    parts = {name: rebuild(part, values, (*place, name)) for name, part in _parts_of(tree)}
+    parts = {
+        name: rebuild(part, values, (*place, name)) for name, part in _parts_of(tree)
+    }
     if isinstance(tree, tuple):
-        return type(tree)(*parts.values()) if hasattr(tree, "_fields") else tuple(parts.values())
+        return (
+            type(tree)(*parts.values())
+            if hasattr(tree, "_fields")
+            else tuple(parts.values())
+        )
     return build_unchecked(type(tree), parts) if parts else tree
 
 
 def key_of(place: Place) -> str:
     """Return a place as a key."""
-    return "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place).removeprefix(".")
+    return "".join(
+        f"[{x}]" if isinstance(x, int) else f".{x}" for x in place
+    ).removeprefix(".")

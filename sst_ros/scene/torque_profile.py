@@ -37,12 +37,15 @@ from sst_ros.state import (
 
 TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
 FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
-_MOST_CROSSINGS = 1e5  # radians of a sine beyond which its clamping is not computed in advance
+# radians of a sine beyond which its clamping is not computed in advance
+_MOST_CROSSINGS = 1e5
 
 
 def ascend(times: Array) -> bool:
     """Return whether times are finite and ascending, shape (n,)."""
-    return times.ndim == 1 and bool(np.isfinite(times).all() and (np.diff(times) > 0.0).all())
+    return times.ndim == 1 and bool(
+        np.isfinite(times).all() and (np.diff(times) > 0.0).all()
+    )
 
 
 class TorqueProfile(ReadOnly):
@@ -56,7 +59,9 @@ class TorqueProfile(ReadOnly):
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute once."""
         if name in vars(self):
-            raise AttributeError(f"{name} is read-only: make another {type(self).__name__}")
+            raise AttributeError(
+                f"{name} is read-only: make another {type(self).__name__}"
+            )
         super().__setattr__(name, value)
 
     def values(self, t: Array) -> Array:
@@ -80,7 +85,10 @@ class LostTorque(TorqueProfile):
 
 
 class ConstantTorque(TorqueProfile):
-    """The same three torques [N m] at all times; InputError is raised where they are none."""
+    """The same three torques [N m] at all times.
+
+    InputError is raised where they are none.
+    """
 
     def __init__(self, torque: Any) -> None:
         self.torque = _three(torque, "torque")
@@ -119,12 +127,20 @@ class SineTorque(TorqueProfile, Section):
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
         found = [np.empty(0)]
-        for amplitude, f, phase in zip(self.amplitude, self.frequency, self.phase, strict=True):
+        for amplitude, f, phase in zip(
+            self.amplitude, self.frequency, self.phase, strict=True
+        ):
             # The step control has to find those of a sine that is too fast.
-            if limit is None or abs(amplitude) <= limit or not 0.0 < f * end <= _MOST_CROSSINGS:
+            if (
+                limit is None
+                or abs(amplitude) <= limit
+                or not 0.0 < f * end <= _MOST_CROSSINGS
+            ):
                 continue
             angle = np.arcsin(limit / amplitude)
-            turns = np.arange(np.floor(phase / np.pi) - 1, np.ceil((phase + f * end) / np.pi) + 2)
+            turns = np.arange(
+                np.floor(phase / np.pi) - 1, np.ceil((phase + f * end) / np.pi) + 2
+            )
             found += [(np.pi * turns + shift - phase) / f for shift in (angle, -angle)]
         times = np.unique(np.concatenate(found))
         return np.asarray(times[(times > 0.0) & (times < end)])
@@ -137,23 +153,32 @@ def _at(profile: TorqueProfile, t: float) -> Vector3:
 
 
 class PolynomialTorque(TorqueProfile):
-    """Polynomial pieces, in the layout of `scipy.interpolate.PPoly`; zero outside of them.
+    """Polynomial pieces, in the layout of `scipy.interpolate.PPoly`.
 
-    The coefficients have the highest power first, shape (order + 1, pieces, 3); the breakpoints are
-    the beginnings of the pieces and the end of the last [s], shape (pieces + 1,). InputError is
-    raised where shapes, order or numbers are not allowed.
+    Zero outside of them.
+
+    The coefficients have the highest power first, shape (order + 1, pieces, 3); the
+    breakpoints are the beginnings of the pieces and the end of the last [s], shape
+    (pieces + 1,). InputError is raised where shapes, order or numbers are not allowed.
     """
 
     @check_kinds
     def __init__(self, coefficients: ArrayLike, breakpoints: TimesLike) -> None:
         self.c = freeze(read_numbers("torque", "coefficients", coefficients))
-        self.x = freeze(read_numbers("torque", "breakpoints", breakpoints, seconds=True))
+        self.x = freeze(
+            read_numbers("torque", "breakpoints", breakpoints, seconds=True)
+        )
         good, pieces = self.x.size > 1 and ascend(self.x), max(self.x.size - 1, 1)
         size, shape = self.c.shape, f"must have the shape (order + 1, {pieces}, 3)"
         finite = bool(np.all(np.isfinite(self.c)))
         refuse_unless(
             "torque",
-            ("breakpoints", breakpoints, good, "must be two or more ascending times [s]"),
+            (
+                "breakpoints",
+                breakpoints,
+                good,
+                "must be two or more ascending times [s]",
+            ),
             ("coefficients", size, size[1:] == (pieces, 3), shape),
             ("coefficients", "not finite", finite, "must be finite"),
         )
@@ -172,8 +197,12 @@ class PolynomialTorque(TorqueProfile):
 
         legs = [PPoly(c, self.x) for c in np.moveaxis(self.c, 2, 0)]
         bounds = () if limit is None else (limit, -limit)
-        roots = [leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds]
-        return np.unique([x for x in np.concatenate([self.x, *roots]) if np.isfinite(x)])
+        roots = [
+            leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds
+        ]
+        return np.unique(
+            [x for x in np.concatenate([self.x, *roots]) if np.isfinite(x)]
+        )
 
     def acting(self, begin: float, end: float) -> Vector3 | TorqueFunction:
         """See `TorqueProfile`."""
@@ -194,7 +223,8 @@ class PolynomialTorque(TorqueProfile):
 class FunctionTorque(TorqueProfile):
     """A function f(t) of the time [s], or f(t, state) of it and the `State` -> three torques [N m].
 
-    `feedback` says whether the state is an argument. InputError: it needs other arguments.
+    `feedback` says whether the state is an argument. InputError: it needs other
+    arguments.
     """
 
     def __init__(self, function: Callable[..., Sequence[float]]) -> None:
@@ -216,7 +246,10 @@ def _three(value: Any, name: str) -> Vector3:
     """Return three finite numbers as floats, or refuse them."""
     if (vector := finite_vector(value)) is not None:
         return vector
-    allowed = "must be three finite numbers [N m], a profile, or a function f(t) or f(t, state)"
+    allowed = (
+        "must be three finite numbers [N m], a profile, or a function f(t) or f(t,"
+        " state)"
+    )
     raise refusal("simulate", name, value, allowed)
 
 
@@ -243,7 +276,9 @@ _COLUMNS = ("time", "tau_1", "tau_2", "tau_3")
 
 
 def _read_numbers(row: Sequence[str], places: Sequence[int]) -> list[float] | None:
-    """Return the numbers in some places of a row of text; None where one is no finite number.
+    """Return the numbers in some places of a row of text.
+
+    None where one is no finite number.
 
     Numbers are written as in scenes: Python would also take 1_0, nan and other digits.
     """
@@ -257,8 +292,8 @@ def _read_numbers(row: Sequence[str], places: Sequence[int]) -> list[float] | No
 class TorqueTable(TorqueProfile):
     """Held torques [N m], shape (n, 3): each row acts from its time until the next.
 
-    They are zero before the first; times [s], shape (n,), are strictly ascending. InputError is
-    raised where shapes, order or numbers are not allowed.
+    They are zero before the first; times [s], shape (n,), are strictly ascending.
+    InputError is raised where shapes, order or numbers are not allowed.
     """
 
     @check_kinds
@@ -280,8 +315,8 @@ class TorqueTable(TorqueProfile):
     def read(cls, path: str | Path) -> TorqueTable:
         """Read a CSV file with columns time, tau_1, tau_2 and tau_3 [s, N m], in any order.
 
-        Columns of other names are skipped. InputError says why the file cannot be read, or
-        lists every bad row with its line.
+        Columns of other names are skipped. InputError says why the file cannot be read,
+        or lists every bad row with its line.
         """
         origin = str(path)
         unread = OSError, UnicodeDecodeError, csv.Error
@@ -304,7 +339,9 @@ class TorqueTable(TorqueProfile):
         for line, row in lines:
             numbers = _read_numbers(row, places) if len(row) == len(names) else None
             if numbers is None:
-                problems.append(Problem("row", row, "must be four finite numbers", line))
+                problems.append(
+                    Problem("row", row, "must be four finite numbers", line)
+                )
             elif numbers[0] <= last:
                 allowed = f"must be > {last:g} s, the last"
                 problems.append(Problem("time", numbers[0], allowed, line))
@@ -344,11 +381,15 @@ def torque_at(torque: Any, *given: Any) -> Any:
 
 
 def profile_of(torque: Any) -> TorqueProfile:
-    """Turn what a user gives into a profile; InputError: it is nothing that `simulate` allows."""
+    """Turn what a user gives into a profile.
+
+    InputError: it is nothing that `simulate` allows.
+    """
     if isinstance(torque, TorqueProfile):
         return torque
     if hasattr(torque, "c") and hasattr(torque, "x") and callable(torque):
-        return PolynomialTorque(torque.c, torque.x)  # scipy.interpolate.PPoly, CubicSpline
+        # scipy.interpolate.PPoly, CubicSpline
+        return PolynomialTorque(torque.c, torque.x)
     return FunctionTorque(torque) if callable(torque) else ConstantTorque(torque)
 
 
@@ -360,7 +401,9 @@ _KINDS = {
 
 def record_of(profile: TorqueProfile) -> dict[str, Any]:
     """Return kind and numbers of a profile, from which `profile_from` builds it again."""
-    kind = next(kind for kind, profiles in _KINDS.items() if isinstance(profile, profiles))
+    kind = next(
+        kind for kind, profiles in _KINDS.items() if isinstance(profile, profiles)
+    )
     given = {} if kind == "function" else vars(profile)
     return {"kind": kind, **{name: np.asarray(x).tolist() for name, x in given.items()}}
 

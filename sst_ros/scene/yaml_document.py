@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A document as YAML text, as nested values, and as numbers with keys.
 
-Text is read into nested dicts and lists, which are built into a checked `Section`, and back; every
-fault has its key and its line. A key is "star.inertia.zz" or "springs[0].rest"; a list without an
-index means all of its entries. The JSON schema is from the same declarations: editors complete and
-check YAML with it; what no schema can express (inertias, angles that must sum to 360 deg) is left
-to reading.
+Text is read into nested dicts and lists, which are built into a checked `Section`, and
+back; every fault has its key and its line. A key is "star.inertia.zz" or
+"springs[0].rest"; a list without an index means all of its entries. The JSON schema is
+from the same declarations: editors complete and check YAML with it; what no schema can
+express (inertias, angles that must sum to 360 deg) is left to reading.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ _INFINITE = re.compile(r"[-+]?\.inf")
 
 LONGEST, MOST_NODES, DEEPEST = 1_000_000, 20_000, 20
 LIMITS = (
-    f"no more than {LONGEST} characters, {MOST_NODES} values and {DEEPEST} levels are allowed, and "
-    "no aliases"
+    f"no more than {LONGEST} characters, {MOST_NODES} values and {DEEPEST} levels are"
+    " allowed, and no aliases"
 )
-"""Of a document: PyYAML reads 20,000 values in 0.5 s, and its time grows with the square of the
-levels."""
+"""Of a document: PyYAML reads 20,000 values in 0.5 s, and its time grows with the
+square of the levels.
+"""
 
 
 class _Loader(yaml.SafeLoader):
@@ -65,7 +66,9 @@ def read(cls: type[S], source: str, origin: str) -> S:
         for one in refused.problems:
             problems.append(replace(one, line=one.line or _line_at(lines, one.key)))
     if problems:
-        raise InputError(origin, sorted(problems, key=lambda problem: problem.line or 0))
+        raise InputError(
+            origin, sorted(problems, key=lambda problem: problem.line or 0)
+        )
     return result
 
 
@@ -111,7 +114,10 @@ def resolve_numbers(value: Any) -> Any:
 
 
 def _parse(source: str, lines: dict[str, int], problems: list[Problem]) -> Any:
-    """Return `_values` of YAML text within the limits; InputError says what is wrong with it."""
+    """Return `_values` of YAML text within the limits.
+
+    InputError says what is wrong with it.
+    """
     try:
         if len(source) > LONGEST:
             raise refusal("", "", "more", LIMITS)
@@ -138,7 +144,9 @@ def line_of(source: str, key: str) -> int | None:
 def _values(
     node: yaml.Node | None, path: str, lines: dict[str, int], problems: list[Problem]
 ) -> Any:
-    """Return a node as dicts, lists and text; note the lines of keys, and keys that come again.
+    """Return a node as dicts, lists and text.
+
+    Note the lines of keys, and keys that come again.
 
     Numbers stay text: YAML 1.1, which PyYAML reads, has others.
     """
@@ -172,7 +180,9 @@ def _line(node: yaml.Node | yaml.Event) -> int:
 def _line_at(lines: Mapping[str, int], key: str) -> int | None:
     """Return the line of a key, or of the deepest part of it that has one."""
     # One entry may stand for all.
-    key = re.sub(r"\[\d+\]", lambda at: at[0] if key[: at.end()] in lines else "[0]", key)
+    key = re.sub(
+        r"\[\d+\]", lambda at: at[0] if key[: at.end()] in lines else "[0]", key
+    )
     while key and key not in lines:
         key = key[: max(key.rfind("."), key.rfind("["), 0)]
     return lines.get(key)
@@ -184,23 +194,31 @@ def plain(value: Any) -> Any:
     Raises LostMeaning where an array means more than its numbers, as a masked one does.
     """
     if isinstance(value, Section):
-        given = {name: x for name, x in vars(value).items() if x is not None and x != ()}
+        given = {
+            name: x for name, x in vars(value).items() if x is not None and x != ()
+        }
         notes = (name for name, spec in value.SPECS.items() if spec.kind == "notes")
-        return plain(given | {name: dict(given[name]) for name in notes if name in given})
+        return plain(
+            given | {name: dict(given[name]) for name in notes if name in given}
+        )
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if hasattr(value, "tolist"):  # arrays and numbers of NumPy, series of pandas
         if reason := find_lost_meaning(value):
             raise LostMeaning(reason)
         return value.tolist()
-    return [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+    return (
+        [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+    )
 
 
 def replace_values(document: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested dicts and lists with other values by key; a single one fills a list.
+    """Return nested dicts and lists with other values by key.
 
-    A section that the document does not have is made; None takes a value or a section away. The
-    argument of KeyError is a key that does not fit the document.
+    A single one fills a list.
+
+    A section that the document does not have is made; None takes a value or a section
+    away. The argument of KeyError is a key that does not fit the document.
     """
     changed: dict[str, Any] = plain(document)
     for key, value in values.items():
@@ -222,7 +240,9 @@ def _set(tree: Any, name: str | int, *rest: str | int, value: Any) -> None:
         else:
             known = part.get(name) if isinstance(name, str) else part[name]
             single = not isinstance(value, (str, list, tuple, Mapping))
-            part[name] = [value] * len(known) if isinstance(known, list) and single else value
+            part[name] = (
+                [value] * len(known) if isinstance(known, list) and single else value
+            )
 
 
 def _split(key: str) -> Place:
@@ -238,8 +258,9 @@ def find_fields(
 ) -> Iterator[tuple[Place, Any, Spec]]:
     """Yield the place of each field that a key names, its value, and what it allows.
 
-    With `components` an index may also pick a component of a vector. `place` is that of the tree in
-    a larger one. ValueError says why there is no such field, or not in this scene.
+    With `components` an index may also pick a component of a vector. `place` is that of
+    the tree in a larger one. ValueError says why there is no such field, or not in this
+    scene.
     """
     found = [(place, tree, Spec("section", ""))]
     for word in _split(key):
@@ -254,18 +275,26 @@ def find_number(tree: Section, key: str) -> float | None:
 
 
 def values_at(tree: Section, key: str, kind: str = "") -> list[Any]:
-    """List the values that a key names, of a kind where it is given; none where there is none."""
+    """List the values that a key names, of a kind where it is given.
+
+    None where there is none.
+    """
     try:
         found = [*find_fields(tree, key, components=True)]
     except ValueError:
         return []
-    return [x for _, x, spec in found if x is not None and spec.kind in (kind or spec.kind,)]
+    return [
+        x for _, x, spec in found if x is not None and spec.kind in (kind or spec.kind,)
+    ]
 
 
 def _below(
     place: Place, value: Any, spec: Spec, word: str | int, components: bool
 ) -> Iterator[tuple[Place, Any, Spec]]:
-    """Yield what the next word of a key names in a field; a name in a list is that of each."""
+    """Yield what the next word of a key names in a field.
+
+    A name in a list is that of each.
+    """
     if value is None:
         raise ValueError(f"the scene has no {place[-1]}")
     if spec.kind == "sections":
@@ -289,18 +318,30 @@ def _below(
 def json_schema(cls: type[Section]) -> dict[str, Any]:
     """Describe the documents that `read(cls, ...)` accepts, by draft 2020-12."""
     described = {"description": (cls.__doc__ or "").partition("\n")[0]}
-    any_of = {"anyOf": [{"required": [name]} for name in cls.ONE_OF]} if cls.ONE_OF else {}
+    any_of = (
+        {"anyOf": [{"required": [name]} for name in cls.ONE_OF]} if cls.ONE_OF else {}
+    )
     properties = {name: _property_schema(spec) for name, spec in cls.SPECS.items()}
     required = [name for name, spec in cls.SPECS.items() if spec.default is REQUIRED]
-    given = {"additionalProperties": False, "properties": properties, "required": required}
+    given = {
+        "additionalProperties": False,
+        "properties": properties,
+        "required": required,
+    }
     return {"type": "object", **described, **any_of, **given}
 
 
 def _property_schema(spec: Spec) -> dict[str, Any]:
-    described: dict[str, Any] = {"description": spec.doc + (f" [{spec.unit}]" if spec.unit else "")}
+    described: dict[str, Any] = {
+        "description": spec.doc + (f" [{spec.unit}]" if spec.unit else "")
+    }
     if isinstance(spec.default, (bool, int, float, str)):
         described["default"] = spec.default
-    bounds = {"exclusiveMinimum": spec.above, "minimum": spec.least, "maximum": spec.most}
+    bounds = {
+        "exclusiveMinimum": spec.above,
+        "minimum": spec.least,
+        "maximum": spec.most,
+    }
     text = {"type": "string", "pattern": "\\S"}
     known: dict[str, dict[str, Any]] = {
         "number": {"type": "number"},
@@ -317,5 +358,7 @@ def _property_schema(spec: Spec) -> dict[str, Any]:
     if spec.kind == "sections":
         own = {"type": "array", "items": own}
     if spec.lengths:
-        own["anyOf"] = [{"minItems": length, "maxItems": length} for length in spec.lengths]
+        own["anyOf"] = [
+            {"minItems": length, "maxItems": length} for length in spec.lengths
+        ]
     return own | described

@@ -40,9 +40,8 @@ class Samples:
 
     Those inside of steps are computed together, by the program of a step over rows.
 
-    Attributes:
-        evaluations: that this takes; they are no part of a motion's budget, as they have a bound.
-
+    Attributes: evaluations: that this takes; they are no part of a motion's budget, as
+        they have a bound.
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -91,12 +90,15 @@ class Samples:
         for samples in by_steps.values():
             steps = samples[0].step.steps
             assert isinstance(steps, MethodSteps)
-            rows = [(s.step.t, s.x, *s.step.begin.y, *s.step.drive.numbers) for s in samples]
+            rows = [
+                (s.step.t, s.x, *s.step.begin.y, *s.step.drive.numbers) for s in samples
+            ]
             states[[s.number for s in samples]] = steps.states_after(np.array(rows))
 
     def _torque_at(self, t: Array, states: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""
-        if states.shape[1] > _STATE + 1:  # the actuators lag: they are part of the state
+        # the actuators lag: they are part of the state
+        if states.shape[1] > _STATE + 1:
             return states[:, _STATE : _STATE + 3]
         times, rows = t.tolist(), list[Sequence[float]]()
         for time, torque, y in zip(times, self._torques, states.tolist(), strict=True):
@@ -106,7 +108,11 @@ class Samples:
                 rows.append(self._stepper.torque.at(torque, time, y))
             else:
                 rows.append(torque)
-        sines = [k for k, torque in enumerate(self._torques) if isinstance(torque, SineTorque)]
+        sines = [
+            k
+            for k, torque in enumerate(self._torques)
+            if isinstance(torque, SineTorque)
+        ]
         if sines:  # one, traced into the program
             values = self._torques[sines[0]].values(t[sines])  # type: ignore[union-attr]
             for k, row in zip(sines, values.tolist(), strict=True):

@@ -49,21 +49,30 @@ _LEAST_GAIN = 0.5
 _FUNCTION_BUDGET = 1_000_000
 """Evaluations where each calls a function of the state: half a minute."""
 _ADVICE = (
-    "; if the torque function switches with the state, give control_period, as a controller "
-    "has it, or smooth the switch"
+    "; if the torque function switches with the state, give control_period, as a"
+    " controller has it, or smooth the switch"
 )
 
 _UNSEEN = 10.0
-"""Factor of the error estimate where it cannot see how a controller answers the error: of 170
-random runs one has an error of more than ten times the estimate without that answer."""
+"""Factor of the error estimate where it cannot see how a controller answers the error:
+of 170 random runs one has an error of more than ten times the estimate without that
+answer.
+"""
 
 _METHODS = "must be one of " + ", ".join(INTEGRATORS)
 _METHOD = {"gauss": f"has left: auto and dop853 are as accurate and faster; {_METHODS}"}
 
 TorqueInput: TypeAlias = (
-    Sequence[float] | SineTorque | TorqueProfile | TorqueFunction | FeedbackFunction | None
+    Sequence[float]
+    | SineTorque
+    | TorqueProfile
+    | TorqueFunction
+    | FeedbackFunction
+    | None
 )
-InitialInput: TypeAlias = Initial | Mapping[str, Any] | tuple[ArrayLike, ArrayLike] | None
+InitialInput: TypeAlias = (
+    Initial | Mapping[str, Any] | tuple[ArrayLike, ArrayLike] | None
+)
 
 
 @check_kinds
@@ -86,45 +95,41 @@ def simulate(
 ) -> Trajectory:
     """Simulate a motion from the initial state of a scene.
 
-    Where a limit of the scene ends the motion, or no step resolves it, the trajectory has the part
-    that is valid, and its `status` and `message` give the reason.
+    Where a limit of the scene ends the motion, or no step resolves it, the trajectory
+    has the part that is valid, and its `status` and `message` give the reason.
 
-    Args:
-        scene: name or path of a scene, its document as a dict, or a `Scene`.
-        torque: three torques [N m]; a profile (`SineTorque`, `TorqueTable`, `PolynomialTorque`, a
-            `scipy.interpolate.PPoly` whose values have the shape (3,)); or a function f(t) or
-            f(t, state) of the time [s] and the `State`. By default the scene's own profile, or
-            zero where it has none.
-        duration: length of the motion [s]; by default that of the scene.
-        initial: initial state in place of the scene's: (gamma [rad], gamma_dot [rad/s]), or a
-            mapping or `Initial` with gamma, gamma_dot, orientation.
-        samples: number of even intervals of time, at whose ends samples are returned; by default
-            200, or the control periods where there are some. The steps do not depend on them.
-        t_eval: the times of the samples instead [s], ascending, in whole nanoseconds (others are
-            rounded).
-        method: "dopri5", "dop853", "rk4" (explicit Runge-Kutta of order 5, 8, 4), "rodas5p"
-            (Rosenbrock, order 5, for stiff scenes) or "auto", which changes between them as the
-            motion asks for.
-        tolerance: error of the orientation at the end that is allowed [rad]. A motion whose
-            `error_estimate` exceeds it is run again by smaller steps, up to three times; if it
-            still does, `status` is 2. A function that may have a memory runs once.
-        control_period: a function is called once a period [s], at its beginning, and its torques
-            are held until the next, as those of a controller, which may have a memory. Without it
-            a function is part of the differential equation, called in each stage of a step, and
-            must have no memory.
-        memoryless: the function depends on its arguments alone. With `control_period` it is then
-            called a second time a period, with the state of the second solution, which shows how
-            it answers the error. Otherwise the error estimate, without this answer, is ten times
-            as large.
-        breaks: times at which a function jumps or has a kink [s], ascending. Jumps in time are
-            found without it, unless a pulse is shorter than a step.
-        max_step: longest step [s]; by default the error alone decides.
-        sensitivities: numbers by which `Trajectory.sensitivities` differentiates the motion: keys
-            of the scene, as "star.inertia.zz", "star.inertia" (its six numbers),
-            "initial.gamma" (three), "base.v" (nine) or "stroke.stiffness", and "torque" for
-            all numbers of the torques. Not with a function of the state. By
-            "star.alpha_deg[0]" the third angle takes what the first leaves.
-        progress: draw a bar on a terminal.
+    Args: scene: name or path of a scene, its document as a dict, or a `Scene`. torque:
+        three torques [N m]; a profile (`SineTorque`, `TorqueTable`, `PolynomialTorque`,
+        a `scipy.interpolate.PPoly` whose values have the shape (3,)); or a function
+        f(t) or f(t, state) of the time [s] and the `State`. By default the scene's own
+        profile, or zero where it has none. duration: length of the motion [s]; by
+        default that of the scene. initial: initial state in place of the scene's:
+        (gamma [rad], gamma_dot [rad/s]), or a mapping or `Initial` with gamma,
+        gamma_dot, orientation. samples: number of even intervals of time, at whose ends
+        samples are returned; by default 200, or the control periods where there are
+        some. The steps do not depend on them. t_eval: the times of the samples instead
+        [s], ascending, in whole nanoseconds (others are rounded). method: "dopri5",
+        "dop853", "rk4" (explicit Runge-Kutta of order 5, 8, 4), "rodas5p" (Rosenbrock,
+        order 5, for stiff scenes) or "auto", which changes between them as the motion
+        asks for. tolerance: error of the orientation at the end that is allowed [rad].
+        A motion whose `error_estimate` exceeds it is run again by smaller steps, up to
+        three times; if it still does, `status` is 2. A function that may have a memory
+        runs once. control_period: a function is called once a period [s], at its
+        beginning, and its torques are held until the next, as those of a controller,
+        which may have a memory. Without it a function is part of the differential
+        equation, called in each stage of a step, and must have no memory. memoryless:
+        the function depends on its arguments alone. With `control_period` it is then
+        called a second time a period, with the state of the second solution, which
+        shows how it answers the error. Otherwise the error estimate, without this
+        answer, is ten times as large. breaks: times at which a function jumps or has a
+        kink [s], ascending. Jumps in time are found without it, unless a pulse is
+        shorter than a step. max_step: longest step [s]; by default the error alone
+        decides. sensitivities: numbers by which `Trajectory.sensitivities`
+        differentiates the motion: keys of the scene, as "star.inertia.zz",
+        "star.inertia" (its six numbers), "initial.gamma" (three), "base.v" (nine) or
+        "stroke.stiffness", and "torque" for all numbers of the torques. Not with a
+        function of the state. By "star.alpha_deg[0]" the third angle takes what the
+        first leaves. progress: draw a bar on a terminal.
 
     Raises:
         InputError: an argument is not allowed; names it and the allowed values.
@@ -148,14 +153,21 @@ def simulate(
     refuse_unless(
         "simulate",
         ("method", method, method in INTEGRATORS, _METHOD.get(str(method), _METHODS)),
-        ("tolerance", tolerance, 0.0 < tolerance < math.inf, "must be a number > 0 [rad]"),
+        (
+            "tolerance",
+            tolerance,
+            0.0 < tolerance < math.inf,
+            "must be a number > 0 [rad]",
+        ),
         ("max_step", max_step, longest >= least, shortest),
         ("breaks", breaks, ascend(jumps), "must be ascending times [s]"),
     )
     period = _check_period(control_period, profile, span_ns)
     inside = jumps[(jumps > 0.0) & (jumps < end)]
     times = _times(samples, t_eval, span_ns, period)
-    parameters = (sensitivities,) if isinstance(sensitivities, str) else tuple(sensitivities)
+    parameters = (
+        (sensitivities,) if isinstance(sensitivities, str) else tuple(sensitivities)
+    )
     if parameters:  # refuses what no motion is differentiated by
         Sensitivities(given, parameters, profile)
     task = Task(
@@ -168,20 +180,24 @@ def simulate(
 def _integrate(task: Task, *, progress: bool) -> Trajectory:
     """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
 
-    A function whose torques are held, and which may have a memory, runs once. All runs share one
-    budget; of two that do not meet the tolerance the one that reached the end is kept.
+    A function whose torques are held, and which may have a memory, runs once. All runs
+    share one budget; of two that do not meet the tolerance the one that reached the end
+    is kept.
     """
     budget = EvaluationBudget(_budget_of(task), whole_run=True)
     remembers = task.period is not None and not task.memoryless
     local, kept, last = task.tolerance, None, math.inf
     for _ in range(_ATTEMPTS):
         attempt = replace(task, tolerance=local)
-        motion = SteppedMotion(attempt, start_of(task.scene), budget, progress=progress).run()
+        motion = SteppedMotion(
+            attempt, start_of(task.scene), budget, progress=progress
+        ).run()
         if kept is not None and motion.status < 0:
             break
         kept = motion
         excess = motion.at.error / task.tolerance
-        hopeless = excess > _LEAST_GAIN * last  # as under torques that switch with the state
+        # as under torques that switch with the state
+        hopeless = excess > _LEAST_GAIN * last
         if remembers or motion.status < 0 or not excess > 1.0 or hopeless:
             break
         last = excess
@@ -197,8 +213,13 @@ def _budget_of(task: Task) -> int:
     return _FUNCTION_BUDGET if calls else WHOLE_MOTION_BUDGET
 
 
-def _trajectory(task: Task, motion: SteppedMotion, spent: int, *, factor: float) -> Trajectory:
-    """Return a run as a trajectory; its error estimate is `factor` times that of the steps."""
+def _trajectory(
+    task: Task, motion: SteppedMotion, spent: int, *, factor: float
+) -> Trajectory:
+    """Return a run as a trajectory.
+
+    Its error estimate is `factor` times that of the steps.
+    """
     point, error, message = motion.at, factor * motion.at.error, motion.message
     if motion.status < 0:
         numbers = describe_conditioning(Geometry.of(task.scene), motion.state())
@@ -207,7 +228,9 @@ def _trajectory(task: Task, motion: SteppedMotion, spent: int, *, factor: float)
             message = f"{message}{_ADVICE}"
     status, message = check_error(error, task.tolerance, motion.status, message)
     if factor > 1.0 and error > task.tolerance:
-        message = f"{message} ({factor:g} times wider, as the function may have a memory)"
+        message = (
+            f"{message} ({factor:g} times wider, as the function may have a memory)"
+        )
     samples = motion.samples.table()
     changes = [f"{to} from {at:g} s ({why})" for at, to, why in point.changes]
     energy = motion.stepper.dynamics.total_energy
@@ -225,7 +248,9 @@ def _trajectory(task: Task, motion: SteppedMotion, spent: int, *, factor: float)
         energy_residual=energy(point.y) - energy(motion.start.y) - point.y[-1],
         evaluations=spent + motion.samples.evaluations,
         step=motion.time / max(point.steps, 1),
-        law=TorqueTable(*zip(*motion.held, strict=True)) if motion.held else task.torque,
+        law=(
+            TorqueTable(*zip(*motion.held, strict=True)) if motion.held else task.torque
+        ),
         parameters=task.parameters,
     )
 
@@ -240,15 +265,25 @@ def _nanoseconds(name: str, value: float) -> int:
     return round(float(value) * NANOSECONDS)
 
 
-def _check_period(period: float | None, profile: TorqueProfile, span: int) -> int | None:
+def _check_period(
+    period: float | None, profile: TorqueProfile, span: int
+) -> int | None:
     if period is None:
         return None
     if not isinstance(profile, FunctionTorque):
-        _refuse("control_period", period, "is for a function; give none for numbers and profiles")
+        _refuse(
+            "control_period",
+            period,
+            "is for a function; give none for numbers and profiles",
+        )
     found = _nanoseconds("control_period", period)
     if span > _MOST_PERIODS * found:
         least = span / NANOSECONDS / _MOST_PERIODS
-        _refuse("control_period", period, f"must be at least {least:.3g} s for this duration")
+        _refuse(
+            "control_period",
+            period,
+            f"must be at least {least:.3g} s for this duration",
+        )
     return found
 
 
@@ -262,7 +297,11 @@ def _times(
         else:
             count = _SAMPLES if samples is None else samples
             if not 1 <= count <= _MOST_SAMPLES:
-                _refuse("samples", samples, f"must be a whole number from 1 to {_MOST_SAMPLES}")
+                _refuse(
+                    "samples",
+                    samples,
+                    f"must be a whole number from 1 to {_MOST_SAMPLES}",
+                )
             found = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
         return np.asarray(found / NANOSECONDS)
     if samples is not None:
@@ -270,9 +309,16 @@ def _times(
     times = np.atleast_1d(read_numbers("simulate", "t_eval", t_eval, seconds=True))
     with np.errstate(over="ignore"):
         rounded = np.rint(times * NANOSECONDS)
-    if not (rounded.size and ascend(rounded) and rounded[0] >= 0.0 and rounded[-1] <= span_ns):
+    if not (
+        rounded.size
+        and ascend(rounded)
+        and rounded[0] >= 0.0
+        and rounded[-1] <= span_ns
+    ):
         end = span_ns / NANOSECONDS
         _refuse(
-            "t_eval", t_eval, f"must be ascending times from 0 to {end:g} s, a nanosecond apart"
+            "t_eval",
+            t_eval,
+            f"must be ascending times from 0 to {end:g} s, a nanosecond apart",
         )
     return np.asarray(np.abs(rounded) / NANOSECONDS)  # -0.0 is 0.0

@@ -14,7 +14,13 @@ import numpy as np
 
 from sst_ros.dynamics.initial_state import derive_by_paper, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
-from sst_ros.errors import Diverged, StepBudgetExceeded, check_kinds, refusal, refuse_unless
+from sst_ros.errors import (
+    Diverged,
+    StepBudgetExceeded,
+    check_kinds,
+    refusal,
+    refuse_unless,
+)
 from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
 from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.stepper import (
@@ -60,7 +66,9 @@ def default_budget(dynamics: Dynamics, equations: str) -> int:
         return _VIRTUAL_WORK_BUDGET
     if llvmlite_version() is not None:
         return _COMPILED_BUDGET
-    return _PLAIN_BUDGET // (len(recent_ode(dynamics, work=True).program.steps) + _STAGE_OPERATIONS)
+    return _PLAIN_BUDGET // (
+        len(recent_ode(dynamics, work=True).program.steps) + _STAGE_OPERATIONS
+    )
 
 
 def _whole(value: Any) -> int:
@@ -78,7 +86,10 @@ def _one_of(names: tuple[str, ...]) -> str:
 
 
 class _Instant(NamedTuple):
-    """What a state is made of, when it is asked for; torque and moment acted before it."""
+    """What a state is made of, when it is asked for.
+
+    Torque and moment acted before it.
+    """
 
     time_ns: int
     point: Point
@@ -89,32 +100,31 @@ class _Instant(NamedTuple):
 class Simulation(Explained):
     """Direct dynamics of a scene from its initial state.
 
-    A copy, also one of pickle, goes on from where the simulation is, to the bit. Only one thread
-    at a time may advance a simulation: another one is refused, for it would lose steps.
+    A copy, also one of pickle, goes on from where the simulation is, to the bit. Only
+    one thread at a time may advance a simulation: another one is refused, for it would
+    lose steps.
 
-    Args:
-        scene: a Scene, the name of a scene that is shipped, the path of a file, or a mapping with
-            the keys of a scene.
-        integrator: auto, or a method of `integration.methods.METHODS`.
-        tolerance: largest local error of a step: of the quaternion, and of the rate relative to
-            its length. RK4 has no error estimate; it takes one step a call.
-        equations: "quaternion", the equations of motion in the quaternion and the body rate, or
-            "virtual_work", the paper's Eqs. 1 to 92: the same motion, a thousand times slower, by
-            explicit methods in plain Python, without the terms that the paper does not have.
-        step_budget: evaluations of the right-hand side that one `step` may take. The default keeps
-            a step below about 0.2 s, see `default_budget`. Long steps of a stiff or fast
-            motion may need more. A Jacobian counts as 30 evaluations.
+    Args: scene: a Scene, the name of a scene that is shipped, the path of a file, or a
+        mapping with the keys of a scene. integrator: auto, or a method of
+        `integration.methods.METHODS`. tolerance: largest local error of a step: of the
+        quaternion, and of the rate relative to its length. RK4 has no error estimate;
+        it takes one step a call. equations: "quaternion", the equations of motion in
+        the quaternion and the body rate, or "virtual_work", the paper's Eqs. 1 to 92:
+        the same motion, a thousand times slower, by explicit methods in plain Python,
+        without the terms that the paper does not have. step_budget: evaluations of the
+        right-hand side that one `step` may take. The default keeps a step below about
+        0.2 s, see `default_budget`. Long steps of a stiff or fast motion may need more.
+        A Jacobian counts as 30 evaluations.
 
     Attributes:
         geometry: constant vectors of the scene.
         dynamics: traced functions of the scene.
         step_budget: evaluations that one step may take.
 
-    Raises:
-        AssemblyError: the initial gamma has no unique admissible assembly.
-        SingularConfiguration: it moves from a parallel singularity.
-        InputError: the initial gamma lies outside the stroke, an argument is not allowed, or the
-            scene has a term that the equations do not have.
+    Raises: AssemblyError: the initial gamma has no unique admissible assembly.
+        SingularConfiguration: it moves from a parallel singularity. InputError: the
+        initial gamma lies outside the stroke, an argument is not allowed, or the scene
+        has a term that the equations do not have.
 
     """
 
@@ -158,23 +168,20 @@ class Simulation(Explained):
         self._now = self._before = _Instant(0, self._start)
         self.reset()
 
-    def step(self, torque: Torque, dt_ns: int, moment: Vector3 = (0.0, 0.0, 0.0)) -> State:
+    def step(
+        self, torque: Torque, dt_ns: int, moment: Vector3 = (0.0, 0.0, 0.0)
+    ) -> State:
         """Advance by dt_ns [ns] in as many steps as the tolerance asks for.
 
-        Args:
-            torque: commanded torques [N m], held constant; a `SineTorque`; or a function of
-                t [s].
-            dt_ns: length [ns], > 0.
-            moment: external moment on the star in {B} [N m], used where the scene takes it from
-                a topic.
+        Args: torque: commanded torques [N m], held constant; a `SineTorque`; or a
+            function of t [s]. dt_ns: length [ns], > 0. moment: external moment on the
+            star in {B} [N m], used where the scene takes it from a topic.
 
-        Raises:
-            InputError: an argument is not finite, or dt_ns not positive.
-            StrokeExceeded, WorkspaceLeft, SingularityReached: the motion ends inside the step, at
-                the `time` of the error.
-            StepBudgetExceeded: the step takes more than `step_budget` evaluations.
-            Diverged: no step resolves the motion. In all cases the state stays as it was.
-
+        Raises: InputError: an argument is not finite, or dt_ns not positive.
+            StrokeExceeded, WorkspaceLeft, SingularityReached: the motion ends inside
+            the step, at the `time` of the error. StepBudgetExceeded: the step takes
+            more than `step_budget` evaluations. Diverged: no step resolves the motion.
+            In all cases the state stays as it was.
         """
         self.steps(torque, dt_ns, 1, moment)
         return self.state
@@ -184,12 +191,17 @@ class Simulation(Explained):
     ) -> None:
         """Advance by `count` times dt_ns: the bits are those of `count` calls of `step`.
 
-        Errors are those of `step`: the state is then that after the last step before, at `time_ns`.
+        Errors are those of `step`: the state is then that after the last step before,
+        at `time_ns`.
         """
         length, number = _whole(dt_ns), _whole(count)
         known = 0 < number <= _MOST and length > 0
         if not (known and finite_vector(torque) and finite_vector(moment)):
-            acts = callable(torque) or isinstance(torque, SineTorque) or finite_vector(torque)
+            acts = (
+                callable(torque)
+                or isinstance(torque, SineTorque)
+                or finite_vector(torque)
+            )
             refuse_unless(
                 "step",
                 ("torque", torque, bool(acts), _TORQUE),
@@ -209,7 +221,10 @@ class Simulation(Explained):
     def _advancing(self) -> Iterator[None]:
         """Refuse another thread while one advances the simulation."""
         if not self._running.acquire(blocking=False):
-            here, allowed = threading.current_thread().name, "must wait: {} advances the simulation"
+            here, allowed = (
+                threading.current_thread().name,
+                "must wait: {} advances the simulation",
+            )
             raise refusal("step", "thread", here, allowed.format(self._thread))
         self._thread = threading.current_thread().name
         try:
@@ -221,7 +236,9 @@ class Simulation(Explained):
         """Return what acts: finite torques [N m] within the limit of the actuators."""
         try:
             if callable(torque) and not getattr(torque, "feedback", False):
-                refuse_unless("step", ("torque", torque, count_arguments(torque) == 1, _TORQUE))
+                refuse_unless(
+                    "step", ("torque", torque, count_arguments(torque) == 1, _TORQUE)
+                )
             acts = callable(torque) or isinstance(torque, SineTorque)
             if not acts and finite_vector(torque) is None:
                 raise ValueError
@@ -230,7 +247,10 @@ class Simulation(Explained):
             raise refusal("step", "torque", torque, _TORQUE) from None
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
-        """Do what `steps` does, for arguments that have been checked; torque is of `acting`."""
+        """Do what `steps` does, for arguments that have been checked.
+
+        Torque is of `acting`.
+        """
         with self._advancing():
             self._advance(torque, dt_ns, count, moment)
 
@@ -244,9 +264,13 @@ class Simulation(Explained):
                 point = self._stepper.advance(at, start, h, torque, held)
             except LimitReached as reached:
                 assert reached.limit.error is not None
-                raise reached.limit.error(reached.limit.reason, reached.time, self.state) from None
+                raise reached.limit.error(
+                    reached.limit.reason, reached.time, self.state
+                ) from None
             except CannotStep as error:
-                kind = StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
+                kind = (
+                    StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
+                )
                 near = describe_conditioning(self.geometry, self.state)
                 raise kind(f"{error} ({near})", start, self.state) from None
             self._before = began
@@ -256,7 +280,8 @@ class Simulation(Explained):
     def within(self, time_ns: int) -> State:
         """State at a time inside the last step, to the full accuracy of the run.
 
-        It is stepped to from the beginning of that step, under the torques that were given.
+        It is stepped to from the beginning of that step, under the torques that were
+        given.
 
         Raises:
             InputError: the time is not inside the last step.
@@ -283,8 +308,8 @@ class Simulation(Explained):
     def load_code(self) -> None:
         """Have the code of all methods compiled that steps under constant torques may turn to.
 
-        Otherwise the first step, and one that changes the method, compiles it, which takes tenths
-        of a second. The state does not change.
+        Otherwise the first step, and one that changes the method, compiles it, which
+        takes tenths of a second. The state does not change.
         """
         self._stepper.load()
 
@@ -324,15 +349,19 @@ class Simulation(Explained):
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the derivative, those of rejected steps too; a Jacobian counts as 30."""
+        """Evaluations of the derivative, those of rejected steps too.
+
+        A Jacobian counts as 30.
+        """
         return self._stepper.budget.spent
 
     @property
     def error_estimate(self) -> float:
         """Estimated global error of the orientation [rad].
 
-        Twice the distance of a second solution, which takes steps of half the length: it holds
-        where the error only halves with the steps, too. Not less than rounding.
+        Twice the distance of a second solution, which takes steps of half the length:
+        it holds where the error only halves with the steps, too. Not less than
+        rounding.
         """
         return self._now.point.error
 
@@ -398,9 +427,14 @@ def conditioning(geometry: Geometry, state: State) -> dict[str, float]:
     r = kinematics.carriage_directions(geometry, state.joints.gamma)
     rotation = rotation_matrix(state.quaternion)
     _, _, determinant, _ = kinematics.describe_assemblies(geometry, r, rotation)
-    return {"sin_mu": float(np.sin(state.joints.mu).min()), "det_j2": float(determinant)}
+    return {
+        "sin_mu": float(np.sin(state.joints.mu).min()),
+        "det_j2": float(determinant),
+    }
 
 
 def describe_conditioning(geometry: Geometry, state: State) -> str:
     """Say how near a state is to a singularity."""
-    return ", ".join(f"{name} = {x:.3g}" for name, x in conditioning(geometry, state).items())
+    return ", ".join(
+        f"{name} = {x:.3g}" for name, x in conditioning(geometry, state).items()
+    )

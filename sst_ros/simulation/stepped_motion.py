@@ -30,14 +30,17 @@ from sst_ros.state import NANOSECONDS, Array, State, Vector3, clamp
 AUTO = "auto"
 
 _WARN_AFTER = 100_000
-"""Evaluations, a second of work where a function gives the torques, after which a motion is
-looked at that will not reach its end: a warning then, and not a stop after half a minute."""
+"""Evaluations, a second of work where a function gives the torques, after which a
+motion is looked at that will not reach its end: a warning then, and not a stop after
+half a minute.
+"""
 _HOPELESS = 3.0
 """...by so many times its budget."""
 
 _MANY = 8
-"""Samples in a step from which on a polynomial costs less than a step for each, where a function
-gives the torques."""
+"""Samples in a step from which on a polynomial costs less than a step for each, where a
+function gives the torques.
+"""
 _WORST = 0.07
 """Share of the step at which the error of that polynomial is largest."""
 
@@ -52,9 +55,12 @@ class Task:
     times: Array  # of the samples, ascending
     method: str  # name, or auto
     tolerance: float  # largest error estimate at the end [rad]
-    period: int | None = None  # of control [ns], from time zero; None where torques are not held
-    memoryless: bool = False  # whether torques that are held depend on time and state alone
-    breaks: Sequence[float] | Array = ()  # further times at which the torques jump, ascending
+    # of control [ns], from time zero; None where torques are not held
+    period: int | None = None
+    # whether torques that are held depend on time and state alone
+    memoryless: bool = False
+    # further times at which the torques jump, ascending
+    breaks: Sequence[float] | Array = ()
     max_step: float = math.inf  # longest step
     parameters: tuple[str, ...] = ()  # by which the motion is differentiated
 
@@ -62,20 +68,15 @@ class Task:
 class SteppedMotion:
     """One run of a task by steps whose local error is at most its tolerance.
 
-    Args:
-        task: what is simulated.
-        y: state at the begin; numbers that it lacks at its end are zero.
-        budget: evaluations that it may take, those of earlier runs of the same motion included.
-        limits: whether the limits of the scene end the motion.
+    Args: task: what is simulated. y: state at the begin; numbers that it lacks at its
+        end are zero. budget: evaluations that it may take, those of earlier runs of the
+        same motion included. limits: whether the limits of the scene end the motion.
         progress: draw a bar on a terminal.
 
-    Attributes:
-        samples: those that were taken.
-        held: times of control [s] and the torques from then on.
-        start, at, time: first and last valid point, and time of the last [s].
-        status, message: 0 at the end, 1 at a limit, -1 where no step resolves the motion; why.
-        stepper: what made the steps.
-
+    Attributes: samples: those that were taken. held: times of control [s] and the
+        torques from then on. start, at, time: first and last valid point, and time of
+        the last [s]. status, message: 0 at the end, 1 at a limit, -1 where no step
+        resolves the motion; why. stepper: what made the steps.
     """
 
     def __init__(
@@ -167,7 +168,13 @@ class SteppedMotion:
         self._torque = self.stepper.torque.acting(torque)
         self._take_if_wanted(begin, self.at.y)
         self.stepper.advance(
-            self.at, begin, h, self._torque, self._moment, other=self._other, visit=self._pass
+            self.at,
+            begin,
+            h,
+            self._torque,
+            self._moment,
+            other=self._other,
+            visit=self._pass,
         )
 
     def _pass(self, step: Step) -> None:
@@ -177,8 +184,12 @@ class SteppedMotion:
         inside = []
         while self._wanted and self._wanted[-1] < end:
             inside.append(self._wanted.pop())
-        is_function = callable(self._torque) and not isinstance(self._torque, SineTorque)
-        polynomial = self._interpolate(step) if is_function and len(inside) >= _MANY else None
+        is_function = callable(self._torque) and not isinstance(
+            self._torque, SineTorque
+        )
+        polynomial = (
+            self._interpolate(step) if is_function and len(inside) >= _MANY else None
+        )
         for time in inside:
             if polynomial is None:
                 self._take_inside(time)
@@ -196,7 +207,10 @@ class SteppedMotion:
         """Warn once where the rest of the motion would take far more than the budget."""
         self._warn_after, most = math.inf, self._budget.per_period
         if _HOPELESS * most * share < self._budget.spent:
-            done = f"{self._budget.spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+            done = (
+                f"{self._budget.spent:,} evaluations for {100.0 * share:.2g} % of the"
+                " motion"
+            )
             advice = f"it stops at {most:,}: shorten it, or change its method"
             text = f"{self._task.scene.name}: {done}; {advice}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
@@ -204,14 +218,16 @@ class SteppedMotion:
     def _interpolate(self, step: Step) -> Callable[[float], Array] | None:
         """Return a polynomial of the time in a step, through states and slopes at its quarters.
 
-        None where it misses the state by more than the tolerance, where its error is largest.
+        None where it misses the state by more than the tolerance, where its error is
+        largest.
         """
         from scipy.interpolate import KroghInterpolator  # many runs have few samples
 
         times = [0.25 * k * step.h for k in range(5)]
         states = [step.begin.y, *(step.inside(x) for x in times[1:-1]), step.end.y]
         slopes = [
-            step.steps.slope(step.t + x, y, step.drive) for x, y in zip(times, states, strict=True)
+            step.steps.slope(step.t + x, y, step.drive)
+            for x, y in zip(times, states, strict=True)
         ]
         data = [row for pair in zip(states, slopes, strict=True) for row in pair]
         self._budget.charge(4 * step.steps.cost + len(times))

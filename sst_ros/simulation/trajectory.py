@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A motion of a scene as a table over time, simulated or recorded.
 
-Between its samples states are propagated from the sample before, under the torques that act there.
+Between its samples states are propagated from the sample before, under the torques that
+act there.
 """
 
 from __future__ import annotations
@@ -73,19 +74,24 @@ _UNMET = 2
 """Status of a motion that reached its end with an error estimate above the tolerance."""
 
 
-def check_error(error: float, tolerance: float, status: int, message: str) -> tuple[int, str]:
+def check_error(
+    error: float, tolerance: float, status: int, message: str
+) -> tuple[int, str]:
     """Return status and message of a motion with an error estimate at its end [rad]."""
     if not error > tolerance:
         return status, message
-    unmet = f"the error estimate {error:.1e} rad exceeds the tolerance {tolerance:g} rad"
+    unmet = (
+        f"the error estimate {error:.1e} rad exceeds the tolerance {tolerance:g} rad"
+    )
     return status or _UNMET, f"{message}; {unmet}"
 
 
 _UNIT = 1e-6
 """Largest deviation of the length of a quaternion from 1 in a file."""
 _CLOSURE = 0.02
-"""Largest abs(r_k . t_k) in a file. A simulated motion has 1e-15; a recorded one has the
-noise of its encoders. What exceeds this is the orientation of another motion."""
+"""Largest abs(r_k . t_k) in a file. A simulated motion has 1e-15; a recorded one has
+the noise of its encoders. What exceeds this is the orientation of another motion.
+"""
 
 
 def _check_columns(path: str | Path, columns: dict[str, Array]) -> None:
@@ -97,7 +103,12 @@ def _check_columns(path: str | Path, columns: dict[str, Array]) -> None:
             f"load: {path}",
             (name, str(column.dtype), number, "must be numbers"),
             (name, column.shape, column.shape == count, f"must have the shape {count}"),
-            (name, "nan", not number or bool(np.isfinite(column).all()), "must be finite"),
+            (
+                name,
+                "nan",
+                not number or bool(np.isfinite(column).all()),
+                "must be finite",
+            ),
         )
 
 
@@ -113,30 +124,27 @@ def _check_figures(about: dict[str, Any]) -> None:
 class Trajectory(MotionTable):
     """A motion over n instants. Arrays are its own, and read-only.
 
-    Args:
-        scene: what moves.
-        t: times [s], shape (n,), strictly ascending.
-        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
-        body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
-        torque: torques that act at the actuators [N m], shape (n, 3), as in `State.torque`. All
-            three are computed by `dense` when they are first asked for, where none is given.
-        joints: angles and rates of the joints where they are known already, shape (n, 18): gamma,
-            mu, beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default they are computed.
-        status: 0 where the motion reached its end, 1 where a limit ended it, 2 where it reached its
-            end with an error estimate above the tolerance, -1 where no step resolved it.
-        message: the same in words.
-        method: the integrator, and why it was chosen.
-        error_estimate: estimated error of the orientation at the end [rad], nan if unknown.
-        energy_residual: energy at the end, less that at the start, less the work done [J]; a
-            number, or a function that computes it when it is asked for.
-        evaluations: how often the derivative was evaluated.
-        step: mean length of the steps of the integrator [s], nan if unknown.
-        law: torques that act between the samples, for `at`, as `simulate` takes them; by default
-            each is held over the interval that ends at its sample.
-        dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses instead.
-        parameters: numbers of the scene, its start or its torques that `sensitivities` are by.
-        gaps: spans of time [s] of which nothing is known, begin and end, shape (g, 2); `at` refuses
-            times inside of them.
+    Args: scene: what moves. t: times [s], shape (n,), strictly ascending. quaternion:
+        orientations (x, y, z, w) of {E} in {B}, shape (n, 4). body_rate: angular
+        velocities of the star in {E} [rad/s], shape (n, 3). torque: torques that act at
+        the actuators [N m], shape (n, 3), as in `State.torque`. All three are computed
+        by `dense` when they are first asked for, where none is given. joints: angles
+        and rates of the joints where they are known already, shape (n, 18): gamma, mu,
+        beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default they are computed.
+        status: 0 where the motion reached its end, 1 where a limit ended it, 2 where it
+        reached its end with an error estimate above the tolerance, -1 where no step
+        resolved it. message: the same in words. method: the integrator, and why it was
+        chosen. error_estimate: estimated error of the orientation at the end [rad], nan
+        if unknown. energy_residual: energy at the end, less that at the start, less the
+        work done [J]; a number, or a function that computes it when it is asked for.
+        evaluations: how often the derivative was evaluated. step: mean length of the
+        steps of the integrator [s], nan if unknown. law: torques that act between the
+        samples, for `at`, as `simulate` takes them; by default each is held over the
+        interval that ends at its sample. dense: a function from times (m,) [s] to
+        states (m, 7 or 10) that `at` uses instead. parameters: numbers of the scene,
+        its start or its torques that `sensitivities` are by. gaps: spans of time [s] of
+        which nothing is known, begin and end, shape (g, 2); `at` refuses times inside
+        of them.
 
     Raises:
         InputError: shapes do not fit, or times do not ascend.
@@ -166,14 +174,30 @@ class Trajectory(MotionTable):
     ) -> None:
         self.scene, self.t = scene, _own("t", t)
         self.gaps = _own("gaps", np.empty((0, 2)) if np.size(gaps) == 0 else gaps)
-        spans = self.gaps.ndim == 2 and self.gaps.shape[1] == 2 and ascend(self.gaps.ravel())
-        given: dict[str, Any] = {"quaternion": quaternion, "body_rate": body_rate, "torque": torque}
+        spans = (
+            self.gaps.ndim == 2
+            and self.gaps.shape[1] == 2
+            and ascend(self.gaps.ravel())
+        )
+        given: dict[str, Any] = {
+            "quaternion": quaternion,
+            "body_rate": body_rate,
+            "torque": torque,
+        }
         given |= {} if joints is None else {"_joints": joints}
         if dense is None or any(array is not None for array in given.values()):
-            vars(self).update({name: _own(name, array) for name, array in given.items()})
+            vars(self).update(
+                {name: _own(name, array) for name, array in given.items()}
+            )
         sizes = {"quaternion": 4, "body_rate": 3, "torque": 3, "_joints": 18}
-        shapes = {name: (self.t.size, size) for name, size in sizes.items() if name in vars(self)}
-        shaped = ((name, vars(self)[name].shape, shape) for name, shape in shapes.items())
+        shapes = {
+            name: (self.t.size, size)
+            for name, size in sizes.items()
+            if name in vars(self)
+        }
+        shaped = (
+            (name, vars(self)[name].shape, shape) for name, shape in shapes.items()
+        )
         known = type(status) is int and status in _STATUSES
         refuse_unless(
             "trajectory",
@@ -181,7 +205,10 @@ class Trajectory(MotionTable):
             ("status", status, known, f"must be one of {_STATUSES}"),
             ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
             ("gaps", gaps, spans, "must be rising pairs of times [s], shape (g, 2)"),
-            *((name.strip("_"), x, x == y, f"must have the shape {y}") for name, x, y in shaped),
+            *(
+                (name.strip("_"), x, x == y, f"must have the shape {y}")
+                for name, x, y in shaped
+            ),
         )
         self.status, self.message, self.method = status, message, method
         self.error_estimate, self._residual = error_estimate, energy_residual
@@ -191,7 +218,9 @@ class Trajectory(MotionTable):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or another process gets: `at` integrates there from the samples."""
-        arrays = {name: getattr(self, name) for name in ("quaternion", "body_rate", "torque")}
+        arrays = {
+            name: getattr(self, name) for name in ("quaternion", "body_rate", "torque")
+        }
         return vars(self) | arrays | {"dense": None, "_residual": self.energy_residual}
 
     @cached_property
@@ -241,7 +270,9 @@ class Trajectory(MotionTable):
         with np.errstate(all="ignore"):
             slope = kernel.derivative(model, y, triple(self.torque.T))
             found = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
-        return freeze(np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1))
+        return freeze(
+            np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1)
+        )
 
     @cached_property
     def reactions(self) -> Reactions:
@@ -249,7 +280,9 @@ class Trajectory(MotionTable):
 
         A moment from a topic is no part of them.
         """
-        return reactions_of(self.scene, self.t, self.quaternion, self.body_rate, self.torque)
+        return reactions_of(
+            self.scene, self.t, self.quaternion, self.body_rate, self.torque
+        )
 
     @cached_property
     def euler_zyz(self) -> Array:
@@ -261,25 +294,36 @@ class Trajectory(MotionTable):
         """Kinetic and potential energy [J], shape (n,)."""
         with np.errstate(all="ignore"):
             model, columns = self._dynamics.model, self._columns
-            total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(model, columns)
+            total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(
+                model, columns
+            )
         return freeze(np.broadcast_to(total, self.t.shape))
 
     @cached_property
     def energy_residual(self) -> float:
-        """Energy at the end, less that at the start, less the work done [J]; nan if unknown."""
+        """Energy at the end, less that at the start, less the work done [J].
+
+        Nan if unknown.
+        """
         return float(self._residual() if callable(self._residual) else self._residual)
 
     @cached_property
     def closure_error(self) -> float:
-        """Largest abs(r_k . t_k) of all samples: how far the loops are from closed; 0 if exact."""
+        """Largest abs(r_k . t_k) of all samples: how far the loops are from closed.
+
+        0 if exact.
+        """
         rotation, geometry = rotation_matrix(self.quaternion), Geometry.of(self.scene)
-        return float(np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0))
+        return float(
+            np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0)
+        )
 
     @cached_property
     def sensitivities(self) -> dict[str, Sensitivity]:
         """Derivatives of the samples by each parameter that `simulate` was given, by its name.
 
-        They are computed when they are first asked for. Raises InputError: no motion is found.
+        They are computed when they are first asked for. Raises InputError: no motion is
+        found.
         """
         if not self._parameters or self.law is None:
             return {}
@@ -297,14 +341,14 @@ class Trajectory(MotionTable):
     def at(self, t: TimesLike) -> Trajectory:
         """Sample the motion at other times, ascending, to the accuracy of the run.
 
-        Each state is integrated from the sample before it, under the torques that act there.
+        Each state is integrated from the sample before it, under the torques that act
+        there.
 
         Args:
             t: one time or times [s], shape (m,), within the trajectory.
 
-        Raises:
-            InputError: a time lies outside, or in a gap; or between samples that were loaded from a
-                file, of a run under a function.
+        Raises: InputError: a time lies outside, or in a gap; or between samples that
+            were loaded from a file, of a run under a function.
 
         """
         times = np.atleast_1d(read_numbers("at", "t", t, seconds=True))
@@ -312,8 +356,12 @@ class Trajectory(MotionTable):
         fits = times.ndim == 1 and times.size > 0 and bool(np.all(inside))
         allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
         refuse_unless("at", ("t", t, fits, allowed))
-        known = not isinstance(self.law, LostTorque) or bool(np.all(np.isin(times, self.t)))
-        allowed = "must be times of samples: the function of the torques is not in the file"
+        known = not isinstance(self.law, LostTorque) or bool(
+            np.all(np.isin(times, self.t))
+        )
+        allowed = (
+            "must be times of samples: the function of the torques is not in the file"
+        )
         refuse_unless("at", ("t", t, known, allowed))
         for begin, end in self.gaps.tolist():
             outside = not np.any((times > begin) & (times < end))
@@ -323,11 +371,18 @@ class Trajectory(MotionTable):
         return self._sampled(times, y[:, :4], y[:, 4:7], y[:, 7:])
 
     def __getitem__(self, rows: slice) -> Trajectory:
-        """Return the samples of a slice, as in `motion[::10]`; InputError: it is none, or empty."""
+        """Return the samples of a slice, as in `motion[::10]`.
+
+        InputError: it is none, or empty.
+        """
         chosen = isinstance(rows, slice) and len(self.t[rows])
-        refuse_unless("trajectory", ("rows", rows, bool(chosen), "must be a slice with samples"))
+        refuse_unless(
+            "trajectory", ("rows", rows, bool(chosen), "must be a slice with samples")
+        )
         arrays = self.t, self.quaternion, self.body_rate, self.torque
-        return self._sampled(*(array[rows] for array in arrays), joints=self._joints[rows])
+        return self._sampled(
+            *(array[rows] for array in arrays), joints=self._joints[rows]
+        )
 
     def _sampled(self, *arrays: Array, joints: Array | None = None) -> Trajectory:
         return Trajectory(
@@ -351,15 +406,18 @@ class Trajectory(MotionTable):
         return table
 
     @check_kinds
-    def save(self, path: str | Path, *, overwrite: bool = False, reactions: bool = False) -> None:
-        """Write a file: whole, or not at all; others may read and write the same path meanwhile.
+    def save(
+        self, path: str | Path, *, overwrite: bool = False, reactions: bool = False
+    ) -> None:
+        """Write a file: whole, or not at all.
 
-        Args:
-            path: ends in .parquet or .npz, which `load` reads back to the bit, units (Parquet) and
-                scene included; or in .csv, the table of `to_pandas` for other programs.
-            overwrite: replace a file that exists.
-            reactions: append the columns of `Reactions.columns` to a .csv; a trajectory that is
-                loaded from another file computes them.
+        Others may read and write the same path meanwhile.
+
+        Args: path: ends in .parquet or .npz, which `load` reads back to the bit, units
+            (Parquet) and scene included; or in .csv, the table of `to_pandas` for other
+            programs. overwrite: replace a file that exists. reactions: append the
+            columns of `Reactions.columns` to a .csv; a trajectory that is loaded from
+            another file computes them.
 
         Raises:
             InputError: the suffix is another, the file exists, or it cannot be written.
@@ -372,7 +430,12 @@ class Trajectory(MotionTable):
             "save",
             ("path", str(path), path.suffix in SUFFIXES, ends),
             ("path", str(path), free, "exists; overwrite=True replaces it"),
-            ("reactions", True, not reactions or path.suffix == ".csv", "is for .csv alone"),
+            (
+                "reactions",
+                True,
+                not reactions or path.suffix == ".csv",
+                "is for .csv alone",
+            ),
         )
         about = self._of_run() | {
             "format": _FORMAT,
@@ -397,7 +460,9 @@ class Trajectory(MotionTable):
             MissingDependency: pyarrow (.parquet) is not installed.
 
         """
-        allowed = "must be a trajectory that `Trajectory.save` has written as Parquet or NPZ"
+        allowed = (
+            "must be a trajectory that `Trajectory.save` has written as Parquet or NPZ"
+        )
         try:
             columns, texts = load_table(Path(path), list(UNITS), [_KEY])
             about = json.loads(texts[_KEY])
@@ -408,7 +473,9 @@ class Trajectory(MotionTable):
         refuse_unless("load", ("format", form, form == _FORMAT, f"must be {_FORMAT}"))
         _check_columns(path, columns)
         arrays = {
-            name: np.stack([columns[f"{name}_{part}"] for part in DIMENSIONS[dimension]], axis=1)
+            name: np.stack(
+                [columns[f"{name}_{part}"] for part in DIMENSIONS[dimension]], axis=1
+            )
             for name, (_, dimension) in QUANTITIES.items()
         }
         try:
@@ -443,7 +510,10 @@ class Trajectory(MotionTable):
         return {name: getattr(self, name) for name in _FIGURES}
 
     def plot(self) -> Figure:
-        """Draw actuator angles, rates, torques and the energy of the samples; needs matplotlib."""
+        """Draw actuator angles, rates, torques and the energy of the samples.
+
+        Needs matplotlib.
+        """
         require("matplotlib")
         from sst_ros.host.figures import DEGREES, draw_panels, leg_names
 
@@ -461,7 +531,9 @@ class Trajectory(MotionTable):
         return {
             "scene": self.scene.name,
             "samples": len(self),
-            "time [s]": f"{self.t[0]:g} to {self.t[-1]:g}" if len(self) else "no samples",
+            "time [s]": (
+                f"{self.t[0]:g} to {self.t[-1]:g}" if len(self) else "no samples"
+            ),
             "status": f"{self.status}: {self.message}",
             "method": self.method,
             "error estimate [rad]": self.error_estimate,
@@ -491,7 +563,9 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
         limit = trajectory.scene.torque_limit or np.inf
         return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
     t, size = trajectory.t, len(trajectory._dynamics.state)
-    samples = np.hstack([trajectory.quaternion, trajectory.body_rate, trajectory.torque])
+    samples = np.hstack(
+        [trajectory.quaternion, trajectory.body_rate, trajectory.torque]
+    )
     before = np.searchsorted(t, times, side="right") - 1
     found = samples[before]
     for k in np.unique(before[times > t[before]]):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A batch under feedback: the control law acts on all scenarios once a period.
 
-At a sample the law and its channel are a function of the state of the plant and of a memory: the
-integral, the queue of delayed commands, the last encoder angles, the observed orientation, and sums
-of tracking errors. It is traced, without branches: what the settings do not use has no operation.
-It becomes machine code as the step does, and is called before the steps of a period, in which the
-torques are held.
+At a sample the law and its channel are a function of the state of the plant and of a
+memory: the integral, the queue of delayed commands, the last encoder angles, the
+observed orientation, and sums of tracking errors. It is traced, without branches: what
+the settings do not use has no operation. It becomes machine code as the step does, and
+is called before the steps of a period, in which the torques are held.
 """
 
 from __future__ import annotations
@@ -34,14 +34,27 @@ from sst_ros.programs.expression import Expression, trace
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
 NEWTON_STEPS = 5
-"""Of the observer at a sample. They square the error; from one sample to the next it is small."""
+"""Of the observer at a sample. They square the error.
 
-_DESIRED = {part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)}
+From one sample to the next it is small.
+"""
+
+_DESIRED = {
+    part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)
+}
 
 REFERENCES = {"first": 1, **_DESIRED, "feedforward": 3, "held": 3}
 """Sizes of what a sample is given: whether it is the first, the reference, its torques."""
 
-GAINS = {"kp": 3, "kd": 3, "inertia": 3, "rate": 1, "limit": 1, "plant_limit": 1, "noise": 2}
+GAINS = {
+    "kp": 3,
+    "kd": 3,
+    "inertia": 3,
+    "rate": 1,
+    "limit": 1,
+    "plant_limit": 1,
+    "noise": 2,
+}
 """Sizes of what may differ between scenarios; `rate` is that of the integral."""
 
 _NOISE = 6
@@ -54,9 +67,10 @@ def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
     return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
 
 
-# Normal noise from a counter: number c of row i depends on the seed, i and c alone. The bits are
-# those of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), started anew for each number; a pair of
-# them becomes a normal number by the method of Box and Muller (1958).
+# Normal noise from a counter: number c of row i depends on the seed, i and c alone. The
+# bits are those of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), started anew for
+# each number; a pair of them becomes a normal number by the method of Box and Muller
+# (1958).
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 
@@ -67,12 +81,16 @@ def streams(seed: int, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
     return _mix(first + rows.astype(np.uint64) * _STEP)
 
 
-def uniform_numbers(starts: NDArray[np.uint64], sample: int, normal: int = _NOISE) -> Array:
+def uniform_numbers(
+    starts: NDArray[np.uint64], sample: int, normal: int = _NOISE
+) -> Array:
     """Return what `normal` numbers a row are made of at a sample, shape (2 normal, N).
 
     They are uniform between 0 and 1, a pair for each normal number.
     """
-    numbers = np.arange(1, 2 * normal + 1, dtype=np.uint64) + np.uint64(2 * normal * sample)
+    numbers = np.arange(1, 2 * normal + 1, dtype=np.uint64) + np.uint64(
+        2 * normal * sample
+    )
     bits = _mix(starts + (numbers * _STEP)[:, None])
     uniform: Array = ((bits >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
     return uniform
@@ -115,10 +133,17 @@ class ControlledBlock(Block):
         noise = 2 * _NOISE if len(feedback.starts) else 0
         self._uniform = np.zeros((noise, width))
         self._starts = np.zeros((1, width), dtype=np.uint64)
-        others = [*self._memory, *self._uniform, *self.given, *self._gains, self.running]
+        others = [
+            *self._memory,
+            *self._uniform,
+            *self.given,
+            *self._gains,
+            self.running,
+        ]
         results = [*self.given[:3], *self._memory]
         self._answer = [
-            feedback.answer.bind([*self.states(which), *others], results) for which in (0, 1)
+            feedback.answer.bind([*self.states(which), *others], results)
+            for which in (0, 1)
         ]
 
     def load(self, part: slice, *columns: NDArray[Any]) -> None:
@@ -150,8 +175,9 @@ class ControlledBlock(Block):
 class ControlledBatch:
     """A batch of plants whose torques come from the controller of a study, with zero-order hold.
 
-    The controller's model of the plant is the scene of the study, which does not vary. A run has
-    `samples` control periods; a length or a number of steps that does not fit them is refused.
+    The controller's model of the plant is the scene of the study, which does not vary.
+    A run has `samples` control periods; a length or a number of steps that does not fit
+    them is refused.
     """
 
     def __init__(self, batch: Batch, study: SweepStudy) -> None:
@@ -171,7 +197,9 @@ class ControlledBatch:
         varied = {one.key for one in study.variations}
 
         def has(*names: str) -> bool:
-            return any(getattr(control, name) or f"control.{name}" in varied for name in names)
+            return any(
+                getattr(control, name) or f"control.{name}" in varied for name in names
+            )
 
         limits = self._scene.torque_limit, batch.scene.torque_limit
         self._limited = has("torque_limit") or any(limits)
@@ -192,7 +220,8 @@ class ControlledBatch:
     def answer(self) -> ColumnFunction:
         """The control law and its channel: torques and new memory at a sample.
 
-        The reference is shared by all columns. A column that has ended keeps what it has.
+        The reference is shared by all columns. A column that has ended keeps what it
+        has.
         """
         model = self._batch.model
         known = len(model.ode.drive)
@@ -226,9 +255,13 @@ class ControlledBatch:
         angle, rate = gains["noise"]
         pairs = zip(of["uniform"][::2], of["uniform"][1::2], strict=True)
         noise = (normal_number(u, v) for u, v in pairs)
-        scaled = [n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)]
+        scaled = [
+            n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)
+        ]
         exact = joints.gamma, joints.gamma_dot
-        gamma, gamma_dot, new["before"] = control.measure(*exact, memory["before"], scaled)
+        gamma, gamma_dot, new["before"] = control.measure(
+            *exact, memory["before"], scaled
+        )
         if observed := memory["observed"]:  # in the last assembly mode
             carriages = space.carriages(gamma)
             for _ in range(NEWTON_STEPS):
@@ -240,19 +273,29 @@ class ControlledBatch:
         def torque(*at: Any) -> Any:
             return kernel.actuator_torque(kernel.model_of(self._scene), *at)[0]
 
-        scheme = law.ControlLaw(control, torque, space.star_accelerations, *numbers, control.period)
+        scheme = law.ControlLaw(
+            control, torque, space.star_accelerations, *numbers, control.period
+        )
         ahead = given["feedforward"], given["held"]
-        found = scheme.answer(desired, ahead, gamma, gamma_dot, observed, memory["integral"])
-        sent, new["queue"] = control.transmit(found.torque, memory["queue"], given["first"][0])
+        found = scheme.answer(
+            desired, ahead, gamma, gamma_dot, observed, memory["integral"]
+        )
+        sent, new["queue"] = control.transmit(
+            found.torque, memory["queue"], given["first"][0]
+        )
         if self._limited:
             cut = axpy(1.0, found.total, -1.0, found.torque)
             new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
             sent = law.bound(sent, gains["plant_limit"][0])
         off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
-        sums, most = (zip(memory[x], (*off, *sent), strict=True) for x in ("squares", "largest"))
+        sums, most = (
+            zip(memory[x], (*off, *sent), strict=True) for x in ("squares", "largest")
+        )
         new |= {"observed": observed, "integral": found.integral}
         new["squares"] = tuple(s + e * e for s, e in sums)
-        new["largest"] = tuple(s + positive(positive(e) + positive(-e) - s) for s, e in most)
+        new["largest"] = tuple(
+            s + positive(positive(e) + positive(-e) - s) for s, e in most
+        )
         (count,), (last,) = memory["samples"], memory["unsettled"]
         beyond = [positive(e - self._band) + positive(-e - self._band) for e in off]
         new["samples"] = (count + 1.0,)
@@ -260,12 +303,17 @@ class ControlledBatch:
         return (*sent, *(number for name in self._memory_sizes for number in new[name]))
 
     def run(
-        self, batch: Batch, given: dict[str, Array], rows: NDArray[np.int64], steps: int, kept: int
+        self,
+        batch: Batch,
+        given: dict[str, Array],
+        rows: NDArray[np.int64],
+        steps: int,
+        kept: int,
     ) -> tuple[BatchResult, dict[str, Array]]:
         """Run the scenarios of a batch; return their results and tracking figures.
 
-        Initial states and gains that differ are given by key. The noise depends on the rows of the
-        scenarios in their study; `steps` is a multiple of `samples`.
+        Initial states and gains that differ are given by key. The noise depends on the
+        rows of the scenarios in their study; `steps` is a multiple of `samples`.
         """
         count, hold = len(rows), steps // self.samples
         start, control = self._motion.at(0.0), self._control
@@ -273,18 +321,24 @@ class ControlledBatch:
         rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
         memory = np.zeros((sum(self._memory_sizes.values()), count))
         blocks = divide(self._memory_sizes, memory)  # views of its rows
-        earlier = control.count(gamma - control.period * rate).T if control.counts else ()
+        earlier = (
+            control.count(gamma - control.period * rate).T if control.counts else ()
+        )
         for name, values in (("observed", start.quaternion), ("before", earlier)):
             for place, value in zip(blocks[name], values, strict=False):
                 place[:] = value
-        noise = streams(self._seed, rows) if self._noise else np.zeros(0, dtype=np.uint64)
+        noise = (
+            streams(self._seed, rows) if self._noise else np.zeros(0, dtype=np.uint64)
+        )
         samples = [tuple(row) for row in self._references.tolist()]
         gains = self._make_gains(batch, given, count)
         feedback = Feedback(self.answer, samples, hold, memory, gains, noise)
         width = block_width(count)
         drives = [np.zeros((3, count))]  # torques that were sent before each kept state
 
-        def advance(first: int, number: int, step: float, *arrays: Any, rows: Any) -> None:
+        def advance(
+            first: int, number: int, step: float, *arrays: Any, rows: Any
+        ) -> None:
             if rows is not None:  # torques are held while a step is repeated
                 batch.advance(first, number, step, *arrays, threads=1)
                 return
@@ -294,12 +348,17 @@ class ControlledBatch:
                 drives.append(arrays[1][:3].copy())
 
         step = self.samples * control.period / steps
-        result = batch.run(gamma, rate, step=step, count=steps, keep_every=kept, advance=advance)
+        result = batch.run(
+            gamma, rate, step=step, count=steps, keep_every=kept, advance=advance
+        )
         if result.kept is not None:
             result.kept.sent = np.moveaxis(np.stack(drives), 1, -1)
-        # Root of the mean square and largest error of gamma [rad] at the samples of a run and its
-        # end, and of the torque [N m]; when the error of all joints is in the band for good [s].
-        final = np.array(divide(REFERENCES, self._references[-1])["gamma"]) - result.gamma
+        # Root of the mean square and largest error of gamma [rad] at the samples of a
+        # run and its end, and of the torque [N m]; when the error of all joints is in
+        # the band for good [s].
+        final = (
+            np.array(divide(REFERENCES, self._references[-1])["gamma"]) - result.gamma
+        )
         complete = result.success[:, None]
         last = np.hstack([np.where(complete, final, 0.0), np.zeros((count, 3))])
         largest = np.maximum(np.stack(blocks["largest"], axis=1), np.abs(last))
@@ -355,4 +414,6 @@ class ControlledBatch:
             value("rate_noise"),
         )
         shaped = (np.atleast_2d(row) for row in rows)
-        return np.concatenate([np.broadcast_to(row, (len(row), count)) for row in shaped])
+        return np.concatenate(
+            [np.broadcast_to(row, (len(row), count)) for row in shaped]
+        )

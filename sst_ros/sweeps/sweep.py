@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many runs of a scene: chunks of a study on threads of this process, or on a Dask cluster.
 
-A chunk depends on the study and its index alone, so it may be computed again. Its Parquet file is
-complete or absent. The metadata of the file hold the study, its digest, the version and the units,
-so that it explains itself and `--resume` knows which chunks are there.
+A chunk depends on the study and its index alone, so it may be computed again. Its
+Parquet file is complete or absent. The metadata of the file hold the study, its digest,
+the version and the units, so that it explains itself and `--resume` knows which chunks
+are there.
 """
 
 from __future__ import annotations
@@ -47,11 +48,16 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-PARTS = 64  # extremes are those of the states at the ends of at most so many equal parts of a run
-REACTION_ROWS = 256  # runs whose reactions are computed at once: their arrays fit the cache
+# extremes are those of the states at the ends of at most so many equal parts of a run
+PARTS = 64
+# runs whose reactions are computed at once: their arrays fit the cache
+REACTION_ROWS = 256
 
 PILOT = 256
-"""Rows by which the number of steps is chosen; drawn apart, so that no number of rows matters."""
+"""Rows by which the number of steps is chosen.
+
+Drawn apart, so that no number of rows matters.
+"""
 
 MOST_STEPS = 1_000_000
 
@@ -80,42 +86,50 @@ def sweep(
 ) -> pd.DataFrame:
     """Run a scene many times with other numbers, and return a table with a row for each run.
 
-    Args:
-        scene: a Scene, its name, its path, or its document as a dict.
-        vary: distribution or values by key of the scene, as in {"star.inertia": ("uniform", 0.8,
-            1.2, "relative"), "initial.gamma": ("normal", 0.785, 0.05)}; or a table (a DataFrame)
-            with a row for each run.
-        torque: None for the scene's own torques over time if it has some, else zero; three constant
-            torques [N m]; or a SineTorque.
-        duration: length of a run [s]; by default that of the scene.
-        n: number of runs; by default that of the grid or of the table.
-        seed: of the random numbers. Row i depends on the seed and on i alone.
-        out: folder of the results as Parquet files, one a chunk; nothing is written without it.
-        client: a dask.distributed client; by default threads of this process.
-        workers: number of threads without a client; 0 for one a core.
-        resume: compute only the chunks that are missing in `out`.
-        progress: draw a bar on a terminal.
-        options: `sampling`, `tolerance`, `steps`, `control`, `outputs` and `chunk` of `SweepStudy`.
+    Args: scene: a Scene, its name, its path, or its document as a dict. vary:
+        distribution or values by key of the scene, as in {"star.inertia": ("uniform",
+        0.8, 1.2, "relative"), "initial.gamma": ("normal", 0.785, 0.05)}; or a table (a
+        DataFrame) with a row for each run. torque: None for the scene's own torques
+        over time if it has some, else zero; three constant torques [N m]; or a
+        SineTorque. duration: length of a run [s]; by default that of the scene. n:
+        number of runs; by default that of the grid or of the table. seed: of the random
+        numbers. Row i depends on the seed and on i alone. out: folder of the results as
+        Parquet files, one a chunk; nothing is written without it. client: a
+        dask.distributed client; by default threads of this process. workers: number of
+        threads without a client; 0 for one a core. resume: compute only the chunks that
+        are missing in `out`. progress: draw a bar on a terminal. options: `sampling`,
+        `tolerance`, `steps`, `control`, `outputs` and `chunk` of `SweepStudy`.
 
-    Returns:
-        Inputs, how each run ended (`status`, `reason`, `t`), `local_error`, and the outputs; units
-        in `attrs`.
+    Returns: Inputs, how each run ended (`status`, `reason`, `t`), `local_error`, and
+        the outputs; units in `attrs`.
 
-    Raises:
-        InputError: an argument or a value in the study is not allowed; nothing has run then.
-        SweepFailed: chunks could not be computed or written; those that are done remain.
-        MissingDependency: pandas or pyarrow is not installed.
-
+    Raises: InputError: an argument or a value in the study is not allowed; nothing has
+        run then. SweepFailed: chunks could not be computed or written; those that are
+        done remain. MissingDependency: pandas or pyarrow is not installed.
     """
     fits = client is None or hasattr(client, "scheduler_info")
     named = not isinstance(vary, Iterable) or all(isinstance(key, str) for key in vary)
     named = named and vary is not None
-    refuse_unless("sweep", ("client", client, fits, "must be a dask.distributed Client"))
-    refuse_unless("sweep", ("vary", vary, named, "must have keys of the scene, as text"))
+    refuse_unless(
+        "sweep", ("client", client, fits, "must be a dask.distributed Client")
+    )
+    refuse_unless(
+        "sweep", ("vary", vary, named, "must have keys of the scene, as text")
+    )
     rows = {"table" if hasattr(vary, "columns") else "vary": vary}
-    given = {"torque": torque, "duration": duration, "n": n, "seed": seed, **options, **rows}
+    given = {
+        "torque": torque,
+        "duration": duration,
+        "n": n,
+        "seed": seed,
+        **options,
+        **rows,
+    }
     study = SweepStudy.from_values({"scene": scene, **given})
-    path, run = None if out is None else Path(out), {"resume": resume, "progress": progress}
+    path, run = (
+        None if out is None else Path(out),
+        {"resume": resume, "progress": progress},
+    )
     return run_study(study, path, client=client, workers=workers, **run)
 
 
@@ -163,7 +177,12 @@ def _compute(
                 left.unlink(missing_ok=True)
     missing = [index for index in range(study.chunks) if index not in complete]
     total = sum(len(study.rows_of(index)) for index in missing)
-    bar, began, reasons, runs = Bar("sweep", progress), time.monotonic(), Counter[str](), 0
+    bar, began, reasons, runs = (
+        Bar("sweep", progress),
+        time.monotonic(),
+        Counter[str](),
+        0,
+    )
     work, tables = partial(run_chunk, ready, out), dict[int, Any]()
     results = run_many(work, missing, workers=workers, client=client, name="chunk")
     try:
@@ -175,7 +194,9 @@ def _compute(
             rate = max(runs / max(time.monotonic() - began, 1e-9), 1e-9)
             text = f"{rate:.0f} runs/s, {(total - runs) / rate:.0f} s left"
             if reasons:
-                common = (f"{count} {reason}" for reason, count in reasons.most_common(3))
+                common = (
+                    f"{count} {reason}" for reason, count in reasons.most_common(3)
+                )
                 text += f"; early: {', '.join(common)}"
             bar.draw(1.0 - (total - runs) / study.rows, text)
     except OSError as error:
@@ -186,13 +207,18 @@ def _compute(
     return to_frame(require("pyarrow").concat_tables(parts), ready.about)
 
 
-def run_chunk(ready: PreparedSweep, out: Path | None, index: int) -> tuple[dict[str, int], Any]:
+def run_chunk(
+    ready: PreparedSweep, out: Path | None, index: int
+) -> tuple[dict[str, int], Any]:
     """Return how runs of a chunk ended early, and its table if there is no folder for its file.
 
     Raises OSError where the file cannot be written.
     """
     table = ready.chunk(index)
-    counts = {row["values"]: row["counts"] for row in table["reason"].value_counts().to_pylist()}
+    counts = {
+        row["values"]: row["counts"]
+        for row in table["reason"].value_counts().to_pylist()
+    }
     counts.pop("reached the end", None)
     if out is None:
         return counts, table
@@ -203,7 +229,8 @@ def run_chunk(ready: PreparedSweep, out: Path | None, index: int) -> tuple[dict[
 class PreparedSweep:
     """A study ready to run: its programs and its number of steps, which may be known already.
 
-    Refuses one whose ranges end in no scene, and one whose tolerance no number of steps reaches.
+    Refuses one whose ranges end in no scene, and one whose tolerance no number of steps
+    reaches.
     """
 
     def __init__(self, study: SweepStudy, steps: int | None = None) -> None:
@@ -211,12 +238,16 @@ class PreparedSweep:
         self._ends, _ = self._split(find_range_ends(study))
         ends = Scenarios(study.model_scene, self._ends)
         for row, error in ends.faults(most=1).items():
-            texts = [str(one).replace(f"scenario {row}: ", "") for one in error.problems]
+            texts = [
+                str(one).replace(f"scenario {row}: ", "") for one in error.problems
+            ]
             allowed = "within its range: " + "; ".join(texts)
             raise refusal("sweep", "vary", "makes no scene", allowed)
         profile = study.model_scene.torque is not None
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
-        self.controlled = None if study.control is None else ControlledBatch(self.batch, study)
+        self.controlled = (
+            None if study.control is None else ControlledBatch(self.batch, study)
+        )
         # Compiled here, before several threads want it.
         _ = self.batch.programs, self.controlled and self.controlled.answer
         over_time = "extremes", "reactions"
@@ -230,11 +261,13 @@ class PreparedSweep:
     def _choose_steps(self) -> int:
         """Find the least number of steps, about, that keeps the tolerance in the pilot rows.
 
-        The error of c steps is the difference from 2c steps; it falls with the eighth power of c.
-        It is nan where no run reaches the end.
+        The error of c steps is the difference from 2c steps; it falls with the eighth
+        power of c. It is nan where no run reaches the end.
         """
         study, tolerance = self.study, self.study.tolerance
-        whole, kind = (PILOT, "random") if study.table is None else (study.rows, study.sampling)
+        whole, kind = (
+            (PILOT, "random") if study.table is None else (study.rows, study.sampling)
+        )
         chosen = np.linspace(0, whole - 1, min(PILOT, whole)).astype(int)
         values = {key: x[chosen] for key, x in study.draw(0, whole, kind).items()}
         scenarios, starts, _ = self.scenarios(values)
@@ -242,7 +275,9 @@ class PreparedSweep:
         unit = 1 if self.controlled is None else self.controlled.samples
         count = max(unit, 16)
         for _ in range(12):
-            coarse, fine = (self.run(scenarios, starts, rows, n)[0] for n in (count, 2 * count))
+            coarse, fine = (
+                self.run(scenarios, starts, rows, n)[0] for n in (count, 2 * count)
+            )
             both = coarse.success & fine.success
             if not both.any():
                 return count
@@ -250,11 +285,17 @@ class PreparedSweep:
             self.pilot_error = error = float(apart.max())
             if error <= tolerance:
                 return count
-            factor = (error / (0.7 * tolerance)) ** (1.0 / 8.0) if math.isfinite(error) else 4.0
+            factor = (
+                (error / (0.7 * tolerance)) ** (1.0 / 8.0)
+                if math.isfinite(error)
+                else 4.0
+            )
             count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
             if count > MOST_STEPS:
                 break
-        allowed = f"is not reached by {MOST_STEPS} steps; give `steps`, or a larger tolerance"
+        allowed = (
+            f"is not reached by {MOST_STEPS} steps; give `steps`, or a larger tolerance"
+        )
         raise refusal("sweep", "tolerance", tolerance, allowed)
 
     def check(self, values: dict[str, Array]) -> None:
@@ -266,12 +307,23 @@ class PreparedSweep:
         """Metadata of the files: study, its digest, version, units."""
         units = UNITS | {"fault_time": "s", "local_error": "1"}
         for k in DIMENSIONS["leg"]:
-            joints = {f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES}
-            units |= {f"{size}_{name}_{part}_{k}": SIZES[size] for size, name, part in REACTIONS}
+            joints = {
+                f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES
+            }
+            units |= {
+                f"{size}_{name}_{part}_{k}": SIZES[size]
+                for size, name, part in REACTIONS
+            }
             units |= joints | {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
-            units |= {f"torque_rms_{k}": "N m", f"torque_max_{k}": "N m", "settling_time": "s"}
+            units |= {
+                f"torque_rms_{k}": "N m",
+                f"torque_max_{k}": "N m",
+                "settling_time": "s",
+            }
         for one in self.study.variations:
-            units |= dict.fromkeys(one.columns, "1" if one.factor else one.targets[0].spec.unit)
+            units |= dict.fromkeys(
+                one.columns, "1" if one.factor else one.targets[0].spec.unit
+            )
         return {
             "version": VERSION,
             "digest": self.study.digest,
@@ -290,16 +342,22 @@ class PreparedSweep:
         scenarios, starts, faults = self.scenarios(values)
         result, more = self.run(scenarios, starts, rows, self.steps)
         columns: dict[str, NDArray[Any]] = {"status": result.status.astype(np.int8)}
-        columns |= {name: getattr(result, name) for name in ("t", "fault_time", "local_error")}
+        columns |= {
+            name: getattr(result, name) for name in ("t", "fault_time", "local_error")
+        }
         columns |= result.columns(self._quantities) | more
         texts, reason = result.reasons
         if faults:  # no numbers, and the first problem as the reason
             wrong = list(faults)
-            keys = [error.problems[0].key.partition(": ")[2] for error in faults.values()]
+            keys = [
+                error.problems[0].key.partition(": ")[2] for error in faults.values()
+            ]
             columns = {name: column.copy() for name, column in columns.items()}
             for name, column in columns.items():
                 column[wrong] = {"status": -1, "fault_time": 0.0}.get(name, np.nan)
-            distinct, which = np.unique([f"no scene: {key}" for key in keys], return_inverse=True)
+            distinct, which = np.unique(
+                [f"no scene: {key}" for key in keys], return_inverse=True
+            )
             reason[wrong] = len(texts) + which
             texts = np.append(texts, distinct)
         inputs = {
@@ -330,12 +388,18 @@ class PreparedSweep:
         return scenarios, starts, faults
 
     def run(
-        self, scenarios: Scenarios, starts: dict[str, Array], rows: NDArray[np.int64], steps: int
+        self,
+        scenarios: Scenarios,
+        starts: dict[str, Array],
+        rows: NDArray[np.int64],
+        steps: int,
     ) -> tuple[BatchResult, dict[str, NDArray[Any]]]:
         """Return results of rows by a number of steps, and their extremes or tracking figures."""
         batch = self.batch.with_parameters(scenarios)
         outputs = self.study.outputs
-        every = -(-steps // PARTS) if "extremes" in outputs or "reactions" in outputs else 0
+        every = (
+            -(-steps // PARTS) if "extremes" in outputs or "reactions" in outputs else 0
+        )
         if self.controlled is not None:
             result, more = self.controlled.run(batch, starts, rows, steps, every)
         else:
@@ -345,7 +409,9 @@ class PreparedSweep:
             if scenarios.count is None:
                 gamma = np.broadcast_to(gamma, (len(rows), 3))
             step = self.study.length / steps
-            result = batch.run(gamma, rate, step=step, count=steps, keep_every=every, threads=1)
+            result = batch.run(
+                gamma, rate, step=step, count=steps, keep_every=every, threads=1
+            )
         if result.kept is not None and "reactions" in outputs:
             more |= self._reactions(batch, scenarios, result)
         if result.kept is not None and "extremes" in outputs:
@@ -357,13 +423,17 @@ class PreparedSweep:
         return result, more
 
     @staticmethod
-    def _reactions(batch: Batch, scenarios: Scenarios, result: BatchResult) -> dict[str, Array]:
+    def _reactions(
+        batch: Batch, scenarios: Scenarios, result: BatchResult
+    ) -> dict[str, Array]:
         """Peak and RMS of the reactions of runs at the states that they kept."""
         kept = result.kept
         assert kept is not None
         model = batch.model.constants(list(batch.columns.inputs)).model
         reactions = ScenarioReactions(scenarios.columns(), model)
-        state = np.moveaxis(np.concatenate([kept.quaternion, kept.body_rate], axis=-1), -1, 0)
+        state = np.moveaxis(
+            np.concatenate([kept.quaternion, kept.body_rate], axis=-1), -1, 0
+        )
         torque = np.moveaxis(kept.torque, -1, 0)
         count = result.t.shape[-1]
         columns = {
@@ -383,13 +453,17 @@ class PreparedSweep:
             column[result.code < 0] = np.nan
         return columns
 
-    def _split(self, values: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
+    def _split(
+        self, values: Mapping[str, Array]
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
         """Numbers of the scene by key, and what a run is given: initial state and gains."""
         inside: dict[str, Array] = {}
         outside: dict[str, Array] = {}
         for one in self.study.variations:
             for key, array in one.parameters(values[one.key]).items():
-                (outside if key.startswith(("initial.", "control.")) else inside)[key] = array
+                (outside if key.startswith(("initial.", "control.")) else inside)[
+                    key
+                ] = array
         return inside, outside
 
 
@@ -399,16 +473,23 @@ def find_range_ends(study: SweepStudy) -> dict[str, Array]:
     Of a table these are the rows with the least and the largest number of a column.
     """
     listed = [one for one in study.variations if one.kind == "table"]
-    picks = {pick for x in (study.table or {}).values() for pick in (x.argmin(), x.argmax())}
+    picks = {
+        pick for x in (study.table or {}).values() for pick in (x.argmin(), x.argmax())
+    }
     middle = {one.key: one.ends()[0] for one in study.variations}
-    rows = [middle | {one.key: one.numbers[pick] for one in listed} for pick in sorted({0} | picks)]
+    rows = [
+        middle | {one.key: one.numbers[pick] for one in listed}
+        for pick in sorted({0} | picks)
+    ]
     for one in study.variations:
         if one.kind != "table":
             rows += [rows[0] | {one.key: end} for end in one.ends()]
     return {key: np.stack([row[key] for row in rows]) for key in middle}
 
 
-def write_part(table: pa.Table, folder: Path, index: int, about: Mapping[str, Any]) -> None:
+def write_part(
+    table: pa.Table, folder: Path, index: int, about: Mapping[str, Any]
+) -> None:
     """Write the table of a chunk as a file that is there whole or not at all."""
     record = {**about, "part": index}
     record["checksum"] = _checksum(record, table)
@@ -416,7 +497,11 @@ def write_part(table: pa.Table, folder: Path, index: int, about: Mapping[str, An
     with replace_file(folder / _part_name(index)) as own:
         # Random mantissas do not compress, and their least and greatest help no reader.
         require("pyarrow.parquet").write_table(
-            table, own, compression="none", use_dictionary=["reason"], write_statistics=False
+            table,
+            own,
+            compression="none",
+            use_dictionary=["reason"],
+            write_statistics=False,
         )
         own.chmod(0o644)
 
@@ -437,8 +522,9 @@ def _checksum(about: Mapping[str, Any], table: pa.Table) -> str:
 def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
     """Return metadata and table of a file; None where it is not whole.
 
-    Raises InputError where its numbers are not those that were written, or it was written
-    under another name. Files of earlier versions have neither number nor checksum.
+    Raises InputError where its numbers are not those that were written, or it was
+    written under another name. Files of earlier versions have neither number nor
+    checksum.
     """
     with contextlib.suppress(*_unreadable()):
         table = require("pyarrow.parquet").read_table(str(path), partitioning=None)
@@ -450,8 +536,18 @@ def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
         name = _part_name(about["part"]) if "part" in about else path.name
         refuse_unless(
             "sweep",
-            ("DIR", str(path), intact, "is damaged (its checksum is another): delete it"),
-            ("DIR", str(path), name == path.name, f"was written as {name}: delete or rename it"),
+            (
+                "DIR",
+                str(path),
+                intact,
+                "is damaged (its checksum is another): delete it",
+            ),
+            (
+                "DIR",
+                str(path),
+                name == path.name,
+                f"was written as {name}: delete or rename it",
+            ),
         )
         return about, table
     return None
@@ -467,7 +563,10 @@ def _unreadable() -> tuple[type[Exception], ...]:
 
 
 def read_about(path: Path) -> dict[str, Any] | None:
-    """Metadata of a file, with its number of rows; None if it is no complete file of a study."""
+    """Metadata of a file, with its number of rows.
+
+    None if it is no complete file of a study.
+    """
     try:
         with require("pyarrow.parquet").ParquetFile(path) as file:
             found: dict[str, Any] = json.loads(file.schema_arrow.metadata[METADATA])
@@ -515,17 +614,23 @@ def read_sweep(folder: Path) -> pd.DataFrame:
         refuse_unless("sweep", ("DIR", str(path), part is not None, allowed))
     first = parts[0][1]
     for path, about, _ in parts:
-        same = all(about.get(key) == first.get(key) for key in ("digest", "version", "steps"))
+        same = all(
+            about.get(key) == first.get(key) for key in ("digest", "version", "steps")
+        )
         allowed = f"is of another study or version than {parts[0][0].name}"
         refuse_unless("sweep", ("DIR", str(path), same, allowed))
     tables = [table.replace_schema_metadata(None) for *_, table in parts]
-    known = {key: value for key, value in first.items() if key not in ("part", "checksum")}
+    known = {
+        key: value for key, value in first.items() if key not in ("part", "checksum")
+    }
     return to_frame(require("pyarrow").concat_tables(tables), known)
 
 
 def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
     """Return a table as pandas, with its metadata as `attrs`."""
-    frame: pd.DataFrame = table.replace_schema_metadata(None).to_pandas().set_index("scenario")
+    frame: pd.DataFrame = (
+        table.replace_schema_metadata(None).to_pandas().set_index("scenario")
+    )
     frame.attrs = {key: value for key, value in about.items() if key != "rows"}
     return frame
 
@@ -552,7 +657,9 @@ def list_outputs(table: pd.DataFrame) -> list[str]:
 
 
 def correlate(table: pd.DataFrame, column: pd.Series | None = None) -> pd.Series:
-    """Spearman's rank correlation of each input with a column, largest first; none if constant.
+    """Spearman's rank correlation of each input with a column, largest first.
+
+    None if constant.
 
     The column is by default whether a run ended early.
     """

@@ -23,8 +23,8 @@ MOST_POINTS = 2000  # of all runs in a scatter plot; the worst are drawn over th
 def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     """Draw the table of a study into a folder; return the paths.
 
-    The worst runs are those that ended first; where none ended early, those with the largest
-    tracking error, or with the outputs farthest from their medians.
+    The worst runs are those that ended first; where none ended early, those with the
+    largest tracking error, or with the outputs farthest from their medians.
     """
     complete = table.loc[table["status"] == 0, list_outputs(table)]
     figures = {"distributions.png": draw_distributions(complete, table.attrs["units"])}
@@ -39,7 +39,9 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
 def _score(table: pd.DataFrame) -> tuple[pd.Series, str]:
     """How bad each run is, and what that means."""
     if (table["status"] != 0).any():
-        return -table["fault_time"].fillna(table["t"]), f"The {MOST_RUNS} runs that ended first"
+        return -table["fault_time"].fillna(
+            table["t"]
+        ), f"The {MOST_RUNS} runs that ended first"
     numbers = table[list_outputs(table)]
     errors = numbers.filter(like="error_max")
     if len(errors.columns):

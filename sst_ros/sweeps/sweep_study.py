@@ -23,7 +23,15 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, Problem, refuse_errors, refuse_unless
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene, scene_of
-from sst_ros.scene.schema import Rules, Section, anything, build, choice, entry, positive
+from sst_ros.scene.schema import (
+    Rules,
+    Section,
+    anything,
+    build,
+    choice,
+    entry,
+    positive,
+)
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import plain, read_file, read_values, resolve_numbers
 from sst_ros.state import QUANTITIES, finite_vector
@@ -45,7 +53,10 @@ CHUNK = 32_768
 """Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
 
 OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
-"""What `outputs` may name: of the final state; extremes of joints and reactions over a run."""
+"""What `outputs` may name: of the final state.
+
+Extremes of joints and reactions over a run.
+"""
 
 MOST = 10_000_000
 MOST_ROWS = 1_000_000_000
@@ -60,13 +71,17 @@ class SampledControl(ControlChannel, ControllerSettings):
 
 
 class SweepStudy(Section):
-    """Many runs of a scene; raises InputError with the key of a value that is not allowed."""
+    """Many runs of a scene.
+
+    Raises InputError with the key of a value that is not allowed.
+    """
 
     ORIGIN = "sweep"
 
     scene: Scene = anything("what is simulated")
     vary: Mapping[str, Any] = anything(
-        "distribution or values by key of the scene, see `variations`", default_factory=dict
+        "distribution or values by key of the scene, see `variations`",
+        default_factory=dict,
     )
     n: int | None = _count(
         "number of runs; by default that of the grid or of the table", most=MOST_ROWS
@@ -74,26 +89,30 @@ class SweepStudy(Section):
     seed: int = entry("of the random numbers", default=0, least=0, most=2**64 - 1)
     sampling: str = choice("of random numbers", SAMPLINGS)
     table: Any = anything(
-        "values by column in place of distributions: DataFrame, mapping or file", default=None
+        "values by column in place of distributions: DataFrame, mapping or file",
+        default=None,
     )
     duration: float | None = positive(
         "length of a run; by default that of the scene, or of its motion", "s"
     )
     tolerance: float = positive(
-        "error of the orientation at the end, for the number of steps", "rad", default=1e-9
+        "error of the orientation at the end, for the number of steps",
+        "rad",
+        default=1e-9,
     )
     steps: int | None = _count("number of steps of a run; by default by the tolerance")
     torque: Any = anything(
-        "None for the scene's own torques if it has some, else zero; three constant torques [N m]; "
-        "or a SineTorque as a mapping",
+        "None for the scene's own torques if it has some, else zero; three constant"
+        " torques [N m]; or a SineTorque as a mapping",
         default=None,
     )
     control: SampledControl | None = entry(
-        "settings of a controller and its channel, also as a mapping; see `ControlChannel`"
+        "settings of a controller and its channel, also as a mapping; see"
+        " `ControlChannel`"
     )
     outputs: tuple[str, ...] = entry(
-        "quantities of the final state; `extremes` of joints, and peak and RMS of `reactions`, at "
-        "the ends of the steps",
+        "quantities of the final state; `extremes` of joints, and peak and RMS of"
+        " `reactions`, at the ends of the steps",
         default=DEFAULT_OUTPUTS,
     )
     chunk: int = _count("rows of a task and of a file", default=CHUNK)
@@ -111,8 +130,18 @@ class SweepStudy(Section):
         allowed = "must be a mapping from keys of the scene to distributions or values"
         yield not mapping, "vary", self.vary, allowed
         for name in self.outputs:
-            yield name not in OUTPUTS, "outputs", name, f"must be of {', '.join(OUTPUTS)}"
-        yield torque is not None and self.control is not None, "torque", "given", _NO_TORQUE
+            yield (
+                name not in OUTPUTS,
+                "outputs",
+                name,
+                f"must be of {', '.join(OUTPUTS)}",
+            )
+        yield (
+            torque is not None and self.control is not None,
+            "torque",
+            "given",
+            _NO_TORQUE,
+        )
         wrong = torque is not None and not isinstance(torque, (Mapping, SineTorque))
         wrong = wrong and finite_vector(torque) is None
         yield wrong, "torque", torque, "must be three finite numbers [N m] or a mapping"
@@ -123,7 +152,10 @@ class SweepStudy(Section):
 
     @classmethod
     def read(cls, path: Path) -> SweepStudy:
-        """Read a YAML file; `scene` is a name, a path relative to the file, or a document."""
+        """Read a YAML file.
+
+        `scene` is a name, a path relative to the file, or a document.
+        """
         refused = "STUDY", str(path), "must be a readable .yaml file"
         with refuse_errors("sweep", *refused, OSError, UnicodeDecodeError):
             source = read_file(path)
@@ -137,7 +169,9 @@ class SweepStudy(Section):
         return cls.from_values(values, path.parent)
 
     @classmethod
-    def from_values(cls, values: Mapping[str, Any], folder: Path = Path()) -> SweepStudy:
+    def from_values(
+        cls, values: Mapping[str, Any], folder: Path = Path()
+    ) -> SweepStudy:
         """Build a study from a mapping; names of files are relative to a folder."""
         given = {"scene": None} | {key: x for key, x in values.items() if x is not None}
         # Of os.path, which is False where a name is too long for the file system.
@@ -145,7 +179,8 @@ class SweepStudy(Section):
             given["scene"] = folder / given["scene"]
         if isinstance(given.get("table"), str):
             given["table"] = folder / given["table"]
-        if given.keys() <= cls.SPECS.keys():  # else the unknown ones say more than no scene
+        # else the unknown ones say more than no scene
+        if given.keys() <= cls.SPECS.keys():
             given["scene"] = scene_of(given["scene"])
         return build(cls, given, "sweep")
 
@@ -157,7 +192,8 @@ class SweepStudy(Section):
             return dataclasses.replace(self.scene, torque=torque)
         if torque is None:
             return self.scene
-        if not isinstance(torque, Mapping):  # constant: a sine that stays at its largest value
+        # constant: a sine that stays at its largest value
+        if not isinstance(torque, Mapping):
             zeros, right = [0.0] * 3, [math.pi / 2] * 3
             torque = {"amplitude": list(torque), "frequency": zeros, "phase": right}
         return self.scene.with_values({"torque": dict(torque)})
@@ -187,7 +223,8 @@ class SweepStudy(Section):
             except (ValueError, TypeError, OverflowError, MemoryError) as error:
                 problems.append(Problem(f"vary.{key}", given, str(error)))
         columns: dict[str, dict[str, Any]] = {}
-        for name, column in (self.table or {}).items():  # a trailing index is that of a component
+        # a trailing index is that of a component
+        for name, column in (self.table or {}).items():
             columns.setdefault(re.sub(r"(\[\d+\])+$", "", name), {})[name] = column
         taken = {name for one in found for name in one.columns}
         for key, own in columns.items():
@@ -207,19 +244,29 @@ class SweepStudy(Section):
     @cached_property
     def rows(self) -> int:
         """Number of runs."""
-        grid = math.prod(len(one.numbers) for one in self.variations if one.kind == "grid")
+        grid = math.prod(
+            len(one.numbers) for one in self.variations if one.kind == "grid"
+        )
         lengths = {len(values) for values in (self.table or {}).values()}
         alone = len(lengths) <= 1 and not (lengths and grid > 1)
         allowed = "must have columns of equal length, and no grid beside it"
         refuse_unless("sweep", ("table", sorted(lengths), alone, allowed))
         natural = min(lengths, default=grid)
         rows, known = self.n or natural, bool(self.n or lengths or grid > 1)
-        drawn, fits = any(one.drawn for one in self.variations), not lengths or rows <= natural
+        drawn, fits = (
+            any(one.drawn for one in self.variations),
+            not lengths or rows <= natural,
+        )
         refuse_unless(
             "sweep",
             ("n", self.n, known or not drawn, "must be given with distributions"),
             ("n", self.n, fits, f"must be <= {natural}, the rows of the table"),
-            ("n", self.n, rows % grid == 0, f"must be a multiple of {grid}, the size of the grid"),
+            (
+                "n",
+                self.n,
+                rows % grid == 0,
+                f"must be a multiple of {grid}, the size of the grid",
+            ),
         )
         return rows
 
@@ -229,7 +276,9 @@ class SweepStudy(Section):
         found, index = {}, np.arange(first, first + count)
         for one in self.variations:
             if one.drawn:
-                found[one.key] = one.values(quantiles[:, used : used + len(one.columns)])
+                found[one.key] = one.values(
+                    quantiles[:, used : used + len(one.columns)]
+                )
                 used += len(one.columns)
             else:
                 found[one.key] = one.numbers[first : first + count]
@@ -267,10 +316,15 @@ class SweepStudy(Section):
         return range(self.rows)[chunk * self.chunk : (chunk + 1) * self.chunk]
 
     def document(self) -> dict[str, Any]:
-        """Return the study as nested dicts and lists; a table as digests of its columns."""
+        """Return the study as nested dicts and lists.
+
+        A table as digests of its columns.
+        """
         values = self.__getstate__()
         if self.table is not None:
-            values["table"] = {name: make_digest(x.tobytes()) for name, x in self.table.items()}
+            values["table"] = {
+                name: make_digest(x.tobytes()) for name, x in self.table.items()
+            }
         return dict(plain(values))
 
     @cached_property
@@ -282,7 +336,10 @@ class SweepStudy(Section):
         section, _, name = key.partition(".")
         if section == "control" and self.control is None:
             raise ValueError("acts with control only")
-        if key in ("initial.orientation", "control.period") or section in ("motion", "duration"):
+        if key in ("initial.orientation", "control.period") or section in (
+            "motion",
+            "duration",
+        ):
             raise ValueError("cannot vary")
         if section == "control" and self.control is not None:
             return targets_of(self.control, name, ("control",))

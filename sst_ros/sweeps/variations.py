@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What varies in a study: keys of the scene, the distribution or the values of each, and the rows.
 
-A distribution is ("uniform", low, high), ("normal", mean, standard deviation[, low, high]), or a
-list of values, which spans a grid with those of other keys; in a YAML file {uniform: [low, high]},
-{normal: [...]}, {grid: [...]}, {linspace: [low, high, count]}. With `relative: true` the numbers
-are factors of the value in the scene. Components of a vector are independent. An inertia as a
-whole ("star.inertia") has one factor, so its principal moments keep their ratios.
+A distribution is ("uniform", low, high), ("normal", mean, standard deviation[, low,
+high]), or a list of values, which spans a grid with those of other keys; in a YAML file
+{uniform: [low, high]}, {normal: [...]}, {grid: [...]}, {linspace: [low, high, count]}.
+With `relative: true` the numbers are factors of the value in the scene. Components of a
+vector are independent. An inertia as a whole ("star.inertia") has one factor, so its
+principal moments keep their ratios.
 
-Row i depends on the seed and on i alone, whatever is drawn before or beside it. Random numbers come
-from the counter-based generator Philox (Salmon et al., SC 2011), whose counter is the number of the
-row; Sobol points from their index.
+Row i depends on the seed and on i alone, whatever is drawn before or beside it. Random
+numbers come from the counter-based generator Philox (Salmon et al., SC 2011), whose
+counter is the number of the row; Sobol points from their index.
 """
 
 from __future__ import annotations
@@ -51,14 +52,11 @@ class Target(NamedTuple):
 class Variation:
     """One key of a study.
 
-    Attributes:
-        key: as given.
-        kind: uniform, normal, grid, or table.
-        numbers: (low, high), (mean, standard deviation, low, high), or the values of a grid or of
-            the columns of a table, rows of as many components as the key has.
-        targets: what it sets; several where one factor scales a tensor, or a key means a list.
-        factor: the one component is a factor of the targets' values.
-
+    Attributes: key: as given. kind: uniform, normal, grid, or table. numbers: (low,
+        high), (mean, standard deviation, low, high), or the values of a grid or of the
+        columns of a table, rows of as many components as the key has. targets: what it
+        sets; several where one factor scales a tensor, or a key means a list. factor:
+        the one component is a factor of the targets' values.
     """
 
     key: str
@@ -81,7 +79,9 @@ class Variation:
     def columns(self) -> tuple[str, ...]:
         """Names of the columns of a table, one for each component."""
         shape = () if self.factor else self.targets[0].nominal.shape
-        return tuple(self.key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape))
+        return tuple(
+            self.key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)
+        )
 
     @property
     def drawn(self) -> bool:
@@ -100,12 +100,17 @@ class Variation:
         return np.asarray(mean + deviation * ndtri(first + (last - first) * quantiles))
 
     def ends(self) -> Array:
-        """Return a middle value, and others that differ in every component; all of a grid."""
+        """Return a middle value, and others that differ in every component.
+
+        All of a grid.
+        """
         if not self.drawn:
             return self.numbers
         middle = self.numbers[0] if self.kind == "normal" else self.numbers.mean(axis=0)
         inner = np.repeat([[0.4], [0.6]], len(self.columns), axis=1)
-        return np.vstack([middle, self.values(inner) if self.kind == "normal" else self.numbers])
+        return np.vstack(
+            [middle, self.values(inner) if self.kind == "normal" else self.numbers]
+        )
 
     def parameters(self, values: Array) -> dict[str, Array]:
         """Arrays (n, ...) by key of the scene for values (n, components)."""
@@ -124,8 +129,12 @@ def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
         if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {here}")
         if isinstance(value, Inertia):
-            parts = ((part, getattr(value, part), of) for part, of in Inertia.SPECS.items())
-            found += [Target(f"{here}.{part}", np.array(x), of) for part, x, of in parts if x]
+            parts = (
+                (part, getattr(value, part), of) for part, of in Inertia.SPECS.items()
+            )
+            found += [
+                Target(f"{here}.{part}", np.array(x), of) for part, x, of in parts if x
+            ]
         elif spec.kind == "number":
             found.append(Target(here, np.array(value, dtype=float), spec))
         else:
@@ -139,27 +148,41 @@ def _scales_tensor(key: str, targets: Sequence[Target]) -> bool:
 
 
 def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
-    """Read one entry of `vary`, whose key names the targets; raises ValueError where it is none."""
+    """Read one entry of `vary`, whose key names the targets.
+
+    Raises ValueError where it is none.
+    """
     kind, numbers, relative = "grid", given, False
     if isinstance(given, Mapping):
         words = dict(given)
         relative = words.pop("relative", False)
         kind, numbers = next(iter(words.items())) if len(words) == 1 else ("", ())
     elif isinstance(given, tuple) and given and isinstance(given[0], str):
-        kind, relative = given[0], isinstance(given[-1], str) and given[-1] == "relative"
+        kind, relative = (
+            given[0],
+            isinstance(given[-1], str) and given[-1] == "relative",
+        )
         numbers = given[1 : len(given) - relative]
     listed = np.iterable(numbers) and not isinstance(numbers, (str, bytes, bytearray))
     if kind not in KINDS or not isinstance(relative, bool) or not listed:
-        raise ValueError(f"must be a list of values, or one of {', '.join(KINDS)} with its numbers")
+        raise ValueError(
+            f"must be a list of values, or one of {', '.join(KINDS)} with its numbers"
+        )
     factor = _scales_tensor(key, targets)
     if factor and not relative:
-        raise ValueError(f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ...")
+        raise ValueError(
+            f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ..."
+        )
     nominal = np.ones(()) if factor else targets[0].nominal
     if kind == "linspace":
         count = numbers[2] if len(numbers) == 3 else 0
         if not (isinstance(count, Integral) and 0 < int(count) <= MOST_VALUES):
-            raise ValueError(f"linspace takes low, high, count (whole, 1 to {MOST_VALUES})")
-        low, high = (np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers[:2])
+            raise ValueError(
+                f"linspace takes low, high, count (whole, 1 to {MOST_VALUES})"
+            )
+        low, high = (
+            np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers[:2]
+        )
         kind, numbers = "grid", np.linspace(low, high, int(count))
     if kind == "normal" and len(numbers) == 2:
         numbers = (*numbers, -np.inf, np.inf)
@@ -189,11 +212,16 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
     return Variation(key, kind, values.reshape(len(values), -1), targets, factor)
 
 
-def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) -> Variation:
+def tabulate(
+    key: str, columns: Mapping[str, Array], targets: Sequence[Target]
+) -> Variation:
     """Return the variation of a key whose values are columns of a table, which must be complete."""
     if len(set(map(len, columns.values()))) > 1:
         raise ValueError("must have columns of equal length")
-    values, factor = np.stack(list(columns.values()), axis=1), _scales_tensor(key, targets)
+    values, factor = (
+        np.stack(list(columns.values()), axis=1),
+        _scales_tensor(key, targets),
+    )
     found = Variation(key, "table", values, targets, factor)
     if tuple(columns) != found.columns:
         raise ValueError(f"needs the columns {', '.join(found.columns)}")
@@ -202,7 +230,11 @@ def tabulate(key: str, columns: Mapping[str, Array], targets: Sequence[Target]) 
 
 def read_table(given: Any) -> dict[str, Array]:
     """Read columns of numbers from a DataFrame, a mapping, or a CSV or Parquet file."""
-    refused = "table", str(given), "must be columns of numbers, or a .csv or .parquet file of them"
+    refused = (
+        "table",
+        str(given),
+        "must be columns of numbers, or a .csv or .parquet file of them",
+    )
     with refuse_errors("sweep", *refused, OSError, ValueError, TypeError, LookupError):
         if isinstance(given, Path):
             kind = "parquet" if given.suffix == ".parquet" else "csv"

@@ -30,18 +30,22 @@ from sst_ros.view.server import PageServer
 from sst_ros.view.source import Replay, RunControl, ViewState
 
 PERIOD_S = 1.0 / 30.0
-_SHOW_EVERY, _DRAW_EVERY = 3, 6  # frames between two updates of the numbers, and of the plots
+# frames between two updates of the numbers, and of the plots
+_SHOW_EVERY, _DRAW_EVERY = 3, 6
 _PANEL_WIDTH = 400.0
 _LARGEST_TORQUE = 5.0  # range of the torque sliders where the scene has no limit [N m]
 _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
 _REFUSAL_S = 4.0
 _WINDOW_S = 10.0
 _POINTS = 500
-_COLOURS = tuple("#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in robot.LEG_COLOURS)
+_COLOURS = tuple(
+    "#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in robot.LEG_COLOURS
+)
 _BRAND = (0, 114, 178)
 _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
 
-Show: TypeAlias = Callable[[str, float | None], None]  # controls as in a phase, at a time [s]
+# controls as in a phase, at a time [s]
+Show: TypeAlias = Callable[[str, float | None], None]
 _PANEL: Any = load_templates("view").get_template("panel.html").module
 
 
@@ -56,8 +60,8 @@ class Page:
         self._server = PageServer(host, port)
         self.url = self._server.url
         self._clear()
-        # No markdown: viser sends its text as an update, which a slow browser complains of where
-        # it gets the removal at once with it.
+        # No markdown: viser sends its text as an update, which a slow browser complains
+        # of where it gets the removal at once with it.
         self._server.gui.add_html("<small>&nbsp; Waiting for a simulator ...</small>")
         self._scene: Scene | None = None
         self._state: ViewState | None = None
@@ -95,7 +99,10 @@ class Page:
         gui, scene = self._server.gui, self._server.scene
         gui.reset()
         gui.configure_theme(
-            brand_color=_BRAND, control_width="large", show_logo=False, show_share_button=False
+            brand_color=_BRAND,
+            control_width="large",
+            show_logo=False,
+            show_share_button=False,
         )
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_WIDTH)
@@ -145,7 +152,9 @@ class Page:
         if count % _DRAW_EVERY == 0 and len(self._rows) >= 2:
             rows = np.array(self._rows)
             rows = rows[rows[:, 0] > rows[-1, 0] - _WINDOW_S]
-            for plot, columns in zip(self._plots, (rows[:, 1:4], rows[:, 4:7]), strict=True):
+            for plot, columns in zip(
+                self._plots, (rows[:, 1:4], rows[:, 4:7]), strict=True
+            ):
                 plot.data = (rows[:, 0], *columns.T.copy())
 
     def _add_to_plots(self, state: ViewState) -> None:
@@ -160,7 +169,10 @@ class Page:
     def _show_numbers(self) -> None:
         """Show name, phase and time, the numbers of the state, and what is possible now."""
         state, status = self._state, self._source.status()
-        phase, at = status.phase or "no simulator", None if state is None else state.time
+        phase, at = (
+            status.phase or "no simulator",
+            None if state is None else state.time,
+        )
         colour = _LEVELS[2 if phase.startswith("fault") else status.level]
         shown = "–" if at is None else f"{at:.2f} s"
         self._head.content = str(_PANEL.head(self._scene, phase, colour, shown))
@@ -171,7 +183,9 @@ class Page:
         self._show_controls(phase, at)
 
 
-def _plot(server: PageServer, label: str, range_: tuple[float, float]) -> viser.GuiUplotHandle:
+def _plot(
+    server: PageServer, label: str, range_: tuple[float, float]
+) -> viser.GuiUplotHandle:
     """Add a plot of three legs whose axis shows a range at least."""
     lines: list[viser.uplot.Series] = [{"label": "t [s]"}]
     for k, colour in zip("₁₂₃", _COLOURS, strict=True):
@@ -181,7 +195,10 @@ def _plot(server: PageServer, label: str, range_: tuple[float, float]) -> viser.
         (np.array([0.0, 1.0]), *np.zeros((3, 2))),
         tuple(lines),
         scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
-        axes=({"label": "t [s]", "labelSize": 16, "size": 26}, {"label": label, "size": 44}),
+        axes=(
+            {"label": "t [s]", "labelSize": 16, "size": 26},
+            {"label": label, "size": 44},
+        ),
         legend={"show": False},
         height=130,
     )
@@ -195,11 +212,15 @@ def _add_run_controls(server: PageServer, scene: Scene, run: RunControl) -> Show
     gui, most = server.gui, scene.torque_limit or _LARGEST_TORQUE
     with gui.add_folder("run", order=1.0):
         pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
-        step = gui.add_button("Step", icon=viser.Icon.PLAYER_SKIP_FORWARD, disabled=True)
+        step = gui.add_button(
+            "Step", icon=viser.Icon.PLAYER_SKIP_FORWARD, disabled=True
+        )
         reset = gui.add_button("Reset", icon=viser.Icon.REFRESH)
     with gui.add_folder("manual torques [N m]", order=5.0):
         note = gui.add_html("")
-        sliders = [gui.add_slider(f"τ{k}", -most, most, most / 100.0, 0.0) for k in "₁₂₃"]
+        sliders = [
+            gui.add_slider(f"τ{k}", -most, most, most / 100.0, 0.0) for k in "₁₂₃"
+        ]
         zero = gui.add_button("Zero", icon=viser.Icon.CIRCLE_OFF)
 
     def ask(event: Any) -> None:
@@ -242,11 +263,16 @@ def _add_run_controls(server: PageServer, scene: Scene, run: RunControl) -> Show
 
 
 def _add_replay_controls(server: PageServer, replay: Replay) -> Show:
-    """Add play, a time slider, and the speed of a recording; the function returned moves them."""
+    """Add play, a time slider, and the speed of a recording.
+
+    The function returned moves them.
+    """
     gui = server.gui
     with gui.add_folder("recording", order=1.0):
         play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
-        slider = gui.add_slider("t [s]", 0.0, replay.length, replay.length / 1000.0, 0.0)
+        slider = gui.add_slider(
+            "t [s]", 0.0, replay.length, replay.length / 1000.0, 0.0
+        )
         speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1 ×")
 
     def seek(event: Any) -> None:
@@ -268,7 +294,9 @@ def _add_replay_controls(server: PageServer, replay: Replay) -> Show:
 
 def _name(button: viser.GuiButtonHandle, label: str) -> None:
     button.label = label
-    button.icon = viser.Icon.PLAYER_PAUSE if label == "Pause" else viser.Icon.PLAYER_PLAY
+    button.icon = (
+        viser.Icon.PLAYER_PAUSE if label == "Pause" else viser.Icon.PLAYER_PLAY
+    )
 
 
 def _move(slider: viser.GuiSliderHandle[float], value: float) -> None:
@@ -279,7 +307,10 @@ PATH_POINTS = 400
 _POINT_PERIOD_S = 0.008
 _PATH_S = 4.0
 _LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
-"""The path lies a little outside the star, which would hide it; newer parts above older ones."""
+"""The path lies a little outside the star, which would hide it.
+
+Newer parts above older ones.
+"""
 _OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
 ROOT = "/manipulator"
 _SIDES = 20  # corners of an arc's cross-section
@@ -293,7 +324,9 @@ class SceneDrawing:
         self._joints = robot.joints_of(self._geometry)
         self._frames = {}
         for link, drawn in robot.shapes(scene).items():
-            self._frames[link] = server.scene.add_frame(f"{ROOT}/{link}", show_axes=False)
+            self._frames[link] = server.scene.add_frame(
+                f"{ROOT}/{link}", show_axes=False
+            )
             for index, shape in enumerate(drawn):
                 add_shape(server, f"{ROOT}/{link}/{index}", shape)
         self._size = size = max(scene.base.radius, scene.star.radius)
@@ -309,9 +342,13 @@ class SceneDrawing:
             thickness=0.016 * size,
         )
         outward = scene.star.radius * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.28]])
-        self._add_arrow(f"{robot.STAR}/s", outward, robot.STAR_COLOUR, (0.010, 0.028, 0.075))
+        self._add_arrow(
+            f"{robot.STAR}/s", outward, robot.STAR_COLOUR, (0.010, 0.028, 0.075)
+        )
         self._torques = [
-            self._add_arrow(f"torque_{k}", np.zeros((2, 3)), colour, (0.014, 0.040, 0.090))
+            self._add_arrow(
+                f"torque_{k}", np.zeros((2, 3)), colour, (0.014, 0.040, 0.090)
+            )
             for k, colour in enumerate(robot.LEG_COLOURS, 1)
         ]
         for arrow in self._torques:
@@ -340,9 +377,13 @@ class SceneDrawing:
             frame.wxyz = wxyz(found[link])
         end = self._scene.star.radius * found[robot.STAR][:, 2]
         points = np.array([*(point for _, point in self._points), end])[-PATH_POINTS:]
-        points = np.concatenate([np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points])
+        points = np.concatenate(
+            [np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points]
+        )
         points *= _LIFT
-        self._path.points = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+        self._path.points = np.stack([points[:-1], points[1:]], axis=1).astype(
+            np.float32
+        )
         # tau_k along w_k, outwards where positive; the largest yet has full length
         self._largest_torque = max(self._largest_torque, *map(abs, torque))
         for arrow, tau, w in zip(self._torques, torque, self._geometry.w, strict=True):
@@ -351,20 +392,30 @@ class SceneDrawing:
             if visible:
                 foot = 1.17 * self._scene.base.radius
                 ends = np.array([foot * w, (foot + length) * w])
-                arrow.points = (ends if tau > 0.0 else ends[::-1]).astype(np.float32)[None]
+                arrow.points = (ends if tau > 0.0 else ends[::-1]).astype(np.float32)[
+                    None
+                ]
             arrow.visible = visible
 
     def _add_arrow(
-        self, name: str, ends: Array, colour: ArrayLike, sizes: tuple[float, float, float]
+        self,
+        name: str,
+        ends: Array,
+        colour: ArrayLike,
+        sizes: tuple[float, float, float],
     ) -> viser.ArrowsHandle:
-        """Add an arrow between two points; sizes of shaft and head are parts of the largest link's.
+        """Add an arrow between two points.
+
+        Sizes of shaft and head are parts of the largest link's.
 
         viser takes linear colours for arrows, and sRGB for all else.
         """
         shaft, head, length = (self._size * size for size in sizes)
         linear = np.asarray(colour, dtype=float) ** 2.2
         given: Any = {"shaft_radius": shaft, "head_radius": head, "head_length": length}
-        return self._server.scene.add_arrows(f"{ROOT}/{name}", ends[None], linear, **given)
+        return self._server.scene.add_arrows(
+            f"{ROOT}/{name}", ends[None], linear, **given
+        )
 
     def _add_labels(self) -> None:
         """Name the vertices P_k of the base triangle, on its outer side, and E."""
@@ -373,10 +424,17 @@ class SceneDrawing:
         outwards /= np.linalg.norm(outwards, axis=1)[:, None]
         points = self._scene.base.radius * (v + 0.13 * outwards)
         end = self._scene.star.radius * np.array([0.0, 0.0, 1.36])
-        places = [(f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at) for k, at in enumerate(points, 1)]
+        places = [
+            (f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at)
+            for k, at in enumerate(points, 1)
+        ]
         for name, text, at in (*places, (f"{robot.STAR}/E", "E", end)):
             self._server.scene.add_label(
-                f"{ROOT}/{name}", text, position=at, anchor="center-center", font_screen_scale=2.0
+                f"{ROOT}/{name}",
+                text,
+                position=at,
+                anchor="center-center",
+                font_screen_scale=2.0,
             )
 
 
@@ -386,7 +444,8 @@ def add_shape(server: viser.ViserServer, name: str, shape: robot.Shape) -> None:
     if isinstance(shape, robot.Ball):
         scene.add_icosphere(
             name, shape.radius, shape.colour, position=shape.centre,
-            subdivisions=3 if shape.radius < 0.1 else 20,  # of an edge of the icosahedron
+            # of an edge of the icosahedron
+            subdivisions=3 if shape.radius < 0.1 else 20,
             opacity=shape.opacity if shape.opacity < 1.0 else None,
         )  # fmt: skip
     elif isinstance(shape, robot.Box):
@@ -395,12 +454,22 @@ def add_shape(server: viser.ViserServer, name: str, shape: robot.Shape) -> None:
         turns = 2.0 * np.pi * np.arange(_SIDES + 1) / _SIDES
         outline = np.stack([np.cos(turns), np.sin(turns)], axis=1) * shape.thickness
         mesh = trimesh.creation.revolve(
-            outline + np.array([shape.radius, 0.0]), angle=shape.angle, sections=len(shape.points())
+            outline + np.array([shape.radius, 0.0]),
+            angle=shape.angle,
+            sections=len(shape.points()),
         )
-        frame = np.stack([shape.begin, np.cross(shape.axis, shape.begin), shape.axis], axis=1)
-        scene.add_mesh_simple(name, mesh.vertices @ frame.T, mesh.faces, color=shape.colour)
+        frame = np.stack(
+            [shape.begin, np.cross(shape.axis, shape.begin), shape.axis], axis=1
+        )
+        scene.add_mesh_simple(
+            name, mesh.vertices @ frame.T, mesh.faces, color=shape.colour
+        )
         for index, end in enumerate(shape.points()[[0, -1]]):
-            add_shape(server, f"{name}/{index}", robot.Ball(end, shape.thickness, shape.colour))
+            add_shape(
+                server,
+                f"{name}/{index}",
+                robot.Ball(end, shape.thickness, shape.colour),
+            )
     else:
         along = shape.end - shape.begin
         middle, length = (shape.begin + shape.end) / 2.0, float(np.linalg.norm(along))

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The web server of the page: viser's, behind a check of address, origin and token.
 
-Everyone who reaches the page can apply torques. Every request, the websocket's too, must therefore
+Everyone who reaches the page can apply torques. Every request, the websocket's too,
+must therefore
 
-- be addressed to this server (Host): no foreign name that was rebound to this machine is served;
+- be addressed to this server (Host): no foreign name that was rebound to this machine
+  is served;
 - come from the page itself where a browser states where it comes from (Origin);
-- carry the token of the printed URL, in the query or in the cookie that the first answer sets.
+- carry the token of the printed URL, in the query or in the cookie that the first
+  answer sets.
 
 A viser that cannot be guarded so is refused, never served without the check.
 """
@@ -59,7 +62,8 @@ class AccessCheck:
             if reason := self.refusal(connection.local_address, request):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
             if urlsplit(request.path).path == "/":
-                request.headers.pop("Accept-Encoding", None)  # the title is in the page's text
+                # the title is in the page's text
+                request.headers.pop("Accept-Encoding", None)
             response = serve_files(connection, request)
             if response is not None and response.status_code == http.HTTPStatus.OK:
                 self._complete(response, connection.local_address[1])
@@ -70,10 +74,15 @@ class AccessCheck:
     def refusal(self, local: tuple[str, int], request: Request) -> str:
         """Return why a request at a local address is refused; empty if it is not."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        names = self._names | {local[0]} | ({"localhost"} if _loopback(local[0]) else set())
+        names = (
+            self._names | {local[0]} | ({"localhost"} if _loopback(local[0]) else set())
+        )
         if len(hosts) != 1 or _name(hosts[0]) not in names:
             return "This page answers only to its own address."
-        if any(origin not in (f"http://{hosts[0]}", f"https://{hosts[0]}") for origin in origins):
+        if any(
+            origin not in (f"http://{hosts[0]}", f"https://{hosts[0]}")
+            for origin in origins
+        ):
             return "Another page must not use this one."
         cookies = http.cookies.SimpleCookie()
         with contextlib.suppress(http.cookies.CookieError):
@@ -81,12 +90,20 @@ class AccessCheck:
         given = parse_qs(urlsplit(request.path).query).get("token", [])
         if (morsel := cookies.get(COOKIE.format(local[1]))) is not None:
             given.append(morsel.value)
-        if not any(secrets.compare_digest(one.encode(), self.token.encode()) for one in given):
-            return "Open the address that `view` has printed: it contains the access token."
+        if not any(
+            secrets.compare_digest(one.encode(), self.token.encode()) for one in given
+        ):
+            return (
+                "Open the address that `view` has printed: it contains the access"
+                " token."
+            )
         return ""
 
     def _complete(self, response: Response, port: int) -> None:
-        """Set the cookie, and the title of the browser's tab; forbid frames and referrers."""
+        """Set the cookie, and the title of the browser's tab.
+
+        Forbid frames and referrers.
+        """
         headers, title = response.headers, f"<title>{TITLE}</title>".encode()
         response.body = response.body.replace(b"<title>Viser</title>", title, 1)
         del headers["Content-Length"]
@@ -104,11 +121,14 @@ class PageServer(ViserServer):
 
     def __init__(self, host: str = LOCAL, port: int = PORT) -> None:
         check = AccessCheck(host)
-        with contextlib.redirect_stdout(io.StringIO()), _swap_serve(check):  # viser's messages
+        # viser's messages
+        with contextlib.redirect_stdout(io.StringIO()), _swap_serve(check):
             super().__init__(host, _free_port(host, port), label=TITLE, verbose=False)
         if not check.installed:
             self.stop()
-            raise SstError("this release of viser cannot be guarded: pip install 'viser>=1.1,<2'")
+            raise SstError(
+                "this release of viser cannot be guarded: pip install 'viser>=1.1,<2'"
+            )
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self.get_port()}/?token={check.token}"
 
@@ -126,8 +146,9 @@ class PageServer(ViserServer):
 def _swap_serve(check: AccessCheck) -> Iterator[None]:
     """Put the check before viser's own handler in the call by which it starts its web server.
 
-    viser 1.1 neither takes a handler of requests nor hands on the server that it starts, and hears
-    of a client only when its websocket is open; so `websockets` gets another `serve` meanwhile.
+    viser 1.1 neither takes a handler of requests nor hands on the server that it
+    starts, and hears of a client only when its websocket is open; so `websockets` gets
+    another `serve` meanwhile.
     """
     module = vars(websockets.asyncio.server)
 
@@ -144,7 +165,10 @@ def _swap_serve(check: AccessCheck) -> Iterator[None]:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return the first free port; viser would look without end, or stop with a traceback."""
+    """Return the first free port.
+
+    Viser would look without end, or stop with a traceback.
+    """
     allowed = f"must be between {_PORTS[0]} and {_PORTS[1]}"
     refuse_unless("view", ("port", port, _PORTS[0] <= port <= _PORTS[1], allowed))
     known = "host", host, "must be an address of this machine"
@@ -161,7 +185,10 @@ def _free_port(host: str, port: int) -> int:
 
 
 def _listen(addresses: list[Any], port: int) -> None:
-    """Listen at a port of all addresses, and end; raise an OSError where that cannot be."""
+    """Listen at a port of all addresses, and end.
+
+    Raise an OSError where that cannot be.
+    """
     for family, _, _, _, address in addresses:
         socket.create_server((address[0], port, *address[2:]), family=family).close()
 

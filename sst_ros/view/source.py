@@ -19,13 +19,15 @@ from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Vector3
 
-_PUBLISH_RATE = 100  # of a simulator that is only looked at [Hz]: more than a screen shows
+# of a simulator that is only looked at [Hz]: more than a screen shows
+_PUBLISH_RATE = 100
 
 
 class ViewState(NamedTuple):
     """The manipulator at one instant, by leg."""
 
-    time: float | None  # of the run [s]; None for a state that is shown while there is no run
+    # of the run [s]; None for a state that is shown while there is no run
+    time: float | None
     gamma: Sequence[float]  # [rad]
     mu: Sequence[float]
     beta: Sequence[float]
@@ -62,7 +64,10 @@ class RunControl(Protocol):
         """Return the latest status of the run."""
 
     def ask(self, request: str) -> tuple[bool, str]:
-        """Ask to pause, resume, step (a paused run by one sample) or reset; success and message."""
+        """Ask to pause, resume, step (a paused run by one sample) or reset.
+
+        Success and message.
+        """
 
     def apply(self, torque: Vector3) -> None:
         """Hold torques [N m] from now on."""
@@ -74,12 +79,13 @@ class RunControl(Protocol):
 class Replay:
     """Plays a bag of `length` [s]; has `scene`, `states` and `status` as a run.
 
-    The namespace is that of `read_bag`. It is used from two threads of the page. Raises InputError
-    where the bag is no whole recording.
+    The namespace is that of `read_bag`. It is used from two threads of the page. Raises
+    InputError where the bag is no whole recording.
     """
 
     def __init__(self, bag: Path, namespace: str | None = None) -> None:
-        from sst_ros.recording.recording import read  # needs rosbags, which a live view does not
+        # needs rosbags, which a live view does not
+        from sst_ros.recording.recording import read
 
         self._run = read(bag, namespace=namespace)
         self.scene, self._seconds = self._run.scene, self._run.seconds
@@ -114,7 +120,9 @@ class Replay:
         self._shown = at
         run, rows = self._run, slice(first, at + 1)
         columns = (run.gamma, run.mu, run.beta, run.gamma_dot, run.effort)
-        parts = zip(self._seconds[rows].tolist(), *(one[rows] for one in columns), strict=True)
+        parts = zip(
+            self._seconds[rows].tolist(), *(one[rows] for one in columns), strict=True
+        )
         return [ViewState(*part) for part in parts]
 
     def status(self) -> RunStatus:
@@ -130,13 +138,17 @@ class Replay:
         with self._lock:
             now = time.monotonic()
             if self.playing:
-                self._now = min(self._now + (now - self._since) * self._factor, self.length)
+                self._now = min(
+                    self._now + (now - self._since) * self._factor, self.length
+                )
                 self.playing = self._now < self.length
             self._since = now
             yield
 
 
-def run_simulator(scene: str, speed: float = 1.0) -> AbstractContextManager[subprocess.Popen[str]]:
+def run_simulator(
+    scene: str, speed: float = 1.0
+) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run a simulator of a scene to look at; `speed` is simulated time per time."""
     given = {"scene": scene, "publish_rate": _PUBLISH_RATE, "real_time_factor": speed}
     return processes.run_beside("simulator", given, stdout=subprocess.DEVNULL)

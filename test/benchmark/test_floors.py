@@ -15,7 +15,10 @@ from sst_ros.integration.batch_step import Block, advance_blocks
 from sst_ros.programs.llvm import LANES
 from sst_ros.scene.scene import load
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc"),
+]
 RUNS = {"kernel": ("--rounds", "1"), "batch": ("--scenarios", "200", "--rounds", "1")}
 
 
@@ -39,7 +42,8 @@ def test_a_batch_in_c_has_the_bits_of_the_batch_where_it_may_not_fuse(tmp_path):
     in_c.advance = c_floor.RowsInC(program, 2, tmp_path, "batch", *flags)
     assert in_c.advance.vectorised
     sets = [
-        [y.copy(), given, code.copy(), np.full(number, np.nan), np.zeros(number)] for _ in range(2)
+        [y.copy(), given, code.copy(), np.full(number, np.nan), np.zeros(number)]
+        for _ in range(2)
     ]
     batch.advance(0, 50, 2e-3, *sets[0])
     width = block_width(number)

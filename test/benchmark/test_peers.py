@@ -49,13 +49,18 @@ def test_gate_sees_a_wrong_inertia(task):
 
 @pytest.mark.slow
 def test_our_headline_is_the_public_call(task):
-    """Every setting ends within its tolerance of the finest one, and no other series counts."""
+    """Every setting ends within its tolerance of the finest one, and no other series
+    counts.
+    """
     pytest.importorskip("llvmlite")
     ours = peer("ours")
     first, *others = ours.series(task, quick=True)
     assert first.name.startswith(ours.PUBLIC)
     assert not any(series.name.startswith(ours.PUBLIC) for series in others)
-    ends = [(engine := setting.make()).pose(engine.run()).rotation for setting in first.settings]
+    ends = [
+        (engine := setting.make()).pose(engine.run()).rotation
+        for setting in first.settings
+    ]
     for setting, end in zip(first.settings, ends, strict=True):
         tolerance = float(setting.label.split()[1])
         assert turn_between(end, ends[-1]) <= tolerance + 1e-13
@@ -66,10 +71,15 @@ def test_the_table_has_times_and_their_ratio_to_ours():
     truth, floor = study.Reference(None, 0.0, ""), peer("floor").Floor({}, None)
     rows = []
     ours = peer("ours")
-    names = {(ours.ENGINE, ours.PUBLIC): 1e-5, (peer("scipy_peer").ENGINE, "DOP853"): 1e-3}
+    names = {
+        (ours.ENGINE, ours.PUBLIC): 1e-5,
+        (peer("scipy_peer").ENGINE, "DOP853"): 1e-3,
+    }
     for (engine, name), seconds in names.items():
         series = study.Series(engine, name, "nowhere", 1e-12, None)
-        point = study.Point(study.Setting("one", 0, None), 1e-12, 1e-12, seconds=[seconds] * 3)
+        point = study.Point(
+            study.Setting("one", 0, None), 1e-12, 1e-12, seconds=[seconds] * 3
+        )
         rows.append(study.Curve(series, 0.0, [point]))
     found = results.Results(rows, {}, truth, 3, True, 1.0, floor).tables()["series"]
     ours, other = found.to_numpy().tolist()
@@ -92,7 +102,9 @@ def test_the_picture_shows_the_best_settings(tmp_path):
     pytest.importorskip("matplotlib")
     pandas = pytest.importorskip("pandas")
     results = peer("results")
-    rows = pandas.DataFrame({"median_ms": [2.0, 1.0, 3.0], "error_at_end_rad": [1.0, 3.0, 2.0]})
+    rows = pandas.DataFrame(
+        {"median_ms": [2.0, 1.0, 3.0], "error_at_end_rad": [1.0, 3.0, 2.0]}
+    )
     assert results.find_front(rows) == ([1.0, 2.0], [3.0, 1.0])
     for name in ("peers.csv", "peers.json"):
         shutil.copy(ROOT / "docs" / name, tmp_path)

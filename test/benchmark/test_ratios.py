@@ -11,7 +11,9 @@ from benchmark.measure import DOCS
 
 def test_the_page_and_its_table_have_all_ten_of_this_release():
     text = (DOCS / "ratios.md").read_text(encoding="utf-8")
-    table = pd.read_csv(DOCS / "ratios.csv", dtype={"release": str}).set_index("release")
+    table = pd.read_csv(DOCS / "ratios.csv", dtype={"release": str}).set_index(
+        "release"
+    )
     assert len(ratios.TRACKS) == 10
     for name in ratios.TRACKS:
         assert text.count(f"| {name} |") == 1 + (name in table)
@@ -20,7 +22,9 @@ def test_the_page_and_its_table_have_all_ten_of_this_release():
 
 
 def test_a_change_between_releases_is_drawn():
-    rows = [{"release": f"0.{k}.0"} | dict.fromkeys(ratios.TRACKS, 1.0 + k) for k in (0, 1)]
+    rows = [
+        {"release": f"0.{k}.0"} | dict.fromkeys(ratios.TRACKS, 1.0 + k) for k in (0, 1)
+    ]
     axes = ratios.draw(pd.DataFrame(rows)).axes
     assert len(axes) == len(ratios.TRACKS)
     assert all([*one.lines[0].get_ydata()] == [1.0, 2.0] for one in axes)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small share of the campaign that tries to break the program; the whole is run by hand."""
+"""A small share of the campaign that tries to break the program.
+
+The whole is run by hand.
+"""
 
 import pytest
 
@@ -23,7 +26,8 @@ def test_nothing_is_found_in_a_share_of(part):
         pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
     if part == "bits":
         pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
-    # Other tests run at the same time: only what takes ten times its bound is a hang here.
+    # Other tests run at the same time: only what takes ten times its bound is a hang
+    # here.
     ledger = run_part(part, 0.02, seed=7, patience=10.0)
     assert ledger.tried > 0
     assert ledger.sound, "\n".join(ledger.notes)

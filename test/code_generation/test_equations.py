@@ -54,7 +54,9 @@ def expected(name):
     size = len(dynamics.state)
     for state, drive in states(scene):
         inputs = [*state.tolist(), *np.concatenate(drive).tolist()]
-        by_state = np.array(ode.linearised(0.0, *inputs)[2 * size :]).reshape(size, size).T
+        by_state = (
+            np.array(ode.linearised(0.0, *inputs)[2 * size :]).reshape(size, size).T
+        )
         by_torque = ode.linearised_by_torque(0.0, *inputs)[-3 * size :]
         results = {
             "derivative": np.array(dynamics.derivative(*inputs)),
@@ -80,10 +82,15 @@ class Compiled:
 
     def __call__(self, output, shape, *arguments):
         result = np.empty(shape)
-        given = [np.ascontiguousarray(argument, dtype=float) for argument in (*arguments, result)]
+        given = [
+            np.ascontiguousarray(argument, dtype=float)
+            for argument in (*arguments, result)
+        ]
         function = getattr(self.library, f"{self.name}_{output}")
         function.restype = None
-        pointers = [one.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for one in given]
+        pointers = [
+            one.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for one in given
+        ]
         function(*pointers)
         return given[-1]
 
@@ -96,13 +103,17 @@ def test_c_has_the_bits_of_the_package(name, tmp_path):
     for state, drive, results in expected(name):
         for output, result in results.items():
             given = drive if output.startswith("derivative") else ()
-            assert (compiled(output, result.shape, state, *given) == result).all(), output
+            assert (compiled(output, result.shape, state, *given) == result).all(), (
+                output
+            )
 
 
 def call(functions, output, state, drive):
     given = drive if output.startswith("derivative") else ()
     result = getattr(functions, output)(state, *given)
-    return np.array(result.tolist() if hasattr(result, "tolist") else result, dtype=float)
+    return np.array(
+        result.tolist() if hasattr(result, "tolist") else result, dtype=float
+    )
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -124,7 +135,11 @@ def test_jacobians_are_those_of_casadi(name):
     parameters = ["star.inertia.xx", "star.inertia.xy", "actuated_links.inertia.zz"]
     if name == "loaded":
         parameters += ["payload.mass", "friction.gamma.coulomb", "stroke.damping"]
-        parameters += ["springs.stiffness", "actuators.time_constant", "gravity.acceleration"]
+        parameters += [
+            "springs.stiffness",
+            "actuators.time_constant",
+            "gravity.acceleration",
+        ]
     functions = equations(scene, "casadi", parameters=parameters)
     written = equations(scene, "numpy", parameters=parameters)
     values = np.array([*functions.parameters.values()])
@@ -133,7 +148,9 @@ def test_jacobians_are_those_of_casadi(name):
     for state, drive in states(scene, 2):
         arguments = (state, *drive, values)
         for by, place in (("state", 0), ("torque", 1), ("parameters", -1)):
-            truth = casadi.Function("truth", symbols, [casadi.jacobian(derivative, symbols[place])])
+            truth = casadi.Function(
+                "truth", symbols, [casadi.jacobian(derivative, symbols[place])]
+            )
             found = getattr(written, f"derivative_by_{by}")(*arguments)
             given = np.array(truth(*arguments))
             assert np.abs(found - given).max() <= CLOSE * np.abs(given).max(), by
@@ -156,15 +173,21 @@ def test_parameters_are_the_numbers_of_another_scene():
         found = functions.derivative(state, *drive, np.array([*values.values()]))
         truth = np.array(other.derivative(*state, *np.concatenate(drive)))
         assert np.abs(found - truth).max() <= CLOSE * np.abs(truth).max()
-        own = functions.derivative(state, *drive, np.array([*functions.parameters.values()]))
+        own = functions.derivative(
+            state, *drive, np.array([*functions.parameters.values()])
+        )
         truth = np.array(Dynamics.of(scene).derivative(*state, *np.concatenate(drive)))
         assert np.abs(own - truth).max() <= CLOSE * np.abs(truth).max()
 
 
 def test_a_vector_or_a_list_means_each_of_its_numbers():
-    keys = equations("gravity_payload", "c", parameters=["gravity.acceleration"]).parameters
+    keys = equations(
+        "gravity_payload", "c", parameters=["gravity.acceleration"]
+    ).parameters
     assert [*keys] == [f"gravity.acceleration[{i}]" for i in range(3)]
-    keys = equations("example2", "c", parameters=["actuated_links.inertia.zz"]).parameters
+    keys = equations(
+        "example2", "c", parameters=["actuated_links.inertia.zz"]
+    ).parameters
     assert [*keys] == [f"actuated_links[{k}].inertia.zz" for k in range(3)]
 
 
@@ -205,10 +228,16 @@ def test_mpmath_has_more_digits():
     with mpmath.workdps(50):
         fine = functions.derivative(state, torque)
         slope = functions.joints(state)
-        # Energy balance to all digits: the kinetic energy grows by the power of the torques.
-        power = sum(mpmath.mpf(t) * rate for t, rate in zip(torque, slope[9:12], strict=True))
+        # Energy balance to all digits: the kinetic energy grows by the power of the
+        # torques.
+        power = sum(
+            mpmath.mpf(t) * rate for t, rate in zip(torque, slope[9:12], strict=True)
+        )
         h = mpmath.mpf(10) ** -20
-        ends = [[x + sign * h * dx for x, dx in zip(state, fine, strict=True)] for sign in (-1, 1)]
+        ends = [
+            [x + sign * h * dx for x, dx in zip(state, fine, strict=True)]
+            for sign in (-1, 1)
+        ]
         before, after = (functions.energies(end)[0] for end in ends)
         rate = (after - before) / (2 * h)
         assert abs(rate - power) < mpmath.mpf(10) ** -14 * abs(power)
@@ -236,7 +265,10 @@ def test_every_target_names_scene_and_hash(target):
 
         described = SceneEquations(load_scene("example2"), (), ())
         assert described.scene_hash in content and "body rate W_x" in content
-        assert described.scene_hash != SceneEquations(load_scene("friction"), (), ()).scene_hash
+        assert (
+            described.scene_hash
+            != SceneEquations(load_scene("friction"), (), ()).scene_hash
+        )
     assert written.target == target and target in repr(written)
 
 
@@ -276,7 +308,10 @@ def test_the_command_writes_and_does_not_overwrite(tmp_path, capsys):
     assert main([*words, "--outputs", "joints"]) == 0
     (path,) = folder.iterdir()
     assert capsys.readouterr().out.strip() == str(path) == str(folder / "swing_jax.py")
-    assert "def joints(state):" in path.read_text() and "def energies" not in path.read_text()
+    assert (
+        "def joints(state):" in path.read_text()
+        and "def energies" not in path.read_text()
+    )
     before = path.read_bytes()
     assert main(words) == 1
     assert "exists already" in capsys.readouterr().err and path.read_bytes() == before
@@ -293,7 +328,9 @@ def test_a_written_module_needs_its_library_alone(tmp_path):
         "print(m.energies(m.INITIAL_STATE).sum(), 'sst_ros' in sys.modules)"
     )
     words = [sys.executable, "-c", program]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        words, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     total, imported = done.stdout.split()
     dynamics = Dynamics.of(load_scene("swing"))
     start = equations("swing", "c").initial_state

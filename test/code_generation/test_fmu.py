@@ -32,7 +32,10 @@ def write(scene, folder, **options):
 
 @contextmanager
 def instance(path, folder, kind="slave", values=None):
-    """An instance after initialization, with other start values by name; its references."""
+    """An instance after initialization, with other start values by name.
+
+    Its references.
+    """
     description = fmpy.read_model_description(str(path))
     references = {one.name: one.valueReference for one in description.modelVariables}
     unpacked = fmpy.extract(str(path), str(folder))
@@ -100,7 +103,10 @@ def test_fixed_steps_converge_with_order_eight(tmp_path):
     path, errors = write(scene, tmp_path), []
     reference = expected(scene, torques)
     for step in (2e-3, 1e-3):
-        with instance(path, tmp_path / f"unit{step}", values={"step": step}) as (unit, known):
+        with instance(path, tmp_path / f"unit{step}", values={"step": step}) as (
+            unit,
+            known,
+        ):
             errors.append(np.abs(follow(unit, known, torques) - reference).max())
     assert 6.5 < np.log2(errors[0] / errors[1]) < 9.5, errors
 
@@ -121,7 +127,9 @@ def test_model_exchange_gives_the_derivative(tmp_path):
             return rates.copy()
 
         unit.getContinuousStates(pointer(start), 7)
-        run = solve_ivp(derivative, (0, 0.1), start.copy(), "DOP853", rtol=1e-13, atol=1e-14)
+        run = solve_ivp(
+            derivative, (0, 0.1), start.copy(), "DOP853", rtol=1e-13, atol=1e-14
+        )
         unit.setContinuousStates(pointer(run.y[:, -1].copy()), 7)
         found = unit.getFloat64([references[name] for name in GAMMA])
     motion = simulate(scene, torque, 0.1, tolerance=1e-13)
@@ -178,7 +186,9 @@ def test_fmpy_finds_the_unit_valid(scene, tmp_path):
     from fmpy.validation import validate_fmu
 
     given = loaded() if scene == "loaded" else scene
-    path = write(given, tmp_path, parameters=["star.inertia.xx", "actuated_links.inertia.zz"])
+    path = write(
+        given, tmp_path, parameters=["star.inertia.xx", "actuated_links.inertia.zz"]
+    )
     assert validate_fmu(str(path)) == []
 
 

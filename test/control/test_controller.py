@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controllers against the paper's equations, closed forms and what a closed loop must do."""
+"""The controllers against the paper's equations, closed forms and what a closed loop
+must do.
+"""
 
 import dataclasses
 
@@ -40,13 +42,19 @@ def turned(model, vector=(0.1, 0.0, 0.0), duration=0.4):
 def answer(sample, desired, gamma_dot=None, **given):
     """The command for the state of a sample."""
     gamma_dot = sample.gamma_dot if gamma_dot is None else gamma_dot
-    acting = Controller(sample.scene, standing(desired), ControllerSettings(**given), PERIOD)
-    return acting.command(0.0, Measurement(tuple(sample.gamma.tolist()), tuple(gamma_dot.tolist())))
+    acting = Controller(
+        sample.scene, standing(desired), ControllerSettings(**given), PERIOD
+    )
+    return acting.command(
+        0.0, Measurement(tuple(sample.gamma.tolist()), tuple(gamma_dot.tolist()))
+    )
 
 
 @pytest.fixture(params=enumerate(seeded_samples(1, 5)), ids=range(5))
 def near(request):
-    """A sample, another pose of its assembly in motion with its posture, and the errors of both."""
+    """A sample, another pose of its assembly in motion with its posture, and the errors
+    of both.
+    """
     seed, sample = request.param
     rng = np.random.default_rng(seed)
     turn = Rotation.from_rotvec(0.1 * rng.standard_normal(3))
@@ -69,21 +77,27 @@ def test_feedforward_is_the_papers_inverse_dynamics(near):
     assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_modes(near):
+def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_modes(
+    near,
+):
     sample, desired, at, error, error_rate = near
     m = -np.diag(virtual_work.equation_of_motion(sample.mechanism, at, np.zeros(3))[0])
     expected = m * (20.0**2 * error + 2.0 * 0.7 * 20.0 * error_rate)
     for mode in ("pd", "gravity_pd", "feedforward_pd"):
         told = answer(sample, desired, mode=mode, bandwidth=20.0, damping_ratio=0.7)
         assert np.allclose(told.feedback, expected, rtol=1e-9, atol=1e-9)
-        assert np.allclose(told.torque, np.add(told.feedforward, told.feedback), rtol=1e-15)
+        assert np.allclose(
+            told.torque, np.add(told.feedforward, told.feedback), rtol=1e-15
+        )
     told = answer(sample, desired, mode="pd", stiffness=m * 400.0, damping=m * 28.0)
     assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics(near):
     sample, desired, _, error, error_rate = near
-    told = answer(sample, desired, mode="computed_torque", bandwidth=15.0, damping_ratio=0.6)
+    told = answer(
+        sample, desired, mode="computed_torque", bandwidth=15.0, damping_ratio=0.6
+    )
     found = virtual_work.direct_dynamics(
         sample.mechanism, sample.posture, sample.gamma_dot, told.torque
     )
@@ -93,7 +107,10 @@ def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics(
 
 @pytest.mark.parametrize("sample", seeded_samples(4, 5), ids=range(5))
 def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says(sample):
-    """R = R_d exp(-phi n) with phi'' = -2 w phi' - w^2 phi; R_d turns about the same axis."""
+    """R = R_d exp(-phi n) with phi'' = -2 w phi' - w^2 phi.
+
+    R_d turns about the same axis.
+    """
     w, phi0, t, axis = 12.0, 0.3, 0.05, np.array([0.48, 0.6, 0.64])
     phi, dot, ddot = (
         phi0 * np.exp(-w * t) * factor
@@ -117,7 +134,8 @@ def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says(sample):
 
 def test_gravity_pd_holds_the_weight_where_the_manipulator_is():
     model = scene.load("gravity_payload")
-    # At rest and without a lag of the actuators, which the torque would have to grow through.
+    # At rest and without a lag of the actuators, which the torque would have to grow
+    # through.
     still = Initial(gamma=model.initial.gamma)
     model = dataclasses.replace(model, initial=still, actuators=None)
     simulation, motion = Simulation(model), turned(model)
@@ -145,9 +163,12 @@ def loop(model, plant, motion, settings, seconds):
 @pytest.mark.parametrize("space", ["gamma", "so3"])
 def test_computed_torque_brings_the_manipulator_to_the_motion(space):
     off = dataclasses.replace(
-        HEAVY, initial=Initial(gamma=tuple(np.add(HEAVY.initial.gamma, (0.2, -0.15, 0.1))))
+        HEAVY,
+        initial=Initial(gamma=tuple(np.add(HEAVY.initial.gamma, (0.2, -0.15, 0.1)))),
     )
-    settings = ControllerSettings(mode="computed_torque", space=space, feedforward_at="middle")
+    settings = ControllerSettings(
+        mode="computed_torque", space=space, feedforward_at="middle"
+    )
     largest, last = loop(HEAVY, off, turned(HEAVY, (0.1, 0.1, -0.2)), settings, 0.6)
     assert largest == pytest.approx(0.2, abs=0.02)  # no overshoot: critically damped
     assert last < 1e-5
@@ -158,7 +179,13 @@ def test_the_integral_takes_out_what_the_model_does_not_know():
     motion = turned(HEAVY, (0.1, 0.1, -0.2), duration=0.2)
     for mode in ("feedforward_pd", "computed_torque"):
         without, with_it = (
-            loop(HEAVY, pushed, motion, ControllerSettings(mode=mode, integral_rate=r), 1.2)[1]
+            loop(
+                HEAVY,
+                pushed,
+                motion,
+                ControllerSettings(mode=mode, integral_rate=r),
+                1.2,
+            )[1]
             for r in (0.0, 12.0)
         )
         assert without > 1e-4
@@ -167,13 +194,17 @@ def test_the_integral_takes_out_what_the_model_does_not_know():
 
 @pytest.mark.parametrize("mode", ["pd", "computed_torque"])
 def test_an_integral_that_would_be_unstable_is_refused(mode):
-    """The bound is where a root of s^3 + kd s^2 + kp s + kp r crosses the imaginary axis."""
+    """The bound is where a root of s^3 + kd s^2 + kp s + kp r crosses the imaginary
+    axis.
+    """
     motion, w, zeta = turned(HEAVY), 30.0, 0.8
     for share, sound in ((0.999, True), (1.001, False)):
         r = share * 2.0 * zeta * w
         roots = np.roots([1.0, 2.0 * zeta * w, w * w, w * w * r])
         assert (roots.real.max() < 0.0) == sound
-        settings = ControllerSettings(mode=mode, bandwidth=w, damping_ratio=zeta, integral_rate=r)
+        settings = ControllerSettings(
+            mode=mode, bandwidth=w, damping_ratio=zeta, integral_rate=r
+        )
         if sound:
             Controller(HEAVY, motion, settings, PERIOD)
         else:
@@ -183,7 +214,10 @@ def test_an_integral_that_would_be_unstable_is_refused(mode):
 
 @pytest.mark.parametrize("mode", ["pd", "computed_torque"])
 def test_the_sum_of_errors_stands_still_at_a_torque_limit(mode):
-    """A second of an error that saturates leaves nothing behind; without a limit it winds up."""
+    """A second of an error that saturates leaves nothing behind.
+
+    Without a limit it winds up.
+    """
     motion = turned(HEAVY)
     begin = motion.at(0.0)
     away = tuple(angle - 0.1 for angle in begin.gamma)
@@ -216,7 +250,10 @@ def test_what_is_not_finite_is_refused_until_a_reset(mode):
     acting = Controller(HEAVY, turned(HEAVY), ControllerSettings(mode=mode), PERIOD)
     gamma = HEAVY.initial.gamma
     good = Measurement(gamma, ZERO)
-    for bad in (Measurement((np.nan, *gamma[1:]), ZERO), Measurement(gamma, (0.0, np.inf, 0.0))):
+    for bad in (
+        Measurement((np.nan, *gamma[1:]), ZERO),
+        Measurement(gamma, (0.0, np.inf, 0.0)),
+    ):
         acting.command(0.0, good)
         with pytest.raises(ControlStopped, match="must be finite"):
             acting.command(0.002, bad)
@@ -234,7 +271,9 @@ def test_angles_that_no_assembly_has_end_the_control(mode):
         if kinematics.direct(sample.geometry, nowhere):
             continue
         begin = ActuatorSpaceMap(sample.geometry).of_star(sample.quaternion, ZERO, ZERO)
-        acting = Controller(sample.scene, standing(begin), ControllerSettings(mode=mode), PERIOD)
+        acting = Controller(
+            sample.scene, standing(begin), ControllerSettings(mode=mode), PERIOD
+        )
         with pytest.raises(ControlStopped, match="parallel singularity"):
             acting.command(PERIOD, Measurement(nowhere, ZERO))
         ended += 1
@@ -242,12 +281,22 @@ def test_angles_that_no_assembly_has_end_the_control(mode):
 
 
 def test_an_assembly_is_followed_as_continuation_proves():
-    """Over short and long steps, of a general manipulator; also back to where it began."""
+    """Over short and long steps, of a general manipulator.
+
+    Also back to where it began.
+    """
     for sample in seeded_samples(7, 5):
         begin = tuple(quaternion_of(sample.rotation).tolist())
-        space, known = ActuatorSpaceMap(sample.geometry), (begin, tuple(sample.gamma.tolist()))
-        way = sample.gamma + np.outer(np.sin([0.01, 0.02, 0.3, 0.31, 0.05]), (0.4, -0.3, 0.5))
-        truth, _ = continuation.follow(sample.geometry, [sample.gamma, *way], sample.rotation)
+        space, known = (
+            ActuatorSpaceMap(sample.geometry),
+            (begin, tuple(sample.gamma.tolist())),
+        )
+        way = sample.gamma + np.outer(
+            np.sin([0.01, 0.02, 0.3, 0.31, 0.05]), (0.4, -0.3, 0.5)
+        )
+        truth, _ = continuation.follow(
+            sample.geometry, [sample.gamma, *way], sample.rotation
+        )
         for gamma, rotation in zip(way, truth[1:], strict=True):
             there = tuple(gamma.tolist())
             known = space.follow(*known, there), there

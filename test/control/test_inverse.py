@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse dynamics against the direct ones, the paper's form, Lagrange's potential, its limits."""
+"""Inverse dynamics against the direct ones, the paper's form, Lagrange's potential, its
+limits.
+"""
 
 from __future__ import annotations
 
@@ -34,20 +36,36 @@ ACCELERATIONS = st.tuples(*[st.floats(-20.0, 20.0)] * 3)
 
 
 def rounding(scene, sample, acceleration, torque):
-    """What rounding of the terms of both balances makes of W_dot, through M^-1 and the g_k."""
+    """What rounding of the terms of both balances makes of W_dot, through M^-1 and the
+    g_k.
+    """
     inertia, force, reach = kernel.balance(
         kernel.model_of(scene), sample.quaternion, sample.body_rate, (0.0,) * 3
     )
     m, reach = np.array(symmetric_rows(inertia)), np.array(reach)
-    terms = np.abs(m) @ np.abs(acceleration) + np.abs(force) + np.abs(reach.T) @ np.abs(torque)
-    return 16.0 * EPS * np.linalg.cond(reach) * np.linalg.norm(np.linalg.inv(m)) * terms.sum()
+    terms = (
+        np.abs(m) @ np.abs(acceleration)
+        + np.abs(force)
+        + np.abs(reach.T) @ np.abs(torque)
+    )
+    return (
+        16.0
+        * EPS
+        * np.linalg.cond(reach)
+        * np.linalg.norm(np.linalg.inv(m))
+        * terms.sum()
+    )
 
 
 @FEW
 @given(samples(), st.floats(0.0, 1.0), ACCELERATIONS)
-def test_direct_dynamics_undo_inverse_dynamics_with_every_term(sample, number, acceleration):
+def test_direct_dynamics_undo_inverse_dynamics_with_every_term(
+    sample, number, acceleration
+):
     scene = loaded(sample, number)
-    torque = InverseDynamics(scene).torque(sample.quaternion, sample.body_rate, acceleration)
+    torque = InverseDynamics(scene).torque(
+        sample.quaternion, sample.body_rate, acceleration
+    )
     found = Dynamics.of(scene).derivative(*sample.state, *torque)[4:]
     error = np.abs(np.subtract(found, acceleration)).max()
     assert error <= rounding(scene, sample, acceleration, torque)
@@ -63,7 +81,9 @@ def test_torques_are_those_of_the_paper(sample, gamma_ddot):
     t1, t2 = virtual_work.equation_of_motion(*paper)
     omega_dot = at.j @ gamma_ddot + virtual_work.bias(at, sample.gamma_dot).omega_dot
     body = tuple((sample.rotation.T @ omega_dot).tolist())
-    found = InverseDynamics(scene).torque(sample.quaternion, sample.body_rate, body, moment)
+    found = InverseDynamics(scene).torque(
+        sample.quaternion, sample.body_rate, body, moment
+    )
     # Both lose to J and to M what the largest of the terms that meet allows.
     size = np.linalg.norm(t1) * np.linalg.norm(gamma_ddot) + np.linalg.norm(t2)
     size += np.linalg.norm(at.j) * np.linalg.norm(moment)
@@ -81,16 +101,29 @@ def test_the_torque_that_holds_is_the_slope_of_the_potential_energy(sample):
 
 @FEW
 @given(samples(), st.floats(0.0, 1.0))
-def test_the_equation_of_motion_at_a_state_is_that_of_the_paper_with_every_load(sample, number):
+def test_the_equation_of_motion_at_a_state_is_that_of_the_paper_with_every_load(
+    sample, number
+):
     scene, start = loaded(sample, number), np.array([sample.state])
-    inverse, state = InverseDynamics(scene), State.of(0, sample.state, (0.0,) * 18, (0.0,) * 3)
+    inverse, state = (
+        InverseDynamics(scene),
+        State.of(0, sample.state, (0.0,) * 18, (0.0,) * 3),
+    )
     motion = Trajectory(scene, [0.0], start[:, :4], start[:, 4:], [sample.torque])
-    mass, bias, gamma_ddot = inverse.mass_matrix(state), inverse.bias(state), motion.gamma_ddot[0]
+    mass, bias, gamma_ddot = (
+        inverse.mass_matrix(state),
+        inverse.bias(state),
+        motion.gamma_ddot[0],
+    )
     bound = 1e-12 * np.linalg.cond(sample.posture.j) ** 2
     terms = np.abs(mass) @ np.abs(gamma_ddot) + np.abs(bias)
     assert np.abs(mass @ gamma_ddot + bias - sample.torque).max() <= bound * terms.max()
 
-    paper, still, moment = (sample.mechanism, sample.posture), np.zeros(3), sample.moment
+    paper, still, moment = (
+        (sample.mechanism, sample.posture),
+        np.zeros(3),
+        sample.moment,
+    )
     inverse = InverseDynamics(sample.scene)
     t1, _ = virtual_work.equation_of_motion(*paper, sample.gamma_dot)
     assert np.abs(inverse.mass_matrix(state) + t1).max() <= bound * np.linalg.norm(t1)
@@ -104,7 +137,9 @@ def test_gamma_ddot_of_a_trajectory_is_the_slope_of_gamma_dot():
     times, h = np.linspace(0.1, 0.4, 7), 1e-4
     before, after = (motion.at(times + step).gamma_dot for step in (-h, h))
     found = motion.at(times).gamma_ddot
-    assert np.abs(found - (after - before) / (2.0 * h)).max() <= 1e-4 * np.abs(found).max()
+    assert (
+        np.abs(found - (after - before) / (2.0 * h)).max() <= 1e-4 * np.abs(found).max()
+    )
 
 
 def test_the_forward_program_is_as_short_as_before_it_shared_its_terms():
@@ -112,14 +147,18 @@ def test_the_forward_program_is_as_short_as_before_it_shared_its_terms():
 
 
 def test_near_a_serial_singularity_a_torque_is_finite_or_refused():
-    """Towards t_1 = w_1 = (0, 0, 1), with e_1 = (0, 1, 0): about e_1, then about x to 90 deg."""
+    """Towards t_1 = w_1 = (0, 0, 1), with e_1 = (0, 1, 0): about e_1, then about x to
+    90 deg.
+    """
     inverse = InverseDynamics(load("example1"))
     said = []
     for off in [*(10.0**-power for power in range(1, 18)), 0.0]:
         turn = Rotation.from_euler("yx", [0.5, 0.5 * math.pi - off])
         q = tuple(turn.as_quat().tolist())
         try:
-            assert all(map(math.isfinite, inverse.torque(q, (0.1,) * 3, (1.0, 2.0, 3.0))))
+            assert all(
+                map(math.isfinite, inverse.torque(q, (0.1,) * 3, (1.0, 2.0, 3.0)))
+            )
             said.append("torque")
         except SingularConfiguration as error:
             assert "serial" in str(error) and 0.0 <= error.measure <= 1e-10
@@ -157,8 +196,14 @@ def test_gravity_torque_takes_a_state_angles_or_a_quaternion():
     inverse, state = InverseDynamics(scene), Simulation(scene).state
     expected = inverse.torque(state.quaternion, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert np.abs(expected).max() > 0.1
-    assert inverse.gravity_torque(state) == inverse.gravity_torque(state.quaternion) == expected
-    assert inverse.gravity_torque(state.joints.gamma) == pytest.approx(expected, abs=1e-13)
+    assert (
+        inverse.gravity_torque(state)
+        == inverse.gravity_torque(state.quaternion)
+        == expected
+    )
+    assert inverse.gravity_torque(state.joints.gamma) == pytest.approx(
+        expected, abs=1e-13
+    )
     assert inverse.gravity_torque(np.array(state.joints.gamma)) == pytest.approx(
         expected, abs=1e-13
     )

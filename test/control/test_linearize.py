@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear models against central differences of motions in 50 digits, and states of equilibrium."""
+"""Linear models against central differences of motions in 50 digits, and states of
+equilibrium.
+"""
 
 from dataclasses import replace
 
@@ -9,7 +11,14 @@ from mechanism.test_loads import loaded
 from models import folding_star, seeded_samples
 from mpmath import mp, mpf
 
-from sst_ros import InputError, SingularConfiguration, equilibrium, linearize, load_scene, simulate
+from sst_ros import (
+    InputError,
+    SingularConfiguration,
+    equilibrium,
+    linearize,
+    load_scene,
+    simulate,
+)
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
@@ -38,7 +47,9 @@ def move(model, y, torque, time, steps):
 
 
 def state_of(scene, near, x, coordinates):
-    """The state at x, a deviation from the state `near` unless x has gamma and gamma_dot."""
+    """The state at x, a deviation from the state `near` unless x has gamma and
+    gamma_dot.
+    """
     q, space = tuple(near[:4]), ActuatorSpaceMap(Geometry.of(scene))
     if coordinates == "star":
         return np.array([*quaternion_product(q, (*x[:3] / 2, 1)), *(near[4:] + x[3:])])
@@ -51,26 +62,38 @@ def coordinates_of(model, near, y, coordinates):
     if coordinates == "star":
         back = (*(-near[:3]), near[3])
         turn = quaternion_product(back, tuple(y[:4]))
-        return np.array([*(2 * part / turn[3] for part in turn[:3]), *(y[4:] - near[4:])])
+        return np.array(
+            [*(2 * part / turn[3] for part in turn[:3]), *(y[4:] - near[4:])]
+        )
     joints = kernel.joints(model, tuple(y[:7]))
     return np.array([*joints.gamma, *joints.gamma_dot, *y[7:]])
 
 
 def differences(scene, y, torque, coordinates, dt):
     """A and B by central differences of motions, over `dt` or over a tiny time."""
-    model, y, torque = kernel.model_of(scene), *(np.array([*map(mpf, x)]) for x in (y, torque))
+    model, y, torque = (
+        kernel.model_of(scene),
+        *(np.array([*map(mpf, x)]) for x in (y, torque)),
+    )
     spans = [(TINY, 1), (-TINY, 1)] if dt is None else [(mpf(dt), 8)]
     ends = [move(model, y, torque, *span) for span in spans]
     zero = coordinates_of(model, y, y, coordinates)
 
     def after(deviation):
         start = state_of(scene, y, zero + deviation[: len(zero)], coordinates)
-        moved = [move(model, start, torque + deviation[len(zero) :], *span) for span in spans]
-        x = [coordinates_of(model, *pair, coordinates) for pair in zip(ends, moved, strict=True)]
+        moved = [
+            move(model, start, torque + deviation[len(zero) :], *span) for span in spans
+        ]
+        x = [
+            coordinates_of(model, *pair, coordinates)
+            for pair in zip(ends, moved, strict=True)
+        ]
         return x[0] if dt else (x[0] - x[1]) / (2 * TINY)
 
     rows = TINY * np.eye(len(zero) + 3, dtype=int)
-    found = np.array([(after(row) - after(-row)) / (2 * TINY) for row in rows]).astype(float)
+    found = np.array([(after(row) - after(-row)) / (2 * TINY) for row in rows]).astype(
+        float
+    )
     return found[:-3].T, found[-3:].T
 
 
@@ -101,7 +124,9 @@ def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):
 def test_a_period_across_a_contact_has_the_model_of_differences(seed):
     scene = load_scene("elastic_stops").with_values({"torque": None})
     rng = np.random.default_rng(seed)
-    start = np.array([1.4995, 0.8019, 0.9342, 1.885, -1.97, 1.288]) + rng.normal(0.0, 0.01, 6)
+    start = np.array([1.4995, 0.8019, 0.9342, 1.885, -1.97, 1.288]) + rng.normal(
+        0.0, 0.01, 6
+    )
     x, dt = np.array([*start, *rng.normal(0.0, 1.0, 3)]), 0.1
     given = (x[:3], x[3:6])
 
@@ -124,7 +149,9 @@ def test_a_period_across_a_limit_has_no_model():
     given, still = ((0.785, 0.785, 0.785), (4.0, -2.0, -2.0)), (0.0, 0.0, 0.0)
     (end,) = simulate("elastic_stops", still, 1.0, initial=given).t[-1:]
     linearize("elastic_stops", given, still, dt=0.99 * end)
-    with pytest.raises(InputError, match=r"dt = .*: must end before a limit: beta_2 < 0"):
+    with pytest.raises(
+        InputError, match=r"dt = .*: must end before a limit: beta_2 < 0"
+    ):
         linearize("elastic_stops", given, still, dt=1.01 * end)
 
 
@@ -133,7 +160,9 @@ def test_a_start_on_a_stop_is_there_also_after_rounding():
     scene = load_scene("swing").with_values({"stroke": {"at_end": "stop"}})
     there, still = (0.0, 0.45, 0.75), (0.0, 0.0, 0.0)
     linearize(scene, (there, (0.5, 0.0, 0.0)), still, dt=0.005)
-    with pytest.raises(InputError, match=r"dt = .*: must end before a limit: gamma_1 < 0"):
+    with pytest.raises(
+        InputError, match=r"dt = .*: must end before a limit: gamma_1 < 0"
+    ):
         linearize(scene, (there, (-0.5, 0.0, 0.0)), still, dt=0.005)
 
 

@@ -80,7 +80,10 @@ def slope(motion, time, part, h=0.02):
     """Derivative of a part at a time: a polynomial through 14 values within h of it."""
     nodes = chebyshev.chebpts1(14)
     values = [part(motion.at(time + h * node)) for node in nodes]
-    return chebyshev.chebval(0.0, chebyshev.chebder(chebyshev.chebfit(nodes, values, 13))) / h
+    return (
+        chebyshev.chebval(0.0, chebyshev.chebder(chebyshev.chebfit(nodes, values, 13)))
+        / h
+    )
 
 
 def check_derivatives(motion, time):
@@ -112,18 +115,26 @@ def test_star_and_actuators_move_as_the_paper_has_it(motion):
         at = motion.at(time)
         rotation = rotation_matrix(at.quaternion)
         assert math.hypot(*at.quaternion) == pytest.approx(1.0, abs=1e-15)
-        assert kinematics.inverse(GEOMETRY, rotation)[0] == pytest.approx(at.gamma, abs=1e-14)
+        assert kinematics.inverse(GEOMETRY, rotation)[0] == pytest.approx(
+            at.gamma, abs=1e-14
+        )
         paper = rates.of_actuators(
-            virtual_work.posture(GEOMETRY, at.gamma, rotation), at.gamma_dot, at.gamma_ddot
+            virtual_work.posture(GEOMETRY, at.gamma, rotation),
+            at.gamma_dot,
+            at.gamma_ddot,
         )
         assert rotation.T @ paper.omega == pytest.approx(at.body_rate, abs=1e-13)
         size = 1.0 + np.abs(at.body_acceleration).max()
-        assert rotation.T @ paper.omega_dot == pytest.approx(at.body_acceleration, abs=1e-13 * size)
+        assert rotation.T @ paper.omega_dot == pytest.approx(
+            at.body_acceleration, abs=1e-13 * size
+        )
 
 
 @every_kind
 def test_a_motion_rests_before_and_after_and_has_no_jumps(motion):
-    """In steps of 1e-7 s nothing moves by more than its own derivative and rounding allow."""
+    """In steps of 1e-7 s nothing moves by more than its own derivative and rounding
+    allow.
+    """
     step = 1e-7
     for time, outside in ((0.0, -1.0), (motion.duration, motion.duration + 1.0)):
         end, beyond = motion.at(time), motion.at(outside)
@@ -134,7 +145,9 @@ def test_a_motion_rests_before_and_after_and_has_no_jumps(motion):
     for time in motion.pieces[1:-1]:
         before, after = motion.at(time - step), motion.at(time + step)
         for name in ("quaternion", "body_rate", "body_acceleration", "gamma_ddot"):
-            assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-3)
+            assert getattr(after, name) == pytest.approx(
+                getattr(before, name), abs=1e-3
+            )
 
 
 @every_kind
@@ -150,10 +163,16 @@ def test_a_turn_goes_straight_along_the_shorter_way():
     motion = moving(to_orientation=goal)
     begin, end = Rotation.from_quat(pose()), Rotation.from_quat(goal.orientation)
     whole, last = (begin.inv() * end).as_rotvec(), motion.at(motion.duration).quaternion
-    assert last == pytest.approx(end.as_quat() * np.sign(end.as_quat() @ last), abs=1e-15)
+    assert last == pytest.approx(
+        end.as_quat() * np.sign(end.as_quat() @ last), abs=1e-15
+    )
     for share in (0.2, 0.5, 0.9):
-        turned = begin.inv() * Rotation.from_quat(motion.at(share * motion.duration).quaternion)
-        assert turned.as_rotvec() == pytest.approx(minimum_jerk(share)[0] * whole, abs=1e-14)
+        turned = begin.inv() * Rotation.from_quat(
+            motion.at(share * motion.duration).quaternion
+        )
+        assert turned.as_rotvec() == pytest.approx(
+            minimum_jerk(share)[0] * whole, abs=1e-14
+        )
 
 
 def test_a_spiral_is_what_its_angles_say():
@@ -161,7 +180,9 @@ def test_a_spiral_is_what_its_angles_say():
     motion = moving(spiral=spiral)
     for share in (0.1, 0.5, 1.0):
         grown = minimum_jerk(share)[0]
-        theta, phi, psi = (grown * end for end in (spiral.theta, spiral.phi, spiral.psi))
+        theta, phi, psi = (
+            grown * end for end in (spiral.theta, spiral.phi, spiral.psi)
+        )
         expected = begin * Rotation.from_euler("ZYZ", [theta, phi, psi - theta])
         found = Rotation.from_quat(motion.at(share * spiral.duration).quaternion)
         assert (expected.inv() * found).magnitude() < 1e-14
@@ -171,7 +192,11 @@ def test_a_spiral_is_what_its_angles_say():
 
 @pytest.mark.parametrize("centre", [None, (0.8, 0.8, 0.8)])
 def test_a_sweep_is_a_chirp_about_the_start_or_its_centre_once_it_has_grown(centre):
-    motion, middle, time = moving(sweep=replace(SWEEP, centre=centre)), centre or START, 1.1
+    motion, middle, time = (
+        moving(sweep=replace(SWEEP, centre=centre)),
+        centre or START,
+        1.1,
+    )
     for k in range(3):
         rise = (SWEEP.last_frequency[k] - SWEEP.frequency[k]) / SWEEP.duration
         angle = SWEEP.frequency[k] * time + 0.5 * rise * time**2
@@ -192,12 +217,15 @@ def test_points_are_passed_at_their_times_with_rates_and_accelerations():
     points += [Waypoint(time=1.0, gamma=(0.9, 0.8, 0.6), gamma_ddot=(0.4, -0.3, 0.0))]
     motion = moving(waypoints=tuple(points))
     assert motion.at(0.5).gamma_dot == pytest.approx((0.3, 0.1, -0.2), abs=1e-14)
-    # The coefficients of a quintic are some ten times its values, and more for accelerations.
+    # The coefficients of a quintic are some ten times its values, and more for
+    # accelerations.
     assert motion.at(1.0).gamma_ddot == pytest.approx((0.4, -0.3, 0.0), abs=1e-12)
 
 
 def test_an_assembly_is_followed_and_not_the_nearest_or_the_first():
-    """The same gamma in two assemblies: each is carried along to where continuation brings it."""
+    """The same gamma in two assemblies: each is carried along to where continuation
+    brings it.
+    """
     found = [one for one in kinematics.direct(GEOMETRY, START) if abs(one.det_j2) > 0.3]
     assert len(found) >= 2
     ends = set()
@@ -220,26 +248,37 @@ def test_a_parallel_singularity_in_the_way_is_told_with_its_time():
     # Where two assemblies meet gamma turns back: ahead of the pose there is none.
     before = poses[1] @ Rotation.from_rotvec([0.0, 0.0, 0.1]).as_matrix()
     here, there = (kinematics.inverse(geometry, r)[0] for r in (before, poses[1]))
-    start, goal = tuple(quaternion_of(before).tolist()), (here + 3.0 * (there - here)).tolist()
-    with pytest.raises(SingularConfiguration, match=r"parallel singularity before t = 0\.\d+ s"):
+    start, goal = (
+        tuple(quaternion_of(before).tolist()),
+        (here + 3.0 * (there - here)).tolist(),
+    )
+    with pytest.raises(
+        SingularConfiguration, match=r"parallel singularity before t = 0\.\d+ s"
+    ):
         through_points(geometry, start, [1.0], [goal])
 
 
 def test_a_recorded_motion_is_what_was_recorded():
-    """Quintic between samples 2 ms apart; the accelerations at both ends are the least certain."""
+    """Quintic between samples 2 ms apart.
+
+    The accelerations at both ends are the least certain.
+    """
     scene, period, torque = load("general"), 2_000_000, (0.5, -0.4, 0.3)
     simulation = Simulation(scene, tolerance=1e-13)
     states = [simulation.state, *(simulation.step(torque, period) for _ in range(100))]
     times = np.array([state.time_ns * 1e-9 for state in states])
     gamma, gamma_dot = (
-        np.array([getattr(state.joints, k) for state in states]) for k in ("gamma", "gamma_dot")
+        np.array([getattr(state.joints, k) for state in states])
+        for k in ("gamma", "gamma_dot")
     )
     motion = through_samples(GEOMETRY, states[0].quaternion, times, gamma, gamma_dot)
     again, errors = Simulation(scene, tolerance=1e-13), []
     for _ in range(100):
         middle = again.step(torque, period // 2)
         at = motion.at(middle.time_ns * 1e-9)
-        expected = again.dynamics.derivative(*middle.quaternion, *middle.body_rate, *torque)[4:7]
+        expected = again.dynamics.derivative(
+            *middle.quaternion, *middle.body_rate, *torque
+        )[4:7]
         pairs = (
             (at.gamma, middle.joints.gamma),
             (at.quaternion, middle.quaternion),
@@ -269,8 +308,14 @@ NAN, INF = math.nan, math.inf
     ("named", "arguments"),
     [
         (r"points = 0: must be one or more", ([], [])),
-        (r"positions = 1: must have a row for each of 2 points", ([1.0, 2.0], GOOD[:1])),
-        (r"positions\[1\] = \[0.7\]: must be 3 finite numbers", ([1.0, 2.0], [GOOD[0], [0.7]])),
+        (
+            r"positions = 1: must have a row for each of 2 points",
+            ([1.0, 2.0], GOOD[:1]),
+        ),
+        (
+            r"positions\[1\] = \[0.7\]: must be 3 finite numbers",
+            ([1.0, 2.0], [GOOD[0], [0.7]]),
+        ),
         (r"positions\[0\] = .*must be 3 finite", ([1.0], [[0.8, NAN, 0.8]])),
         (r"times\[0\] = .*must be finite", ([NAN], GOOD[:1])),
         (r"times\[1\] = .*must be finite", ([1.0, INF], GOOD)),
@@ -281,10 +326,16 @@ NAN, INF = math.nan, math.inf
         (r"velocities\[0\] = .*must be zero", ([1.0], GOOD[:1], [[0.1, 0.0, 0.0]])),
         (r"velocities\[0\] = .*3 finite", ([1.0], GOOD[:1], [[0.0, 0.0]])),
         (r"accelerations = 1: .*each of 2", ([1.0, 2.0], GOOD, None, [[0.0] * 3])),
-        (r"accelerations\[1\] = .*3 finite", ([1.0, 2.0], GOOD, None, [[], [INF, 0.0, 0.0]])),
+        (
+            r"accelerations\[1\] = .*3 finite",
+            ([1.0, 2.0], GOOD, None, [[], [INF, 0.0, 0.0]]),
+        ),
         (r"positions\[0\] = .*within 0.1 rad of the start", ([0.0, 1.0], GOOD[::-1])),
         (r"path length of gamma = .*less than 100 rad", ([1.0], [[1e300, 0.0, 0.0]])),
-        (r"path length of gamma = .*less than 100", ([1.0, 2.0], GOOD, [[1e12, 0.0, 0.0], []])),
+        (
+            r"path length of gamma = .*less than 100",
+            ([1.0, 2.0], GOOD, [[1e12, 0.0, 0.0], []]),
+        ),
     ],
 )
 def test_points_that_make_no_motion_are_refused_with_the_reason(named, arguments):
@@ -345,7 +396,9 @@ def test_a_quintic_between_points_is_hermites_polynomial(seed):
 
 
 def jerk_squared(times, nodes):
-    """Integral of the jerk squared, by SciPy's polynomials and Gauss' rule, which is exact here."""
+    """Integral of the jerk squared, by SciPy's polynomials and Gauss' rule, which is
+    exact here.
+    """
     jerk = BPoly.from_derivatives(times, nodes).derivative(3)
     x, weights = np.polynomial.legendre.leggauss(3)
     h = np.diff(times)[:, None]
@@ -355,7 +408,9 @@ def jerk_squared(times, nodes):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_what_is_open_has_the_least_jerk(seed):
-    """The integral is a quadratic of the open numbers: both its neighbours are equally above."""
+    """The integral is a quadratic of the open numbers: both its neighbours are equally
+    above.
+    """
     times, *given_nodes = points(seed, 6)
     nodes = np.stack(given_nodes, axis=1)
     rng = np.random.default_rng(seed)
@@ -369,7 +424,9 @@ def test_what_is_open_has_the_least_jerk(seed):
     for index in np.argwhere(open_):
         step = np.zeros_like(filled)
         step[tuple(index)] = 0.1
-        above = [jerk_squared(times, filled + sign * step) - least for sign in (-1.0, 1.0)]
+        above = [
+            jerk_squared(times, filled + sign * step) - least for sign in (-1.0, 1.0)
+        ]
         assert min(above) > 0.0
         assert above[0] == pytest.approx(above[1], abs=1e-9 * (least + above[0]))
 
@@ -377,7 +434,9 @@ def test_what_is_open_has_the_least_jerk(seed):
 def test_thousands_of_samples_are_completed_at_once():
     """A recording of 20 s at 1 kHz: the band is solved in one go."""
     times = np.arange(20_001) * 1e-3
-    positions, velocities = (f(3.0 * times)[:, None] for f in (np.sin, lambda x: 3.0 * np.cos(x)))
+    positions, velocities = (
+        f(3.0 * times)[:, None] for f in (np.sin, lambda x: 3.0 * np.cos(x))
+    )
     found = quintic(times, positions, velocities, np.full_like(positions, OPEN))
     fine = np.linspace(1.0, 19.0, 501)
     assert found(fine)[:, 2, 0] == pytest.approx(-9.0 * np.sin(3.0 * fine), abs=1e-6)

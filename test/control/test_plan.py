@@ -68,7 +68,9 @@ def swing_torque(time):
     law = WAY * np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     u = time / TIME
     x, rate, acceleration = law(u), law.deriv()(u) / TIME, law.deriv(2)(u) / TIME**2
-    return inertia(EXAMPLE1, x) * acceleration + 0.5 * inertia_slope(EXAMPLE1, x) * rate**2, rate
+    return inertia(EXAMPLE1, x) * acceleration + 0.5 * inertia_slope(
+        EXAMPLE1, x
+    ) * rate**2, rate
 
 
 def summit(function, count=400):
@@ -77,7 +79,10 @@ def summit(function, count=400):
     top = int(np.argmax([abs(function(time)) for time in times]))
     bounds = times[max(top - 1, 0)], times[min(top + 1, count - 1)]
     found = minimize_scalar(
-        lambda time: -abs(function(time)), bounds=bounds, method="bounded", options={"xatol": 1e-12}
+        lambda time: -abs(function(time)),
+        bounds=bounds,
+        method="bounded",
+        options={"xatol": 1e-12},
     )
     return function(found.x), found.x
 
@@ -105,7 +110,9 @@ def test_demands_of_the_one_degree_of_freedom_are_its_closed_form():
             assert found.time == pytest.approx(time, abs=1e-6)
         assert plan.torque_rms[leg] == pytest.approx(math.sqrt(square / TIME), rel=1e-6)
         assert peaks["velocity"].value == pytest.approx(VELOCITY, rel=1e-14)
-        assert abs(peaks["acceleration"].value) == pytest.approx(ACCELERATION, rel=1e-14)
+        assert abs(peaks["acceleration"].value) == pytest.approx(
+            ACCELERATION, rel=1e-14
+        )
         at = {round(share * TIME, 6) for share in (root, 1.0 - root)}
         assert round(peaks["acceleration"].time, 6) in at
 
@@ -113,16 +120,24 @@ def test_demands_of_the_one_degree_of_freedom_are_its_closed_form():
 @FAST
 @given(st.floats(0.0, 6.3), st.floats(0.5, 12.0), st.integers(40, 90))
 def test_extremes_between_samples_are_found(phase, frequency, count):
-    """Two sines of up to two periods, some 20 samples each at least; the truth from 20001."""
+    """Two sines of up to two periods, some 20 samples each at least.
+
+    The truth from 20001.
+    """
 
     def function(time):
-        return math.sin(frequency * time + phase) + 0.5 * math.sin(2.3 * frequency * time)
+        return math.sin(frequency * time + phase) + 0.5 * math.sin(
+            2.3 * frequency * time
+        )
 
     times, fine = np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, 20_001)
     values = np.array([function(time) for time in times.tolist()])
     truth = np.array([function(time) for time in fine.tolist()])
-    # A parabola through the best of the fine samples is lower than the truth by 1e-6 at most.
-    assert maximum(function, times, values).value == pytest.approx(truth.max(), abs=2e-6)
+    # A parabola through the best of the fine samples is lower than the truth by 1e-6 at
+    # most.
+    assert maximum(function, times, values).value == pytest.approx(
+        truth.max(), abs=2e-6
+    )
     low = maximum(lambda time: -function(time), times, -values)
     assert -low.value == pytest.approx(truth.min(), abs=2e-6)
     assert maximum(function, times, values).value >= truth.max() - 1e-12
@@ -149,7 +164,9 @@ def test_the_speed_of_pure_inertia_is_a_quotient_or_a_root(limits, highest, bind
 
 def rubbing(duration, limit):
     """A turn under gravity with friction: torques that follow no power of the speed."""
-    rub = JointFriction(gamma=Friction(viscous=0.3, coulomb=0.2), beta=Friction(coulomb=0.1))
+    rub = JointFriction(
+        gamma=Friction(viscous=0.3, coulomb=0.2), beta=Friction(coulomb=0.1)
+    )
     turn = Rotation.from_quat(
         quaternion_of(kinematics.admissible(Geometry.of(EXAMPLE1), HOME).rotation)
     )
@@ -177,21 +194,32 @@ def test_the_highest_speed_is_where_the_check_turns():
 
 def test_a_weight_beyond_the_limit_is_infeasible_at_any_speed():
     plan = planned(rubbing(1.0, 0.5))
-    assert {problem.key for problem in plan.problems} <= {f"torque_{leg}" for leg in (1, 2, 3)}
+    assert {problem.key for problem in plan.problems} <= {
+        f"torque_{leg}" for leg in (1, 2, 3)
+    }
     assert plan.problems and time_scaling(plan).highest is None
 
 
 def resonant(factor=1.0):
-    """A sweep against springs: near their resonance it takes little, slower and faster it does."""
-    springs = tuple(Spring(joint=f"gamma_{k}", stiffness=20.0, rest=HOME[0]) for k in (1, 2, 3))
+    """A sweep against springs: near their resonance it takes little, slower and faster
+    it does.
+    """
+    springs = tuple(
+        Spring(joint=f"gamma_{k}", stiffness=20.0, rest=HOME[0]) for k in (1, 2, 3)
+    )
     own = factor * math.sqrt(20.0 / inertia(EXAMPLE1, 0.0))
-    motion = Sweep(amplitude=(0.1,) * 3, frequency=(own,) * 3, fade=20.0 / own, duration=60.0 / own)
+    motion = Sweep(
+        amplitude=(0.1,) * 3, frequency=(own,) * 3, fade=20.0 / own, duration=60.0 / own
+    )
     motion, actuators = DesiredMotion(sweep=motion), Actuators(torque_limit=1.2)
     return replace(EXAMPLE1, springs=springs, actuators=actuators, motion=motion)
 
 
 def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
-    """At rest the springs ask for 20 * 0.1 = 2 N m at the turning points; 1.2 are there."""
+    """At rest the springs ask for 20 * 0.1 = 2 N m at the turning points.
+
+    1.2 are there.
+    """
     found = time_scaling(planned(resonant()))
     assert found.highest is not None and 0.3 < found.lowest < 1.0 < found.highest
     for end, inside in ((found.lowest, 1.0 + 1e-6), (found.highest, 1.0 - 1e-6)):
@@ -202,7 +230,9 @@ def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
 def test_what_leaves_the_stroke_is_refused_unless_the_scene_ignores_it():
     away = DesiredMotion(to_angles=ToAngles(gamma=(1.7, 0.9, 0.9), duration=1.0))
     scene = replace(EXAMPLE1, motion=away, workspace=FREE["workspace"])
-    with pytest.raises(MotionRefused, match=r"gamma_1 = 1\.7.*must stay below 1\.57079633 rad"):
+    with pytest.raises(
+        MotionRefused, match=r"gamma_1 = 1\.7.*must stay below 1\.57079633 rad"
+    ):
         planned(scene, check_motion)
     elastic = replace(scene, stroke=Stroke(at_end="elastic", stiffness=1e3))
     assert planned(elastic).problems
@@ -231,7 +261,11 @@ def test_limits_are_held_between_samples_and_told_with_the_instant():
     assert not planned(swing(torque_limit=limit * (1.0 + 1e-12)), check_motion).problems
     with pytest.raises(MotionRefused) as told:
         planned(swing(torque_limit=limit * (1.0 - 1e-9)), check_motion)
-    assert [problem.key for problem in told.value.problems] == ["torque_1", "torque_2", "torque_3"]
+    assert [problem.key for problem in told.value.problems] == [
+        "torque_1",
+        "torque_2",
+        "torque_3",
+    ]
     fast = planned(swing(velocity_limit=1.1, acceleration_limit=6.9))
     keys = {problem.key.partition("_")[0] for problem in fast.problems}
     assert keys == {"velocity", "acceleration"}
@@ -239,7 +273,9 @@ def test_limits_are_held_between_samples_and_told_with_the_instant():
 
 def test_a_turn_through_a_parallel_singularity_is_refused():
     scene, poses = folding_star()
-    ends = (Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() for angle in (-0.1, 0.123))
+    ends = (
+        Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() for angle in (-0.1, 0.123)
+    )
     first, last = (tuple(quaternion_of(poses[1] @ end).tolist()) for end in ends)
     motion = geodesic_motion(Geometry.of(scene), first, last, 1.0)
     with pytest.raises(
@@ -266,7 +302,9 @@ def test_shipped_motions_are_feasible_and_end_where_they_should(name):
     plan = planned(scene, check_motion)
     assert scene.duration == plan.motion.duration
     assert time_scaling(plan).highest > 1.0
-    assert min(distance.least for distance in plan.distances if distance.sign > 0.0) > 0.1
+    assert (
+        min(distance.least for distance in plan.distances if distance.sign > 0.0) > 0.1
+    )
 
 
 def test_the_command_tells_verdict_and_status(capsys, tmp_path):
@@ -301,7 +339,9 @@ def test_json_says_what_the_table_says(capsys):
 
 
 def test_written_torques_do_the_motion(tmp_path):
-    """Held torques of the middles err with the square of the period: 16 times less at a quarter."""
+    """Held torques of the middles err with the square of the period: 16 times less at a
+    quarter.
+    """
     scene, errors = load("point_to_point"), []
     goal = reference_motion(scene).at(1.0).gamma
     for period_ns in (8_000_000, 2_000_000):

@@ -26,7 +26,10 @@ def written(folder, text, encoding="utf-8"):
 @FAST
 @given(st.floats(0.0, 10.0))
 def test_torques_of_example_2_are_the_printed_ones(t):
-    """4 sin 18t, 5 cos 12t, 3 cos 24t; phases of pi/2 cost rounding of angles up to 240."""
+    """4 sin 18t, 5 cos 12t, 3 cos 24t.
+
+    Phases of pi/2 cost rounding of angles up to 240.
+    """
     first, second, third = load("example2_heavy").torque.at(t)
     assert first == pytest.approx(4.0 * math.sin(18.0 * t), abs=1e-13)
     assert second == pytest.approx(5.0 * math.cos(12.0 * t), abs=5e-13)
@@ -37,7 +40,12 @@ def test_rows_hold_until_the_next_and_before_the_first_there_is_no_torque(tmp_pa
     profile = TorqueTable.read(written(tmp_path, HEADER + "0.5,1,2,3\n1.0,-4,5e-1,6\n"))
     assert profile.times[-1] == 1.0
     assert profile(math.nextafter(0.5, 0.0)) == profile(-1.0) == (0.0, 0.0, 0.0)
-    assert profile(0.5) == profile(0.75) == profile(math.nextafter(1.0, 0.0)) == (1.0, 2.0, 3.0)
+    assert (
+        profile(0.5)
+        == profile(0.75)
+        == profile(math.nextafter(1.0, 0.0))
+        == (1.0, 2.0, 3.0)
+    )
     assert profile(1.0) == profile(9.0) == (-4.0, 0.5, 6.0)
 
 
@@ -61,9 +69,13 @@ def test_a_table_as_other_programs_write_it(tmp_path, text):
     assert profile(0.0) == (1.0, 2.0, 3.0) and profile.times.tolist() == [0.0]
 
 
-@pytest.mark.parametrize("number", ["1_0", "\u0661", "\uff11", "0x1", "1e", "infinity", "1e400"])
+@pytest.mark.parametrize(
+    "number", ["1_0", "\u0661", "\uff11", "0x1", "1e", "infinity", "1e400"]
+)
 def test_numbers_are_those_of_scenes(tmp_path, number):
-    with pytest.raises(InputError, match=r"line 2: row = .*must be four finite numbers"):
+    with pytest.raises(
+        InputError, match=r"line 2: row = .*must be four finite numbers"
+    ):
         TorqueTable.read(written(tmp_path, HEADER + f"0,1,{number},3\n"))
 
 
@@ -80,15 +92,30 @@ def test_each_column_is_there_once(tmp_path, header):
         ("0,1,2,3\n", r"line 1: header = \['0', .*: must be time, tau_1, tau_2, tau_3"),
         ("t,tau_1,tau_2,tau_3\n", r"line 1: header = \['t', .*: must be time,"),
         (HEADER, r"rows = 0: must be one or more"),
-        (HEADER + "0,1,2\n", r"line 2: row = \['0', '1', '2'\]: must be four finite numbers"),
+        (
+            HEADER + "0,1,2\n",
+            r"line 2: row = \['0', '1', '2'\]: must be four finite numbers",
+        ),
         (HEADER + "0,1,2,3,4\n", r"line 2: row = .*: must be four finite numbers"),
         (HEADER + "0,1,2,x\n", r"line 2: row = .*'x'\]: must be four finite numbers"),
-        (HEADER + "0,1,2,nan\n", r"line 2: row = .*'nan'\]: must be four finite numbers"),
+        (
+            HEADER + "0,1,2,nan\n",
+            r"line 2: row = .*'nan'\]: must be four finite numbers",
+        ),
         (HEADER + "0,1,inf,3\n", r"line 2: row = .*: must be four finite numbers"),
         (HEADER + "nan,1,2,3\n", r"line 2: row = .*: must be four finite numbers"),
-        (HEADER + "0,1,2,3\n\n1,1,2,3\n", r"line 3: row = \[\]: must be four finite numbers"),
-        (HEADER + "0,1,2,3\n0,1,2,3\n", r"line 3: time = 0\.0: must be > 0 s, the last"),
-        (HEADER + "1,1,2,3\n0.5,1,2,3\n", r"line 3: time = 0\.5: must be > 1 s, the last"),
+        (
+            HEADER + "0,1,2,3\n\n1,1,2,3\n",
+            r"line 3: row = \[\]: must be four finite numbers",
+        ),
+        (
+            HEADER + "0,1,2,3\n0,1,2,3\n",
+            r"line 3: time = 0\.0: must be > 0 s, the last",
+        ),
+        (
+            HEADER + "1,1,2,3\n0.5,1,2,3\n",
+            r"line 3: time = 0\.5: must be > 1 s, the last",
+        ),
         (HEADER + '"0\n', r"line 2: row = .*: must be four finite numbers"),
         (HEADER + "1" * 200_000, r"must be readable .*field larger"),
     ],

@@ -11,11 +11,16 @@ TIME = np.linspace(0.0, 2.0, 2001)
 
 
 def track(error, gamma=None, **given):
-    """A track of the same error in all joints; gamma rises over the first second by default."""
+    """A track of the same error in all joints.
+
+    Gamma rises over the first second by default.
+    """
     gamma = np.minimum(TIME, 1.0) if gamma is None else gamma
     columns = {"gamma": gamma, "gamma_dot": np.gradient(gamma), "error": error}
     columns |= {name: np.zeros_like(TIME) for name in ("feedforward", "feedback")}
-    columns |= {"torque": given.get("feedforward", 0.0) + given.get("feedback", 0.0 * TIME)}
+    columns |= {
+        "torque": given.get("feedforward", 0.0) + given.get("feedback", 0.0 * TIME)
+    }
     columns |= given
     parts = (np.outer(columns[name], [1, 1, 1]) for name in TRACK.names[1:])
     return track_of(np.column_stack([TIME, *parts]))
@@ -37,7 +42,8 @@ def test_settling_time_of_a_decay_after_the_motion():
 
 
 def test_settling_time_is_unknown_where_it_is_not_seen():
-    assert TrackingMetrics(track(np.full_like(TIME, 0.5))).settling is None  # never settles
+    # never settles
+    assert TrackingMetrics(track(np.full_like(TIME, 0.5))).settling is None
     endless = track(0.0 * TIME, gamma=TIME)  # the motion never ends
     assert TrackingMetrics(endless).settling is None
     assert TrackingMetrics(track(0.0 * TIME)).settling == 0.0
@@ -47,10 +53,14 @@ def test_shares_are_those_of_the_torque_and_sum_to_one():
     feedforward = 3.0 * np.sin(2.0 * np.pi * TIME[:-1])
     feedback = np.cos(2.0 * np.pi * TIME[:-1])
     whole = track(
-        0.0 * TIME, feedforward=np.append(feedforward, 0.0), feedback=np.append(feedback, 0.0)
+        0.0 * TIME,
+        feedforward=np.append(feedforward, 0.0),
+        feedback=np.append(feedback, 0.0),
     )
     found = TrackingMetrics(whole)
-    assert found.shares[0] == pytest.approx(0.9) and found.shares[1] == pytest.approx(0.1)
+    assert found.shares[0] == pytest.approx(0.9) and found.shares[1] == pytest.approx(
+        0.1
+    )
     assert found.torque_rms == pytest.approx(np.sqrt(5.0), rel=1e-3)
     nothing = TrackingMetrics(track(0.0 * TIME))
     assert np.isnan(nothing.shares).all()
@@ -75,4 +85,6 @@ def test_a_record_in_parts_has_the_metrics_of_the_whole(size):
         found.add(whole[first : first + size])
     expected = TrackingMetrics(whole, 3)
     for name in {name for name in dir(expected) if name[0] != "_"} - {"add"}:
-        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-12), name
+        assert getattr(found, name) == pytest.approx(
+            getattr(expected, name), rel=1e-12
+        ), name

@@ -19,7 +19,8 @@ from sst_ros.scene.scene import names
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
 
-AS_LOADED = 3e-4  # relative: MuJoCo's ties give way by (1 - 0.9999) of a load, whatever they tie
+# relative: MuJoCo's ties give way by (1 - 0.9999) of a load, whatever they tie
+AS_LOADED = 3e-4
 STIFF = 3e-7  # with MOBILITY, up to the tolerance of its solver
 MOBILITY = 1e-3  # of bodies in ties, in place of MuJoCo's own estimate [1/kg]
 
@@ -66,7 +67,9 @@ def test_accelerations_are_those_of_the_package(name):
 
 
 def test_every_load_that_mujoco_has_is_in_it():
-    """Payload, gravity, springs, viscous friction, rotors, lag, general inertia, at once."""
+    """Payload, gravity, springs, viscous friction, rotors, lag, general inertia, at
+    once.
+    """
     scene = without_dry_friction(loaded())
     scene = replace(scene, stroke=load_scene("general").stroke)
     found, expected = accelerations(scene, MOBILITY)

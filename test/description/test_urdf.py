@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The URDF of a scene, as Pinocchio, MuJoCo and ros2_control read it; shapes of the links."""
+"""The URDF of a scene, as Pinocchio, MuJoCo and ros2_control read it.
+
+Shapes of the links.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,9 @@ class Read:
     """A URDF as Pinocchio reads it."""
 
     def __init__(self, scene):
-        self.pin = pytest.importorskip("pinocchio", reason="Pinocchio is missing: pip install pin")
+        self.pin = pytest.importorskip(
+            "pinocchio", reason="Pinocchio is missing: pip install pin"
+        )
         self.model = self.pin.buildModelFromXML(urdf(scene))
         self.data = self.model.createData()
 
@@ -63,7 +68,9 @@ class Read:
         return q
 
     def rotation(self, angles, link):
-        self.pin.framesForwardKinematics(self.model, self.data, self.configuration(angles))
+        self.pin.framesForwardKinematics(
+            self.model, self.data, self.configuration(angles)
+        )
         placement = self.data.oMf[self.model.getFrameId(link, self.pin.FrameType.BODY)]
         assert not placement.translation.any()
         return placement.rotation
@@ -132,11 +139,16 @@ def test_masses_are_those_of_the_scene_or_said_to_be_assumed():
     assert "has no masses" in urdf(bare)
     # Thin arcs on the sphere: the printed masses come back.
     read = Read(bare)
-    assert read.model.inertias[read.model.getJointId("gamma_1")].mass == pytest.approx(0.3)
+    assert read.model.inertias[read.model.getJointId("gamma_1")].mass == pytest.approx(
+        0.3
+    )
 
 
 def closed(read, geometry):
-    """Lock the frames without bodies; tie a point of the axis t_k on legs 2 and 3 to the star."""
+    """Lock the frames without bodies.
+
+    Tie a point of the axis t_k on legs 2 and 3 to the star.
+    """
     pin = read.pin
     locked = [read.model.getJointId(name) for name in ("beta_2", "beta_3")]
     model = pin.buildReducedModel(read.model, locked, pin.neutral(read.model))
@@ -160,7 +172,9 @@ def acceleration(scene, angles, motion, torque, moment=(0.0, 0.0, 0.0)):
     read.model, read.data = model, model.createData()
     gravity = scene.gravity.acceleration if scene.gravity else (0.0, 0.0, 0.0)
     model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
-    open_joints = {name: angle for name, angle in angles.items() if model.existJointName(name)}
+    open_joints = {
+        name: angle for name, angle in angles.items() if model.existJointName(name)
+    }
     q, v, u = read.configuration(open_joints), np.zeros(model.nv), np.zeros(model.nv)
     rate_of = by_joint(motion.gamma_dot, motion.mu_dot, motion.beta_dot)
     for name in open_joints:
@@ -169,12 +183,18 @@ def acceleration(scene, angles, motion, torque, moment=(0.0, 0.0, 0.0)):
         u[model.joints[model.getJointId(f"gamma_{leg}")].idx_v] = torque[k]
     pin.computeJointJacobians(model, read.data, q)
     in_base = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    u += pin.getJointJacobian(model, read.data, model.getJointId("beta_1"), in_base)[3:].T @ moment
+    u += (
+        pin.getJointJacobian(model, read.data, model.getJointId("beta_1"), in_base)[
+            3:
+        ].T
+        @ moment
+    )
     try:
         pin.initConstraintDynamics(model, read.data, ties, tied)
     except TypeError:  # before Pinocchio 4
         pin.initConstraintDynamics(model, read.data, ties)
-    # Each tie has three rows of rank two: proximal steps bring the least-squares answer.
+    # Each tie has three rows of rank two: proximal steps bring the least-squares
+    # answer.
     proximal = pin.ProximalSettings(1e-16, 1e-3, 30)
     a = pin.constraintDynamics(model, read.data, q, v, u, ties, tied, proximal)
     pin.forwardKinematics(model, read.data, q, v, a)
@@ -184,7 +204,9 @@ def acceleration(scene, angles, motion, torque, moment=(0.0, 0.0, 0.0)):
 @pytest.mark.parametrize("seed", range(32))
 def test_motion_of_random_mechanisms(seed):
     """Other engines are compared, on one scene, in test/benchmark/test_peers.py."""
-    sample = random_sample(np.random.default_rng(seed), ISOTROPIC if seed % 4 == 0 else None)
+    sample = random_sample(
+        np.random.default_rng(seed), ISOTROPIC if seed % 4 == 0 else None
+    )
     loads = sample.torque, sample.moment
     answer = virtual_work.direct_dynamics(
         sample.mechanism, sample.posture, sample.gamma_dot, *loads
@@ -198,7 +220,10 @@ def test_motion_of_random_mechanisms(seed):
 
 def test_motion_under_gravity_with_payload_and_rotors():
     scene = replace(loaded(), friction=None, moment=None, actuators=GEARED)
-    geometry, gamma = Geometry.of(scene), np.add(scene.initial.gamma, [0.05, -0.03, 0.02])
+    geometry, gamma = (
+        Geometry.of(scene),
+        np.add(scene.initial.gamma, [0.05, -0.03, 0.02]),
+    )
     at = virtual_work.posture(geometry, gamma)
     gamma_dot, torque = np.array([1.0, -2.0, 0.5]), np.array([0.3, -1.0, 2.0])
     motion = rates.of_actuators(at, gamma_dot)
@@ -209,24 +234,33 @@ def test_motion_under_gravity_with_payload_and_rotors():
         )
     found = acceleration(scene, angles, motion, torque)
     state = (*quaternion_of(at.rotation), *(at.rotation.T @ motion.omega))
-    expected = np.array(Dynamics.of(replace(scene, springs=())).derivative(*state, *torque)[4:7])
+    expected = np.array(
+        Dynamics.of(replace(scene, springs=())).derivative(*state, *torque)[4:7]
+    )
     assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("name", names())
 def test_mujoco_loads_every_scene(name):
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
+    mujoco = pytest.importorskip(
+        "mujoco", reason="MuJoCo is missing: pip install mujoco"
+    )
     model = mujoco.MjModel.from_xml_string(urdf(load(name)))
     assert {model.joint(i).name for i in range(model.njnt)} == set(JOINTS)
-    assert model.body_inertia[1:].min() == LEAST  # of the frames, which MuJoCo wants to weigh
+    # of the frames, which MuJoCo wants to weigh
+    assert model.body_inertia[1:].min() == LEAST
 
 
 def test_mujoco_reads_it():
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
+    mujoco = pytest.importorskip(
+        "mujoco", reason="MuJoCo is missing: pip install mujoco"
+    )
     sample = seeded_samples(3, 1)[0]
     model = mujoco.MjModel.from_xml_string(urdf(sample.scene))
     data = mujoco.MjData(model)
-    for name, angle in angles_of(sample.geometry, sample.gamma, sample.rotation).items():
+    for name, angle in angles_of(
+        sample.geometry, sample.gamma, sample.rotation
+    ).items():
         data.qpos[model.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)
     for star in STARS:
@@ -237,8 +271,13 @@ def test_mujoco_reads_it():
 
 @pytest.mark.parametrize("name", names())
 def test_mujoco_loads_every_scene_as_it_is_written(name):
-    """It refuses a moving body without mass or inertia; the torques act on what has been read."""
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is missing: pip install mujoco")
+    """It refuses a moving body without mass or inertia.
+
+    The torques act on what has been read.
+    """
+    mujoco = pytest.importorskip(
+        "mujoco", reason="MuJoCo is missing: pip install mujoco"
+    )
     model = mujoco.MjModel.from_xml_string(urdf(load(name)))
     data = mujoco.MjData(model)
     assert {model.joint(i).name for i in range(model.njnt)} == set(JOINTS)
@@ -276,17 +315,25 @@ def test_ends_limits_and_friction_are_in_it():
     friction = load("friction").friction.gamma
     assert float(first.find("dynamics").get("damping")) == friction.viscous
     limited = replace(load("example2_heavy"), actuators=Actuators(torque_limit=4.0))
-    effort = ET.fromstring(urdf(limited)).find("joint[@name='gamma_2']/limit").get("effort")
+    effort = (
+        ET.fromstring(urdf(limited)).find("joint[@name='gamma_2']/limit").get("effort")
+    )
     assert float(effort) == 4.0
 
 
 @pytest.mark.parametrize("name", names())
 def test_limits_are_those_of_a_drive_and_shapes_can_be_hit(name):
-    """As Pinocchio reads them: finite, above the scene's own start; no drive, no torque."""
+    """As Pinocchio reads them: finite, above the scene's own start.
+
+    No drive, no torque.
+    """
     scene, read = load(name), Read(load(name))
     motor = scene.actuators or Actuators(torque_limit=10.6)
     for joint, effort, rate in zip(
-        read.model.names[1:], read.model.effortLimit, read.model.velocityLimit, strict=True
+        read.model.names[1:],
+        read.model.effortLimit,
+        read.model.velocityLimit,
+        strict=True,
     ):
         driven = joint.startswith("gamma")
         assert effort == (motor.torque_limit if driven else 0.0)
@@ -294,12 +341,15 @@ def test_limits_are_those_of_a_drive_and_shapes_can_be_hit(name):
         assert rate == (motor.velocity_limit if driven else 0.0) or rate >= np.pi
     kinds = read.pin.GeometryType.VISUAL, read.pin.GeometryType.COLLISION
     document = urdf(scene)
-    seen, hit = (read.pin.buildGeomFromUrdfString(read.model, document, kind) for kind in kinds)
+    seen, hit = (
+        read.pin.buildGeomFromUrdfString(read.model, document, kind) for kind in kinds
+    )
     assert len(hit.geometryObjects) == len(seen.geometryObjects) > 50
     for one, other in zip(hit.geometryObjects, seen.geometryObjects, strict=True):
         assert one.parentJoint == other.parentJoint and one.placement == other.placement
         one.geometry.computeLocalAABB()
-        assert 0.0 < one.geometry.aabb_radius < 0.5  # of the radii of the scenes, 0.35 and 0.4 m
+        # of the radii of the scenes, 0.35 and 0.4 m
+        assert 0.0 < one.geometry.aabb_radius < 0.5
 
 
 def test_an_arc_begins_ends_and_stays_on_its_sphere():
@@ -316,7 +366,11 @@ def test_every_scene_is_drawn(name):
     drawn = shapes(load(name))
     assert len(drawn) == 8
     for shape in (shape for link in drawn.values() for shape in link):
-        size = shape.size.min() if isinstance(shape, Box) else getattr(shape, "radius", 1.0)
+        size = (
+            shape.size.min()
+            if isinstance(shape, Box)
+            else getattr(shape, "radius", 1.0)
+        )
         assert size > 0.0 and getattr(shape, "thickness", 1.0) > 0.0
         ends = (shape.centre,) if isinstance(shape, Ball | Box) else ()
         assert all(np.isfinite(end).all() for end in ends)
@@ -333,7 +387,9 @@ def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name)
 
 
 @pytest.mark.parametrize("lockstep", [False, True])
-def test_the_tags_have_the_joints_the_topics_and_the_states_before_the_first_message(lockstep):
+def test_the_tags_have_the_joints_the_topics_and_the_states_before_the_first_message(
+    lockstep,
+):
     """Without those a controller that is activated first holds nan, and no run starts."""
     scene = load("swing")
     text = urdf(scene, ("/a/commands", "/a/states"), lockstep=lockstep)
@@ -356,13 +412,23 @@ def test_the_tags_have_the_joints_the_topics_and_the_states_before_the_first_mes
     assert [joint.get("name") for joint in tag.findall("joint")] == ACTUATORS
     starts = zip(scene.initial.gamma, scene.initial.gamma_dot, strict=True)
     for joint, (gamma, gamma_dot) in zip(tag.findall("joint"), starts, strict=True):
-        assert [one.get("name") for one in joint.findall("command_interface")] == ["effort"]
+        assert [one.get("name") for one in joint.findall("command_interface")] == [
+            "effort"
+        ]
         assert [
-            (one.get("name"), one.find("param").get("name"), float(one.findtext("param")))
+            (
+                one.get("name"),
+                one.find("param").get("name"),
+                float(one.findtext("param")),
+            )
             for one in joint.findall("state_interface")
         ] == [
             (name, "initial_value", value)
-            for name, value in (("position", gamma), ("velocity", gamma_dot), ("effort", 0.0))
+            for name, value in (
+                ("position", gamma),
+                ("velocity", gamma_dot),
+                ("effort", 0.0),
+            )
         ]
 
 
@@ -381,9 +447,14 @@ def test_the_command_writes_both_and_the_rest_of_the_second_is_the_first(capsys)
 
 def test_every_controller_has_its_parameters_and_drives_the_actuators():
     document = yaml.safe_load(CONTROLLERS.read_text(encoding="utf-8"))
-    given = {name.rpartition("/")[2]: node["ros__parameters"] for name, node in document.items()}
+    given = {
+        name.rpartition("/")[2]: node["ros__parameters"]
+        for name, node in document.items()
+    }
     manager = given.pop("controller_manager")
-    assert set(given) == {name for name, value in manager.items() if isinstance(value, dict)}
+    assert set(given) == {
+        name for name, value in manager.items() if isinstance(value, dict)
+    }
     assert given["joint_state_broadcaster"]["use_local_topics"] is True
     for name in ("effort_controller", "trajectory_controller", "pid_controller"):
         joints = given[name].get("joints", given[name].get("dof_names"))

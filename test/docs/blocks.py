@@ -51,7 +51,9 @@ def prose(page):
 def commands(text):
     """Lines of a shell block: continued ones joined, comments and empty ones left out."""
     joined = re.sub(r"\s*\\\n\s*", " ", text)
-    bare = (re.sub(r"(^|\s)#(?!!).*$", "", line).strip() for line in joined.splitlines())
+    bare = (
+        re.sub(r"(^|\s)#(?!!).*$", "", line).strip() for line in joined.splitlines()
+    )
     return [line for line in bare if line]
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that need what a plain machine has not: checked against what exists in the tree."""
+"""Commands that need what a plain machine has not: checked against what exists in the
+tree.
+"""
 
 import re
 import shlex
@@ -54,7 +56,9 @@ def _ros2(words):
     elif words[0] in ENDPOINTS:
         verbs, *uses = ENDPOINTS[words[0]]
         assert words[1] in verbs.split(), words
-        given = [w for w in words[2:] if w[0] in "/{" or re.search("/(msg|srv|action)/", w)]
+        given = [
+            w for w in words[2:] if w[0] in "/{" or re.search("/(msg|srv|action)/", w)
+        ]
         _endpoint(names(*uses), *given)
     elif words[0] == "param":
         assert words[1] in ("get", "set"), words
@@ -65,17 +69,26 @@ def _ros2(words):
             _value(spec, words[4])
     elif words[0] == "bag":
         for word in words:
-            assert not word.startswith("/") or word in names(PUBLISHES, SUBSCRIBES), word
+            assert not word.startswith("/") or word in names(PUBLISHES, SUBSCRIBES), (
+                word
+            )
     else:
-        assert words[0] in ("pkg", "security"), f"ros2 {words[0]} is not known to this test"
+        assert words[0] in (
+            "pkg",
+            "security",
+        ), f"ros2 {words[0]} is not known to this test"
 
 
 def run(words):
-    """Check an executable and its parameters, as plain options or as --ros-args has them."""
+    """Check an executable and its parameters, as plain options or as --ros-args has
+    them.
+    """
     command, *rest = words
     assert (ROOT / "executables" / command).is_file(), command
     known = COMMANDS[command][1].SPECS
-    for name, assigned, text in (w.partition(":=") for w in ros_arguments(command, rest)):
+    for name, assigned, text in (
+        w.partition(":=") for w in ros_arguments(command, rest)
+    ):
         if assigned and name in known:
             _value(known[name], text)
 
@@ -91,7 +104,9 @@ def _value(spec, text):
 def _launch(words):
     name, *given = words
     shared = ROOT / "sst_ros" / "launch_parts.py"
-    text = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "launch" / name, shared))
+    text = "".join(
+        path.read_text(encoding="utf-8") for path in (ROOT / "launch" / name, shared)
+    )
     for argument in (word.partition(":=")[0] for word in given if ":=" in word):
         assert f'"{argument}"' in text, f"{name} has no argument {argument}"
 
@@ -115,7 +130,9 @@ def _endpoint(offered, name, kind=None, content="{}"):
 def _make(words):
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in (word for word in words if "=" not in word):
-        assert re.search(rf"^{target}:", makefile, re.M), f"make {target} is not in the Makefile"
+        assert re.search(rf"^{target}:", makefile, re.M), (
+            f"make {target} is not in the Makefile"
+        )
 
 
 def _pip(words):

@@ -31,7 +31,10 @@ class Terminal:
         self.words, self.log = words, log
         with log.open("w") as file:
             self.process = subprocess.Popen(
-                ["bash", "-c", f"exec {line}"], stdout=file, stderr=subprocess.STDOUT, **given
+                ["bash", "-c", f"exec {line}"],
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                **given,
             )
 
     def wait_for(self, condition):
@@ -46,20 +49,30 @@ class Terminal:
         assert self.process.returncode == 0, self
 
     def __str__(self):
-        return f"{shlex.join(self.words)}: {self.process.returncode}\n{self.log.read_text()}"
+        return (
+            f"{shlex.join(self.words)}:"
+            f" {self.process.returncode}\n{self.log.read_text()}"
+        )
 
 
 class Session:
-    """Runs blocks in order; what a node was told to write is there for the next command."""
+    """Runs blocks in order.
+
+    What a node was told to write is there for the next command.
+    """
 
     def __init__(self, folder: Path, domain: int | None):
         self.folder = folder
         (folder / ".venv").symlink_to(sys.prefix)
         shutil.copytree(ROOT / "examples", folder / "examples")
-        shutil.copy(ROOT / "config" / "scenes" / "general.yaml", folder / "my_scene.yaml")
+        shutil.copy(
+            ROOT / "config" / "scenes" / "general.yaml", folder / "my_scene.yaml"
+        )
         self.environment = {
             **os.environ,
-            "PATH": os.pathsep.join([str(Path(sys.prefix) / "bin"), os.environ["PATH"]]),
+            "PATH": os.pathsep.join(
+                [str(Path(sys.prefix) / "bin"), os.environ["PATH"]]
+            ),
             "MPLBACKEND": "agg",
         }
         self._domain = domain
@@ -68,7 +81,11 @@ class Session:
     def run(self, block):
         """Run a block, or check it where it needs more than a plain machine."""
         first = block.text.lstrip().partition("\n")[0]
-        if block.language in ("python", "yaml") and first.startswith("# ") and "." in first:
+        if (
+            block.language in ("python", "yaml")
+            and first.startswith("# ")
+            and "." in first
+        ):
             self._file(first.removeprefix("# ").strip(), block)
         elif block.language == "python":
             self.settle()
@@ -77,12 +94,14 @@ class Session:
             for line in commands(block.text):
                 self._line(line, block)
         else:
-            assert block.language in ("", "text", "yaml") or block.language.startswith("{"), (
-                f"{block}: nobody knows what to do with {block.language}"
-            )
+            assert block.language in ("", "text", "yaml") or block.language.startswith(
+                "{"
+            ), f"{block}: nobody knows what to do with {block.language}"
 
     def settle(self):
-        """Wait for what ends by itself, for recorders to have something, and press Ctrl-C."""
+        """Wait for what ends by itself, for recorders to have something, and press
+        Ctrl-C.
+        """
         for terminal in self._terminals:
             self._wait_ready(terminal)
         for terminal in self._terminals:
@@ -90,7 +109,9 @@ class Session:
                 try:
                     terminal.end()
                 except AssertionError as error:
-                    raise AssertionError("\n".join(map(str, self._terminals))) from error
+                    raise AssertionError(
+                        "\n".join(map(str, self._terminals))
+                    ) from error
         for terminal in self._terminals:
             if "recorder" in terminal.words:
                 files = (self.folder / _value(terminal.words, "output")).glob
@@ -159,7 +180,9 @@ class Session:
         """Wait until a node listens to Ctrl-C, and a recorder to its simulator."""
         if terminal.words[1] == "-m":
             terminal.wait_for(terminal.log.read_text)
-        if "recorder" in terminal.words and any("simulator" in t.words for t in self._terminals):
+        if "recorder" in terminal.words and any(
+            "simulator" in t.words for t in self._terminals
+        ):
             terminal.wait_for(lambda: "ready" in terminal.log.read_text())
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published pages and pictures are those of this program: same text, cases, scenes, equations."""
+"""Published pages and pictures are those of this program: same text, cases, scenes,
+equations.
+"""
 
 import csv
 import importlib
@@ -39,18 +41,24 @@ def stale(name, page, table):
         found = {row["scene"] for row in rows}
         if "WARNING" in page:
             yield "an order is not that of theory"
-    introduction, *_ = re.split(r"^(?:## |\*\*|sst_ros )", empty, maxsplit=1, flags=re.MULTILINE)
+    introduction, *_ = re.split(
+        r"^(?:## |\*\*|sst_ros )", empty, maxsplit=1, flags=re.MULTILINE
+    )
     if len(introduction) < 500 or introduction not in page:
         yield "the introduction"
     for entry in sorted(wanted ^ found):
         yield entry
     for entry in sorted(wanted):
-        if not re.search(rf"^(\| |## |- ){re.escape(entry)}( \||$)", page, re.MULTILINE):
+        if not re.search(
+            rf"^(\| |## |- ){re.escape(entry)}( \||$)", page, re.MULTILINE
+        ):
             yield f"not on the page: {entry}"
 
 
 def published(name):
-    return [(ROOT / "docs" / f"{name}.{kind}").read_text("utf-8") for kind in ("md", "csv")]
+    return [
+        (ROOT / "docs" / f"{name}.{kind}").read_text("utf-8") for kind in ("md", "csv")
+    ]
 
 
 @pytest.mark.parametrize("name", ["accuracy", "control_rate", "stability"])
@@ -74,7 +82,9 @@ def test_a_renamed_function_changes_the_page(monkeypatch, tmp_path):
     room = tmp_path / "sst_ros" / "mechanism"
     room.mkdir(parents=True)
     source = (paper_page.ROOT / "sst_ros" / "mechanism" / "virtual_work.py").read_text()
-    (room / "virtual_work.py").write_text(source.replace("def link_frames", "def frames_of_links"))
+    (room / "virtual_work.py").write_text(
+        source.replace("def link_frames", "def frames_of_links")
+    )
     monkeypatch.setattr(paper_page, "ROOT", tmp_path)
     assert paper_page.places()[51] == "`virtual_work.frames_of_links`"
 

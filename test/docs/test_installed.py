@@ -20,7 +20,10 @@ BAD = (
     "ros2 run sst_ros simulator --ros-args -p compiled:=1",
     "ros2 topic echo /sst_simulator/command",
     "ros2 topic pub /sst_simulator/commands std_msgs/msg/Float64 '{data: 1.0}'",
-    "ros2 topic pub /sst_simulator/commands std_msgs/msg/Float64MultiArray '{dat: [1.0]}'",
+    (
+        "ros2 topic pub /sst_simulator/commands std_msgs/msg/Float64MultiArray '{dat:"
+        " [1.0]}'"
+    ),
     "ros2 service call /sst_simulator/restart std_srvs/srv/Trigger",
     "ros2 service call /sst_simulator/pause std_srvs/srv/SetBool '{data: 1}'",
     "ros2 param set /sst_simulator rate 500",

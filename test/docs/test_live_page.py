@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulation on the first page of the documentation, in a browser, against `simulate`."""
+"""The simulation on the first page of the documentation, in a browser, against
+`simulate`.
+"""
 
 import importlib.util
 import json
@@ -18,7 +20,9 @@ pytest.importorskip("selenium", reason="needs selenium: pip install .[test]")
 from tools.browser import browse, chromium
 
 pytestmark = [
-    pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH"),
+    pytest.mark.skipif(
+        chromium() is None, reason="no chromium with chromedriver on the PATH"
+    ),
     pytest.mark.slow,
     pytest.mark.timeout(600),
 ]
@@ -36,7 +40,9 @@ document.querySelector("#found").textContent = JSON.stringify({{ y, slopes, turn
 
 @pytest.fixture(scope="module")
 def equations():
-    spec = importlib.util.spec_from_file_location("live_equations", ROOT / "docs/live_equations.py")
+    spec = importlib.util.spec_from_file_location(
+        "live_equations", ROOT / "docs/live_equations.py"
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -57,7 +63,9 @@ def test_the_page_has_the_equations_and_the_motion_of_simulate(equations, tmp_pa
         page.open((tmp_path / "page.html").as_uri(), (900, 900))
         page.until(lambda: page.text("#found"), "result")
         found = json.loads(page.text("#found"))
-        page.until(lambda: "t = 0.5" in page.text(".live-status"), "half a second of motion")
+        page.until(
+            lambda: "t = 0.5" in page.text(".live-status"), "half a second of motion"
+        )
         page.press("Pause")
         page.press("Zero torques")
         page.until(lambda: page.enabled("Resume"), "button Resume")
@@ -66,7 +74,9 @@ def test_the_page_has_the_equations_and_the_motion_of_simulate(equations, tmp_pa
         assert page.complaints() == []
     expected = [Dynamics.of(scene).derivative(*state, *TORQUE) for state in states]
     # The browser's own sin, cos and atan2 may differ in the last bit.
-    assert np.array(found["slopes"]) == pytest.approx(np.array(expected), rel=1e-11, abs=1e-11)
+    assert np.array(found["slopes"]) == pytest.approx(
+        np.array(expected), rel=1e-11, abs=1e-11
+    )
     motion = simulate(scene, TORQUE, 1.0, tolerance=1e-10)
     assert motion.success
     quaternion, body_rate = motion.quaternion[-1], motion.body_rate[-1]
@@ -76,7 +86,9 @@ def test_the_page_has_the_equations_and_the_motion_of_simulate(equations, tmp_pa
     assert np.array(found["turned"]) == pytest.approx(turned, abs=1e-6)
 
 
-def test_where_a_limit_is_passed_the_page_keeps_the_last_valid_state(equations, tmp_path):
+def test_where_a_limit_is_passed_the_page_keeps_the_last_valid_state(
+    equations, tmp_path
+):
     scene = load_scene("example2_heavy").with_values({"actuators.torque_limit": 6.0})
     start = "<script>document.querySelectorAll('input')[0].value = 6;</script>"
     for name, text in {
@@ -87,7 +99,10 @@ def test_where_a_limit_is_passed_the_page_keeps_the_last_valid_state(equations, 
         (tmp_path / name).write_text(text, encoding="utf-8")
     with browse() as page:
         page.open((tmp_path / "page.html").as_uri(), (900, 900))
-        page.until(lambda: "stopped: gamma_1" in page.text(".live-status"), "stop at the stroke")
+        page.until(
+            lambda: "stopped: gamma_1" in page.text(".live-status"),
+            "stop at the stroke",
+        )
         text = page.text(".live-status")
         page.drawn()
         assert page.text(".live-status") == text

@@ -9,7 +9,16 @@ from functools import cache
 
 from docs.blocks import ROOT
 
-TREES = ("sst_ros", "studies", "docs", "examples", "launch", "test", "tools", "benchmark")
+TREES = (
+    "sst_ros",
+    "studies",
+    "docs",
+    "examples",
+    "launch",
+    "test",
+    "tools",
+    "benchmark",
+)
 FILE = re.compile(r"(?<![\w/.-])((?:\w+/)+\w+\.py)(?:::(\w+))?")
 MODULE = re.compile(r"(?<![\w/.-])sst_ros(?:\.\w+)+")
 NAME = re.compile(r"`([A-Za-z_][\w.]*)(?:\([^`]*\))?`")
@@ -34,7 +43,9 @@ def split(source):
         value = node.value if isinstance(node, ast.Expr) else None
         if isinstance(value, ast.Constant) and type(value.value) is str:
             said += lines[node.lineno - 1 : node.end_lineno]
-            lines[node.lineno - 1 : node.end_lineno] = [""] * (node.end_lineno - node.lineno + 1)
+            lines[node.lineno - 1 : node.end_lineno] = [""] * (
+                node.end_lineno - node.lineno + 1
+            )
     said += [line.partition("# ")[2] for line in lines]
     return "\n".join(said), "\n".join(line.partition("# ")[0] for line in lines)
 
@@ -45,7 +56,11 @@ def code():
     words = {*dir(builtins), *sys.stdlib_module_names, "scipy", "PPoly"}
     for path in found("*.py"):
         words |= set(re.findall(r"\w+", split(path.read_text(encoding="utf-8"))[1]))
-    for path in (*ROOT.glob("config/**/*.yaml"), *ROOT.glob("*.cfg"), ROOT / "Makefile"):
+    for path in (
+        *ROOT.glob("config/**/*.yaml"),
+        *ROOT.glob("*.cfg"),
+        ROOT / "Makefile",
+    ):
         words |= set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
     return words
 
@@ -54,8 +69,12 @@ def missing(said, *, names):
     """Yield files, modules and, as far as they are meant, names that are not there."""
     said = re.sub(r"https?://\S+", "", said)
     for name, function in set(FILE.findall(said)):
-        places = [top / name for top in (ROOT, ROOT / "sst_ros") if (top / name).exists()]
-        if not places or (function and f"def {function}(" not in places[0].read_text("utf-8")):
+        places = [
+            top / name for top in (ROOT, ROOT / "sst_ros") if (top / name).exists()
+        ]
+        if not places or (
+            function and f"def {function}(" not in places[0].read_text("utf-8")
+        ):
             yield name
     for name in set(MODULE.findall(said)):
         place, (first, *rest) = ROOT, name.split(".")

@@ -15,12 +15,17 @@ from sst_ros.cli.commands import NODES, parser
 
 PAGES = pages()
 LONG = (
-    "README batch collocation controller evaluate fast faults follow geometry identify index "
-    "lockstep look many own_loads plot reactions record rodas5p simulate sweep torque twelve_tasks"
+    "README batch collocation controller evaluate fast faults follow geometry identify"
+    " index lockstep look many own_loads plot reactions record rodas5p simulate sweep"
+    " torque twelve_tasks"
 )
 """Pages that start nodes or whole runs, which other tests do as well, or that compile."""
 WITH_BLOCKS = [
-    pytest.param(page, marks=pytest.mark.slow) if Path(page).stem in LONG.split() else page
+    (
+        pytest.param(page, marks=pytest.mark.slow)
+        if Path(page).stem in LONG.split()
+        else page
+    )
     for page in PAGES
     if blocks(page)
 ]
@@ -35,19 +40,27 @@ def test_every_block_of_a_page_runs(page, tmp_path):
         pytest.importorskip("pyarrow", reason="needs pyarrow: pip install .[record]")
     from docs.session import Session
 
-    with own_domain() as domain, contextlib.closing(Session(tmp_path, domain)) as session:
+    with (
+        own_domain() as domain,
+        contextlib.closing(Session(tmp_path, domain)) as session,
+    ):
         for block in blocks(page):
             session.run(block)
         session.settle()
 
 
 def test_each_of_the_twelve_tasks_is_a_short_block_or_a_link():
-    page, shown = "docs/howto/twelve_tasks.md", ROOT / "docs" / "tutorial" / "first_steps.ipynb"
+    page, shown = (
+        "docs/howto/twelve_tasks.md",
+        ROOT / "docs" / "tutorial" / "first_steps.ipynb",
+    )
     text = (ROOT / page).read_text(encoding="utf-8")
     tasks = re.split(r"^## \d+\. ", text, flags=re.M)[1:]
     assert len(tasks) == 12 and all("```" in task or "](" in task for task in tasks)
     linked = [f"docs/howto/{name}.md" for name in ("sweep", "linearize")]
-    lines = [block.text.count("\n") for name in (page, *linked) for block in blocks(name)]
+    lines = [
+        block.text.count("\n") for name in (page, *linked) for block in blocks(name)
+    ]
     cells = json.loads(shown.read_text(encoding="utf-8"))["cells"]
     assert max(lines + [len(cell["source"]) for cell in cells]) <= 25
 
@@ -84,7 +97,9 @@ def test_commands_in_the_text_are_commands(page):
 
 
 def _choices(of):
-    return next((a.choices for a in of._actions if hasattr(a, "_choices_actions")), None)
+    return next(
+        (a.choices for a in of._actions if hasattr(a, "_choices_actions")), None
+    )
 
 
 def test_the_readme_is_short_and_begins_with_the_mechanism_and_the_two_commands_that_do_all():
@@ -92,7 +107,9 @@ def test_the_readme_is_short_and_begins_with_the_mechanism_and_the_two_commands_
     assert len(text.splitlines()) < 120
     before, picture, after = text.partition("docs/mechanism.png")
     assert picture and len(before.splitlines()) < 20
-    assert [line.split("  #")[0] for line in after.split("```")[1].split("\n")[1:3]] == [
+    assert [
+        line.split("  #")[0] for line in after.split("```")[1].split("\n")[1:3]
+    ] == [
         "make demo",
         "make test",
     ]
@@ -100,7 +117,9 @@ def test_the_readme_is_short_and_begins_with_the_mechanism_and_the_two_commands_
 
 
 def test_every_page_is_in_the_site():
-    """All but the README are listed in an index, so that nobody has to guess an address."""
+    """All but the README are listed in an index, so that nobody has to guess an
+    address.
+    """
     listed, docs = {"index"}, ROOT / "docs"
     for index in docs.rglob("index.md"):
         folder = index.parent.relative_to(docs)
@@ -108,8 +127,14 @@ def test_every_page_is_in_the_site():
             if block.language == "{toctree}":
                 entries = re.findall(r"^[\w/]+$", block.text, re.M)
                 listed |= {(folder / entry).as_posix() for entry in entries}
-    there = {path.relative_to(docs) for kind in ("md", "ipynb") for path in docs.rglob(f"*.{kind}")}
-    there = {path.with_suffix("").as_posix() for path in there if path.parts[0] != "gallery"}
+    there = {
+        path.relative_to(docs)
+        for kind in ("md", "ipynb")
+        for path in docs.rglob(f"*.{kind}")
+    }
+    there = {
+        path.with_suffix("").as_posix() for path in there if path.parts[0] != "gallery"
+    }
     assert listed == there | {"gallery/index"}
 
 

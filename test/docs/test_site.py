@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The site: built without a warning, complete, found by search, without traces of its tools."""
+"""The site: built without a warning, complete, found by search, without traces of its
+tools.
+"""
 
 import html
 import json
@@ -23,7 +25,9 @@ FOUND = {
     "diagram": "howto/work_precision",
     "lockstep": "howto/lockstep",
 }
-"""Words that a reader searches for, and a page whose title must have them (stems, as indexed)."""
+"""Words that a reader searches for, and a page whose title must have them (stems, as
+indexed).
+"""
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +61,9 @@ def shown(text):
 def test_a_page_fetches_nothing_names_the_release_and_has_no_trace_of_the_tools(site):
     for page in site.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
-        fetched = re.findall(r"<(?:script|img|link)\b[^>]*(?:src|href)=\"(https?:[^\"]*)\"", text)
+        fetched = re.findall(
+            r"<(?:script|img|link)\b[^>]*(?:src|href)=\"(https?:[^\"]*)\"", text
+        )
         assert fetched == [], page.name
         assert f"sst_ros {sst_ros.__version__}" in text, page.name
         traces = r"do not edit|rather than edit|%\(default\)s|AUTOMATICALLY"
@@ -72,7 +78,9 @@ def test_search_finds_a_term_of_the_field_in_a_title(index, word, page):
 
     stem = stemmer("porter").stemWord(word)
     hits = index["titleterms"].get(word) or index["titleterms"][stem]
-    assert page in [index["docnames"][hit] for hit in (hits if isinstance(hits, list) else [hits])]
+    assert page in [
+        index["docnames"][hit] for hit in (hits if isinstance(hits, list) else [hits])
+    ]
 
 
 def test_search_finds_public_names(index):
@@ -81,7 +89,11 @@ def test_search_finds_public_names(index):
 
 
 def test_the_gallery_has_at_least_twelve_pictures_with_their_code(site):
-    texts = [page.read_text() for page in (site / "gallery").glob("*.html") if page.stem != "index"]
+    texts = [
+        page.read_text()
+        for page in (site / "gallery").glob("*.html")
+        if page.stem != "index"
+    ]
     drawn = [text for text in texts if "sphx_glr_" in text and "_001.png" in text]
     assert len(drawn) >= 12
     assert all("highlight-Python" in text for text in drawn)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Own loads against Lagrange's equations, against built-in loads, and in all that takes a scene."""
+"""Own loads against Lagrange's equations, against built-in loads, and in all that takes
+a scene.
+"""
 
 import math
 import pickle
@@ -11,7 +13,16 @@ from lagrange import Lagrange, exact, partials
 from models import seeded_samples
 from mpmath import mp
 
-from sst_ros import Batch, Simulation, certify, linearize, load_scene, own_load, simulate, sweep
+from sst_ros import (
+    Batch,
+    Simulation,
+    certify,
+    linearize,
+    load_scene,
+    own_load,
+    simulate,
+    sweep,
+)
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import model_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
@@ -23,8 +34,14 @@ from sst_ros.scene.yaml_document import dump, read
 POTENTIALS = (
     "0.7 * R13**2 + 0.4 * R23 * R31 - k * R33",
     "k * sin(gamma_1) * mu_2**2 + exp(-beta_3)",
-    "0.3 * (gamma_1 - gamma_2)**2 + sqrt(1 + R12**2) * cos(mu_3) + atan2(beta_1, 2) * k",
-    "tanh(k * beta_2) + positive(mu_1 - 0.1)**2 + max(R11, -2) * abs(R22) / (2 + min(R33, 5))",
+    (
+        "0.3 * (gamma_1 - gamma_2)**2 + sqrt(1 + R12**2) * cos(mu_3) + atan2(beta_1,"
+        " 2) * k"
+    ),
+    (
+        "tanh(k * beta_2) + positive(mu_1 - 0.1)**2 + max(R11, -2) * abs(R22) / (2 +"
+        " min(R33, 5))"
+    ),
 )
 TORQUE = (0.4, -0.3, 0.2)
 
@@ -35,11 +52,15 @@ def of_potential(text, k=1.3):
 
 
 def mpmath_energy(truth, text, gamma, k=1.3):
-    """Evaluate a potential by Python's own arithmetic on the numbers of the independent model."""
+    """Evaluate a potential by Python's own arithmetic on the numbers of the independent
+    model.
+    """
     here = truth.at(gamma)
     names = dict(zip(ROTATION, here.rotation.ravel(), strict=True))
     names |= dict(zip(ANGLES, here.angles.ravel(), strict=True))
-    functions = {name: getattr(mp, name) for name in ("sqrt", "exp", "sin", "cos", "tanh")}
+    functions = {
+        name: getattr(mp, name) for name in ("sqrt", "exp", "sin", "cos", "tanh")
+    }
     functions |= {"atan2": mp.atan2, "positive": lambda x: max(x, 0), "k": mp.mpf(k)}
     return eval(text, functions | {"abs": abs, "min": min, "max": max}, names)
 
@@ -51,7 +72,9 @@ def test_the_acceleration_under_a_potential_is_lagranges(text):
     truth = Lagrange(sample.scene, sample.rotation)
     gamma = exact(sample.gamma)
     loads = -partials(lambda x: mpmath_energy(truth, text, x), gamma).astype(float)
-    expected = truth.acceleration(gamma, sample.gamma_dot, sample.torque + loads).astype(float)
+    expected = truth.acceleration(
+        gamma, sample.gamma_dot, sample.torque + loads
+    ).astype(float)
     slope = Dynamics.of(scene).derivative(*sample.state, *sample.torque.tolist())
     found = sample.gamma_ddot_of(slope[4:])
     assert np.abs(loads).max() > 0.05
@@ -71,12 +94,17 @@ def test_formulas_of_built_in_loads_move_alike():
     bare = load_scene("general")
     spring = {"springs": [{"joint": "mu_2", "stiffness": 3.0, "rest": 0.4}]}
     formula = "0.5 * k * (mu_2 - rest)**2"
-    numbers = (LoadParameter(name="k", value=3.0), LoadParameter(name="rest", value=0.4))
+    numbers = (
+        LoadParameter(name="k", value=3.0),
+        LoadParameter(name="rest", value=0.4),
+    )
     own = FormulaLoad(name="spring", potential=formula, parameters=numbers)
     equal_motions(bare.with_values(spring), replace(bare, own_loads=(own,)))
     heavy = {"star.mass": 4.0, "star.centre": [0.01, 0.0, 0.1]}
     heavy |= {"gravity.acceleration": [0.0, 0.0, -9.81]}
-    own = own_load("weight", potential=lambda at: 9.81 * 4.0 * (at.rotation[2] @ [0.01, 0, 0.1]))
+    own = own_load(
+        "weight", potential=lambda at: 9.81 * 4.0 * (at.rotation[2] @ [0.01, 0, 0.1])
+    )
     equal_motions(bare.with_values(heavy), replace(bare, own_loads=(own,)))
 
 
@@ -129,7 +157,9 @@ def test_a_traced_function_has_the_values_of_the_function():
 
     At.omega = omega
     moment = wind(At, 0.3, 3.0)
-    change = kernel.power(model, sample.state, TORQUE) - kernel.power(bare, sample.state, TORQUE)
+    change = kernel.power(model, sample.state, TORQUE) - kernel.power(
+        bare, sample.state, TORQUE
+    )
     assert change == pytest.approx(moment @ omega, rel=1e-13)
     energy = kernel.potential_energy(model, sample.state)
     assert energy == pytest.approx(spring(At, 40.0), rel=1e-14)
@@ -152,7 +182,8 @@ def test_step_by_step_and_by_the_paper():
     assert np.abs(np.subtract(stepped.state.joints.gamma, whole.gamma[-1])).max() < 1e-9
     with pytest.raises(InputError, match="own_loads"):
         Simulation(
-            replace(load_scene("general"), own_loads=scene.own_loads), equations="virtual_work"
+            replace(load_scene("general"), own_loads=scene.own_loads),
+            equations="virtual_work",
         )
 
 
@@ -160,7 +191,9 @@ def test_parameters_of_own_loads_vary_in_batches_and_sweeps():
     scene, key = windy(), "own_loads[1].parameters[1].value"
     speeds = [0.0, 3.0, 6.0]
     batch = Batch(scene, parameters={key: speeds})
-    gamma, rate = (np.tile(x, (3, 1)) for x in (scene.initial.gamma, scene.initial.gamma_dot))
+    gamma, rate = (
+        np.tile(x, (3, 1)) for x in (scene.initial.gamma, scene.initial.gamma_dot)
+    )
     result = batch.run(gamma, rate, TORQUE, step=1e-3, count=200)
     for row, speed in enumerate(speeds):
         alone = simulate(scene.with_values({key: speed}), TORQUE, 0.2, tolerance=1e-11)
@@ -188,9 +221,15 @@ def test_linear_models_have_own_loads():
 
 def test_sensitivities_by_a_parameter_of_an_own_load():
     scene, key = windy(), "own_loads[0].parameters[0].value"
-    found = simulate(scene, TORQUE, 0.2, sensitivities=[key]).sensitivities[key].gamma[-1, :, 0]
+    found = (
+        simulate(scene, TORQUE, 0.2, sensitivities=[key])
+        .sensitivities[key]
+        .gamma[-1, :, 0]
+    )
     ends = [
-        simulate(scene.with_values({key: 40.0 + x}), TORQUE, 0.2, tolerance=1e-12).gamma[-1]
+        simulate(
+            scene.with_values({key: 40.0 + x}), TORQUE, 0.2, tolerance=1e-12
+        ).gamma[-1]
         for x in (-0.2, -0.1, 0.1, 0.2)
     ]
     expected = np.tensordot([1.0, -8.0, 8.0, -1.0], ends, 1) / 1.2
@@ -209,7 +248,9 @@ def test_a_scene_with_own_loads_is_the_same_from_text_and_from_another_process()
     scene = windy()
     assert read(Scene, dump(scene), "scene") == scene
     assert pickle.loads(pickle.dumps(scene)) == scene
-    assert simulate(pickle.loads(pickle.dumps(simulate(scene, TORQUE, 0.1))).scene, TORQUE, 0.1)
+    assert simulate(
+        pickle.loads(pickle.dumps(simulate(scene, TORQUE, 0.1))).scene, TORQUE, 0.1
+    )
 
 
 @pytest.mark.parametrize(
@@ -249,12 +290,21 @@ def test_what_is_no_formula_is_refused(text, message):
     ("given", "message"),
     [
         ({}, "give one of potential, moment"),
-        ({"potential": "1", "moment": ("1", "2", "3")}, "give one of potential, moment"),
+        (
+            {"potential": "1", "moment": ("1", "2", "3")},
+            "give one of potential, moment",
+        ),
         ({"moment": ("1", "2")}, "must be three formulas"),
         ({"potential": "1", "terms": {"R13": "2"}}, "means nothing else"),
         ({"potential": "1", "terms": {"a": "b", "b": "1"}}, "b is neither state"),
-        ({"potential": "1", "parameters": ({"name": "sin", "value": 1.0},)}, "means nothing else"),
-        ({"potential": "1", "parameters": ({"name": "k", "value": 1.0},) * 2}, "is given twice"),
+        (
+            {"potential": "1", "parameters": ({"name": "sin", "value": 1.0},)},
+            "means nothing else",
+        ),
+        (
+            {"potential": "1", "parameters": ({"name": "k", "value": 1.0},) * 2},
+            "is given twice",
+        ),
     ],
 )
 def test_loads_that_contradict_themselves_are_refused(given, message):

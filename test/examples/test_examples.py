@@ -59,13 +59,17 @@ def test_an_example_draws_its_picture(name, run):
 
 
 CHECKS = {
-    "own_controller": lambda found: np.abs(found["GOAL"] - found["motion"].gamma[-1]).max() < 1e-3,
+    "own_controller": lambda found: (
+        np.abs(found["GOAL"] - found["motion"].gamma[-1]).max() < 1e-3
+    ),
     "monte_carlo": lambda found: (
         0 < found["left"].sum() < len(found["runs"])
         and np.all(found["runs"].status[found["left"]] == 1)
     ),
     "energy": lambda found: np.ptp(found["motion"].energy) < 1e-12,
-    "inverse_dynamics": lambda found: np.abs(found["torque"].T - found["applied"]).max() < 1e-4,
+    "inverse_dynamics": lambda found: (
+        np.abs(found["torque"].T - found["applied"]).max() < 1e-4
+    ),
     "work_precision": lambda found: min(found["errors"]) < 1e-6,
     "iterative_lqr": lambda found: (
         found["errors"][-1] < 1e-4 and found["changes"][-1] < 1e-4 * found["changes"][0]
@@ -109,7 +113,11 @@ def test_a_recording_as_a_table(run, tmp_path):
 
 def test_the_examples_geometry_stays_inside_for_its_whole_run():
     scene = load_scene(EXAMPLES / "my_geometry.yaml")
-    simulation, torque, reach = Simulation(scene), scene.torque.at, Geometry.of(scene).arc
+    simulation, torque, reach = (
+        Simulation(scene),
+        scene.torque.at,
+        Geometry.of(scene).arc,
+    )
     least = np.inf
     for tick in range(round(scene.duration * 500)):
         gamma = simulation.step(torque(tick * 2e-3), 2_000_000).joints.gamma
@@ -121,9 +129,21 @@ def test_the_tutorials_scene_is_the_examples():
     """The tutorial shows the same manipulator with less around it."""
     from docs.blocks import blocks
 
-    (shown,) = (b.text for b in blocks("docs/tutorial/geometry.md") if b.language == "yaml")
-    tutorial, example = read(Scene, shown, "tutorial"), load_scene(EXAMPLES / "my_geometry.yaml")
-    for part in ("base", "star", "actuated_links", "intermediate_links", "gravity", "initial"):
+    (shown,) = (
+        b.text for b in blocks("docs/tutorial/geometry.md") if b.language == "yaml"
+    )
+    tutorial, example = (
+        read(Scene, shown, "tutorial"),
+        load_scene(EXAMPLES / "my_geometry.yaml"),
+    )
+    for part in (
+        "base",
+        "star",
+        "actuated_links",
+        "intermediate_links",
+        "gravity",
+        "initial",
+    ):
         assert getattr(tutorial, part) == getattr(example, part), part
 
 

@@ -18,7 +18,9 @@ def robots_of():
 
 @pytest.mark.filterwarnings("ignore:.*A Box .* space .*bound")
 def test_one_robot_passes_gymnasiums_checker(robots_of):
-    """The checker knows single environments: one of one robot, begun again by its caller."""
+    """The checker knows single environments: one of one robot, begun again by its
+    caller.
+    """
 
     class Single(gymnasium.Env):
         def __init__(self):
@@ -32,8 +34,16 @@ def test_one_robot_passes_gymnasiums_checker(robots_of):
             return observed[0], info
 
         def step(self, action):
-            observed, reward, ended, truncated, info = self.robots.step(np.array([action]))
-            return observed[0], float(reward[0]), bool(ended[0]), bool(truncated[0]), info
+            observed, reward, ended, truncated, info = self.robots.step(
+                np.array([action])
+            )
+            return (
+                observed[0],
+                float(reward[0]),
+                bool(ended[0]),
+                bool(truncated[0]),
+                info,
+            )
 
     from gymnasium.utils.env_checker import check_env
 

@@ -54,7 +54,9 @@ def test_a_process_keeps_its_domain_until_it_ends(monkeypatch):
 
 @pytest.mark.parametrize("participant", [0, 3])
 def test_a_domain_in_which_a_node_is_left_is_not_taken(monkeypatch, participant):
-    """A node that has lost its parent goes on for a second or two; a user's has no lock at all.
+    """A node that has lost its parent goes on for a second or two.
+
+    A user's has no lock at all.
 
     A test once recorded the scene of another test's simulator beside its own.
     """

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The request for short exit latencies of idle states, against a file in place of the device."""
+"""The request for short exit latencies of idle states, against a file in place of the
+device.
+"""
 
 import sys
 
@@ -24,6 +26,10 @@ def test_a_request_is_written_as_the_kernel_reads_it(tmp_path, latency_us):
 def test_what_is_not_permitted_is_said_and_nothing_is_opened_unasked(tmp_path):
     assert CpuDmaLatency(tmp_path / "none").request(-1) == "no limit"
     said = CpuDmaLatency(tmp_path).request(0)  # a folder cannot be written
-    assert said.startswith("no limit: 0 us is not permitted (") and str(tmp_path) in said
+    assert (
+        said.startswith("no limit: 0 us is not permitted (") and str(tmp_path) in said
+    )
     said = CpuDmaLatency(tmp_path / "none").request(5)
-    assert said.startswith("no limit: 5 us is not permitted (") and "No such file" in said
+    assert (
+        said.startswith("no limit: 5 us is not permitted (") and "No such file" in said
+    )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes with exciting motions, and runs under a digital controller, as a node records them."""
+"""Scenes with exciting motions, and runs under a digital controller, as a node records
+them.
+"""
 
 import dataclasses
 
@@ -47,7 +49,10 @@ def general():
     """General geometry, three different links of each kind, gravity and friction."""
     masses = {"star.mass": 2.0, "star.centre": [0.02, 0.01, 0.2]}
     for k in range(3):
-        masses |= {f"actuated_links[{k}].mass": 0.3, f"actuated_links[{k}].centre": [0.1, 0.02, 0]}
+        masses |= {
+            f"actuated_links[{k}].mass": 0.3,
+            f"actuated_links[{k}].centre": [0.1, 0.02, 0],
+        }
     field = {"gravity.acceleration": [3.0, 4.0, 8.0]}
     return sweeping(load_scene("general").with_values(masses | field | FRICTION))
 
@@ -57,7 +62,9 @@ def payload():
 
 
 def run(plant, model=None, period=PERIOD, mode="feedforward_pd"):
-    """The trajectory of a plant that follows its motion by a controller with a model of it."""
+    """The trajectory of a plant that follows its motion by a controller with a model of
+    it.
+    """
     settings = ControllerSettings(mode=mode, feedforward_at="middle", bandwidth=60.0)
     controller = Controller(model or plant, reference_motion(plant), settings, period)
     count = round(plant.duration / period)
@@ -84,11 +91,15 @@ def torques(scene, quaternion, rate, acceleration):
 def wrong(scene, seed=0, share=0.2):
     """The scene with every link's inertia wrong by up to `share`, masses alike."""
     rng = np.random.default_rng(seed)
-    factors = iter(1.0 + share * rng.choice([-1.0, 1.0], 20) * rng.uniform(0.5, 1.0, 20))
+    factors = iter(
+        1.0 + share * rng.choice([-1.0, 1.0], 20) * rng.uniform(0.5, 1.0, 20)
+    )
 
     def scaled(body, factor):
         parts = body.inertia and dataclasses.asdict(body.inertia)
-        inertia = parts and type(body.inertia)(**{k: factor * v for k, v in parts.items()})
+        inertia = parts and type(body.inertia)(
+            **{k: factor * v for k, v in parts.items()}
+        )
         return dataclasses.replace(body, inertia=inertia, mass=factor * body.mass)
 
     links = {}
@@ -96,5 +107,7 @@ def wrong(scene, seed=0, share=0.2):
         given = getattr(scene, kind)
         alike = given[0] == given[1] == given[2]
         factor = next(factors)
-        links[kind] = tuple(scaled(link, factor if alike else next(factors)) for link in given)
+        links[kind] = tuple(
+            scaled(link, factor if alike else next(factors)) for link in given
+        )
     return dataclasses.replace(scene, star=scaled(scene.star, next(factors)), **links)

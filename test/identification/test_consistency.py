@@ -27,7 +27,8 @@ def of_points(rng, count=6):
     """The ten parameters of point masses."""
     masses, places = draw_points(rng, count)
     inertia = sum(
-        m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True)
+        m * (p @ p * np.eye(3) - np.outer(p, p))
+        for m, p in zip(masses, places, strict=True)
     )
     six = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return np.array([masses.sum(), *(masses @ places), *six])
@@ -52,7 +53,9 @@ def consistent(names, given, fit, reach):
 
 def test_the_pseudo_inertia_is_the_sum_over_mass_of_p_p_t():
     masses, places = draw_points(np.random.default_rng(1), 4)
-    expected = sum(m * np.outer([*p, 1.0], [*p, 1.0]) for m, p in zip(masses, places, strict=True))
+    expected = sum(
+        m * np.outer([*p, 1.0], [*p, 1.0]) for m, p in zip(masses, places, strict=True)
+    )
     found = pseudo_inertia(of_points(np.random.default_rng(1), 4), 1.0)
     assert np.abs(found - expected).max() < 1e-14
 
@@ -68,7 +71,9 @@ def test_estimates_of_a_body_that_exists_are_not_changed(points):
 
 
 def test_a_body_that_cannot_exist_is_replaced_by_the_nearest():
-    """A negative principal moment of S: the optimum against SciPy's on the same problem."""
+    """A negative principal moment of S: the optimum against SciPy's on the same
+    problem.
+    """
     names = tuple(f"star.{part}" for part in STANDARD[4:])
     given = np.array([0.3, 0.3, 0.2, 0.0, 0.0, 0.0])
     target = np.array([0.1, 0.1, 0.4, 0.02, 0.0, 0.01])  # zz > xx + yy
@@ -89,7 +94,11 @@ def test_a_body_that_cannot_exist_is_replaced_by_the_nearest():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # "delta_grad == 0.0"
         expected = minimize(
-            cost, given, constraints=limits, method="trust-constr", options={"maxiter": 3000}
+            cost,
+            given,
+            constraints=limits,
+            method="trust-constr",
+            options={"maxiter": 3000},
         )
     assert second_moments(values)[0] > 0.0
     assert cost(values) == pytest.approx(expected.fun, rel=1e-6)

@@ -28,9 +28,12 @@ SCENES = (
 def identified(name):
     """The true scene and what is identified from a run of it, from wrong values."""
     plant = getattr(manipulators, name)()
-    # The mean over a period is of fourth order; general geometry has the worst condition.
+    # The mean over a period is of fourth order; general geometry has the worst
+    # condition.
     period = 4e-4 if name == "general" else manipulators.PERIOD
-    return plant, identify(manipulators.run(plant, period=period), manipulators.wrong(plant))
+    return plant, identify(
+        manipulators.run(plant, period=period), manipulators.wrong(plant)
+    )
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -39,7 +42,9 @@ def test_base_parameters_are_those_of_the_plant(name):
 
 
 def test_a_recording_gives_them_as_exactly(bags, tmp_path, monkeypatch):
-    """The bag has stamps in whole nanoseconds, and the torque of every tick, two a sample."""
+    """The bag has stamps in whole nanoseconds, and the torque of every tick, two a
+    sample.
+    """
     plant = load_scene("example2_heavy")
     monkeypatch.setattr(bags, "TICK_NS", round(manipulators.PERIOD * 1e9))
     path = bags.write(tmp_path / "bag", bags.simulated(plant, 1.0))
@@ -76,25 +81,34 @@ def test_torques_of_another_motion_are_predicted(name):
 
 
 def test_smooth_samples_without_a_hold_are_as_exact():
-    """A free swing under sine torques: samples of torque, angle and rate at the same instants."""
+    """A free swing under sine torques: samples of torque, angle and rate at the same
+    instants.
+    """
     scene = load_scene("example2_heavy")
     motion = simulate(scene, t_eval=np.arange(1001) * 1e-3, tolerance=1e-13)
-    found = identify(motion, scene.with_values({"star.inertia.xx": 0.5}), parameters=("star",))
+    found = identify(
+        motion, scene.with_values({"star.inertia.xx": 0.5}), parameters=("star",)
+    )
     true = found.base.transform @ parameters.values(scene, found.names)
     assert np.abs(found.estimate - true).max() < EXACT * np.abs(true).max()
 
 
 @pytest.mark.slow
 def test_of_a_free_motion_without_noise_the_bodies_can_exist():
-    # All terms cancel, so that the data fix no scale; their rounding is not that of zero torque.
+    # All terms cancel, so that the data fix no scale; their rounding is not that of
+    # zero torque.
     plant = load_scene("swing")
-    found = identify(simulate(plant, t_eval=np.arange(1000) * 1e-3, tolerance=1e-12), plant)
+    found = identify(
+        simulate(plant, t_eval=np.arange(1000) * 1e-3, tolerance=1e-12), plant
+    )
     assert found.consistent
     assert found.noise.min() > 1e-13
 
 
 def test_unknown_friction_and_offsets_are_found():
-    plant = manipulators.sweeping(manipulators.thin_arcs(), 1.5).with_values(manipulators.FRICTION)
+    plant = manipulators.sweeping(manipulators.thin_arcs(), 1.5).with_values(
+        manipulators.FRICTION
+    )
     motion = manipulators.run(plant)
     arrays = arrays_of(motion, motion.torque[1:] + np.array([0.1, -0.2, 0.3]))
     guessed = {"viscous": 1.0, "coulomb": 1.0, "smoothing": 0.1}
@@ -104,7 +118,9 @@ def test_unknown_friction_and_offsets_are_found():
     for name, true in manipulators.FRICTION.items():
         if "smoothing" not in name:
             assert values[name] == pytest.approx(true, rel=1e-6)
-    assert [values[f"offset[{k}]"] for k in range(3)] == pytest.approx([0.1, -0.2, 0.3], rel=1e-7)
+    assert [values[f"offset[{k}]"] for k in range(3)] == pytest.approx(
+        [0.1, -0.2, 0.3], rel=1e-7
+    )
     assert found.scene.friction.gamma.viscous == pytest.approx(0.2, rel=1e-6)
 
 
@@ -125,7 +141,9 @@ def test_saturated_samples_are_left_out_with_a_warning():
     motion = manipulators.run(plant, period=1e-3)
     limit = float(np.abs(motion.torque).max()) * 0.8
     model = plant.with_values({"actuators.torque_limit": limit})
-    found = identify(arrays_of(motion, np.clip(motion.torque[1:], -limit, limit)), model)
+    found = identify(
+        arrays_of(motion, np.clip(motion.torque[1:], -limit, limit)), model
+    )
     assert "a torque was at the limit" in found.warnings[0]
     check_estimate(plant, found)
 
@@ -142,12 +160,24 @@ def samples():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"gamma": None}, r"gamma = None: is missing; must be finite numbers, shape \(n, 3\)"),
-        ({"t": None}, r"t = None: is missing; must be finite numbers, shape \(n,\) \[s\]$"),
+        (
+            {"gamma": None},
+            r"gamma = None: is missing; must be finite numbers, shape \(n, 3\)",
+        ),
+        (
+            {"t": None},
+            r"t = None: is missing; must be finite numbers, shape \(n,\) \[s\]$",
+        ),
         ({"t": [[0.0], [1.0, 2.0]]}, r"must be finite numbers, shape \(n,\) \[s\]$"),
         ({"t": np.zeros(400)}, "must be rising times"),
-        ({"torque": np.zeros((400, 2))}, r"torque = \(400, 2\): must be finite.*shape \(n, 3\)"),
-        ({"torque": np.zeros((397, 3))}, r"torque = \(397, 3\): must have the shape \(400, 3\)"),
+        (
+            {"torque": np.zeros((400, 2))},
+            r"torque = \(400, 2\): must be finite.*shape \(n, 3\)",
+        ),
+        (
+            {"torque": np.zeros((397, 3))},
+            r"torque = \(397, 3\): must have the shape \(400, 3\)",
+        ),
         ({"speed": 1.0}, "speed = 1.0: unknown key; allowed are t, gamma"),
         ({"gamma": np.full((400, 3), np.nan)}, r"gamma\[0, 0\] = nan: must be finite"),
         (
@@ -197,7 +227,8 @@ def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "actuators", [pytest.param(None, marks=pytest.mark.slow), Actuators(time_constant=0.02)]
+    "actuators",
+    [pytest.param(None, marks=pytest.mark.slow), Actuators(time_constant=0.02)],
 )
 def test_a_recording_is_fitted_by_simulation(written, tmp_path, capsys, actuators):
     recorded = replace(load_scene("example2"), actuators=actuators)
@@ -207,13 +238,17 @@ def test_a_recording_is_fitted_by_simulation(written, tmp_path, capsys, actuator
     bag = written(simulated(recorded, 0.3))
     words = ["identify", str(bag), "--scene", str(guess), "--method", "simulation"]
     out = tmp_path / "identified.yaml"
-    assert run_command([*words, "--parameters", "star.inertia.zz", "--out", str(out)]) == 0
+    assert (
+        run_command([*words, "--parameters", "star.inertia.zz", "--out", str(out)]) == 0
+    )
     assert "known to" in capsys.readouterr().out
     expected = recorded.star.inertia.zz
     assert load_scene(out).star.inertia.zz == pytest.approx(expected, rel=1e-8)
     assert run_command(words) == 1
     assert "must be keys of numbers of the scene" in capsys.readouterr().err
-    assert run_command([*words, "--parameters", "star.inertia.zz", "--cutoff", "3"]) == 1
+    assert (
+        run_command([*words, "--parameters", "star.inertia.zz", "--cutoff", "3"]) == 1
+    )
     assert "takes no cutoff" in capsys.readouterr().err
 
 
@@ -231,7 +266,10 @@ def test_a_scene_becomes_a_motion(tmp_path, capsys):
         (["design"], "must be given after design"),
         (["bag", "reach"], "only there"),
         (["design", "reach", "--cutoff", "3"], "is no option of identify design"),
-        (["design", "reach", "--method", "simulation"], "is no option of identify design"),
+        (
+            ["design", "reach", "--method", "simulation"],
+            "is no option of identify design",
+        ),
         (["bag", "--seed", "3"], "is no option of identify BAG"),
         (["nowhere"], "nowhere"),
     ],

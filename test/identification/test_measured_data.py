@@ -28,11 +28,17 @@ class Measured:
         self.torque = manipulators.torques(plant, *manipulators.states(motion, self.t))
 
     def recording(self, seed):
-        """One measurement: the encoders' zeros are anywhere, noise is a share of the peak."""
+        """One measurement: the encoders' zeros are anywhere, noise is a share of the
+        peak.
+        """
         rng = np.random.default_rng(seed)
         zero = rng.uniform(0.0, COUNT, 3)
         gamma = COUNT * (np.floor((self.gamma + zero) / COUNT) + 0.5) - zero
-        noise = rng.normal(size=self.torque.shape) * self.noise * np.abs(self.torque).max(axis=0)
+        noise = (
+            rng.normal(size=self.torque.shape)
+            * self.noise
+            * np.abs(self.torque).max(axis=0)
+        )
         return {"t": self.t, "gamma": gamma, "torque": self.torque + noise}
 
 
@@ -56,7 +62,10 @@ def errors(case, seeds):
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_200_recordings_are_covered_by_their_95_percent_intervals():
-    """Each base parameter in 90 to 99 % of the recordings; its bias is below its deviation."""
+    """Each base parameter in 90 to 99 % of the recordings.
+
+    Its bias is below its deviation.
+    """
     z = errors(measured(), range(200))
     covered = np.mean(np.abs(z) < NORMAL_95, axis=0)
     assert covered.min() >= 0.90 and covered.max() <= 0.99
@@ -65,7 +74,10 @@ def test_200_recordings_are_covered_by_their_95_percent_intervals():
 
 @pytest.mark.slow
 def test_a_short_recording_is_biased_by_less_than_the_standard_deviation():
-    """In 1.2 s of `reach` the star hardly turns about its axis; torques have little noise."""
+    """In 1.2 s of `reach` the star hardly turns about its axis.
+
+    Torques have little noise.
+    """
     plant = load_scene("reach")
     case = Measured(plant, manipulators.wrong(plant), noise=0.004)
     z = errors(case, range(20))
@@ -93,8 +105,11 @@ def test_noise_is_found_and_may_be_given():
     several = [identify(case.recording(seed), case.model) for seed in range(6)]
     found = several[0]
     true = NOISE * np.abs(case.torque).max(axis=0)
-    # One estimate, by some 40 equations of an actuator, errs by 11 %, the mean of six by 5 %.
-    assert np.mean([one.noise for one in several], axis=0) == pytest.approx(true, rel=0.1)
+    # One estimate, by some 40 equations of an actuator, errs by 11 %, the mean of six
+    # by 5 %.
+    assert np.mean([one.noise for one in several], axis=0) == pytest.approx(
+        true, rel=0.1
+    )
     given = identify(case.recording(0), case.model, noise=2.0 * found.noise)
     assert given.deviation == pytest.approx(2.0 * found.deviation, rel=1e-9)
     assert given.estimate == pytest.approx(found.estimate, rel=1e-9, abs=1e-12)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification from data as real robots give them: late, uneven, with gaps, wrapped, noisy."""
+"""Identification from data as real robots give them: late, uneven, with gaps, wrapped,
+noisy.
+"""
 
 import dataclasses
 from functools import cache
@@ -27,7 +29,9 @@ FRICTION = {
 
 
 class Plant:
-    """Six seconds of chirps of `reach` with friction: exact angles and torques at any time."""
+    """Six seconds of chirps of `reach` with friction: exact angles and torques at any
+    time.
+    """
 
     def __init__(self):
         rubbing = load_scene("reach").with_values(FRICTION)
@@ -38,10 +42,14 @@ class Plant:
 
     def gamma(self, times):
         last = self.motion.duration
-        return np.array([self.motion.at(min(max(t, 0.0), last)).gamma for t in times.tolist()])
+        return np.array(
+            [self.motion.at(min(max(t, 0.0), last)).gamma for t in times.tolist()]
+        )
 
     def torque(self, times):
-        return manipulators.torques(self.scene, *manipulators.states(self.motion, times))
+        return manipulators.torques(
+            self.scene, *manipulators.states(self.motion, times)
+        )
 
     def errors(self, found):
         """Estimates less truth, in standard deviations."""
@@ -62,7 +70,10 @@ def exact():
 
 
 def measured(seed, t=None):
-    """One measurement: angles with noise and delay, torques with noise; at other times too."""
+    """One measurement: angles with noise and delay, torques with noise.
+
+    At other times too.
+    """
     random = np.random.default_rng(seed)
     if t is None:
         t, gamma, torque = exact()
@@ -97,13 +108,16 @@ def test_a_delay_is_estimated_and_told():
     found = identify(measured(1), plant().model)
     assert abs(found.delay - DELAY) < 4.0 * found.delay_deviation < 1e-3
     assert np.abs(plant().errors(found)).max() < 4.0
-    assert f"delay of the angles {1e3 * found.delay:.3g} ms (std. dev. " in found.table()
+    assert (
+        f"delay of the angles {1e3 * found.delay:.3g} ms (std. dev. " in found.table()
+    )
 
 
 def test_a_delay_that_is_left_out_or_given():
     late = identify(measured(1), plant().model, delay=0.0)
     given = identify(measured(1), plant().model, delay=DELAY)
-    # In the deviations that the data have: without the delay the residuals seem to be noise.
+    # In the deviations that the data have: without the delay the residuals seem to be
+    # noise.
     wrong = plant().errors(late) * late.deviation / given.deviation
     assert np.abs(wrong).max() > 10.0 and late.delay_deviation is None
     assert np.abs(plant().errors(given)).max() < 4.0
@@ -164,14 +178,24 @@ def test_measured_joints_need_not_close_the_loops_but_be_of_this_manipulator():
     shown = joints(model_of(model), (*orientation.T, *np.zeros((3, len(t)))))
     mu, beta = (np.stack(getattr(shown, name), axis=1) for name in ("mu", "beta"))
     off = 5e-3 * random.normal(size=mu.shape)  # far from closing the loops
-    data = {"t": t, "gamma": gamma, "torque": torque, "mu": mu + off, "beta": beta - off}
+    data = {
+        "t": t,
+        "gamma": gamma,
+        "torque": torque,
+        "mu": mu + off,
+        "beta": beta - off,
+    }
     assert identify(data, model).delay == pytest.approx(DELAY, abs=1e-4)
-    with pytest.raises(InputError, match=r"mu = '0\.3\d* rad off': must be within 0.05 rad"):
+    with pytest.raises(
+        InputError, match=r"mu = '0\.3\d* rad off': must be within 0.05 rad"
+    ):
         identify(data | {"mu": mu + 0.3}, model)
 
 
 def test_a_recorded_run_with_sensors_is_identified(bags, written, monkeypatch):
-    """Noise, delay and lost samples in joint_states: by them, and not by the truth beside."""
+    """Noise, delay and lost samples in joint_states: by them, and not by the truth
+    beside.
+    """
     true = "/sst_simulator/true_joint_states"
     monkeypatch.setitem(bags.KINDS, true, bags.KINDS[bags.JOINTS])
     given, random = scene.load("example2_heavy"), np.random.default_rng(8)

@@ -12,7 +12,11 @@ from sst_ros.control.plan import examine_motion
 from sst_ros.errors import InputError, MotionRefused
 from sst_ros.identification import parameters
 from sst_ros.identification.excitation import design
-from sst_ros.identification.parameters import Regressor, find_base_parameters, find_independent
+from sst_ros.identification.parameters import (
+    Regressor,
+    find_base_parameters,
+    find_independent,
+)
 from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
@@ -24,7 +28,9 @@ FOREIGN = ("friction.gamma", "actuators.rotor_inertia", "offset")
 def states(scene, count, seed=0):
     """Quaternion, and random W and W_dot, of poses with E inside the base triangle."""
     rng, geometry = np.random.default_rng(seed), Geometry.of(scene)
-    turns = [star_orientation(geometry, rng.uniform(-1.0, 1.0, 4)) for _ in range(count)]
+    turns = [
+        star_orientation(geometry, rng.uniform(-1.0, 1.0, 4)) for _ in range(count)
+    ]
     rates = rng.normal(size=(2, count, 3)) * [[[1.0]], [[5.0]]]
     return np.array([quaternion_of(turn) for turn in turns]), *rates
 
@@ -37,7 +43,9 @@ def own(scene, names):
 
 
 def by_chance(seed):
-    """Seven bodies of random points: elsewhere Pinocchio and Lagrange check the torques."""
+    """Seven bodies of random points: elsewhere Pinocchio and Lagrange check the
+    torques.
+    """
     rng = np.random.default_rng(seed)
     return lambda scene, names: np.concatenate([of_points(rng) for _ in BODIES])
 
@@ -50,7 +58,9 @@ def by_chance(seed):
         ("thin_arcs", FOREIGN, lambda *_: np.array([0.3, 0.2, 1e-3, 0.1, -0.2, 0.3])),
     ],
 )
-def test_torques_are_the_known_part_plus_regressor_times_parameters(name, wanted, values_of):
+def test_torques_are_the_known_part_plus_regressor_times_parameters(
+    name, wanted, values_of
+):
     """Of the scene's own numbers, of other bodies, and of what it does not have."""
     scene = getattr(manipulators, name)()
     names = parameters.select_names(scene, wanted)
@@ -110,7 +120,9 @@ LIMITS = {
 
 
 def condition(scene):
-    """Of the regressor of the base parameters over the scene's motion, columns of length one."""
+    """Of the regressor of the base parameters over the scene's motion, columns of
+    length one.
+    """
     motion = reference_motion(scene)
     regressor = Regressor(scene, parameters.select_names(scene, None))
     times = np.linspace(0.0, motion.duration, 200)

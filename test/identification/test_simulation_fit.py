@@ -10,7 +10,11 @@ from symmetric_motion import inertia
 
 from sst_ros import load_scene, simulate
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.variational import REBOUND, VariationalEquations, differentiate_damping
+from sst_ros.dynamics.variational import (
+    REBOUND,
+    VariationalEquations,
+    differentiate_damping,
+)
 from sst_ros.errors import InputError
 from sst_ros.identification.identify import identify
 from sst_ros.scene.yaml_document import find_number
@@ -34,12 +38,17 @@ def thick():
     """Links that are not flat: their inertias may change alone."""
     given = load_scene("example2_heavy")
     axial = 1.05 * given.actuated_links[0].inertia.zz
-    thicker = {"actuated_links.inertia.zz": axial, "intermediate_links.inertia.xx": 1e-3}
+    thicker = {
+        "actuated_links.inertia.zz": axial,
+        "intermediate_links.inertia.xx": 1e-3,
+    }
     return given.with_values(thicker)
 
 
 def bouncing():
-    """Actuator 1 meets the lower end of its stroke at 20 ms, and leaves it some 16 ms later."""
+    """Actuator 1 meets the lower end of its stroke at 20 ms, and leaves it some 16 ms
+    later.
+    """
     return load_scene("impacts").with_values(
         {
             "stroke": {"at_end": "elastic", "stiffness": 2e4, "damping": 0.3},
@@ -50,9 +59,19 @@ def bouncing():
 
 
 def rebounding():
-    """gamma_1 meets its stop at 0.91 s; a stop as soft as this lets E leave the workspace."""
-    elastic = {"at_end": "elastic", "stiffness": 500.0, "impact_rate": 1.5, "restitution": 0.6}
-    return load_scene("impacts").with_values({"stroke": elastic, "workspace.at_edge": "ignore"})
+    """gamma_1 meets its stop at 0.91 s.
+
+    A stop as soft as this lets E leave the workspace.
+    """
+    elastic = {
+        "at_end": "elastic",
+        "stiffness": 500.0,
+        "impact_rate": 1.5,
+        "restitution": 0.6,
+    }
+    return load_scene("impacts").with_values(
+        {"stroke": elastic, "workspace.at_edge": "ignore"}
+    )
 
 
 def record(motion, noise=0.0):
@@ -84,7 +103,10 @@ def slow(*case):
     ],
 )
 def test_sensitivities_are_derivatives_of_what_simulate_finds(build, end, name):
-    """A polynomial through runs of scenes with other values; nothing jumps where a stop is met."""
+    """A polynomial through runs of scenes with other values.
+
+    Nothing jumps where a stop is met.
+    """
     scene = build()
     value = find_number(scene, name)
     motion = VariationalEquations(scene, (name,), scene.torque)
@@ -106,7 +128,9 @@ def test_restitution_and_impact_rate_together_have_the_slopes_of_each():
     values = np.array([find_number(scene, name) for name in names])
     _, both = VariationalEquations(scene, names, scene.torque).run(values, t)
     for k in range(2):
-        _, one = VariationalEquations(scene, names[k : k + 1], scene.torque).run(values[[k]], t)
+        _, one = VariationalEquations(scene, names[k : k + 1], scene.torque).run(
+            values[[k]], t
+        )
         assert both[0, :, k] == pytest.approx(one[0, :, 0], rel=1e-9, abs=1e-9)
         assert np.abs(one).max() > 1e-3
 
@@ -114,10 +138,14 @@ def test_restitution_and_impact_rate_together_have_the_slopes_of_each():
 def test_the_slopes_of_the_damping_by_restitution_and_impact_rate():
     elastic = {"at_end": "elastic", "stiffness": 2000.0, "impact_rate": 0.7}
     for e in (0.05, 0.3, 0.8, 0.97):
-        scene = load_scene("swing").with_values({"stroke": elastic | {"restitution": e}})
+        scene = load_scene("swing").with_values(
+            {"stroke": elastic | {"restitution": e}}
+        )
         for name, slope in zip(REBOUND, differentiate_damping(scene), strict=True):
             high, low = (
-                damping_of(scene.with_values({name: find_number(scene, name) + h}).stroke)
+                damping_of(
+                    scene.with_values({name: find_number(scene, name) + h}).stroke
+                )
                 for h in (1e-6, -1e-6)
             )
             assert slope == pytest.approx((high - low) / 2e-6, rel=1e-7)
@@ -126,8 +154,14 @@ def test_the_slopes_of_the_damping_by_restitution_and_impact_rate():
 @pytest.mark.slow
 def test_smoothing_and_lag_which_no_torque_is_linear_in_are_found():
     plant = rubbing()
-    names = ("friction.gamma.smoothing", "actuators.time_constant", "initial.gamma_dot[0]")
-    motion = simulate(plant, t_eval=np.linspace(0.0, 0.3, 61), duration=0.3, tolerance=1e-11)
+    names = (
+        "friction.gamma.smoothing",
+        "actuators.time_constant",
+        "initial.gamma_dot[0]",
+    )
+    motion = simulate(
+        plant, t_eval=np.linspace(0.0, 0.3, 61), duration=0.3, tolerance=1e-11
+    )
     guess = plant.with_values(dict(zip(names[:2], (0.3, 0.03), strict=True)))
     found = identify(motion, guess, names, method="simulation")
     assert found.values == pytest.approx([0.5, 0.02, 0.3], rel=1e-6)
@@ -143,13 +177,17 @@ def test_the_torques_of_a_trajectory_lag_once(torque):
     times = np.linspace(0.0, 0.3, 151)
     motion = simulate(plant, torque, t_eval=times, duration=0.3, tolerance=1e-11)
     by_torques = identify(motion, plant, [name, "star.inertia"])
-    assert by_torques.values[by_torques.names.index(name)] == pytest.approx(0.1, rel=1e-6)
+    assert by_torques.values[by_torques.names.index(name)] == pytest.approx(
+        0.1, rel=1e-6
+    )
     guess = plant.with_values({name: 0.12})
     found = identify(motion, guess, [name], method="simulation")
     assert found.values == pytest.approx([0.1], rel=1e-6)
 
 
-@pytest.mark.parametrize("torque", [(3.0, -2.0, 1.0), pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "torque", [(3.0, -2.0, 1.0), pytest.param(None, marks=pytest.mark.slow)]
+)
 def test_torques_that_a_limit_has_cut_off_are_those_that_acted(torque):
     free = load_scene("example2_heavy")
     limited = free.with_values(
@@ -182,7 +220,9 @@ def test_the_standard_deviations_cover_the_errors_of_noisy_angles():
 
 @pytest.mark.slow
 def test_angles_of_example_1_fix_the_product_of_inertia_and_initial_rate():
-    """No drift over a period: I_eff gamma_dot(0) = -1.13 / 12, far better than either alone."""
+    """No drift over a period: I_eff gamma_dot(0) = -1.13 / 12, far better than either
+    alone.
+    """
     scene, period = load_scene("example1"), math.pi / 6
     motion = simulate(scene, t_eval=np.linspace(0.0, period, 27), duration=period)
     guess = scene.with_values({"star.inertia.zz": 0.3})
@@ -195,14 +235,18 @@ def test_angles_of_example_1_fix_the_product_of_inertia_and_initial_rate():
     assert product == pytest.approx(-1.13 / 12.0, rel=4.0 * found.relative[0])
     # Along what stays open the product stays: relative changes of 1e-3 cancel.
     changed = found.values * (1.0 + 1e-3 * found.directions[-1])
-    moved = found.scene.with_values(dict(zip(found.names, changed.tolist(), strict=True)))
+    moved = found.scene.with_values(
+        dict(zip(found.names, changed.tolist(), strict=True))
+    )
     there = inertia(moved, 0.0) * moved.initial.gamma_dot[0]
     assert there == pytest.approx(product, rel=1e-4)
     assert "known to " in found.table()
 
 
 def test_inertias_that_no_bodies_have_do_not_enter_the_scene():
-    """The thin arc of the links is flat: a smaller zz alone breaks the triangle inequality."""
+    """The thin arc of the links is flat: a smaller zz alone breaks the triangle
+    inequality.
+    """
     plant = load_scene("example2_heavy")
     heavier = plant.with_values({"star.inertia.xx": 0.34})
     motion = simulate(heavier, t_eval=np.linspace(0.0, 0.3, 31), tolerance=1e-10)
@@ -219,7 +263,10 @@ def test_inertias_that_no_bodies_have_do_not_enter_the_scene():
     [
         ((), "must be keys of numbers"),
         (("base.v",), "is geometry"),
-        (("friction.gamma.smoothing",), "must be the key of a number that the scene has"),
+        (
+            ("friction.gamma.smoothing",),
+            "must be the key of a number that the scene has",
+        ),
         (("star.moment.x",), "must be the key of a number that the scene has"),
     ],
 )
@@ -247,7 +294,9 @@ def test_fig_9_fixes_the_product_of_inertia_and_initial_rate_and_little_more():
 
 
 @pytest.mark.parametrize(("panel", "worst"), [(1, 0.05), (2, 0.2)])
-def test_example_2_fixes_the_moments_of_the_star_and_two_combinations_never(panel, worst):
+def test_example_2_fixes_the_moments_of_the_star_and_two_combinations_never(
+    panel, worst
+):
     _, name, read, rate = PANELS[panel]
     _, relative = determined(name, read, rate)
     assert relative[0] < 0.011 and relative[2] < worst

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches: every scenario is a run of its own, on any threads; what they keep, tell and refuse."""
+"""Batches: every scenario is a run of its own, on any threads.
+
+What they keep, tell and refuse.
+"""
 
 import copy
 import signal
@@ -35,7 +38,10 @@ TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 
 class Rows(NamedTuple):
-    """A batch, where its scenarios start, and what becomes of them; None drives by the profile."""
+    """A batch, where its scenarios start, and what becomes of them.
+
+    None drives by the profile.
+    """
 
     batch: Batch
     gamma: np.ndarray
@@ -56,7 +62,9 @@ def swarm():
     """Example 2 from many starts under its torques."""
     gamma = np.random.default_rng(5).uniform(0.6, 1.0, (N, 3))
     gamma[7] = (0.05, 0.05, 1.5)  # no admissible assembly
-    rows = Rows(Batch(EXAMPLE2, profile=True), gamma, np.zeros((N, 3)), None, 0.01, None)
+    rows = Rows(
+        Batch(EXAMPLE2, profile=True), gamma, np.zeros((N, 3)), None, 0.01, None
+    )
     return rows._replace(result=rows.run(keep_every=25, threads=3))
 
 
@@ -85,7 +93,9 @@ def manipulators(samples):
             bodies[f"{links}[{k}]"] = [getattr(scene, links)[k] for scene in scenes]
     for name, rows in bodies.items():
         for key in TENSOR:
-            parameters[f"{name}.inertia.{key}"] = [getattr(one.inertia, key) for one in rows]
+            parameters[f"{name}.inertia.{key}"] = [
+                getattr(one.inertia, key) for one in rows
+            ]
     gamma, gamma_dot, torque = (
         np.array([getattr(one, name) for one in samples])
         for name in ("gamma", "gamma_dot", "torque")
@@ -123,19 +133,28 @@ def alone(scene, gamma, gamma_dot, torque, tick_ns, count):
 def test_a_scenario_equals_a_run_of_its_own(rows, n):
     torque = EXAMPLE2.torque.at if rows.torque is None else tuple(rows.torque[n])
     tick_ns, scene = round(rows.step * 1e9), rows.batch.scenario(n)
-    state, reason, time = alone(scene, rows.gamma[n], rows.gamma_dot[n], torque, tick_ns, 100)
+    state, reason, time = alone(
+        scene, rows.gamma[n], rows.gamma_dot[n], torque, tick_ns, 100
+    )
     result, bound = rows.result, 1e-10 if rows.torque is None else 1e-9
     assert result.message[n] == reason
     if state is not None:
         sign = np.sign(result.quaternion[n] @ state.quaternion)
-        np.testing.assert_allclose(sign * result.quaternion[n], state.quaternion, atol=bound)
-        np.testing.assert_allclose(result.body_rate[n], state.body_rate, atol=10.0 * bound)
+        np.testing.assert_allclose(
+            sign * result.quaternion[n], state.quaternion, atol=bound
+        )
+        np.testing.assert_allclose(
+            result.body_rate[n], state.body_rate, atol=10.0 * bound
+        )
     if time is not None:
         assert abs(result.fault_time[n] - time) < 10.0 * bound
 
 
 def test_faults_stay_with_their_scenario(rows):
-    """What is told is what a run of its own says, see above; here: of different ends."""
+    """What is told is what a run of its own says, see above.
+
+    here: of different ends.
+    """
     result = rows.result
     told = {result.message[n] for n in np.flatnonzero(~result.success)}
     assert 0 < np.count_nonzero(result.status) < len(result.status)
@@ -153,7 +172,9 @@ def test_threads_change_no_bit(rows):
 
 
 def test_a_scenario_has_the_bits_of_steps_of_its_own(rows):
-    """Lanes, blocks and slices of time change none: the same operations in the same order."""
+    """Lanes, blocks and slices of time change none: the same operations in the same
+    order.
+    """
     batch, result = rows.batch, rows.result
     y, _ = batch.initial(rows.gamma, rows.gamma_dot)
     done = np.flatnonzero(result.success)[: MANY + 1].tolist()
@@ -163,7 +184,9 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(rows):
         if rows.torque is not None:
             torque, method, drive = None, DORMAND_PRINCE, rows.torque[n].tolist()
         machine = MethodSteps(ODE(Dynamics.of(scene), torque), method)
-        ended = machine.fixed(0.0, rows.step, 100, y[:, n].tolist(), Drive(tuple(drive)))
+        ended = machine.fixed(
+            0.0, rows.step, 100, y[:, n].tolist(), Drive(tuple(drive))
+        )
         assert ended == [*result.quaternion[n], *result.body_rate[n]]
 
 
@@ -192,7 +215,9 @@ batch.run([(0.8, 0.8, 0.8)] * 20_000, (0.0, 0.0, 0.0), step=1e-6, count=10**8, t
 @pytest.mark.parametrize("threads", [1, 2])
 def test_an_interrupt_ends_a_batch_at_once(threads):
     program = [sys.executable, "-c", LONG_RUN.format(threads=threads)]
-    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+    with subprocess.Popen(
+        program, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as run:
         assert run.stdout.readline() == b"runs\n"
         run.send_signal(signal.SIGINT)
         _, said = run.communicate(timeout=20)  # without it the run would take hours
@@ -253,7 +278,10 @@ def test_torques_are_no_moments_where_a_profile_takes_their_place():
 @pytest.mark.parametrize(
     ("scene", "said"),
     [
-        (EXAMPLE2.with_values({"actuators.torque_limit": 4.5}), "limit = 4.5: must not be less"),
+        (
+            EXAMPLE2.with_values({"actuators.torque_limit": 4.5}),
+            "limit = 4.5: must not be less",
+        ),
         (load_scene("stiff"), "torque = None: must be given"),
     ],
 )
@@ -263,14 +291,19 @@ def test_profiles_that_a_batch_cannot_follow_are_refused(scene, said):
 
 
 def test_a_start_outside_the_stroke_is_a_fault_of_its_scenario():
-    """Where a simulation refuses it: between gamma_1 = -0.01 and 0 there is an assembly."""
+    """Where a simulation refuses it: between gamma_1 = -0.01 and 0 there is an
+    assembly.
+    """
     outside = np.array([[0.8, 0.8, 0.8], [-0.01, 0.5, 0.6], [0.8, 0.8, 1.6]])
     for gamma in outside[1:]:
         with pytest.raises(InputError, match="must lie in the stroke"):
             Simulation(replace(EXAMPLE2, initial=Initial(gamma=tuple(gamma))))
     batch = Batch(EXAMPLE2, profile=True)
     found = batch.run(outside, REST, step=0.01, count=1)
-    assert found.message == ("reached the end", *("initial gamma outside the stroke",) * 2)
+    assert found.message == (
+        "reached the end",
+        *("initial gamma outside the stroke",) * 2,
+    )
     assert found.fault_time[1:].tolist() == [0.0, 0.0]
     free = replace(EXAMPLE2, stroke=replace(EXAMPLE2.stroke, at_end="ignore"))
     assert "stroke" not in "".join(
@@ -291,9 +324,14 @@ ELASTIC = {"stroke.at_end": "elastic", "stroke.stiffness": 100.0}
 def test_the_result_has_the_quantities_of_simulate(changes):
     """Scenario by scenario, with another inertia and amplitude in each."""
     scene = EXAMPLE2.with_values({"duration": 0.1, **changes})
-    parameters = {"star.inertia.zz": [0.25, 0.3], "torque.amplitude": [[1, 2, 3], [2, 0.1, 1]]}
+    parameters = {
+        "star.inertia.zz": [0.25, 0.3],
+        "torque.amplitude": [[1, 2, 3], [2, 0.1, 1]],
+    }
     batch = Batch(scene, profile=True, parameters=parameters)
-    found = batch.run(scene.initial.gamma, (0, 0, 0), step=1e-3, count=100, keep_every=50)
+    found = batch.run(
+        scene.initial.gamma, (0, 0, 0), step=1e-3, count=100, keep_every=50
+    )
     assert found.success.all()
     assert set(found.message) == {"reached the end"}
     for row in range(2):
@@ -302,11 +340,15 @@ def test_the_result_has_the_quantities_of_simulate(changes):
             expected, kept = getattr(motion, name), getattr(found.kept, name)[:, row]
             np.testing.assert_allclose(kept, expected, atol=2e-8, err_msg=name)
             assert np.array_equal(getattr(found, name)[row], kept[-1])
-    np.testing.assert_allclose(found.kept.t, [[0.0] * 2, [0.05] * 2, [0.1] * 2], rtol=1e-15)
+    np.testing.assert_allclose(
+        found.kept.t, [[0.0] * 2, [0.05] * 2, [0.1] * 2], rtol=1e-15
+    )
 
 
 def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation():
-    """The actuator turns near its end in the first of two steps, which end inside again."""
+    """The actuator turns near its end in the first of two steps, which end inside
+    again.
+    """
     scene = replace(EXAMPLE2, torque=None)
     depth = np.random.default_rng(5).uniform(3.2e-3, 4.8e-3, N)
     depth[depth > 4e-3] += 1.2e-3  # the turning point is 5e-3 rad on
@@ -315,7 +357,9 @@ def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation():
     found = Batch(scene).run(gamma, rate, torque, step=0.06, count=2)
     ended = 0
     for n in range(0, N, 4):
-        _, reason, time = alone(scene, gamma[n], rate[n], tuple(torque[n]), 120_000_000, 1)
+        _, reason, time = alone(
+            scene, gamma[n], rate[n], tuple(torque[n]), 120_000_000, 1
+        )
         assert found.message[n] == reason
         if time is not None:
             ended += 1
@@ -328,7 +372,9 @@ def test_rates_of_distances_are_their_slopes_over_time(swarm):
         compile_program(swarm.batch.model.limit_distances),
         [0.1, -0.2, 0.3, 0.9, 0.5, -0.4, 0.7],
     )
-    x, y, z, w, *rate = np.divide(state, [*[np.linalg.norm(state[:4])] * 4, 1.0, 1.0, 1.0])
+    x, y, z, w, *rate = np.divide(
+        state, [*[np.linalg.norm(state[:4])] * 4, 1.0, 1.0, 1.0]
+    )
     turned = Rotation.from_quat([x, y, z, w])
     ends = [
         program(*(turned * Rotation.from_rotvec(np.multiply(h, rate))).as_quat(), *rate)
@@ -364,4 +410,6 @@ def test_tables_have_units_and_a_row_a_scenario(swarm):
     assert float((data["status"] == 1).mean()) == np.mean(result.status == 1)
     kept = result.kept.to_xarray()
     assert kept["beta"].dims == ("time", "scenario", "leg")
-    assert np.array_equal(kept["beta"].sel(leg=3), result.kept.beta[..., 2], equal_nan=True)
+    assert np.array_equal(
+        kept["beta"].sel(leg=3), result.kept.beta[..., 2], equal_nan=True
+    )

@@ -64,7 +64,9 @@ LOADED = dataclasses.replace(
 
 
 def drawn(seed):
-    """Some numbers of a scene with every term, three rows of each, zero in some of them."""
+    """Some numbers of a scene with every term, three rows of each, zero in some of
+    them.
+    """
     rng, found = np.random.default_rng(seed), {}
     for key, (low, high, may_vanish) in RANGES.items():
         if rng.random() < 0.3:
@@ -81,7 +83,10 @@ DRIVE = (0.4, -0.1, 0.2)
 
 @pytest.mark.parametrize("seed", range(30))
 def test_programs_have_the_bits_of_those_of_each_row(seed):
-    """Zero in one row and not in another is one program; nothing but the inputs differs."""
+    """Zero in one row and not in another is one program.
+
+    Nothing but the inputs differs.
+    """
     batch = Batch(LOADED, RK4, profile=True, parameters=drawn(seed))
     columns = batch.drives(REST, 3)
     for row in range(3):
@@ -90,7 +95,9 @@ def test_programs_have_the_bits_of_those_of_each_row(seed):
         assert compile_program(batch.model.program)(*at, *drive) == compile_program(
             own.model.program
         )(*at, *DRIVE)
-        inside = compile_program(batch.model.limit_distances)(*STATE[:7], *columns[3:, row])
+        inside = compile_program(batch.model.limit_distances)(
+            *STATE[:7], *columns[3:, row]
+        )
         assert inside == compile_program(own.model.limit_distances)(*STATE[:7])
 
 
@@ -122,11 +129,17 @@ def test_a_singular_start_stops_no_other():
     """Where det J2 = 0 gamma_dot says nothing of the body rate; rest stays rest."""
     odd = (210.0, 75.0, 75.0)
     scene = dataclasses.replace(EXAMPLE2, **IGNORE)
-    of_odd = dataclasses.replace(scene, star=dataclasses.replace(scene.star, alpha_deg=odd))
+    of_odd = dataclasses.replace(
+        scene, star=dataclasses.replace(scene.star, alpha_deg=odd)
+    )
     geometry = Geometry.of(of_odd)
-    chart = workspace.over_orientations(geometry, workspace.triangle_directions(geometry, 12)[0])
+    chart = workspace.over_orientations(
+        geometry, workspace.triangle_directions(geometry, 12)[0]
+    )
     gamma = workspace.parallel_singularities(chart).gamma[0]
-    batch = Batch(scene, RK4, parameters={"star.alpha_deg": [odd, scene.star.alpha_deg]})
+    batch = Batch(
+        scene, RK4, parameters={"star.alpha_deg": [odd, scene.star.alpha_deg]}
+    )
     y, code = batch.initial(gamma, REST)
     assert code.tolist() == [0, 0]
     assert np.all(y[4:7] == 0.0)
@@ -137,7 +150,9 @@ def test_valid_rows_are_prepared_without_a_scene_for_each(monkeypatch):
     """Columns are checked and prepared as arrays, zeros too."""
     built = []
     scene = Scenarios.scene
-    monkeypatch.setattr(Scenarios, "scene", lambda self, row: built.append(row) or scene(self, row))
+    monkeypatch.setattr(
+        Scenarios, "scene", lambda self, row: built.append(row) or scene(self, row)
+    )
     rng = np.random.default_rng(3)
     parameters = {
         "star.inertia.zz": rng.uniform(0.25, 0.3, 1000),
@@ -154,18 +169,27 @@ def test_valid_rows_are_prepared_without_a_scene_for_each(monkeypatch):
 
 
 REFUSED = [
-    ({"star.weight": [1.0]}, r"star.weight = \[1.0\]: unknown key; allowed are inertia, mass"),
+    (
+        {"star.weight": [1.0]},
+        r"star.weight = \[1.0\]: unknown key; allowed are inertia, mass",
+    ),
     ({"payload.mass": [1.0]}, "payload.mass = .*: the scene has no payload"),
     ({"springs[0].rest": [1.0]}, "the scene has 0 springs"),
     ({"actuated_links[3].mass": [1.0]}, "the scene has 3 actuated_links"),
     ({"star.inertia": [1.0]}, "must name a number, as star.mass does"),
     ({"stroke.at_end": [1.0]}, "must name a number, as star.mass does"),
     ({"base.v[0]": np.ones((2, 3))}, "must name a number, as star.mass does"),
-    ({"base.v": np.eye(3)}, r"must have the shape \(N, 3, 3\), a row a scenario; it has \(3, 3\)"),
+    (
+        {"base.v": np.eye(3)},
+        r"must have the shape \(N, 3, 3\), a row a scenario; it has \(3, 3\)",
+    ),
     ({"base.radius": 1.0}, r"must have the shape \(N,\)"),
     ({"base.radius": []}, r"must have the shape \(N,\)"),
     ({"star.inertia.zz": ["much"]}, "must be numbers"),
-    ({"star.inertia.zz": [0.3, 0.3], "star.inertia.xx": [0.3]}, r"must have the shape \(2,\)"),
+    (
+        {"star.inertia.zz": [0.3, 0.3], "star.inertia.xx": [0.3]},
+        r"must have the shape \(2,\)",
+    ),
     (
         {"actuated_links.mass": [0.0], "actuated_links[1].mass": [0.0]},
         r"actuated_links\[1\].mass = .*: is given twice",
@@ -176,17 +200,35 @@ REFUSED = [
     ),
     (
         {"actuated_links[2].mass": [0.0, -1.0]},
-        r"scenario 1: actuated_links\[2\].mass = -1.0: must be a finite number >= 0 \[kg\]",
+        (
+            r"scenario 1: actuated_links\[2\].mass = -1.0: must be a finite number >= 0"
+            r" \[kg\]"
+        ),
     ),
-    ({"star.inertia.zz": [0.3, np.nan]}, "scenario 1: star.inertia.zz = nan: must be a finite"),
-    ({"actuated_links[0].centre": [(0.0, 0.0, np.nan)]}, r"scenario 0: actuated_links\[0\].centre"),
-    ({"star.alpha_deg": [(120.0, 120.0, 121.0)]}, "scenario 0: star.alpha_deg = .*must sum to 360"),
+    (
+        {"star.inertia.zz": [0.3, np.nan]},
+        "scenario 1: star.inertia.zz = nan: must be a finite",
+    ),
+    (
+        {"actuated_links[0].centre": [(0.0, 0.0, np.nan)]},
+        r"scenario 0: actuated_links\[0\].centre",
+    ),
+    (
+        {"star.alpha_deg": [(120.0, 120.0, 121.0)]},
+        "scenario 0: star.alpha_deg = .*must sum to 360",
+    ),
     (
         {"stroke.restitution": [0.5, 0.6]},
-        "scenario 0: stroke.restitution = 0.5: is given with at_end: elastic, and only there",
+        (
+            "scenario 0: stroke.restitution = 0.5: is given with at_end: elastic, and"
+            " only there"
+        ),
     ),
     ({"initial.gamma": np.ones((2, 3))}, "initial.gamma = .*: is given to run"),
-    ({"torque.amplitude": np.ones((2, 3))}, "torque.amplitude = .*: acts with profile=True only"),
+    (
+        {"torque.amplitude": np.ones((2, 3))},
+        "torque.amplitude = .*: acts with profile=True only",
+    ),
     ({"duration": [1.0, 2.0]}, "duration = .*: has no effect on a batch"),
 ]
 
@@ -200,9 +242,14 @@ def test_bad_parameters_are_refused_by_key_and_row(parameters, said):
 def test_numbers_of_a_term_that_is_left_out_are_held_to_what_is_allowed_too():
     """Friction of zero is none, but its smoothing is no less wrong."""
     values = {"viscous": [0.0, 0.1], "coulomb": [0.0, 0.1], "smoothing": [-1.0, 0.1]}
-    said = "scenario 0: friction.beta.smoothing = -1.0: must be a finite number >= 1e-12"
+    said = (
+        "scenario 0: friction.beta.smoothing = -1.0: must be a finite number >= 1e-12"
+    )
     with pytest.raises(InputError, match=said):
-        Batch(LOADED, parameters={f"friction.beta.{key}": rows for key, rows in values.items()})
+        Batch(
+            LOADED,
+            parameters={f"friction.beta.{key}": rows for key, rows in values.items()},
+        )
 
 
 SPREAD = {
@@ -231,7 +278,11 @@ def test_rules_refuse_the_same_rows_as_columns_and_as_scenes(key):
         except InputError:
             refused.add(row)
     assert 0 < len(refused) < 60
-    assert set(scenarios.faults(most=60)) == refused == set(np.flatnonzero(scenarios._doubtful()))
+    assert (
+        set(scenarios.faults(most=60))
+        == refused
+        == set(np.flatnonzero(scenarios._doubtful()))
+    )
 
 
 def test_no_more_than_ten_problems_are_told():

@@ -64,7 +64,9 @@ def test_a_robot_that_ends_waits_until_it_is_reset():
 
 def test_threads_and_other_numbers_of_robots_change_no_bit():
     many, few = starts(2000), 5
-    session, alone = (Batch(SCENE).start(rows, step=2e-3) for rows in (many, many[-few:]))
+    session, alone = (
+        Batch(SCENE).start(rows, step=2e-3) for rows in (many, many[-few:])
+    )
     for _ in range(3):
         both = session.step((0.1, 0.2, 0.3)), alone.step((0.1, 0.2, 0.3))
     for whole, part in zip(*both, strict=True):
@@ -74,7 +76,10 @@ def test_threads_and_other_numbers_of_robots_change_no_bit():
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda of: of.step(np.zeros((4, 3))), r"torque = \(4, 3\): must have the shape"),
+        (
+            lambda of: of.step(np.zeros((4, 3))),
+            r"torque = \(4, 3\): must have the shape",
+        ),
         (lambda of: of.step((np.nan, 0.0, 0.0)), "(?s)torque = .*must be finite"),
         (lambda of: of.reset([9]), r"rows = \[9\]: must be whole numbers from 0 to 8"),
         (lambda of: of.reset([0], gamma=(np.nan,) * 3), "(?s)gamma = .*must be finite"),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error that a run tells of itself, its energy balance and its closure.
 
-Truth: the same periods by DOP853 at tolerance 1e-14 (Rodas5P for the stiff scene). Its own estimate
-is asserted to be 20 times below the errors it judges; smaller errors are rounding, and only
-bounded.
+Truth: the same periods by DOP853 at tolerance 1e-14 (Rodas5P for the stiff scene). Its
+own estimate is asserted to be 20 times below the errors it judges; smaller errors are
+rounding, and only bounded.
 """
 
 from __future__ import annotations
@@ -61,7 +61,10 @@ def slowly(*values):
     ("name", "method"),
     [
         *((name, "auto") for name in SPANS),
-        *(slowly(name, "dop853") for name in ("friction", "fast_spin", "elastic_stops", "impacts")),
+        *(
+            slowly(name, "dop853")
+            for name in ("friction", "fast_spin", "elastic_stops", "impacts")
+        ),
         ("elastic_stops", "rodas5p"),
         *(slowly(name, "rodas5p") for name in ("friction", "impacts", "general")),
     ],
@@ -70,7 +73,9 @@ def test_the_estimate_is_within_ten_times_of_the_true_error(name, method, tolera
     simulation, truth = travelled(name, method, tolerance), truth_of(name)
     estimates = simulation.error_estimate, simulation.rate_error_estimate
     own = truth.error_estimate, truth.rate_error_estimate
-    for estimate, error, its_own in zip(estimates, apart(simulation, truth), own, strict=True):
+    for estimate, error, its_own in zip(
+        estimates, apart(simulation, truth), own, strict=True
+    ):
         unsure = max(ROUNDING, 20.0 * its_own)
         assert estimate > 0.1 * error - unsure
         assert estimate < 10.0 * error + unsure
@@ -78,7 +83,9 @@ def test_the_estimate_is_within_ten_times_of_the_true_error(name, method, tolera
 
 @pytest.mark.parametrize("name", ["elastic_stops", "impacts"])
 def test_contacts_lose_no_order(name):
-    """Steps end where a force has its kink, so 100 times the accuracy costs few steps more."""
+    """Steps end where a force has its kink, so 100 times the accuracy costs few steps
+    more.
+    """
     loose, tight, truth = (
         travelled(name, "dop853", 1e-6),
         travelled(name, "dop853", 1e-10),
@@ -108,7 +115,8 @@ def test_springs_keep_their_energy(seconds, bound):
         assert abs(simulation.energy_residual) < bound * scale
 
 
-SHARP = [  # underestimated 27, 11, 16 and 10 times by an estimate that took order 4 for granted
+# underestimated 27, 11, 16 and 10 times by an estimate that took order 4 for granted
+SHARP = [
     ("example2_heavy", 0.05, 1e-4, 1),
     ("example2_heavy", 0.5, 1e-3, 5),
     ("example2_heavy", 0.5, 1e-4, 5),

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """When events happen, against times that our integrators did not make.
 
-A star without inertia of its legs, and alike about all axes, turns at a constant rate about a fixed
-axis: then every event is a root of A cos(rate t) + B sin(rate t) + C. Motions through elastic
-contacts are held against SciPy in `test/mechanism/test_symmetric_motion.py`.
+A star without inertia of its legs, and alike about all axes, turns at a constant rate
+about a fixed axis: then every event is a root of A cos(rate t) + B sin(rate t) + C.
+Motions through elastic contacts are held against SciPy in
+`test/mechanism/test_symmetric_motion.py`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ MILLISECOND = 1_000_000
 
 START = Simulation(replace(EXAMPLE2, initial=Initial(gamma=GAMMA))).state
 AT = virtual_work.posture(
-    Geometry.of(EXAMPLE2), np.array(START.joints.gamma), rotation_matrix(START.quaternion)
+    Geometry.of(EXAMPLE2),
+    np.array(START.joints.gamma),
+    rotation_matrix(START.quaternion),
 )
 
 
@@ -54,7 +57,9 @@ def turning(scene, axis, method="dop853"):
 
 
 def first_root(axis, moving, fixed):
-    """When a vector that turns about `axis` at RATE is first at right angles to a fixed one."""
+    """When a vector that turns about `axis` at RATE is first at right angles to a fixed
+    one.
+    """
     along = (axis @ moving) * (axis @ fixed)
     a, b = moving @ fixed - along, np.cross(axis, moving) @ fixed
     base, spread = math.atan2(b, a), math.acos(-along / math.hypot(a, b))
@@ -92,7 +97,9 @@ def test_the_edge_of_the_workspace_is_met_when_e_lies_in_the_plane_of_an_arc(leg
     assert abs(stop.time - first_root(axis, s, AT.w[leg])) < 1e-12
 
 
-@pytest.mark.parametrize(("upper", "method"), [(False, "dop853"), (True, "dop853"), (True, "auto")])
+@pytest.mark.parametrize(
+    ("upper", "method"), [(False, "dop853"), (True, "dop853"), (True, "auto")]
+)
 def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper, method):
     """gamma_k has a value where t_k is at right angles to r_k there."""
     geometry = Geometry.of(EXAMPLE2)
@@ -100,14 +107,18 @@ def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper, method):
     simulation = turning(replace(FREE_STAR, stroke=Stroke()), axis, method)
     stop = met(simulation, StrokeExceeded)
     k = int(stop.reason.removeprefix("gamma_")[0]) - 1
-    ends = kinematics.carriage_directions(geometry, geometry.arc if upper else np.zeros(3))
+    ends = kinematics.carriage_directions(
+        geometry, geometry.arc if upper else np.zeros(3)
+    )
     times = [first_root(axis, AT.t[j], ends[j]) for j in range(3)]
     assert abs(stop.time - times[k]) < 1e-12
     assert times[k] == min(times)
 
 
 def test_auto_follows_a_run_that_is_stiff_then_not_and_then_stiff_again():
-    """A soft end with much damping: pressed against it, torn off, pressed against it again."""
+    """A soft end with much damping: pressed against it, torn off, pressed against it
+    again.
+    """
     scene = replace(
         EXAMPLE2,
         torque=None,
@@ -136,20 +147,40 @@ def test_auto_follows_a_run_that_is_stiff_then_not_and_then_stiff_again():
 
 
 FOUND = {
-    "a crossing, to the rounding of its time": (math.cos, lambda t: -math.sin(t), 2.0, math.pi / 2),
-    "a dip inside": (lambda t: (t - 0.4) * (t - 0.6), lambda t: 2.0 * t - 1.0, 1.0, 0.4),
-    "leaving an end and back": (lambda t: t * (0.5 - t), lambda t: 0.5 - 2.0 * t, 1.0, 0.5),
+    "a crossing, to the rounding of its time": (
+        math.cos,
+        lambda t: -math.sin(t),
+        2.0,
+        math.pi / 2,
+    ),
+    "a dip inside": (
+        lambda t: (t - 0.4) * (t - 0.6),
+        lambda t: 2.0 * t - 1.0,
+        1.0,
+        0.4,
+    ),
+    "leaving an end and back": (
+        lambda t: t * (0.5 - t),
+        lambda t: 0.5 - 2.0 * t,
+        1.0,
+        0.5,
+    ),
     "through an end at once": (lambda t: -t, lambda t: -1.0, 1.0, 0.0),
     "from beyond it by rounding": (lambda t: -1e-15 - t, lambda t: -1.0, 1.0, 0.0),
     "pushed from rest through an end": (lambda t: -t * t, lambda t: -2.0 * t, 1.0, 0.0),
 }
 NONE = {
-    "a minimum above zero": (lambda t: (t - 0.5) ** 2 + 1e-9, lambda t: 2.0 * (t - 0.5), 1.0),
+    "a minimum above zero": (
+        lambda t: (t - 0.5) ** 2 + 1e-9,
+        lambda t: 2.0 * (t - 0.5),
+        1.0,
+    ),
     "leaving an end": (lambda t: t, lambda t: 1.0, 1.0),
     "inside, away": (lambda t: 1.0 + t, lambda t: 1.0, 1.0),
     "inside, towards an end": (lambda t: 2.0 - t, lambda t: -1.0, 1.0),
     "rest at an end": (lambda t: -1e-16, lambda t: 0.0, 1.0),
-    # What has just left an end at almost no rate is off it by less than an angle's rounding.
+    # What has just left an end at almost no rate is off it by less than an angle's
+    # rounding.
     "rounding on the way inwards": (lambda t: 1e-14 * t - 1e-16, lambda t: 1e-14, 1e-3),
 }
 

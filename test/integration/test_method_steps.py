@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of every method: the same bits as machine code and as plain Python, order, Jacobians."""
+"""Steps of every method: the same bits as machine code and as plain Python, order,
+Jacobians.
+"""
 
 from __future__ import annotations
 
@@ -42,9 +44,15 @@ def system_of(scene, torque=None, work=False):
 SINE = (replace(EXAMPLE2, **IGNORE), 0.4, EXAMPLE2.torque)
 SPIN = (replace(load("fast_spin"), **IGNORE), 0.01, None)
 ORDERS = [
-    *((SINE, method, n) for method, n in ((RK4, 256), (DORMAND_PRINCE, 64), (DOP853, 16))),
+    *(
+        (SINE, method, n)
+        for method, n in ((RK4, 256), (DORMAND_PRINCE, 64), (DOP853, 16))
+    ),
     (SINE, RODAS5P, 128),
-    *((SPIN, method, n) for method, n in ((RK4, 256), (DORMAND_PRINCE, 96), (RODAS5P, 96))),
+    *(
+        (SPIN, method, n)
+        for method, n in ((RK4, 256), (DORMAND_PRINCE, 96), (RODAS5P, 96))
+    ),
 ]
 
 
@@ -62,10 +70,15 @@ def truth_of(scene, span, torque):
 @pytest.mark.parametrize(
     ("case", "method", "steps"),
     ORDERS,
-    ids=[f"{'sine' if case[2] else 'spin'}-{method.name}" for case, method, _ in ORDERS],
+    ids=[
+        f"{'sine' if case[2] else 'spin'}-{method.name}" for case, method, _ in ORDERS
+    ],
 )
 def test_measured_order_is_that_of_the_theory(case, method, steps):
-    """Errors stay well above rounding. Under sine torques the d/dt of Rodas5P is at work."""
+    """Errors stay well above rounding.
+
+    Under sine torques the d/dt of Rodas5P is at work.
+    """
     system, y, drive, truth = truth_of(*case)
     machine = MethodSteps(system, method)
     errors = []
@@ -88,14 +101,20 @@ def linearised(scene, torque, t, y, drive):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("what", ["inertia", "loaded"])
 def test_jacobians_are_exact(what, seed):
-    """Against the complex step through the kernel itself, which has no difference to cancel.
+    """Against the complex step through the kernel itself, which has no difference to
+    cancel.
 
-    At rest of contact: the elastic stops are not in touch, where complex steps have no meaning.
+    At rest of contact: the elastic stops are not in touch, where complex steps have no
+        meaning.
     """
     (sample,) = seeded_samples(seed + 80, 1)
     scene = loaded() if what == "loaded" else sample.scene
     dynamics = Dynamics.of(scene)
-    y = [*start_of(scene)[:4], *(0.3, -0.2, 0.4), *(0.5, -0.4, 0.2)[: len(dynamics.state) - 7]]
+    y = [
+        *start_of(scene)[:4],
+        *(0.3, -0.2, 0.4),
+        *(0.5, -0.4, 0.2)[: len(dynamics.state) - 7],
+    ]
     y = [x + 0.003 * (seed + 1) * (-1) ** i for i, x in enumerate(y)]
     slope, by_time, matrix = linearised(scene, None, 0.0, [*y, 0.0], (*DRIVE, *MOMENT))
     moment = MOMENT if dynamics.has_moment_topic else None
@@ -104,7 +123,9 @@ def test_jacobians_are_exact(what, seed):
     for j in range(size):
         stepped = [complex(x) for x in y]
         stepped[j] += 1e-30j
-        truth[:, j] = np.imag(derivative(dynamics.model, tuple(stepped), DRIVE, moment)) / 1e-30
+        truth[:, j] = (
+            np.imag(derivative(dynamics.model, tuple(stepped), DRIVE, moment)) / 1e-30
+        )
     assert np.abs(truth).max() > 1.0
     np.testing.assert_allclose(
         matrix[:size, :size], truth, rtol=0, atol=1e-12 * np.abs(truth).max()
@@ -115,7 +136,9 @@ def test_jacobians_are_exact(what, seed):
 
 
 def test_the_derivative_by_time_is_exact():
-    """With M_dot = 0 it is M^-1 J^T tau_dot: linear in tau, so two exact torques give it."""
+    """With M_dot = 0 it is M^-1 J^T tau_dot: linear in tau, so two exact torques give
+    it.
+    """
     t, torque = 0.13, EXAMPLE2.torque
     y = [*start_of(EXAMPLE2)[:4], 0.3, -0.2, 0.4, 0.0]
     slope, by_time, _ = linearised(EXAMPLE2, torque, t, y, ())
@@ -123,9 +146,13 @@ def test_the_derivative_by_time_is_exact():
     model = Dynamics.of(EXAMPLE2).model
     now = tuple(a * math.sin(f * t + p) for a, f, p in rows)
     rate = tuple(a * f * math.cos(f * t + p) for a, f, p in rows)
-    moving, free = (np.array(derivative(model, tuple(y[:7]), tau)) for tau in (rate, (0.0,) * 3))
+    moving, free = (
+        np.array(derivative(model, tuple(y[:7]), tau)) for tau in (rate, (0.0,) * 3)
+    )
     np.testing.assert_allclose(by_time[:7], moving - free, atol=1e-12)
-    np.testing.assert_allclose(slope[:7], derivative(model, tuple(y[:7]), now), atol=1e-12)
+    np.testing.assert_allclose(
+        slope[:7], derivative(model, tuple(y[:7]), now), atol=1e-12
+    )
     assert np.abs(by_time).max() > 1.0
 
 
@@ -149,9 +176,15 @@ SCENES = sorted(path.stem for path in Path("config/scenes").glob("*.yaml"))
 
 
 def perturb(value, rng, size=0.1):
-    """Change all numbers of a scene that are neither 0 nor 1, without a look at physics."""
+    """Change all numbers of a scene that are neither 0 nor 1, without a look at
+    physics.
+    """
     if isinstance(value, float):
-        return value if value in (0.0, 1.0, -1.0) else value * (1.0 + size * rng.uniform(-1.0, 1.0))
+        return (
+            value
+            if value in (0.0, 1.0, -1.0)
+            else value * (1.0 + size * rng.uniform(-1.0, 1.0))
+        )
     if isinstance(value, tuple):
         return tuple(perturb(part, rng, size) for part in value)
     if not isinstance(value, Section):
@@ -187,7 +220,9 @@ def test_all_scenes_of_a_kind_have_one_text(name):
     assert {other for other, _ in others} == {text}
     assert len({tuple(values) for _, values in others}) == 20
     assert all(len(values) == len(numbers) for _, values in others)
-    one, other = (text_of(ode_of(x), implicit=True) for x in (scene, perturb(scene, rng)))
+    one, other = (
+        text_of(ode_of(x), implicit=True) for x in (scene, perturb(scene, rng))
+    )
     assert one[0] == other[0]
 
 
@@ -195,7 +230,11 @@ def test_a_term_or_a_zero_more_is_another_structure():
     text, _ = text_of(ode_of(EXAMPLE2))
     rubbing = replace(EXAMPLE2, friction=JointFriction(gamma=Friction(viscous=0.1)))
     skew = replace(EXAMPLE2.star, inertia=replace(EXAMPLE2.star.inertia, xz=1e-4))
-    assert text_of(ode_of(rubbing))[0] != text != text_of(ode_of(replace(EXAMPLE2, star=skew)))[0]
+    assert (
+        text_of(ode_of(rubbing))[0]
+        != text
+        != text_of(ode_of(replace(EXAMPLE2, star=skew)))[0]
+    )
 
 
 def test_the_torques_of_a_scene_are_numbers_too():
@@ -209,16 +248,29 @@ def test_the_torques_of_a_scene_are_numbers_too():
 
 
 def test_coincidences_of_numbers_change_no_text():
-    """Equal ones, powers of two, and sums that vanish; the value is that of the floats."""
+    """Equal ones, powers of two, and sums that vanish.
+
+    The value is that of the floats.
+    """
 
     def function(a, b, c):
         def of(x, y):
             folded = (2.0 - a) * (b - 2.0) + 1.0 / -b - (1.0 + c) / 3.0
-            return (x / a + x * b + (y * b + y * c) + (b - c) * x + 2.0 * a * y + folded * x,)
+            return (
+                x / a
+                + x * b
+                + (y * b + y * c)
+                + (b - c) * x
+                + 2.0 * a * y
+                + folded * x,
+            )
 
         return of
 
-    texts, given = set(), [(3.0, 5.0, 7.0), (4.0, 5.0, 5.0), (0.5, 2.0, 0.3), (2.0, 0.25, -0.25)]
+    texts, given = (
+        set(),
+        [(3.0, 5.0, 7.0), (4.0, 5.0, 5.0), (0.5, 2.0, 0.3), (2.0, 0.25, -0.25)],
+    )
     for values in given:
         program = trace(function(*number_constants(values)), ("x", "y"))
         module = write_module({"f": program})
@@ -275,7 +327,13 @@ def test_many_steps_at_once_have_the_bits_of_each(start):
     scene = loaded()
     steps, rng = MethodSteps(ode_of(scene), DOP853), np.random.default_rng(5)
     rows = [
-        [t, h, *np.array(start) * (1.0 + 1e-3 * rng.uniform(-1, 1, len(start))), *DRIVE, *MOMENT]
+        [
+            t,
+            h,
+            *np.array(start) * (1.0 + 1e-3 * rng.uniform(-1, 1, len(start))),
+            *DRIVE,
+            *MOMENT,
+        ]
         for t, h in rng.uniform(1e-4, 1e-2, (11, 2))
     ]
     size, after = len(start), steps.states_after(np.array(rows))

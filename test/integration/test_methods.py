@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of coefficients against all their order conditions, and what the code makes of them.
+"""Tables of coefficients against all their order conditions, and what the code makes of
+them.
 
-Explicit coefficients are rounded in their last digit and sums of DOP853 pass through numbers up to
-1e2, so a condition may be missed by some 1e-14; a wrong digit anywhere misses one by far more than
-1e-13. Those of Rodas5P are printed to 16 digits and go up to 165; the code works with u = Gamma k
-(Hairer & Wanner II, section IV.7), here they are turned back into alpha and gamma.
+Explicit coefficients are rounded in their last digit and sums of DOP853 pass through
+numbers up to 1e2, so a condition may be missed by some 1e-14; a wrong digit anywhere
+misses one by far more than 1e-13. Those of Rodas5P are printed to 16 digits and go up
+to 165; the code works with u = Gamma k (Hairer & Wanner II, section IV.7), here they
+are turned back into alpha and gamma.
 """
 
 from __future__ import annotations
@@ -18,7 +20,13 @@ import pytest
 from loaded_scenes import start_of
 
 from sst_ros.dynamics import kernel
-from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RODAS5P, Tableau
+from sst_ros.integration.methods import (
+    DOP853,
+    DORMAND_PRINCE,
+    METHODS,
+    RODAS5P,
+    Tableau,
+)
 from sst_ros.integration.steps import Linearisation, explicit_step, rosenbrock_step
 from sst_ros.scene.scene import load
 
@@ -57,8 +65,8 @@ def density(tree):
 def stage_weights(tree, many, single):
     """Elementary weights of the stages, Hairer I, section II.2.
 
-    A node with a single branch takes the matrix `single`, which is alpha + gamma for a Rosenbrock
-    method (II, section IV.7) and the same as `many` for an explicit one.
+    A node with a single branch takes the matrix `single`, which is alpha + gamma for a
+    Rosenbrock method (II, section IV.7) and the same as `many` for an explicit one.
     """
     weights = np.ones(len(many))
     for branch in tree:
@@ -68,10 +76,16 @@ def stage_weights(tree, many, single):
 
 
 def misses(order, weights, many, single=None, *, zero=False):
-    """By how much the conditions of one order are missed; `zero` for the weights of an estimate."""
+    """By how much the conditions of one order are missed.
+
+    `zero` for the weights of an estimate.
+    """
     single = many if single is None else single
     return [
-        abs(weights @ stage_weights(tree, many, single) - (0.0 if zero else 1.0 / density(tree)))
+        abs(
+            weights @ stage_weights(tree, many, single)
+            - (0.0 if zero else 1.0 / density(tree))
+        )
         for tree in trees(order)
     ]
 
@@ -110,7 +124,9 @@ def test_weights_meet_every_order_condition_and_not_those_of_the_next_order(tabl
     ],
     ids=["dopri5", "dop853-error", "dop853-damping"],
 )
-def test_error_weights_vanish_up_to_the_embedded_order_and_no_further(weights, tableau, order):
+def test_error_weights_vanish_up_to_the_embedded_order_and_no_further(
+    weights, tableau, order
+):
     a, e = matrix(tableau), np.array(weights)
     for lower in range(1, order + 1):
         assert max(misses(lower, e, a, zero=True)) < CONDITION
@@ -154,12 +170,15 @@ def march(step, count):
     ids=["dopri5", "dop853"],
 )
 def test_estimates_shrink_by_their_order_and_bound_the_true_error(tableau, many, few):
-    """In the median: where a weight of DOP853's passes zero a step has an estimate of order 6.
+    """In the median: where a weight of DOP853's passes zero a step has an estimate of
+    order 6.
 
     Truth: 8 small steps of DOP853, 8^8 times finer than its one and exact to rounding.
     """
     step, fine, h = stepper(tableau), stepper(DOP853), SPAN / few / 8
-    coarse, finer = (np.median([e for *_, e in march(step, n)]) for n in (many, 2 * many))
+    coarse, finer = (
+        np.median([e for *_, e in march(step, n)]) for n in (many, 2 * many)
+    )
     assert math.log2(coarse / finer) == pytest.approx(tableau.error_order + 1, abs=0.05)
     for t, truth, moved, estimate in march(step, few):
         for i in range(8):
@@ -189,7 +208,9 @@ def test_nodes_of_rodas5p_are_the_sums_of_their_rows():
 
 @pytest.mark.parametrize("order", [4, 5], ids=["embedded", "solution"])
 def test_rodas5p_is_of_order_five_and_its_embedded_solution_of_order_four(order):
-    """The embedded one is the argument of the last stage, so that the estimate is the last u."""
+    """The embedded one is the argument of the last stage, so that the estimate is the
+    last u.
+    """
     alpha, gamma, b = matrices()
     weights = b if order == 5 else alpha[-1]
     for lower in range(1, order + 1):
@@ -220,12 +241,16 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
     for k in range(count):
         t = k * h
         at = Linearisation([slope_of(t, y[0])], [by_time(t)], [[matrix_of(y[0])]])
-        y = rosenbrock_step(lambda t, y, _: [slope_of(t, y[0])], at, RODAS5P, t, h, y, None).state
+        y = rosenbrock_step(
+            lambda t, y, _: [slope_of(t, y[0])], at, RODAS5P, t, h, y, None
+        ).state
     return y[0]
 
 
 @pytest.mark.parametrize("rate", [1.0, 1e3, 1e6, 1e9])
-def test_one_step_of_the_code_on_the_linear_test_equation_is_its_stability_function(rate):
+def test_one_step_of_the_code_on_the_linear_test_equation_is_its_stability_function(
+    rate,
+):
     with mpmath.workdps(30):
         wanted = float(stability(mpmath.mpf(-0.5 * rate)).real)
     got = steps_of(1.0, 0.5, 1, lambda y: -rate, lambda t, y: -rate * y)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop: choice of method, work bounds, budgets, many ticks in a call with the bits of each."""
+"""The loop: choice of method, work bounds, budgets, many ticks in a call with the bits
+of each.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ import pytest
 from loaded_scenes import IGNORE, REST, loaded, run, viscous
 
 from benchmark.plain_python import without_llvmlite
-from sst_ros.errors import Diverged, InputError, RunStopped, StepBudgetExceeded, StrokeExceeded
+from sst_ros.errors import (
+    Diverged,
+    InputError,
+    RunStopped,
+    StepBudgetExceeded,
+    StrokeExceeded,
+)
 from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.scene.bodies import Inertia, Link, Workspace
 from sst_ros.scene.loads import Friction, Initial, JointFriction
@@ -25,7 +33,10 @@ MILLISECOND = 1_000_000
 
 @pytest.fixture
 def pairs(monkeypatch):
-    """Count attempts by method; a pair of Rodas5P makes 3 Jacobians and 24 evaluations."""
+    """Count attempts by method.
+
+    A pair of Rodas5P makes 3 Jacobians and 24 evaluations.
+    """
     counts = {}
     attempt = MethodSteps.pair
 
@@ -43,7 +54,9 @@ def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pair
     simulation = Simulation(viscous(coefficient), tolerance=1e-10, step_budget=10**6)
     simulation.step(REST, 1_000_000_000)
     assert simulation.method == "rodas5p"
-    fastest = np.abs(simulation._stepper.ode.eigenvalues(0.0, simulation._now.point.y, REST)).max()
+    fastest = np.abs(
+        simulation._stepper.ode.eigenvalues(0.0, simulation._now.point.y, REST)
+    ).max()
     explicit = fastest / 3.3  # DOPRI5 is stable on the negative axis up to about 3.3
     assert explicit > 0.6 * coefficient
     assert pairs["rodas5p"] < min(350, explicit / 2)
@@ -67,7 +80,9 @@ def light(about_z, across=1.0):
     """A star without links that a small torque spins to 1e7 rad/s in a millisecond."""
     links = (Link(),) * 3
     star = replace(EXAMPLE2.star, inertia=Inertia(xx=across, yy=across, zz=about_z))
-    return replace(EXAMPLE2, star=star, actuated_links=links, intermediate_links=links, **IGNORE)
+    return replace(
+        EXAMPLE2, star=star, actuated_links=links, intermediate_links=links, **IGNORE
+    )
 
 
 def rubbing(coulomb, smoothing):
@@ -89,20 +104,29 @@ def test_a_step_that_takes_too_much_ends_with_the_last_valid_state(scene, torque
     before = simulation.state
     for _ in range(2):  # the first one compiles
         began = time.process_time()
-        with pytest.raises(StepBudgetExceeded, match=f"{simulation.step_budget} evaluations") as e:
+        with pytest.raises(
+            StepBudgetExceeded, match=f"{simulation.step_budget} evaluations"
+        ) as e:
             simulation.step(torque, MILLISECOND)
         lasted = time.process_time() - began
-        assert isinstance(e.value, Diverged) and e.value.state == before == simulation.state
+        assert (
+            isinstance(e.value, Diverged)
+            and e.value.state == before == simulation.state
+        )
     assert lasted < 0.4  # 0.12 s here, beside whatever else runs
     simulation.step(REST, MILLISECOND)  # it can go on
     assert simulation.time_ns == MILLISECOND
 
 
 @pytest.mark.parametrize(
-    ("coulomb", "smoothing"), [(1e9, 1e-9), (5.0, 1e-12)], ids=["1e9 N m", "1e-12 rad/s"]
+    ("coulomb", "smoothing"),
+    [(1e9, 1e-9), (5.0, 1e-12)],
+    ids=["1e9 N m", "1e-12 rad/s"],
 )
 def test_sharp_coulomb_friction_is_stiff_from_the_first_step(coulomb, smoothing):
-    """These steps took 18 and 2.1 s: explicit steps shrank before the spectrum was asked for."""
+    """These steps took 18 and 2.1 s: explicit steps shrank before the spectrum was
+    asked for.
+    """
     simulation = Simulation(rubbing(coulomb, smoothing))
     for _ in range(3):
         simulation.step((1.0, 2.0, -1.0), MILLISECOND)
@@ -121,7 +145,8 @@ def test_the_budget_is_an_argument():
         Simulation(EXAMPLE2, step_budget=0)
 
 
-# Many ticks in one call: the bits, the faults and the book-keeping of one tick at a time.
+# Many ticks in one call: the bits, the faults and the book-keeping of one tick at a
+# time.
 
 TORQUES = ((0.3, -0.2, 0.1), (-1.5, 0.5, 2.0), (0.0, 0.0, 0.0), (4.0, 4.0, -4.0))
 
@@ -154,7 +179,10 @@ def told(simulation):
 
 
 def run_ticks(scene, at_once, ticks, tick=MILLISECOND, **how):
-    """Ticks under torques that change every 60, `at_once` in a call; also what ended it."""
+    """Ticks under torques that change every 60, `at_once` in a call.
+
+    Also what ended it.
+    """
     simulation = Simulation(scene, **how)
     for k in range(0, ticks, at_once):
         try:
@@ -198,7 +226,9 @@ def test_a_fault_comes_at_its_tick_with_the_last_valid_state():
 def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside():
     scene = replace(
         EXAMPLE2,
-        initial=Initial(gamma=(math.pi / 2 - 0.005, 0.4, 1.0), gamma_dot=(0.5, 0.0, 0.0)),
+        initial=Initial(
+            gamma=(math.pi / 2 - 0.005, 0.4, 1.0), gamma_dot=(0.5, 0.0, 0.0)
+        ),
         workspace=Workspace(at_edge="ignore"),
     )
     fine = Simulation(scene, "dop853")

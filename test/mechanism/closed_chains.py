@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random manipulators and states; all assemblies as the eight complex zeros of three quadrics."""
+"""Random manipulators and states.
+
+All assemblies as the eight complex zeros of three quadrics.
+"""
 
 from itertools import combinations, combinations_with_replacement
 
@@ -19,7 +22,9 @@ SIZES = (0.3, *(0.1,) * 3, *(0.05,) * 3)
 
 
 def random_geometry(rng, roughness=1.0):
-    """A general manipulator: a right-handed base triangle of some size, arcs of >= 20 deg."""
+    """A general manipulator: a right-handed base triangle of some size, arcs of >= 20
+    deg.
+    """
     while True:
         v = np.eye(3) + roughness * rng.uniform(-0.6, 0.6, (3, 3))
         v /= np.linalg.norm(v, axis=1)[:, None]
@@ -33,7 +38,9 @@ def random_sample(rng, geometry=None) -> Sample:
     """Full tensors for all seven links, in motion anywhere off the singularities."""
     geometry = random_geometry(rng) if geometry is None else geometry
     tensors = [rigid_body(rng.uniform(-1.0, 1.0, 6), size) for size in SIZES]
-    scene = scene_of(geometry.v, np.degrees(geometry.alpha), tensors[0], tensors[1:4], tensors[4:])
+    scene = scene_of(
+        geometry.v, np.degrees(geometry.alpha), tensors[0], tensors[1:4], tensors[4:]
+    )
     gamma, rotation = random_pose(rng, geometry)
     rate, torque, moment = rng.normal(size=(3, 3)) * [[2.0], [1.0], [1.0]]
     return Sample(scene, Geometry.of(scene), rotation, gamma, rate, torque, moment)
@@ -58,8 +65,8 @@ def rotation_of(q):
     return Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix()
 
 
-# All assemblies: r_k . R(q) e_k = 0 are three quadrics in the homogeneous quaternion q. By Bezout
-# they have eight zeros; eight distinct ones that are found are all there are.
+# All assemblies: r_k . R(q) e_k = 0 are three quadrics in the homogeneous quaternion q.
+# By Bezout they have eight zeros; eight distinct ones that are found are all there are.
 
 _FOURTH = list(combinations_with_replacement(range(4), 4))
 _THIRD = list(combinations_with_replacement(range(4), 3))
@@ -68,7 +75,10 @@ _ROW = {monomial: row for row, monomial in enumerate(_FOURTH)}
 
 
 def _patterns():
-    """Symmetric P_ij with R_ij(q) = q . P_ij q for quaternions (w, x, y, z), (3, 3, 4, 4)."""
+    """Symmetric P_ij with R_ij(q) = q .
+
+    P_ij q for quaternions (w, x, y, z), (3, 3, 4, 4).
+    """
 
     def form(q):
         return (q @ q) * rotation_of(q)
@@ -79,16 +89,19 @@ def _patterns():
 
 
 def quadrics(r, e):
-    """Symmetric Q_k with q . Q_k q = r_k . R(q) e_k; r and e (..., 3, 3) -> (..., 3, 4, 4)."""
+    """Symmetric Q_k with q . Q_k q = r_k . R(q) e_k.
+
+    r and e (..., 3, 3) -> (..., 3, 4, 4).
+    """
     return np.tensordot(r[..., :, None] * np.asarray(e)[..., None, :], _patterns(), 2)
 
 
 def complex_zeros(forms, seed=7):
     """The eight complex zeros, shape (n, 8, 4), unit largest entry, and how well, (n,).
 
-    Null space of the degree-4 Macaulay matrix, then the pencil of two linear forms on it, then
-    Newton's method in complex numbers. The second result is the distance of the nearest two
-    zeros, or 0 where some zero did not settle.
+    Null space of the degree-4 Macaulay matrix, then the pencil of two linear forms on
+    it, then Newton's method in complex numbers. The second result is the distance of
+    the nearest two zeros, or 0 where some zero did not settle.
     """
     n = len(forms)
     macaulay = np.zeros((n, 30, 35))
@@ -101,13 +114,17 @@ def complex_zeros(forms, seed=7):
     null = np.linalg.svd(macaulay)[2][:, -8:].transpose(0, 2, 1)
     linear = np.random.default_rng(seed).normal(size=(2, 4))
     times = [[_ROW[tuple(sorted((*third, i)))] for third in _THIRD] for i in range(4)]
-    first, second = (sum(form[i] * null[:, times[i]] for i in range(4)) for form in linear)
+    first, second = (
+        sum(form[i] * null[:, times[i]] for i in range(4)) for form in linear
+    )
     thirds = first @ np.linalg.eig(np.linalg.pinv(first) @ second)[1]
     cubes = [_THIRD.index((i, i, i)) for i in range(4)]
     largest = np.argmax(np.abs(thirds[:, cubes]), axis=1)
     q = np.empty((n, 8, 4), dtype=complex)
     for i in range(4):
-        rows = np.array([_THIRD.index(tuple(sorted((big, big, i)))) for big in range(4)])[largest]
+        rows = np.array(
+            [_THIRD.index(tuple(sorted((big, big, i)))) for big in range(4)]
+        )[largest]
         q[:, :, i] = np.take_along_axis(thirds, rows[:, None, :], axis=1)[:, 0]
     scale = np.take_along_axis(q, np.argmax(np.abs(q), axis=2)[:, :, None], axis=2)
     q /= scale
@@ -132,21 +149,27 @@ def complex_zeros(forms, seed=7):
 
 
 def exact_rotations(r, e, q, digits=50):
-    """Refine eight zeros (8, 4) to `digits`, tell the real ones apart there, and give them.
+    """Refine eight zeros (8, 4) to `digits`, tell the real ones apart there, and give
+    them.
 
-    r and e are what the doubles say exactly. Returns (m, 3, 3) doubles; asserts that the eight
-    stay distinct, which proves that none is missing.
+    r and e are what the doubles say exactly. Returns (m, 3, 3) doubles; asserts that
+    the eight stay distinct, which proves that none is missing.
     """
     with mp.workdps(digits):
         forms = quadrics(exact(r), exact(e))
         zeros = [_refine(forms, zero) for zero in q]
         for first, second in combinations(zeros, 2):
-            at = np.argmax(np.abs(first.astype(complex)))  # both scaled to 1 there, if they can be
-            other = second / second[at] if abs(second[at]) >= mp.mpf(10) ** -10 else second
+            # both scaled to 1 there, if they can be
+            at = np.argmax(np.abs(first.astype(complex)))
+            other = (
+                second / second[at] if abs(second[at]) >= mp.mpf(10) ** -10 else second
+            )
             assert np.abs(first / first[at] - other).max() > mp.mpf(10) ** -20
         small = mp.mpf(10) ** -25
         real = [zero for zero in zeros if max(abs(z.imag) for z in zero) < small]
-        return rotation_of(np.reshape([[float(z.real) for z in zero] for zero in real], (-1, 4)))
+        return rotation_of(
+            np.reshape([[float(z.real) for z in zero] for zero in real], (-1, 4))
+        )
 
 
 def _refine(forms, zero):
@@ -169,15 +192,19 @@ def same_rotations(found, expected, tolerance):
     if not len(found) or not len(expected):
         return len(expected), len(found)
     apart = np.abs(found[:, None] - expected[None]).max(axis=(2, 3))
-    return int(np.sum(apart.min(axis=0) > tolerance)), int(np.sum(apart.min(axis=1) > tolerance))
+    return int(np.sum(apart.min(axis=0) > tolerance)), int(
+        np.sum(apart.min(axis=1) > tolerance)
+    )
 
 
 def census(solve, geometries, gammas, hardest):
-    """Compare `solve(geometry, gammas)` -> (owner, rotations, admissible) with the zeros.
+    """Compare `solve(geometry, gammas)` -> (owner, rotations, admissible) with the
+    zeros.
 
-    Configurations whose zeros are nearest to each other, or not real by least, are decided in 50
-    digits: at least `hardest` of them, and all with a gap below 1e-5. Returns how many
-    configurations there were, assemblies that were missing and spurious, and the least gap.
+    Configurations whose zeros are nearest to each other, or not real by least, are
+    decided in 50 digits: at least `hardest` of them, and all with a gap below 1e-5.
+    Returns how many configurations there were, assemblies that were missing and
+    spurious, and the least gap.
     """
     pairs = list(zip(geometries, gammas, strict=True))
     r = np.concatenate([kinematics.carriage_directions(*pair) for pair in pairs])
@@ -186,7 +213,9 @@ def census(solve, geometries, gammas, hardest):
     imaginary = np.abs(zeros.imag).max(axis=2)
     doubtful = np.where(imaginary > 1e-10, imaginary, np.inf).min(axis=1)
     order = np.argsort(np.minimum(gap, doubtful))
-    exact_rows = set(order[:hardest]) | set(np.nonzero(np.minimum(gap, doubtful) < 1e-5)[0])
+    exact_rows = set(order[:hardest]) | set(
+        np.nonzero(np.minimum(gap, doubtful) < 1e-5)[0]
+    )
     missing = spurious = index = 0
     for geometry, gamma in pairs:
         owner, rotations, valid = solve(geometry, gamma)
@@ -197,14 +226,20 @@ def census(solve, geometries, gammas, hardest):
             else:
                 expected = rotation_of(zeros[index].real[imaginary[index] < 1e-9])
             lost, extra = same_rotations(rotations[mine], expected, 1e-9)
-            expected_valid = sum(_admissible(geometry, r[index], one) for one in expected)
+            expected_valid = sum(
+                _admissible(geometry, r[index], one) for one in expected
+            )
             assert expected_valid == int(np.sum(valid[mine])), (geometry, gamma[row])
             missing, spurious, index = missing + lost, spurious + extra, index + 1
     return index, missing, spurious, float(gap.min())
 
 
 def _admissible(geometry, r, rotation):
-    """Eq. 4 and 0 < beta_k <= beta_max, with beta_k as the angle from s to r_k against t_k."""
+    """Eq. 4 and 0 < beta_k <= beta_max, with beta_k as the angle from s to r_k against
+    t_k.
+    """
     s, t = rotation[:, 2], geometry.e @ rotation.T
     beta = np.arctan2(np.sum(r * np.cross(t, s), axis=1), r @ s)
-    return bool(np.all(geometry.w @ s > 0) and np.all((beta > 0) & (beta <= geometry.beta_max)))
+    return bool(
+        np.all(geometry.w @ s > 0) and np.all((beta > 0) & (beta <= geometry.beta_max))
+    )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A branch is followed without jumps, through the edge of the workspace, up to a singularity."""
+"""A branch is followed without jumps, through the edge of the workspace, up to a
+singularity.
+"""
 
 import numpy as np
 import pytest
@@ -25,7 +27,9 @@ def beta_and_det_j2(geometry, gamma, rotations):
 
 def test_a_loop_in_gamma_comes_back_to_the_start():
     x = np.linspace(0, 2 * np.pi, 60)
-    gamma = np.pi / 4 + 0.25 * np.stack([np.sin(x), np.sin(2 * x), np.cos(x) - 1], axis=1)
+    gamma = np.pi / 4 + 0.25 * np.stack(
+        [np.sin(x), np.sin(2 * x), np.cos(x) - 1], axis=1
+    )
     rotations, _ = continuation.follow(ISOTROPIC, gamma)
     np.testing.assert_allclose(rotations[-1], rotations[0], atol=1e-14)
     for row in range(0, 60, 5):
@@ -36,11 +40,14 @@ def test_a_loop_in_gamma_comes_back_to_the_start():
 
 
 def test_the_edge_of_the_workspace_is_no_obstacle():
-    """s crosses the plane of P_1's leg: beta_1 goes through 0 and every joint stays smooth."""
+    """s crosses the plane of P_1's leg: beta_1 goes through 0 and every joint stays
+    smooth.
+    """
     home = kinematics.admissible(ISOTROPIC, [np.pi / 4] * 3)
     r1 = kinematics.carriage_directions(ISOTROPIC, [np.pi / 4] * 3)[0]
     axis = np.cross(home.rotation[:, 2], r1)
-    share = np.append(np.linspace(0.0, 1.3, 200), 1.0)  # the last is exactly on the edge
+    # the last is exactly on the edge
+    share = np.append(np.linspace(0.0, 1.3, 200), 1.0)
     turns = np.multiply.outer(home.beta[0] * share, axis / np.linalg.norm(axis))
     rotations = Rotation.from_rotvec(turns).as_matrix() @ home.rotation
     gamma, _, beta = kinematics.inverse(ISOTROPIC, rotations)
@@ -53,7 +60,9 @@ def test_the_edge_of_the_workspace_is_no_obstacle():
 
 
 def test_a_parallel_singularity_ends_the_branch_and_says_so():
-    """Spin about s at fixed s until det J2 = 0: the geometry 210, 75, 75 deg has such poses."""
+    """Spin about s at fixed s until det J2 = 0: the geometry 210, 75, 75 deg has such
+    poses.
+    """
     rng = np.random.default_rng(0)
     ended = 0
     for _ in range(40):
@@ -66,11 +75,16 @@ def test_a_parallel_singularity_ends_the_branch_and_says_so():
             ended += 1
             assert isinstance(error, continuation.BranchEnds)
             assert 0 < error.measure <= continuation.SINGULAR
-            assert abs(error.det_j2) <= 1.5 * error.measure  # rows of J2 are unit vectors
+            # rows of J2 are unit vectors
+            assert abs(error.det_j2) <= 1.5 * error.measure
             assert 1 <= error.row < 8
             r = kinematics.carriage_directions(FOLDING, error.gamma)
-            assert np.abs(np.sum(r * (FOLDING.e @ error.rotation.T), axis=1)).max() <= 1e-14
-            # The fold is right there: a little further on the pair of assemblies is gone.
+            assert (
+                np.abs(np.sum(r * (FOLDING.e @ error.rotation.T), axis=1)).max()
+                <= 1e-14
+            )
+            # The fold is right there: a little further on the pair of assemblies is
+            # gone.
             beyond = error.gamma + 1e-7 * (ends - gamma)
             assert nearest_gap(FOLDING, beyond, error.rotation) > 1e-5
             assert "parallel singularity" in str(error)

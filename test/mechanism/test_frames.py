@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orientation conventions against SciPy's Rotation and against products of plain rotations."""
+"""Orientation conventions against SciPy's Rotation and against products of plain
+rotations.
+"""
 
 from __future__ import annotations
 
@@ -36,13 +38,19 @@ def test_zyz_angles_and_quaternions_build_the_rotation_again(theta, phi, psi):
     found = zyz_angles(rotation)
     assert found[1] == pytest.approx(phi, abs=ROUNDING)
     for ours, given_angle in ((found[0], theta), (found[2], psi)):
-        # Angles about z lose digits like 1 / sin(phi) near the poles, where psi carries both.
+        # Angles about z lose digits like 1 / sin(phi) near the poles, where psi carries
+        # both.
         if np.sin(phi) > 1e-3:
-            assert abs(np.exp(1j * ours) - np.exp(1j * given_angle)) < ROUNDING / np.sin(phi)
+            assert abs(
+                np.exp(1j * ours) - np.exp(1j * given_angle)
+            ) < ROUNDING / np.sin(phi)
     np.testing.assert_allclose(zyz(found), rotation, atol=ROUNDING, rtol=0)
     quaternion, scipys = quaternion_of(rotation), given_rotation.as_quat()
     assert quaternion[3] >= 0.0
-    assert min(np.abs(quaternion - scipys).max(), np.abs(quaternion + scipys).max()) < ROUNDING
+    assert (
+        min(np.abs(quaternion - scipys).max(), np.abs(quaternion + scipys).max())
+        < ROUNDING
+    )
     np.testing.assert_allclose(rotation_matrix(quaternion), rotation, atol=ROUNDING)
     batch = np.stack([rotation, np.eye(3)])
     np.testing.assert_array_equal(zyz_angles(batch), [zyz_angles(one) for one in batch])
@@ -52,12 +60,16 @@ def test_zyz_angles_and_quaternions_build_the_rotation_again(theta, phi, psi):
 def test_at_a_pole_theta_is_zero_and_psi_carries_all(phi, expected):
     flip = np.diag([np.cos(phi), 1.0, np.cos(phi)])
     rotation = zyz([0.3, 0.0, 0.0]) @ flip @ zyz([0.5, 0.0, 0.0])
-    np.testing.assert_allclose(zyz_angles(rotation), [0.0, phi, expected], atol=ROUNDING)
+    np.testing.assert_allclose(
+        zyz_angles(rotation), [0.0, phi, expected], atol=ROUNDING
+    )
 
 
 @pytest.mark.parametrize("phi", [1e-9, 1e-12, np.pi - 1e-9])
 def test_phi_keeps_its_digits_near_the_poles(phi):
-    found = zyz_angles(zyz([0.4, 0.0, 0.0]) @ zyz([0.0, phi, 0.0]) @ zyz([1.1, 0.0, 0.0]))[1]
+    found = zyz_angles(
+        zyz([0.4, 0.0, 0.0]) @ zyz([0.0, phi, 0.0]) @ zyz([1.1, 0.0, 0.0])
+    )[1]
     assert np.sin(found) == pytest.approx(np.sin(phi), rel=1e-6)
 
 
@@ -72,7 +84,9 @@ def test_angle_between_is_exact_for_tiny_and_for_large_angles(angle, sign):
 @given(angles, st.floats(0.0, np.pi), angles, angles)
 def test_angle_between_is_the_angle_of_the_relative_rotation(theta, phi, psi, turn):
     first = zyz([theta, phi, psi])
-    second = first @ zyz([0.7, 1.1, 0.2]) @ zyz([turn, 0.0, 0.0]) @ zyz([0.7, 1.1, 0.2]).T
+    second = (
+        first @ zyz([0.7, 1.1, 0.2]) @ zyz([turn, 0.0, 0.0]) @ zyz([0.7, 1.1, 0.2]).T
+    )
     found = angle_between(quaternion_of(first), quaternion_of(second))
     # asin loses half the digits where the angle nears pi.
     assert found == pytest.approx(abs(turn), abs=1e-7)
@@ -93,7 +107,10 @@ def test_many_turns_of_every_angle():
 
 @pytest.mark.parametrize("samples", [200, 201])
 def test_straight_through_the_pole(samples):
-    """phi goes through 0 with theta and psi smooth; 201 samples have one exactly at the pole."""
+    """phi goes through 0 with theta and psi smooth.
+
+    201 samples have one exactly at the pole.
+    """
     x = np.linspace(-1, 1, samples)
     angles = np.stack([0.4 + 0.1 * x, -0.5 * x, 1.1 - 0.3 * x], axis=1)
     rotations = zyz(angles)
@@ -106,7 +123,9 @@ def test_straight_through_the_pole(samples):
 
 @pytest.mark.parametrize("pole", [0.0, np.pi])
 def test_resting_at_the_pole_keeps_theta_and_the_sum(pole):
-    given = np.array([[0.7, pole - np.sign(pole - 1) * 0.01, 0.2]] + [[0.0, pole, 0.9]] * 3)
+    given = np.array(
+        [[0.7, pole - np.sign(pole - 1) * 0.01, 0.2]] + [[0.0, pole, 0.9]] * 3
+    )
     given[1:, 2] = [0.9, 1.0, 1.1] if pole == 0.0 else [-0.5, -0.4, -0.3]
     found = unwrap_zyz(given)
     np.testing.assert_allclose(found[1:, 0], 0.7)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every assembly, none missing and none too many; the inverse; which assembly is meant."""
+"""Every assembly, none missing and none too many; the inverse.
+
+Which assembly is meant.
+"""
 
 from __future__ import annotations
 
@@ -48,17 +51,22 @@ def solve(geometry, gammas):
 
 
 def isotropic(count, rng):
-    return [ISOTROPIC] * (count // 100), list(rng.uniform(0, np.pi / 2, (count // 100, 100, 3)))
+    return [ISOTROPIC] * (count // 100), list(
+        rng.uniform(0, np.pi / 2, (count // 100, 100, 3))
+    )
 
 
 def general(count, rng):
     geometries = [random_geometry(rng) for _ in range(count // 10)]
-    return geometries, [rng.uniform(0, 1, (10, 3)) * geometry.arc for geometry in geometries]
+    return geometries, [
+        rng.uniform(0, 1, (10, 3)) * geometry.arc for geometry in geometries
+    ]
 
 
 @pytest.mark.parametrize("kind", [isotropic, general])
 @pytest.mark.parametrize(
-    ("count", "hardest"), [(1000, 10), pytest.param(10_000, 200, marks=pytest.mark.slow)]
+    ("count", "hardest"),
+    [(1000, 10), pytest.param(10_000, 200, marks=pytest.mark.slow)],
 )
 def test_the_assemblies_are_all_the_real_zeros(kind, count, hardest):
     configurations, missing, spurious, gap = census(
@@ -88,7 +96,11 @@ def folds(count, seed):
         for i in range(19):
             if values[i] * values[i + 1] < 0:
                 x = brentq(volume, 3 * i / 19, 3 * (i + 1) / 19, xtol=1e-16)
-                yield geometry, kinematics.inverse(geometry, pose(x))[0], rng.normal(size=3)
+                yield (
+                    geometry,
+                    kinematics.inverse(geometry, pose(x))[0],
+                    rng.normal(size=3),
+                )
                 count -= 1
                 break
 
@@ -127,7 +139,9 @@ def test_many_at_once_are_the_same_bits_and_in_the_same_order_as_one_by_one():
             one = [assembly.rotation for assembly in kinematics.direct(geometry, gamma)]
             mine = many.rotation[many.configuration == row]
             assert len(one) == len(mine)
-            np.testing.assert_allclose(np.reshape(one, (-1, 3, 3)), mine, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(
+                np.reshape(one, (-1, 3, 3)), mine, rtol=0, atol=1e-12
+            )
         again = kinematics.direct_many(geometry, gammas)
         assert again.rotation.tobytes() == many.rotation.tobytes()
         s = many.rotation[:, :, 2]
@@ -152,7 +166,9 @@ def test_inverse_of_direct_is_gamma_again(seed):
             continue
         signs = np.where(np.sin(assembly.mu) > 0, 1, -1)
         again, mu, beta = kinematics.inverse(geometry, assembly.rotation, signs)
-        np.testing.assert_allclose([again, mu], [gamma, assembly.mu], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            [again, mu], [gamma, assembly.mu], rtol=1e-12, atol=1e-12
+        )
         same_angles(beta, assembly.beta)
 
 
@@ -184,7 +200,9 @@ def test_home_of_the_isotropic_design():
     j = np.abs(virtual_work.posture(ISOTROPIC, HOME).j)
     for axis in (0, 1):
         ordered = np.sort(j, axis=axis)
-        np.testing.assert_allclose(np.moveaxis(ordered, axis, 1), [[0, 0, 1]] * 3, atol=1e-14)
+        np.testing.assert_allclose(
+            np.moveaxis(ordered, axis, 1), [[0, 0, 1]] * 3, atol=1e-14
+        )
 
 
 def has_fermat_point(gamma):
@@ -203,7 +221,8 @@ def test_isotropic_pose_exists_iff_the_carriages_have_a_fermat_point():
     many = kinematics.direct_many(ISOTROPIC, sweep)
     answers = np.isin(np.arange(400), many.configuration[many.admissible]).tolist()
     assert answers == [has_fermat_point(gamma) for gamma in sweep]
-    # A quarter of the cube; sqrt(0.25 0.75 / 400) = 0.022, so 0.08 is more than three sigma.
+    # A quarter of the cube; sqrt(0.25 0.75 / 400) = 0.022, so 0.08 is more than three
+    # sigma.
     assert 1.0 - np.mean(answers) == pytest.approx(0.25, abs=0.08)
 
 
@@ -215,9 +234,12 @@ def test_carriages_and_arcs_of_the_star_are_vectors_turned_about_axes(sample):
     for k in range(3):
         expected = turned(sample.gamma[k], geometry.w[k], geometry.v[k])
         np.testing.assert_allclose(r[k], expected, atol=1e-15, rtol=0)
-        # Sums of three angles up to 2 pi, whose last place is 8.9e-16; 1.3e-15 in 4,000 samples.
+        # Sums of three angles up to 2 pi, whose last place is 8.9e-16; 1.3e-15 in 4,000
+        # samples.
         following = turned(geometry.alpha[k], [0.0, 0.0, 1.0], geometry.e[k])
-        np.testing.assert_allclose(following, geometry.e[(k + 1) % 3], atol=4e-15, rtol=0)
+        np.testing.assert_allclose(
+            following, geometry.e[(k + 1) % 3], atol=4e-15, rtol=0
+        )
     ends = kinematics.carriage_directions(geometry, geometry.arc)
     np.testing.assert_allclose(ends, np.roll(geometry.v, -1, axis=0), atol=1e-15)
 
@@ -228,7 +250,9 @@ def test_carriages_and_arcs_of_the_star_are_vectors_turned_about_axes(sample):
 def test_no_admissible_assembly_says_where():
     gamma = np.array([0.05, 0.05, 1.5])
     assert not has_fermat_point(gamma)
-    with pytest.raises(NoAdmissibleAssembly, match=r"gamma = \[0\.05 0\.05 1\.5 *\] rad") as caught:
+    with pytest.raises(
+        NoAdmissibleAssembly, match=r"gamma = \[0\.05 0\.05 1\.5 *\] rad"
+    ) as caught:
         kinematics.admissible(ISOTROPIC, gamma)
     np.testing.assert_array_equal(caught.value.gamma, gamma)
 
@@ -247,7 +271,9 @@ def test_ambiguity_is_told_with_all_candidates():
         kinematics.admissible(geometry, gamma)
     one, two = caught.value.candidates
     assert not (
-        one.rotation.flags.writeable or one.mu.flags.writeable or geometry.v.flags.writeable
+        one.rotation.flags.writeable
+        or one.mu.flags.writeable
+        or geometry.v.flags.writeable
     )
     assert one.admissible and two.admissible
     assert np.abs(one.rotation - two.rotation).max() > 1e-3

@@ -20,7 +20,14 @@ from sst_ros.dynamics.kernel import friction_torque, stop_torque
 from sst_ros.dynamics.model import model_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.scene.bodies import Inertia, Link, Payload, Stroke
-from sst_ros.scene.loads import Actuators, Friction, Gravity, JointFriction, Moment, Spring
+from sst_ros.scene.loads import (
+    Actuators,
+    Friction,
+    Gravity,
+    JointFriction,
+    Moment,
+    Spring,
+)
 
 STEP = 1e-200
 REST = (0.0, 0.0, 0.0)
@@ -32,19 +39,27 @@ def loaded(sample, number):
     scene = sample.scene
     links = [
         tuple(
-            Link(inertia=link.inertia, mass=0.2 + number, centre=(0.02 * k, -0.01, 0.01 + 0.01 * k))
+            Link(
+                inertia=link.inertia,
+                mass=0.2 + number,
+                centre=(0.02 * k, -0.01, 0.01 + 0.01 * k),
+            )
             for k, link in enumerate(group)
         )
         for group in (scene.actuated_links, scene.intermediate_links)
     ]
-    rub = Friction(viscous=0.3 + number, coulomb=0.2, static=0.3, stribeck=0.5, smoothing=0.1)
+    rub = Friction(
+        viscous=0.3 + number, coulomb=0.2, static=0.3, stribeck=0.5, smoothing=0.1
+    )
     return replace(
         scene,
         star=replace(scene.star, mass=1.0, centre=(0.02, -0.01, 0.03 * number)),
         actuated_links=links[0],
         intermediate_links=links[1],
         payload=Payload(
-            mass=0.5, centre=(0.1, 0.0, 0.3), inertia=Inertia(xx=0.01, yy=0.012, zz=0.015)
+            mass=0.5,
+            centre=(0.1, 0.0, 0.3),
+            inertia=Inertia(xx=0.01, yy=0.012, zz=0.015),
         ),
         gravity=Gravity(acceleration=(1.0 - number, 2.0, -9.0)),
         moment=Moment(value=(0.3, -0.2, number)),
@@ -63,14 +78,17 @@ def loaded(sample, number):
 @FAST
 @given(samples(), st.floats(0.0, 1.0))
 def test_energy_changes_by_the_power_put_in(sample, number):
-    # The forces are linear in what the energy and power functions say, so a wrong sign or factor
-    # of any term breaks this for a random velocity.
+    # The forces are linear in what the energy and power functions say, so a wrong sign
+    # or factor of any term breaks this for a random velocity.
     model = kernel.model_of(loaded(sample, number))
     state, torque = sample.state, tuple(sample.torque)
     rate = kernel.derivative(model, state, torque)
     moved = [complex(x, STEP * dx) for x, dx in zip(state, rate, strict=True)]
     change = (
-        np.imag(kernel.kinetic_energy(model, moved) + kernel.potential_energy(model, moved)) / STEP
+        np.imag(
+            kernel.kinetic_energy(model, moved) + kernel.potential_energy(model, moved)
+        )
+        / STEP
     )
     power = kernel.power(model, state, torque)
     scale = sum(abs(p) for p in (*np.multiply(rate[4:], 1.0), power, 1.0))
@@ -78,13 +96,18 @@ def test_energy_changes_by_the_power_put_in(sample, number):
 
 
 def laden(sample):
-    """What `Lagrange.loads` knows: weight, springs and friction, of payload and rotors too."""
+    """What `Lagrange.loads` knows: weight, springs and friction, of payload and rotors
+    too.
+    """
     return replace(loaded(sample, 0.5), moment=None, stroke=Stroke(at_end="ignore"))
 
 
 @pytest.mark.parametrize("sample", seeded_samples(71, 3), ids=range(3))
 def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
-    """Both lose some two digits of 1e-16 to M and J; the loads are of the size of the torques."""
+    """Both lose some two digits of 1e-16 to M and J.
+
+    The loads are of the size of the torques.
+    """
     scene = laden(sample)
     truth = Lagrange(scene, sample.rotation)
     height = float(truth.potential(exact(sample.gamma)))
@@ -100,7 +123,9 @@ def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
 
 def springs(scene):
     """Springs at one joint are one, with the mean of their angles of rest."""
-    two = [Spring(joint="mu_1", stiffness=k, rest=r) for k, r in ((2.0, 0.5), (3.0, -0.2))]
+    two = [
+        Spring(joint="mu_1", stiffness=k, rest=r) for k, r in ((2.0, 0.5), (3.0, -0.2))
+    ]
     one = Spring(joint="mu_1", stiffness=5.0, rest=0.08)
     return {"springs": tuple(two)}, {"springs": (one,)}, 1e-10
 
@@ -108,7 +133,11 @@ def springs(scene):
 def bare(scene):
     """A link without inertia is one of vanishing inertia."""
     light = Link(inertia=inertia_of(1e-12 * np.eye(3)))
-    return {"intermediate_links": (Link(),) * 3}, {"intermediate_links": (light,) * 3}, 1e-9
+    return (
+        {"intermediate_links": (Link(),) * 3},
+        {"intermediate_links": (light,) * 3},
+        1e-9,
+    )
 
 
 @pytest.mark.parametrize("pair", [springs, bare])
@@ -116,7 +145,9 @@ def test_two_ways_to_say_the_same_move_alike(pair):
     sample = seeded_samples(7, 1)[0]
     *terms, tolerance = pair(sample.scene)
     one, other = (
-        Dynamics.of(replace(sample.scene, **term)).derivative(*sample.state, *sample.torque)
+        Dynamics.of(replace(sample.scene, **term)).derivative(
+            *sample.state, *sample.torque
+        )
         for term in terms
     )
     assert one == pytest.approx(other, rel=tolerance)
@@ -124,7 +155,9 @@ def test_two_ways_to_say_the_same_move_alike(pair):
 
 def test_elastic_stops_push_only_beyond_the_stroke_and_never_pull():
     sample = seeded_samples(9, 1)[0]
-    scene = replace(sample.scene, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0))
+    scene = replace(
+        sample.scene, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0)
+    )
     stops = model_of(scene).legs[0].stops
     assert stop_torque(stops, 0.5 * stops.arc, 1.0) == 0.0
     assert stop_torque(stops, -0.01, 0.0) == pytest.approx(1.0)
@@ -135,7 +168,9 @@ def test_elastic_stops_push_only_beyond_the_stroke_and_never_pull():
 
 @pytest.mark.parametrize("v", [-2.0, -0.05, 0.0, 0.003, 0.4])
 def test_friction_is_the_documented_torque_of_its_rate(v):
-    friction = Friction(viscous=0.3, coulomb=0.2, static=0.5, stribeck=0.1, smoothing=0.01)
+    friction = Friction(
+        viscous=0.3, coulomb=0.2, static=0.5, stribeck=0.1, smoothing=0.01
+    )
     expected = float(documented_torque(friction, mpf(v)))
     assert friction_torque(friction, v) == pytest.approx(expected, rel=1e-14)
     assert friction_torque(friction, -v) == -friction_torque(friction, v)

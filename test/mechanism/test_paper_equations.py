@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All 92 equations of the paper with the signs that hold, against differences to 80 digits.
+"""All 92 equations of the paper with the signs that hold, against differences to 80
+digits.
 
-The left side of each check is the equation as `docs/paper.md` prints it; the right side comes from
-`lagrange`, which knows the loop closure, differences and Lagrange's equations, but no formula of
-the paper. Two mechanisms: an isotropic one and a general one, both with full inertia matrices.
+The left side of each check is the equation as `docs/paper.md` prints it; the right side
+comes from `lagrange`, which knows the loop closure, differences and Lagrange's
+equations, but no formula of the paper. Two mechanisms: an isotropic one and a general
+one, both with full inertia matrices.
 """
 
 import numpy as np
@@ -14,7 +16,9 @@ from mpmath import mp
 
 LEGS = range(3)
 BOUND = mp.mpf(10) ** -20
-"""Differences of second order with a step of 1e-13 leave errors of about 1e-25 times a derivative."""
+"""Differences of second order with a step of 1e-13 leave errors of about 1e-25 times a
+derivative.
+"""
 X, Y, Z = EYE
 
 
@@ -37,7 +41,12 @@ class Paper:
         motion = Motion(truth, sample.gamma, sample.gamma_dot, np.array(gamma_ddot))
         here = self.here = motion.here
         self.legs = [Leg(self, k) for k in LEGS]
-        self.v, self.w, self.e, self.v_next = truth.v, truth.w, truth.e, np.roll(truth.v, -1, 0)
+        self.v, self.w, self.e, self.v_next = (
+            truth.v,
+            truth.w,
+            truth.e,
+            np.roll(truth.v, -1, 0),
+        )
         self.r, self.t, self.s, self.R = here.r, here.t, here.s, here.rotation
         # measured
         self.gamma, self.mu, self.beta = here.angles
@@ -49,7 +58,12 @@ class Paper:
         self.first, self.second = here.frames[1:4], here.frames[4:]
         self.lever = truth.lever(motion.gamma)
         own, own_dot = here.own(motion.omega), here.own(motion.omega_dot)
-        self.wa, self.wp, self.wad, self.wpd = own[1:4], own[4:], own_dot[1:4], own_dot[4:]
+        self.wa, self.wp, self.wad, self.wpd = (
+            own[1:4],
+            own[4:],
+            own_dot[1:4],
+            own_dot[4:],
+        )
         # moments n = n_ext - d/dt (I omega), in the body's own frame for links
         changes = motion.momentum_rates()
         self.ne, of_links = self.moment - changes[0], here.own(-changes)[1:]
@@ -58,7 +72,9 @@ class Paper:
         self.turn_e, own = spins[0], here.own(spins)
         self.turn_a, self.turn_p = own[1:4], own[4:]
         self.inertia = truth.inertia_matrix(motion.gamma)
-        self.tau = self.inertia @ self.gdd + truth.resistance(motion.gamma, self.gd, self.moment)
+        self.tau = self.inertia @ self.gdd + truth.resistance(
+            motion.gamma, self.gd, self.moment
+        )
         self._define()
 
     def _define(self):
@@ -98,9 +114,13 @@ class Paper:
         self.L = self.each(lambda k: -k.Ia @ k.E)
         self.ell = self.each(lambda k: -cross(k.Ja @ gd, k.Ia @ (k.Ja @ gd)))
         self.P = self.each(lambda k: k.R21 @ k.E + np.outer(k.r2, J.T @ k.r))
-        self.p = self.each(lambda k: -cross(k.R21 @ (k.Ja @ gd), k.r2 * (k.a @ gd)) - k.f * k.r2)
+        self.p = self.each(
+            lambda k: -cross(k.R21 @ (k.Ja @ gd), k.r2 * (k.a @ gd)) - k.f * k.r2
+        )
         self.K = self.each(lambda k: -k.Ip @ k.P)
-        self.kk = self.each(lambda k: -k.Ip @ k.p - cross(k.Jp @ gd, k.Ip @ (k.Jp @ gd)))
+        self.kk = self.each(
+            lambda k: -k.Ip @ k.p - cross(k.Jp @ gd, k.Ip @ (k.Jp @ gd))
+        )
         self.T1 = J.T @ self.Q + sum(k.Ja.T @ k.L + k.Jp.T @ k.K for k in self.legs)
         self.T2 = J.T @ self.q + sum(k.Ja.T @ k.ell + k.Jp.T @ k.kk for k in self.legs)
 
@@ -118,7 +138,9 @@ class Paper:
 
     def balance(self, ne, na, np_):
         """Generalized forces of all moments, Eq. 88."""
-        links = (k.Ja.T @ a + k.Jp.T @ p for k, a, p in zip(self.legs, na, np_, strict=True))
+        links = (
+            k.Ja.T @ a + k.Jp.T @ p for k, a, p in zip(self.legs, na, np_, strict=True)
+        )
         return self.tau + self.J.T @ ne + sum(links)
 
 
@@ -140,7 +162,9 @@ RESIDUALS = {
     10: legs(lambda p, k: k.w * k.gd - k.r * k.mud - k.t * k.betad - p.omega),
     11: legs(lambda p, k: (k.N @ k.w) * k.gd - k.N @ p.omega),
     12: lambda p: p.J1 - partials(lambda g: p.gaps(g, p.R), p.gamma).T,
-    13: lambda p: p.J2 - partials(lambda x: p.gaps(p.gamma, turn(x) @ p.R), 0 * p.gamma).T,
+    13: lambda p: (
+        p.J2 - partials(lambda x: p.gaps(p.gamma, turn(x) @ p.R), 0 * p.gamma).T
+    ),
     14: legs(lambda p, k: k.c - mp.sin(k.mu)),
     15: lambda p: [p.J - p.lever, p.J @ p.gd - p.omega],
     16: legs(lambda p, k: k.d @ p.gd - k.gd),
@@ -177,7 +201,13 @@ RESIDUALS = {
     ),
     29: legs(
         lambda p, k: (
-            k.N @ (k.w * k.gdd - p.omegad - k.gd * k.mud * k.wr - k.betad * cross(p.omega, k.t))
+            k.N
+            @ (
+                k.w * k.gdd
+                - p.omegad
+                - k.gd * k.mud * k.wr
+                - k.betad * cross(p.omega, k.t)
+            )
         )
     ),
     30: legs(
@@ -211,11 +241,19 @@ RESIDUALS = {
     39: legs(lambda p, k: k.n - k.betad * k.mud),
     40: lambda p: p.omegad - p.J @ p.gdd + p.x,
     41: legs(lambda p, k: k.d @ p.gdd - k.gdd),
-    42: legs(lambda p, k: k.mudd + k.betad * (k.r @ cross(p.omega, k.t)) + k.r @ p.omegad),
-    43: legs(lambda p, k: k.mudd + k.betad * (cross(k.t, k.r) @ p.omega) + k.r @ p.omegad),
+    42: legs(
+        lambda p, k: k.mudd + k.betad * (k.r @ cross(p.omega, k.t)) + k.r @ p.omegad
+    ),
+    43: legs(
+        lambda p, k: k.mudd + k.betad * (cross(k.t, k.r) @ p.omega) + k.r @ p.omegad
+    ),
     44: legs(lambda p, k: k.mudd + p.J.T @ k.r @ p.gdd - k.f),
     45: legs(lambda p, k: k.f - k.mudd - p.lever.T @ k.r @ p.gdd),
-    46: legs(lambda p, k: k.betadd - k.tw * k.gdd + k.gd * k.mud * (k.t @ k.wr) + k.t @ p.omegad),
+    46: legs(
+        lambda p, k: (
+            k.betadd - k.tw * k.gdd + k.gd * k.mud * (k.t @ k.wr) + k.t @ p.omegad
+        )
+    ),
     47: legs(lambda p, k: k.betadd - k.u_vector @ p.gdd - k.u),
     48: legs(lambda p, k: k.u_vector - k.tw * k.d + p.lever.T @ k.t),
     49: legs(lambda p, k: k.u - k.betadd + k.tw * k.gdd - p.lever.T @ k.t @ p.gdd),
@@ -234,7 +272,8 @@ RESIDUALS = {
     62: legs(lambda p, k: k.R2B - k.second.T),
     63: lambda p: p.ne - p.moment + p.Is @ p.omegad + cross(p.omega, p.Is @ p.omega),
     64: lambda p: (
-        p.omega @ p.Is @ p.omega - (p.R.T @ p.omega) @ p.truth.inertias[0] @ (p.R.T @ p.omega)
+        p.omega @ p.Is @ p.omega
+        - (p.R.T @ p.omega) @ p.truth.inertias[0] @ (p.R.T @ p.omega)
     ),
     65: lambda p: p.ne - p.Q @ p.gdd - p.q,
     66: lambda p: p.Q + p.Is @ p.lever,
@@ -248,7 +287,9 @@ RESIDUALS = {
     74: legs(lambda p, k: k.ell + cross(k.wa, k.Ia @ k.wa)),
     75: legs(lambda p, k: k.np + k.Ip @ k.wpd + cross(k.wp, k.Ip @ k.wp)),
     76: legs(
-        lambda p, k: k.wpd - k.R21 @ k.wad + cross(k.R21 @ k.wa, k.mud * k.r2) + k.mudd * k.r2
+        lambda p, k: (
+            k.wpd - k.R21 @ k.wad + cross(k.R21 @ k.wa, k.mud * k.r2) + k.mudd * k.r2
+        )
     ),
     77: legs(lambda p, k: k.wpd - k.P @ p.gdd - k.p),
     78: legs(lambda p, k: k.P - k.Jp),

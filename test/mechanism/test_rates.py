@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rates of every joint and link against differences, and the moments between the links.
 
-The moments are held against the multipliers of a maximal-coordinate Newton-Euler model, which knows
-bodies, axes and inertias only: 21 angular accelerations, 18 multipliers.
+The moments are held against the multipliers of a maximal-coordinate Newton-Euler model,
+which knows bodies, axes and inertias only: 21 angular accelerations, 18 multipliers.
 """
 
 from dataclasses import replace
@@ -42,7 +42,9 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample, gamma):
     exact = Motion(Lagrange(sample.scene, sample.rotation), gamma, rate, acceleration)
     here = exact.here
     omega, omega_dot = (x[0].astype(float) for x in (exact.omega, exact.omega_dot))
-    of_links, links_dot = (here.own(x)[1:].astype(float) for x in (exact.omega, exact.omega_dot))
+    of_links, links_dot = (
+        here.own(x)[1:].astype(float) for x in (exact.omega, exact.omega_dot)
+    )
     joints, joints_dot = exact.rates.astype(float), exact.accelerations.astype(float)
     at = virtual_work.posture(sample.geometry, gamma, here.rotation.astype(float))
     from_star = rates.of_star(sample.geometry, at.rotation, omega, omega_dot, gamma)
@@ -79,16 +81,24 @@ def test_rates_and_accelerations_of_every_joint_and_link(sample, gamma):
 
 
 def newton_euler(sample):
-    """Accelerations (7, 3) and joint moments (9, 3) in {B}; joints by kind, then by leg."""
+    """Accelerations (7, 3) and joint moments (9, 3) in {B}.
+
+    Joints by kind, then by leg.
+    """
     scene, rotation, at = sample.scene, sample.rotation, sample.posture
     w, r, t = at.w, at.r, at.t
     joints = [(None, k, w[k]) for k in range(3)]
-    joints += [(k, 3 + k, r[k]) for k in range(3)] + [(3 + k, 6, t[k]) for k in range(3)]
+    joints += [(k, 3 + k, r[k]) for k in range(3)] + [
+        (3 + k, 6, t[k]) for k in range(3)
+    ]
     frames = [*np.concatenate(virtual_work.link_frames(at)), rotation]
     links = [*scene.actuated_links, *scene.intermediate_links, scene.star]
-    inertia = [f @ body.inertia.matrix @ f.T for f, body in zip(frames, links, strict=True)]
+    inertia = [
+        f @ body.inertia.matrix @ f.T for f, body in zip(frames, links, strict=True)
+    ]
 
-    # Two directions across each axis, fixed in the parent, which all of the axis is too.
+    # Two directions across each axis, fixed in the parent, which all of the axis is
+    # too.
     pairs = [np.linalg.svd(axis[None])[2][1:] for _, _, axis in joints]
     rows = np.zeros((18, 3 * BODIES))
     for index, ((parent, child, _), pair) in enumerate(zip(joints, pairs, strict=True)):

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reactions against Newton's and Euler's equations of each link, virtual work, and Pinocchio.
+"""Reactions against Newton's and Euler's equations of each link, virtual work, and
+Pinocchio.
 
-The links' accelerations are differences of positions in 80 digits, which know loop closure alone.
+The links' accelerations are differences of positions in 80 digits, which know loop
+closure alone.
 """
 
 from dataclasses import replace
@@ -66,21 +68,35 @@ def test_every_link_obeys_newton_and_euler_under_every_load(sample):
     mass[0] += scene.payload.mass
     gravity = np.array(scene.gravity.acceleration)
     heavy = centres(0).astype(float)
-    needs_force = slope(lambda t: slope(centres, t)).astype(float) - mass[:, None] * gravity
+    needs_force = (
+        slope(lambda t: slope(centres, t)).astype(float) - mass[:, None] * gravity
+    )
     needs_moment = motion.momentum_rates().astype(float) - np.cross(heavy, gravity)
     needs_moment[0] -= scene.moment.value
     scale_force, scale = np.abs(needs_force).max(), np.abs(needs_moment).max()
-    for got, needs, size in ((force, needs_force, scale_force), (moment, needs_moment, scale)):
+    for got, needs, size in (
+        (force, needs_force, scale_force),
+        (moment, needs_moment, scale),
+    ):
         actuated, revolute, prismatic = got
-        rest = np.array([*(actuated - revolute), *(revolute - prismatic), prismatic.sum(axis=0)])
+        rest = np.array(
+            [*(actuated - revolute), *(revolute - prismatic), prismatic.sum(axis=0)]
+        )
         wanted = np.array([*needs[1:4], *needs[4:7], needs[0]])
         assert np.abs(rest - wanted).max() < EXACT * size
-        # Virtual work: any turns and shifts of all links, whether or not joints allow them.
+        # Virtual work: any turns and shifts of all links, whether or not joints allow
+        # them.
         rng = np.random.default_rng(5)
-        drives, links, star = rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), rng.normal(size=3)
+        drives, links, star = (
+            rng.normal(size=(3, 3)),
+            rng.normal(size=(3, 3)),
+            rng.normal(size=3),
+        )
         work = np.sum(actuated * drives) + np.sum(revolute * (links - drives))
         work += np.sum(prismatic * (star - links))
-        expected = np.sum(needs[1:4] * drives) + np.sum(needs[4:7] * links) + needs[0] @ star
+        expected = (
+            np.sum(needs[1:4] * drives) + np.sum(needs[4:7] * links) + needs[0] @ star
+        )
         assert work == pytest.approx(expected, abs=EXACT * size)
     # About its own axis a joint transmits what acts there, and nothing else.
     angles, speeds = here.angles.astype(float), motion.rates.astype(float)
@@ -93,7 +109,10 @@ def test_every_link_obeys_newton_and_euler_under_every_load(sample):
             rubbing = documented_torque(friction, mpf(speeds[kind, leg]))
             expected[kind, leg] -= float(rubbing)
     for spring in scene.springs:
-        kind, leg = ("gamma", "mu", "beta").index(spring.joint[:-2]), int(spring.joint[-1]) - 1
+        kind, leg = (
+            ("gamma", "mu", "beta").index(spring.joint[:-2]),
+            int(spring.joint[-1]) - 1,
+        )
         expected[kind, leg] -= spring.stiffness * (angles[kind, leg] - spring.rest)
     arcs = Geometry.of(scene).arc
     for leg in range(3):
@@ -122,7 +141,9 @@ def test_forces_have_the_least_sum_of_squares():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_pinocchios_internal_forces(seed):
-    """From the URDF alone: moments about O in all joints that its tree has, sums of forces."""
+    """From the URDF alone: moments about O in all joints that its tree has, sums of
+    forces.
+    """
     rub = Friction(viscous=0.3, coulomb=0.2, smoothing=0.1)
     scene = replace(
         loaded_scene(),
@@ -155,7 +176,9 @@ def test_pinocchios_internal_forces(seed):
     model.gravity = pin.Motion(np.array(scene.gravity.acceleration), np.zeros(3))
     angles = angles_of(geometry, gamma, at.rotation)
     speeds = by_joint(motion.gamma_dot, motion.mu_dot, motion.beta_dot)
-    opened = {name: angle for name, angle in angles.items() if model.existJointName(name)}
+    opened = {
+        name: angle for name, angle in angles.items() if model.existJointName(name)
+    }
     q, v, u = read.configuration(opened), np.zeros(model.nv), np.zeros(model.nv)
     for name in opened:
         index = model.joints[model.getJointId(name)].idx_v
@@ -177,7 +200,8 @@ def test_pinocchios_internal_forces(seed):
     pin.forwardKinematics(model, data, q, v, a)
     external = [pin.Force.Zero() for _ in range(model.njoints)]
     for tie, own in zip(ties, tied, strict=True):
-        # The tie's force acts on its first joint, in the frame there; its opposite on the second.
+        # The tie's force acts on its first joint, in the frame there; its opposite on
+        # the second.
         at_first = tie.joint1_placement.act(own.contact_force)
         external[tie.joint1_id] += at_first
         in_world = data.oMi[tie.joint1_id].act(at_first)
@@ -197,13 +221,23 @@ def test_pinocchios_internal_forces(seed):
 
 def test_a_payload_at_rest_hangs_in_the_joints():
     """The base carries all weights, and holds them about O."""
-    scene = load_scene("gravity_payload").with_values({"friction": None, "springs": None})
-    motion = simulate(scene, duration=1e-3, samples=1, initial=(scene.initial.gamma, np.zeros(3)))
+    scene = load_scene("gravity_payload").with_values(
+        {"friction": None, "springs": None}
+    )
+    motion = simulate(
+        scene, duration=1e-3, samples=1, initial=(scene.initial.gamma, np.zeros(3))
+    )
     still = motion.reactions
-    bodies = [scene.star, scene.payload, *scene.actuated_links, *scene.intermediate_links]
+    bodies = [
+        scene.star,
+        scene.payload,
+        *scene.actuated_links,
+        *scene.intermediate_links,
+    ]
     mass = sum(body.mass for body in bodies)
     accelerated = np.abs(motion.gamma_ddot[0]).max()
-    assert accelerated > 0.1  # torques do not hold it: the weight is not all that the base carries
+    # torques do not hold it: the weight is not all that the base carries
+    assert accelerated > 0.1
     from sst_ros import equilibrium
 
     held = equilibrium(scene, scene.initial.gamma)
@@ -222,13 +256,17 @@ def test_a_payload_at_rest_hangs_in_the_joints():
 
 
 def test_an_own_load_acts_where_its_formula_says():
-    """A spring, a formula of its angle: the same reactions, in the joint and in all others."""
+    """A spring, a formula of its angle: the same reactions, in the joint and in all
+    others.
+    """
     scene = load_scene("friction").with_values(
         {"springs": [{"joint": "beta_2", "stiffness": 6.0, "rest": 0.2}]}
     )
     own = own_load("spring", potential=lambda at: 3.0 * (at.beta[1] - 0.2) ** 2)
     given = [simulate(scene, duration=0.2, samples=5)]
-    given.append(simulate(replace(scene, springs=(), own_loads=(own,)), duration=0.2, samples=5))
+    given.append(
+        simulate(replace(scene, springs=(), own_loads=(own,)), duration=0.2, samples=5)
+    )
     one, other = (motion.reactions.columns() for motion in given)
     assert np.abs(one["moment_prismatic_2_z"]).max() > 0.1
     for name, column in one.items():
@@ -244,7 +282,9 @@ def test_columns_figures_and_pictures():
         loads = getattr(found, name)
         parts = [columns[f"force_{name}_2_{axis}"] for axis in "xyz"]
         whole = np.sqrt(sum(x * x for x in parts))
-        assert np.hypot(loads.radial_force, loads.axial_force)[:, 1] == pytest.approx(whole)
+        assert np.hypot(loads.radial_force, loads.axial_force)[:, 1] == pytest.approx(
+            whole
+        )
     figures = found.figures["prismatic"]["bending_moment"]
     bending = found.prismatic.bending_moment
     assert figures.peak == pytest.approx(bending.max(axis=0))

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one-degree-of-freedom motion of Example 1 against the full dynamics, at elastic stops too."""
+"""The one-degree-of-freedom motion of Example 1 against the full dynamics, at elastic
+stops too.
+"""
 
 from dataclasses import replace
 
@@ -25,19 +27,24 @@ REST = (0.0, 0.0, 0.0)
 def test_with_the_rate_without_drift_the_full_dynamics_return_after_one_period(scene):
     start = {"initial.gamma_dot": [drift_free_rate(scene)] * 3}
     motion = simulate(scene.with_values(start), t_eval=[np.pi / 6], tolerance=1e-14)
-    # Samples are taken at whole nanoseconds. An error of the rate shows about pi/6 times as large.
+    # Samples are taken at whole nanoseconds. An error of the rate shows about pi/6
+    # times as large.
     drift = motion.gamma[-1] + (np.pi / 6 - motion.t[-1]) * motion.gamma_dot[-1] - HOME
     assert np.abs(drift).max() < 5e-13
 
 
 def test_example_1_starts_with_the_rate_without_drift():
-    assert EXAMPLE1.initial.gamma_dot == pytest.approx((drift_free_rate(EXAMPLE1),) * 3, abs=1e-12)
+    assert EXAMPLE1.initial.gamma_dot == pytest.approx(
+        (drift_free_rate(EXAMPLE1),) * 3, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("e", [0.1, 0.5, 0.6, 0.9, 0.99, 0.998, 0.999, 1.0 - 1e-6, 1.0])
 def test_the_damping_satisfies_the_exact_relation(e):
     """d (1 + e) = ln((1 + d) / (1 - d e)), solved by mpmath to 40 digits."""
-    damping = damping_of(Stroke(at_end="elastic", stiffness=10.0, restitution=e, impact_rate=2.5))
+    damping = damping_of(
+        Stroke(at_end="elastic", stiffness=10.0, restitution=e, impact_rate=2.5)
+    )
     if e == 1.0:
         assert damping == 0.0
         return
@@ -48,7 +55,9 @@ def test_the_damping_satisfies_the_exact_relation(e):
             return d * (1 + restitution) - mpmath.log((1 + d) / (1 - d * restitution))
 
         d = mpmath.mpf(2.5) * damping
-        exact = mpmath.findroot(relation, (d * (1 - mpmath.mpf("1e-9")), d), verify=False)
+        exact = mpmath.findroot(
+            relation, (d * (1 - mpmath.mpf("1e-9")), d), verify=False
+        )
         assert abs(d / exact - 1) < 2e-13
 
 
@@ -67,7 +76,9 @@ def bounced(**stroke):
     return simulation
 
 
-@pytest.mark.parametrize(("stiffness", "restitution"), [(2e3, 0.5), (1e6, 0.5), (1e6, 0.9)])
+@pytest.mark.parametrize(
+    ("stiffness", "restitution"), [(2e3, 0.5), (1e6, 0.5), (1e6, 0.9)]
+)
 def test_three_contacts_at_once_stay_symmetric_and_bounce_as_one_freedom_does(
     stiffness, restitution
 ):
@@ -75,13 +86,16 @@ def test_three_contacts_at_once_stay_symmetric_and_bounce_as_one_freedom_does(
     how = {"stiffness": stiffness, "restitution": restitution, "impact_rate": 1.0}
     simulation = bounced(**how)
     joints, c = simulation.state.joints, damping_of(Stroke(at_end="elastic", **how))
-    assert np.ptp(joints.gamma) < 3e-12 and np.ptp(joints.gamma_dot) < 3e-12  # rounding, grown
+    # rounding, grown
+    assert np.ptp(joints.gamma) < 3e-12 and np.ptp(joints.gamma_dot) < 3e-12
 
     def acceleration(t, y):
         x, v = y
         depth = max(x - np.pi / 4, 0.0)
         push = stiffness * depth * max(1.0 + c * v, 0.0)
-        return v, -(push + 0.5 * inertia_slope(EXAMPLE1, x) * v * v) / inertia(EXAMPLE1, x)
+        return v, -(push + 0.5 * inertia_slope(EXAMPLE1, x) * v * v) / inertia(
+            EXAMPLE1, x
+        )
 
     def contact(t, y):
         return y[0] - np.pi / 4
@@ -91,7 +105,13 @@ def test_three_contacts_at_once_stay_symmetric_and_bounce_as_one_freedom_does(
     rates = []
     while t < 1.5:
         found = solve_ivp(
-            acceleration, (t, 1.5), y, "DOP853", events=contact, rtol=2.3e-14, atol=1e-15
+            acceleration,
+            (t, 1.5),
+            y,
+            "DOP853",
+            events=contact,
+            rtol=2.3e-14,
+            atol=1e-15,
         )
         t, y = found.t[-1], found.y[:, -1]
         if found.status == 1:
@@ -104,7 +124,9 @@ def test_three_contacts_at_once_stay_symmetric_and_bounce_as_one_freedom_does(
 
 
 def test_stiff_stops_have_the_restitution_at_the_impact_rate():
-    """The relation is exact for a constant inertia: the depth of contact is what remains."""
+    """The relation is exact for a constant inertia: the depth of contact is what
+    remains.
+    """
     # Rate at the stops of a motion that keeps its energy, from rate 1 at home.
     rate = np.sqrt(inertia(EXAMPLE1, 0.0) / inertia(EXAMPLE1, np.pi / 4))
     found = []

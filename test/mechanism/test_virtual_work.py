@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's equations and the kernel that runs, against Lagrange's to 80 digits and each other.
+"""The paper's equations and the kernel that runs, against Lagrange's to 80 digits and
+each other.
 
-Samples keep abs(det J2) > 0.05 and sin(mu) > 0.2, so J and the inertia matrix lose at most about
-two digits of double precision: 1e-12 of the largest terms that meet leaves two more. The kernel is
-also held on every type of number.
+Samples keep abs(det J2) > 0.05 and sin(mu) > 0.2, so J and the inertia matrix lose at
+most about two digits of double precision: 1e-12 of the largest terms that meet leaves
+two more. The kernel is also held on every type of number.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ def test_direct_dynamics_is_lagranges(sample, pushed):
     agree(virtual_work.direct_dynamics(*arguments, *loads), gamma_ddot)
     motion = Motion(truth, sample.gamma, sample.gamma_dot, gamma_ddot)
     expected = motion.here.rotation.T @ motion.omega_dot[0]
-    found = kernel.derivative(sample.model, sample.state, *(tuple(x.tolist()) for x in loads))
+    found = kernel.derivative(
+        sample.model, sample.state, *(tuple(x.tolist()) for x in loads)
+    )
     agree(found[4:], expected)
 
 
@@ -53,7 +56,9 @@ def test_the_truth_does_not_depend_on_its_steps(monkeypatch):
 @every_sample
 def test_t1_is_minus_the_inertia_matrix(sample):
     truth = Lagrange(sample.scene, sample.rotation).inertia_matrix(exact(sample.gamma))
-    t1, _ = virtual_work.equation_of_motion(sample.mechanism, sample.posture, sample.gamma_dot)
+    t1, _ = virtual_work.equation_of_motion(
+        sample.mechanism, sample.posture, sample.gamma_dot
+    )
     agree(-t1, truth)
 
 
@@ -88,8 +93,12 @@ def test_energy_momentum_and_both_dynamics_agree(seed):
 
 
 def worst_term(sample):
-    """Size of what adds up to gamma_ddot: torque and velocity products, each through M^-1."""
-    t1, t2 = virtual_work.equation_of_motion(sample.mechanism, sample.posture, sample.gamma_dot)
+    """Size of what adds up to gamma_ddot: torque and velocity products, each through
+    M^-1.
+    """
+    t1, t2 = virtual_work.equation_of_motion(
+        sample.mechanism, sample.posture, sample.gamma_dot
+    )
     bias = virtual_work.bias(sample.posture, sample.gamma_dot).omega_dot
     force = np.abs(sample.torque).max() + np.abs(t2).max() + np.abs(sample.moment).max()
     through_j = np.abs(np.linalg.inv(sample.posture.j)).max() * np.abs(bias).max()
@@ -99,8 +108,16 @@ def worst_term(sample):
 @FAST
 @given(samples(), st.floats(1e-6, 1e6))
 def test_the_kernel_is_the_paper(sample, length):
-    """Acceleration, energy, angles and rates; the length of the quaternion does not matter."""
-    at, rate, torque, moment = sample.posture, sample.gamma_dot, sample.torque, sample.moment
+    """Acceleration, energy, angles and rates.
+
+    The length of the quaternion does not matter.
+    """
+    at, rate, torque, moment = (
+        sample.posture,
+        sample.gamma_dot,
+        sample.torque,
+        sample.moment,
+    )
     paper = virtual_work.direct_dynamics(sample.mechanism, at, rate, torque, moment)
     state = (*(length * part for part in sample.quaternion), *sample.body_rate)
     body = kernel.derivative(sample.model, state, tuple(torque), tuple(moment))[4:]
@@ -113,7 +130,9 @@ def test_the_kernel_is_the_paper(sample, length):
     agree([joints.gamma, joints.mu, joints.beta], angles, 1.0)
     size = (1.0 + np.linalg.norm(rate)) * (1.0 + np.linalg.cond(at.j))
     agree(
-        [joints.gamma_dot, joints.mu_dot, joints.beta_dot], [rate, at.a @ rate, at.b @ rate], size
+        [joints.gamma_dot, joints.mu_dot, joints.beta_dot],
+        [rate, at.a @ rate, at.b @ rate],
+        size,
     )
 
 
@@ -138,14 +157,17 @@ def test_complex_step_by_the_state_is_the_mp_difference(sample):
     for k in range(7):
         moved = [complex(x) for x in sample.state]
         moved[k] += 1j * TINY
-        slope = [x.imag / TINY for x in kernel.derivative(sample.model, tuple(moved), torque)]
+        slope = [
+            x.imag / TINY for x in kernel.derivative(sample.model, tuple(moved), torque)
+        ]
         ends = []
         for sign in (-1, 1):
             state = [mpf(x) for x in sample.state]
             state[k] += sign * h
             ends.append(kernel.derivative(sample.model, tuple(state), torque))
         truth = [(y - x) / (2 * h) for x, y in zip(*ends, strict=True)]
-        # A slope divides the terms of the sum by sin(mu) or det J2 once more: ten times as large.
+        # A slope divides the terms of the sum by sin(mu) or det J2 once more: ten times
+        # as large.
         agree(slope[4:], truth[4:], worst_term(sample) * 10.0 + 1.0)
 
 
@@ -153,7 +175,9 @@ def test_complex_step_by_the_state_is_the_mp_difference(sample):
 def test_quaternion_rate_turns_the_frame_by_the_body_rate(sample):
     h = 1j * TINY
     rates = kernel.derivative(sample.model, sample.state, (0.0, 0.0, 0.0))
-    moved = tuple(x + h * rate for x, rate in zip(sample.quaternion, rates, strict=False))
+    moved = tuple(
+        x + h * rate for x, rate in zip(sample.quaternion, rates, strict=False)
+    )
     slope = np.array(rotation_rows(moved)).imag / TINY
     wx, wy, wz = sample.body_rate
     skew = np.array([[0, -wz, wy], [wz, 0, -wx], [-wy, wx, 0]])
@@ -167,7 +191,9 @@ def test_branch_without_products_of_inertia_is_the_general_one(sample):
     full = [leg._replace(iyz=1e-300) for leg in bare]
     short, long = (
         kernel.derivative(
-            sample.model._replace(legs=tuple(legs)), sample.state, tuple(sample.torque.tolist())
+            sample.model._replace(legs=tuple(legs)),
+            sample.state,
+            tuple(sample.torque.tolist()),
         )
         for legs in (bare, full)
     )

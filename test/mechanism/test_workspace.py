@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps against one pose at a time, against what is proved, and singular poses against theory."""
+"""Maps against one pose at a time, against what is proved, and singular poses against
+theory.
+"""
 
 import io
 import sys
@@ -45,7 +47,9 @@ def test_the_map_is_the_inverse_kinematics(isotropic):
         i, j = rng.integers(len(isotropic.s)), rng.integers(len(isotropic.psi))
         rotation = workspace.orientations(isotropic.s[i], isotropic.psi[j])
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
-        np.testing.assert_allclose(zyz_angles(rotation)[2], isotropic.psi[j], atol=1e-12)
+        np.testing.assert_allclose(
+            zyz_angles(rotation)[2], isotropic.psi[j], atol=1e-12
+        )
         gamma, _, beta = kinematics.inverse(ISOTROPIC, rotation)
         np.testing.assert_allclose(isotropic.measures.gamma[i, j], gamma, atol=1e-14)
         np.testing.assert_allclose(isotropic.measures.beta[i, j], beta, atol=1e-14)
@@ -55,7 +59,10 @@ def test_the_map_is_the_inverse_kinematics(isotropic):
 
 
 def test_the_isotropic_workspace(isotropic):
-    """Proved: no singular pose inside; known: cond J <= 2.44 and 120 deg of turn at the centre."""
+    """Proved: no singular pose inside.
+
+    known: cond J <= 2.44 and 120 deg of turn at the centre.
+    """
     found = isotropic.measures
     assert found.cond_j[found.admissible].max() < 2.45
     assert np.nanmin(isotropic.best_cond_j) >= 1.0
@@ -69,7 +76,9 @@ def test_the_isotropic_workspace(isotropic):
 
 
 def test_parallel_singularities_of_the_folding_geometry(folding):
-    """v = I, alpha = 210, 75, 75 deg: tan b1 sin a2 + tan b2 sin a3 + tan b3 sin a1 = 0."""
+    """v = I, alpha = 210, 75, 75 deg: tan b1 sin a2 + tan b2 sin a3 + tan b3 sin a1 =
+    0.
+    """
     poses = workspace.parallel_singularities(folding)
     assert len(poses) > 20
     a1, a2, a3 = FOLDING.alpha
@@ -147,13 +156,17 @@ def test_the_nearest_singularity_is_singular_and_no_ray_meets_one_before_it():
             r = kinematics.carriage_directions(geometry, angles)
             t = geometry.e @ np.swapaxes(rotation, -1, -2)
             rows = np.cross(r, t)
-            return np.linalg.det(rows), np.linalg.norm(np.cross(t, geometry.w), axis=-1).min(-1)
+            return np.linalg.det(rows), np.linalg.norm(
+                np.cross(t, geometry.w), axis=-1
+            ).min(-1)
 
         dependent, sine = measure(found.rotation)
         assert abs(dependent if found.kind == "parallel" else sine) < 1e-8
         axes = rng.normal(size=(500, 3))
         axes /= np.linalg.norm(axes, axis=1)[:, None]
         lengths = np.linspace(0.0, 0.99, 100) * found.distance
-        rays = Rotation.from_rotvec((axes[:, None] * lengths[:, None]).reshape(-1, 3)).as_matrix()
+        rays = Rotation.from_rotvec(
+            (axes[:, None] * lengths[:, None]).reshape(-1, 3)
+        ).as_matrix()
         dependent, sine = measure(start @ rays)
         assert np.ptp(np.sign(dependent)) == 0.0 and sine.min() > 1e-3

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command lines of the nodes: what is accepted, and what is refused with the right spelling."""
+"""Command lines of the nodes: what is accepted, and what is refused with the right
+spelling.
+"""
 
 import pytest
 import yaml

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a run: all that the bag allows, with units, told apart without colour, as vectors.
+"""Pictures of a run: all that the bag allows, with units, told apart without colour, as
+vectors.
 
-Several runs are laid on each other: differences against differences made by hand. Long curves keep
-their spikes and gaps; a picture that finds no room is an OSError.
+Several runs are laid on each other: differences against differences made by hand. Long
+curves keep their spikes and gaps; a picture that finds no room is an OSError.
 """
 
 import dataclasses
@@ -39,7 +40,9 @@ def sway(t):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, bags, example2):
-    path = bags.write(tmp_path_factory.mktemp("plot") / "bag", bags.tracked(example2, sway))
+    path = bags.write(
+        tmp_path_factory.mktemp("plot") / "bag", bags.tracked(example2, sway)
+    )
     return read_signals(path)
 
 
@@ -65,7 +68,9 @@ def test_every_picture_shows_something_and_is_a_vector_too(drawn):
     figures, out = drawn
     for name in figures:
         pixels = image.imread(out / f"{name}.png")
-        assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 300, f"{name} shows no curve"
+        assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 300, (
+            f"{name} shows no curve"
+        )
         content = (out / f"{name}.pdf").read_bytes()
         assert content.startswith(b"%PDF") and b"/Subtype /Image" not in content
 
@@ -73,29 +78,44 @@ def test_every_picture_shows_something_and_is_a_vector_too(drawn):
 def test_every_axis_has_its_unit(drawn):
     for name, figure in drawn[0].items():
         if name == "sphere":
-            assert not figure.axes[0].axison  # a map, with the joints' names along its sides
+            # a map, with the joints' names along its sides
+            assert not figure.axes[0].axison
             assert figure.axes[1].get_ylabel() == "deg"
             continue
         for axes in figure.axes:
             shared = axes.get_shared_x_axes().get_siblings(axes)
-            labels = [axes.get_ylabel(), next(filter(None, (a.get_xlabel() for a in shared)))]
-            assert all(re.search(r"\[[^\]]+\]$", label) for label in labels), (name, labels)
+            labels = [
+                axes.get_ylabel(),
+                next(filter(None, (a.get_xlabel() for a in shared))),
+            ]
+            assert all(re.search(r"\[[^\]]+\]$", label) for label in labels), (
+                name,
+                labels,
+            )
 
 
 def test_curves_are_told_apart_without_colour(drawn):
     for name, figure in drawn[0].items():
         for axes in figure.axes:
-            lines = [line for line in axes.lines if not line.get_label().startswith("_")]
-            looks = [(x.get_linestyle(), x.get_marker(), x.get_linewidth()) for x in lines]
+            lines = [
+                line for line in axes.lines if not line.get_label().startswith("_")
+            ]
+            looks = [
+                (x.get_linestyle(), x.get_marker(), x.get_linewidth()) for x in lines
+            ]
             assert len(set(looks)) == len(looks), name
 
 
 def test_tracking_shows_what_was_desired_and_what_was_measured(drawn, run):
     desired, measured = drawn[0]["tracking"].axes[0].lines
     np.testing.assert_allclose(
-        desired.get_ydata(), [np.degrees(sway(t)[0][0]) for t in run.seconds()], rtol=1e-12
+        desired.get_ydata(),
+        [np.degrees(sway(t)[0][0]) for t in run.seconds()],
+        rtol=1e-12,
     )
-    np.testing.assert_allclose(measured.get_ydata(), np.degrees(run.legs("gamma")[:, 0]))
+    np.testing.assert_allclose(
+        measured.get_ydata(), np.degrees(run.legs("gamma")[:, 0])
+    )
 
 
 def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
@@ -119,7 +139,9 @@ def test_friction_takes_energy_out_and_weight_keeps_it(tmp_path, bags):
     loaded = scene.load("friction")
     run = read_signals(bags.write(tmp_path / "bag", bags.simulated(loaded, 0.1)))
     kinetic, potential = pictures.energies(run, loaded)
-    left = kinetic + potential - kinetic[0] - potential[0] - pictures.work(run).sum(axis=1)
+    left = (
+        kinetic + potential - kinetic[0] - potential[0] - pictures.work(run).sum(axis=1)
+    )
     assert left[-1] < -1e-3 * kinetic.max()
     assert (np.diff(left) < 1e-9).all()
 
@@ -136,14 +158,20 @@ def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.ORIENTATION, 60)]
     bag = bags.write(tmp_path / "bag", kept)
     run = read_signals(bag)
-    assert np.flatnonzero(np.isnan(pictures.energies(run, run.scene)[0])).tolist() == [60]
+    assert np.flatnonzero(np.isnan(pictures.energies(run, run.scene)[0])).tolist() == [
+        60
+    ]
     left = reference.integration(recording.read(bag)).energy
     assert np.flatnonzero(np.isnan(left)).tolist() == [60]
     assert np.nanmax(np.abs(left)) < 1e-9
 
 
-def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2, capsys, undrawn):
-    kept = bags.without(example2, bags.ORIENTATION, bags.EULER, bags.APPLIED, bags.COMMANDS)
+def test_what_the_bag_lacks_is_told_and_the_rest_drawn(
+    tmp_path, bags, example2, capsys, undrawn
+):
+    kept = bags.without(
+        example2, bags.ORIENTATION, bags.EULER, bags.APPLIED, bags.COMMANDS
+    )
     bag, out = bags.write(tmp_path / "bag", kept), tmp_path / "out"
     assert cli.main(["plot", str(bag), "--out", str(out)]) == 0
     said = capsys.readouterr().out
@@ -156,7 +184,10 @@ def test_what_the_bag_lacks_is_told_and_the_rest_drawn(tmp_path, bags, example2,
 def test_one_picture_may_be_asked_for(run, tmp_path, capsys, undrawn):
     words = ["plot", str(run.bag.path), "--out", str(tmp_path), "--only", "power"]
     assert cli.main(words) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["power.pdf", "power.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "power.pdf",
+        "power.png",
+    ]
     assert cli.main(["plot", "--force", *words[1:], "nothing"]) == 1
     assert "only = 'nothing': must be one of path_of_E" in capsys.readouterr().err
 
@@ -175,7 +206,10 @@ def test_a_spike_of_one_sample_is_seen_and_a_gap_stays_a_gap(tmp_path):
     paths = [tmp_path / f"picture.{form}" for form in pictures.FORMATS]
     figures.save_figure(figure, *paths)
     red = image.imread(paths[1])[:, :, :3] @ [1.0, -1.0, -1.0] > 0.5
-    assert red.any(axis=1).sum() > 200 and np.diff(np.flatnonzero(red.any(axis=0))).max() > 30
+    assert (
+        red.any(axis=1).sum() > 200
+        and np.diff(np.flatnonzero(red.any(axis=0))).max() > 30
+    )
     assert paths[0].stat().st_size < 100_000
 
 
@@ -210,14 +244,21 @@ def shifted(bags, entries, by_ns, turn=0.0, keep=lambda sample: True):
         if hasattr(content, "header"):
             stamp = content.header.stamp.sec * 10**9 + content.header.stamp.nanosec
             if stamp:
-                content = dataclasses.replace(content, header=bags.header(stamp + by_ns))
+                content = dataclasses.replace(
+                    content, header=bags.header(stamp + by_ns)
+                )
         if entry.topic == bags.JOINTS and entry.sample >= 0 and entry.sample % 2:
             position = np.array(content.position)
             position[0] += 1e-3
             content = dataclasses.replace(content, position=position)
         if entry.topic == bags.ORIENTATION:
             q, c, s = content.quaternion, math.cos(turn / 2), math.sin(turn / 2)
-            x, y, z, w = c * q.x - s * q.y, c * q.y + s * q.x, c * q.z + s * q.w, c * q.w - s * q.z
+            x, y, z, w = (
+                c * q.x - s * q.y,
+                c * q.y + s * q.x,
+                c * q.z + s * q.w,
+                c * q.w - s * q.z,
+            )
             about_z = bags.make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
             content = dataclasses.replace(content, quaternion=about_z)
         if keep(entry.sample):
@@ -231,7 +272,9 @@ def pair(tmp_path_factory, bags, example2):
     folder = tmp_path_factory.mktemp("pair")
     first = bags.write(folder / "first", example2)
     changed = shifted(bags, example2, 5 * 10**9, 0.02, lambda k: not 20 <= k < 30)
-    return [read_signals(bag) for bag in (first, bags.write(folder / "second", changed))]
+    return [
+        read_signals(bag) for bag in (first, bags.write(folder / "second", changed))
+    ]
 
 
 def test_the_differences_are_those_that_were_made(pair):
@@ -239,7 +282,9 @@ def test_the_differences_are_those_that_were_made(pair):
     assert (found[["samples", "of"]] == 141).all(axis=None)
     angles = found[["max_rad", "rms_rad"]]
     # 70 of the 141 samples are odd, in which one angle is changed.
-    assert angles.loc["gamma_1"].tolist() == pytest.approx([1e-3, 1e-3 * math.sqrt(70 / 141)])
+    assert angles.loc["gamma_1"].tolist() == pytest.approx(
+        [1e-3, 1e-3 * math.sqrt(70 / 141)]
+    )
     assert angles.loc["star"].tolist() == pytest.approx([0.02, 0.02], rel=1e-9)
     assert (angles.drop(["gamma_1", "star"]) == 0.0).all(axis=None)
     rates = found[["rate_max_rad_per_s", "rate_rms_rad_per_s"]]
@@ -264,9 +309,14 @@ def test_samples_at_other_times_are_not_compared(pair, bags, example2, tmp_path)
     assert differences([pair[0], other]).iloc[0].tolist()[-2:] == [1, 151]
 
 
-def test_the_panel_of_differences_says_which_runs_do_not_differ_and_which_share_nothing(pair):
+def test_the_panel_of_differences_says_which_runs_do_not_differ_and_which_share_nothing(
+    pair,
+):
     late = dataclasses.replace(pair[0], start_ns=pair[0].start_ns - 1)
-    runs, names = [pair[0], pair[0], pair[1], late], ["first", "same", "changed", "late"]
+    runs, names = (
+        [pair[0], pair[0], pair[1], late],
+        ["first", "same", "changed", "late"],
+    )
     drawn = list(zip(runs, names, figures.LINES, strict=False))
     panel = compare.PICTURES["gamma"].make(drawn).axes[-1]
     said = [line.get_label() for line in panel.lines]
@@ -281,20 +331,33 @@ def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
     said = capsys.readouterr().out
     assert cli.main(["plot", "--compare", *words, "--force"]) == 0
     old = capsys.readouterr()
-    assert old.out.splitlines() == [line for line in said.splitlines() if line != str(table)]
+    assert old.out.splitlines() == [
+        line for line in said.splitlines() if line != str(table)
+    ]
     assert "use sst-ros compare" in old.err
-    assert "at samples that both have at the same time since the start of each run" in said
+    assert (
+        "at samples that both have at the same time since the start of each run" in said
+    )
     assert "second: 141 of 141 samples\n" in said and "gamma_1 1.000e-03" in said
     written = pd.read_csv(table, index_col=["run", "joint"])
     pd.testing.assert_frame_equal(written, differences(pair), check_exact=True)
     drawn = {path.name for path in (tmp_path / "out").iterdir()}
     names = [name for name in compare.PICTURES if name != "tracking_error"]
-    assert drawn == {f"compare_{name}.{form}" for name in names for form in ("pdf", "png")}
-    assert "tracking_error: not drawn: without first, second: no tracking_error there" in said
+    assert drawn == {
+        f"compare_{name}.{form}" for name in names for form in ("pdf", "png")
+    }
+    assert (
+        "tracking_error: not drawn: without first, second: no tracking_error there"
+        in said
+    )
 
 
-def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(pair, bags, example2, tmp_path):
-    poor = bags.write(tmp_path / "poor", [e for e in example2 if e.topic == bags.APPLIED])
+def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(
+    pair, bags, example2, tmp_path
+):
+    poor = bags.write(
+        tmp_path / "poor", [e for e in example2 if e.topic == bags.APPLIED]
+    )
     runs = [*pair, read_signals(poor)]
     paths, missing = draw_comparison(runs, tmp_path / "out", ["gamma", "torques"])
     assert [path.stem for path in paths[::2]] == ["compare_gamma", "compare_torques"]

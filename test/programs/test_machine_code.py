@@ -60,7 +60,10 @@ def random_function(random, inputs, operations):
 
 def bits(numbers):
     """Return the bits of numbers; all that are no number are the same."""
-    return ["nan" if math.isnan(x) else struct.pack("d", x).hex() for x in map(float, numbers)]
+    return [
+        "nan" if math.isnan(x) else struct.pack("d", x).hex()
+        for x in map(float, numbers)
+    ]
 
 
 def rows_of(program, columns):
@@ -111,12 +114,18 @@ def test_a_program_calls_another_by_its_name_scalar_and_in_lanes():
 
     programs = {"inner": inner, "f": trace(twice, ("t", "x"))}
     fast = write_module(programs).function("f")
-    plain = compile_program(programs["f"], {**FUNCTIONS, "inner": compile_program(inner)})
+    plain = compile_program(
+        programs["f"], {**FUNCTIONS, "inner": compile_program(inner)}
+    )
     assert tuple(fast(0.3, 0.7)) == plain(0.3, 0.7) == written_out(0.3, 0.7)
     x = np.linspace(0.1, 2.0, 2 * LANES + 3)
     outputs = [np.empty_like(x) for _ in range(4)]
-    RowFunction(write_module(programs, rows=["f"], shared=1), "f", 1)([0.3], [x], outputs)
-    assert [tuple(row) for row in np.array(outputs).T] == [written_out(0.3, v) for v in x]
+    RowFunction(write_module(programs, rows=["f"], shared=1), "f", 1)(
+        [0.3], [x], outputs
+    )
+    assert [tuple(row) for row in np.array(outputs).T] == [
+        written_out(0.3, v) for v in x
+    ]
 
 
 def test_a_call_with_the_wrong_count_of_numbers_is_refused():
@@ -194,7 +203,9 @@ COLD = """
 
 def run_cold(code):
     text = textwrap.dedent(COLD) + textwrap.dedent(code)
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", text], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -32,12 +32,26 @@ from studies.sixty_digits import Motion, angle
 REFERENCES = ("example1", "example2", "general", "gravity_payload")
 ROUNDING = 1e-15  # of a reference that is rounded to doubles [rad]
 FREE = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore"}
-SINE = SineTorque(amplitude=(1.0, -0.5, 2.0), frequency=(15.0, 12.0, 20.0), phase=(0.0, 1.0, 0.5))
+SINE = SineTorque(
+    amplitude=(1.0, -0.5, 2.0), frequency=(15.0, 12.0, 20.0), phase=(0.0, 1.0, 0.5)
+)
 CASES = {
     "general": ("general", {}, None),
-    "gravity_payload": ("gravity_payload", {"initial.gamma_dot": (0.5, -0.5, 0.2)}, SINE),
-    "lag": ("example2_heavy", {"actuators": {"time_constant": 0.02, "rotor_inertia": 1e-3}}, SINE),
-    "friction": ("friction", {"friction.gamma.smoothing": 0.3, "friction.mu.smoothing": 0.3}, None),
+    "gravity_payload": (
+        "gravity_payload",
+        {"initial.gamma_dot": (0.5, -0.5, 0.2)},
+        SINE,
+    ),
+    "lag": (
+        "example2_heavy",
+        {"actuators": {"time_constant": 0.02, "rotor_inertia": 1e-3}},
+        SINE,
+    ),
+    "friction": (
+        "friction",
+        {"friction.gamma.smoothing": 0.3, "friction.mu.smoothing": 0.3},
+        None,
+    ),
 }
 NAMES = [f"{joint}_{leg}" for joint in JOINTS for leg in (1, 2, 3)]
 
@@ -49,7 +63,9 @@ def worst(columns, motion, row, time):
     ratios = [angle(y[:4], q) / mpf(columns["angle"][row])]
     names = ["body_rate_x", "body_rate_y", "body_rate_z", *NAMES]
     for name, x in zip(names, [*y[4:7], *motion.joints(y)], strict=True):
-        ratios.append(abs(x - mpf(columns[name][row])) / mpf(columns[f"{name}_bound"][row]))
+        ratios.append(
+            abs(x - mpf(columns[name][row])) / mpf(columns[f"{name}_bound"][row])
+        )
     return float(max(ratios))
 
 
@@ -59,7 +75,8 @@ def case(name):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x == "friction")) for x in CASES]
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] * (x == "friction")) for x in CASES],
 )
 def test_a_solution_of_60_digits_lies_inside(name):
     scene, torque = case(name)
@@ -74,19 +91,31 @@ def test_a_solution_of_60_digits_lies_inside(name):
 
 def test_all_motions_of_ranges_lie_inside():
     scene, _ = case("general")
-    ranges = {"initial.gamma_dot": 1e-4, "initial.gamma[0]": 1e-5, "star.inertia.zz": 5e-4}
+    ranges = {
+        "initial.gamma_dot": 1e-4,
+        "initial.gamma[0]": 1e-5,
+        "star.inertia.zz": 5e-4,
+    }
     proven = certify(scene, SINE, 0.1, ranges=ranges, t_eval=[0.1])
     assert not proven.reason and proven.until == 0.1
     found = []
-    for signs in ((1, 1, 1, 1, 1), (-1, 1, -1, 1, -1), (1, -1, -1, -1, 1), (-1, -1, 1, 1, 1)):
+    for signs in (
+        (1, 1, 1, 1, 1),
+        (-1, 1, -1, 1, -1),
+        (1, -1, -1, -1, 1),
+        (-1, -1, 1, 1, 1),
+    ):
         values = {
             "initial.gamma_dot": tuple(
-                x + 1e-4 * sign for x, sign in zip(scene.initial.gamma_dot, signs, strict=False)
+                x + 1e-4 * sign
+                for x, sign in zip(scene.initial.gamma_dot, signs, strict=False)
             ),
             "initial.gamma": (0.75 + 1e-5 * signs[3], 0.7, 0.75),
             "star.inertia.zz": 0.22 + 5e-4 * signs[4],
         }
-        found.append(worst(proven.columns, Motion(scene.with_values(values), SINE), 0, 0.1))
+        found.append(
+            worst(proven.columns, Motion(scene.with_values(values), SINE), 0, 0.1)
+        )
     assert max(found) < 1.0
     assert max(found) > 0.3  # not wider than needed by much
 
@@ -128,7 +157,8 @@ def halve_the_defect(patch):
 
 
 def test_a_halved_defect_misses_the_solution(monkeypatch):
-    # y' = 3 (t - h/2)^2 by p = 0: the defect is all of it, and its integral is the error, h^3 / 4.
+    # y' = 3 (t - h/2)^2 by p = 0: the defect is all of it, and its integral is the
+    # error, h^3 / 4.
     h = arb(0.125)
 
     def miss():
@@ -148,8 +178,8 @@ def test_a_halved_defect_misses_the_solution(monkeypatch):
 
 
 def test_the_norm_of_an_integral_is_no_bound(monkeypatch):
-    # x' = 100 (y - x) + .., y' = 0 by p = (0, -t): the defect of y acts all the time, that of x
-    # at the end, and x has both; each has the integral h.
+    # x' = 100 (y - x) + .., y' = 0 by p = (0, -t): the defect of y acts all the time,
+    # that of x at the end, and x has both; each has the integral h.
     h, order = 0.125, 30
     monkeypatch.setattr(enclosure, "_weights", lambda _: [arb(1), arb(1)])
 
@@ -162,7 +192,8 @@ def test_the_norm_of_an_integral_is_no_bound(monkeypatch):
         given = (lambda *y: (*f(*y), -100, 0, 100, 0)), step, order, 1e3
         bound = float(enclosure.prove(f, *given).at(h)[1][0])
     error = mp.quad(
-        lambda s: mp.exp(100 * (s - h)) * (100 * s + (order + 1) * (s / h) ** order), [0, h]
+        lambda s: mp.exp(100 * (s - h)) * (100 * s + (order + 1) * (s / h) ** order),
+        [0, h],
     )
     assert 1.2 * h < error < bound
 
@@ -211,7 +242,9 @@ def test_a_wrong_jacobian_misses_a_motion_of_the_range(monkeypatch):
         e = last(f, jacobian, box, 1.0).at(1.0)[1]
         approximate = enclosure.approximate  # by the right one
         monkeypatch.setattr(
-            enclosure, "approximate", lambda f, _, *given: approximate(f, jacobian, *given)
+            enclosure,
+            "approximate",
+            lambda f, _, *given: approximate(f, jacobian, *given),
         )
         wrong = last(f, lambda t, x, v: (v, -x, 0, -0.5, 0.5, 0), box, 1.0).at(1.0)[1]
     # from (1.001, 0.001)
@@ -267,7 +300,9 @@ def test_a_halved_defect_misses_a_motion_of_60_digits(monkeypatch):
             p = enclosure.approximate(f, jacobian, here, 20)
             for row in p:
                 row[1] += arb(2) ** -20
-            step = enclosure.Advance(here, h, list(map(arb_poly, p)), [arb(0, 1e-3)] * 7)
+            step = enclosure.Advance(
+                here, h, list(map(arb_poly, p)), [arb(0, 1e-3)] * 7
+            )
             return ratios(enclosure.prove(f, jacobian, step, 20, 1.0), motion)
 
     assert 0.9 < min(found()) <= max(found()) <= 1.0
@@ -278,7 +313,8 @@ def test_a_halved_defect_misses_a_motion_of_60_digits(monkeypatch):
 def test_a_wrong_jacobian_misses_a_motion_of_60_digits(monkeypatch):
     scene, _ = case("general")
     rates = tuple(
-        x + 1e-4 * sign for x, sign in zip(scene.initial.gamma_dot, (1, -1, 1), strict=True)
+        x + 1e-4 * sign
+        for x, sign in zip(scene.initial.gamma_dot, (1, -1, 1), strict=True)
     )
     motion = Motion(scene.with_values({"initial.gamma_dot": rates}), SINE)
 
@@ -295,7 +331,9 @@ def test_a_wrong_jacobian_misses_a_motion_of_60_digits(monkeypatch):
             return approximate(*given)
 
     monkeypatch.setattr(enclosure, "approximate", find_with_the_right_one)
-    monkeypatch.setattr(enclosure, "_matrices", lambda *given: [x / 8 for x in matrices(*given)])
+    monkeypatch.setattr(
+        enclosure, "_matrices", lambda *given: [x / 8 for x in matrices(*given)]
+    )
     assert found() > 1.0
 
 
@@ -313,9 +351,16 @@ def test_polynomials_are_followed_over_their_pieces():
 
 
 def test_the_end_of_the_stroke_is_enclosed_where_simulate_stops():
-    proven, found = certify("example2_stroke", t_eval=[0.5, 0.9]), simulate("example2_stroke")
+    proven, found = (
+        certify("example2_stroke", t_eval=[0.5, 0.9]),
+        simulate("example2_stroke"),
+    )
     (span,) = proven.limits["gamma_1 > 1.570796 rad"]
-    assert proven.reason == "gamma_1 > 1.570796 rad" and proven.until == span[0] and proven.success
+    assert (
+        proven.reason == "gamma_1 > 1.570796 rad"
+        and proven.until == span[0]
+        and proven.success
+    )
     assert span[1] - span[0] < 1e-11
     assert abs(found.t[-1] - 0.5 * sum(span)) < 1e-9
 
@@ -324,12 +369,18 @@ def test_limits_that_are_passed_are_enclosed():
     proven = certify("example2", t_eval=[1.0])
     passed = {name: spans for name, spans in proven.limits.items() if spans}
     assert list(passed) == ["gamma_1 > 1.570796 rad", "beta_2 < 0"]
-    assert all(len(spans) == 1 and spans[0][1] - spans[0][0] < 1e-11 for spans in passed.values())
+    assert all(
+        len(spans) == 1 and spans[0][1] - spans[0][0] < 1e-11
+        for spans in passed.values()
+    )
 
 
 def test_a_torque_passes_its_limit_where_the_time_is_enclosed():
-    scene = load_scene("example2_heavy").with_values({"actuators": {"torque_limit": 4.5}})
-    proven, kink = certify(scene, None, 0.1), math.acos(4.5 / 5.0) / 12.0  # of 5 cos(12 t)
+    scene = load_scene("example2_heavy").with_values(
+        {"actuators": {"torque_limit": 4.5}}
+    )
+    # of 5 cos(12 t)
+    proven, kink = certify(scene, None, 0.1), math.acos(4.5 / 5.0) / 12.0
     ((begin, end),) = proven.limits["torque_2 at its limit"]
     assert proven.success and proven.until == 0.1 and proven.largest < 1e-12
     assert begin - 1e-15 < kink < end + 1e-15 and end - begin < 1e-12
@@ -337,7 +388,11 @@ def test_a_torque_passes_its_limit_where_the_time_is_enclosed():
 
 def test_a_proof_ends_after_its_steps():
     proven = certify("example2", max_steps=2, t_eval=[0.01, 1.0])
-    assert proven.reason == "2 steps are not enough" and proven.steps == 2 and not proven.success
+    assert (
+        proven.reason == "2 steps are not enough"
+        and proven.steps == 2
+        and not proven.success
+    )
     assert 0.01 < proven.until < 1.0 and list(proven.columns["t"]) == [0.01]
 
 
@@ -350,11 +405,15 @@ def test_a_cell_of_a_table_has_the_bound_or_the_reason():
 
 
 def test_a_range_around_a_rate_of_zero_widens_what_is_proven():
-    scene = load_scene("general").with_values({**FREE, "initial.gamma_dot": (0.0, 0.0, 0.0)})
+    scene = load_scene("general").with_values(
+        {**FREE, "initial.gamma_dot": (0.0, 0.0, 0.0)}
+    )
     motion, slow = {"t_eval": [0.0, 0.05]}, {"ranges": {"initial.gamma_dot": 1e-4}}
     wide = certify(scene, SINE, 0.05, **motion, **slow).columns
     for rate in ((1e-4, -1e-4, 1e-4), (-1e-4, -1e-4, 0.0)):
-        moving = simulate(scene.with_values({"initial.gamma_dot": rate}), SINE, 0.05, **motion)
+        moving = simulate(
+            scene.with_values({"initial.gamma_dot": rate}), SINE, 0.05, **motion
+        )
         for leg, found in enumerate(moving.gamma_dot.T, 1):
             name = f"gamma_dot_{leg}"
             assert (abs(found - wide[name]) <= wide[f"{name}_bound"] + 1e-9).all()
@@ -395,7 +454,8 @@ def test_held_torques_are_followed_over_their_ticks():
 
 
 @pytest.mark.parametrize(
-    "name", ["example2_heavy", *(pytest.param(x, marks=pytest.mark.slow) for x in REFERENCES)]
+    "name",
+    ["example2_heavy", *(pytest.param(x, marks=pytest.mark.slow) for x in REFERENCES)],
 )
 def test_the_reference_of_other_tests_lies_inside(name):
     scene = load_scene(name)
@@ -417,7 +477,10 @@ def test_torques_at_their_limit_are_clamped_exactly():
     scene = case("general")[0].with_values({"actuators": {"torque_limit": 0.5}})
     beyond, at = TorqueTable([0.0], [[0.5, -9.0, 0.1]]), (0.5, -0.5, 0.1)
     times = {"t_eval": [0.02]}
-    clamped, same = certify(scene, beyond, 0.02, **times), certify(scene, at, 0.02, **times)
+    clamped, same = (
+        certify(scene, beyond, 0.02, **times),
+        certify(scene, at, 0.02, **times),
+    )
     assert clamped.success and clamped.columns["angle"] == same.columns["angle"]
 
 
@@ -425,11 +488,15 @@ SHORT = {"duration": 0.05, "t_eval": [0.05]}
 
 
 def widest_distance(scene, changes):
-    """Angle between the motion of a scene and those with other values, by simulate [rad]."""
+    """Angle between the motion of a scene and those with other values, by simulate
+    [rad].
+    """
     at = {**SHORT, "tolerance": 1e-12}
     centre = simulate(scene, **at).quaternion[-1]
     return [
-        float(angle_between(simulate(scene.with_values(one), **at).quaternion[-1], centre))
+        float(
+            angle_between(simulate(scene.with_values(one), **at).quaternion[-1], centre)
+        )
         for one in changes
     ]
 
@@ -460,7 +527,11 @@ def test_ranges_reach_the_motion(values, ranges, changes):
 def about_centre(**values):
     inertia = {"xx": "0.31", "yy": "0.31", "zz": "0.20"}
     star = {"inertia": inertia, "mass": 2.6, "centre": [0.0, 0.01, 0.05], "radius": 0.4}
-    star |= {"inertia_about": "centre_of_mass", "alpha_deg": [120.0, 120.0, 120.0], **values}
+    star |= {
+        "inertia_about": "centre_of_mass",
+        "alpha_deg": [120.0, 120.0, 120.0],
+        **values,
+    }
     return load_scene("example2").with_values({**FREE, "star": star})
 
 
@@ -468,8 +539,12 @@ def test_a_range_of_what_reading_converts_is_one_of_the_document():
     scene = about_centre()
     proven = certify(scene, ranges={"star.mass": 0.02}, **SHORT)
     at = {**SHORT, "tolerance": 1e-12}
-    centre, other = (simulate(x, **at).quaternion[-1] for x in (scene, about_centre(mass=2.62)))
-    assert not proven.reason and 1e-9 < float(angle_between(centre, other)) <= proven.error
+    centre, other = (
+        simulate(x, **at).quaternion[-1] for x in (scene, about_centre(mass=2.62))
+    )
+    assert (
+        not proven.reason and 1e-9 < float(angle_between(centre, other)) <= proven.error
+    )
 
 
 def test_digits_are_those_that_are_written():
@@ -479,7 +554,9 @@ def test_digits_are_those_that_are_written():
         )
         given = {"star.inertia.zz": "digits"}
         with balls.precision():
-            found = scene_balls.range_balls(document, given, own_torque=True, origin="certify")
+            found = scene_balls.range_balls(
+                document, given, own_torque=True, origin="certify"
+            )
             return float(found["star", "inertia", "zz"].rad())
 
     assert width("0.20") == pytest.approx(0.005) and width("0.2") == pytest.approx(0.05)
@@ -553,4 +630,7 @@ def test_what_cannot_be_proven_is_refused(given, word):
 def test_the_command_prints_what_is_proven(capsys):
     assert main(["certify", "example2", "--duration", "0.05", "--bound", "1e-12"]) == 0
     said = capsys.readouterr().out
-    assert "to 0.05 s" in said and "no limit is reached and no singularity is passed" in said
+    assert (
+        "to 0.05 s" in said
+        and "no limit is reached and no singularity is passed" in said
+    )

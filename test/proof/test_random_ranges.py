@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random scenes with ranges, converted documents, contacts and clamps: no corner lies outside.
+"""Random scenes with ranges, converted documents, contacts and clamps: no corner lies
+outside.
 
-The other motions are those of `simulate` at a tolerance of 1e-12, whose own estimate is allowed.
+The other motions are those of `simulate` at a tolerance of 1e-12, whose own estimate is
+allowed.
 """
 
 import itertools
@@ -16,7 +18,10 @@ END, COUNT = 0.1, 60  # s
 
 
 def draw(number):
-    """A scene with a converted document, a contact or clamp, or neither; and its ranges."""
+    """A scene with a converted document, a contact or clamp, or neither.
+
+    And its ranges.
+    """
     rng = np.random.default_rng([51, number])
     values = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore"}
     values["initial.orientation"] = None
@@ -75,7 +80,9 @@ def compare(number):
     for signs in corners:
         other = changed(scene, ranges, signs) if ranges else scene
         motion = simulate(other, None, END, t_eval=[END], tolerance=1e-12)
-        apart = float(angle_between(motion.quaternion[-1], proven.trajectory.quaternion[-1]))
+        apart = float(
+            angle_between(motion.quaternion[-1], proven.trajectory.quaternion[-1])
+        )
         worst = max(worst, (apart - motion.error_estimate - 1e-14) / proven.error)
     return worst, ""
 

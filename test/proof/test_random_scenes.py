@@ -15,7 +15,11 @@ SCENES = ("example2_heavy", "general", "gravity_payload")
 def draw(number):
     """A scene with one of: nothing more, a lag, tanh friction, an external moment."""
     rng = np.random.default_rng([36, number])
-    values = {"stroke.at_end": "ignore", "workspace.at_edge": "ignore", "initial.orientation": None}
+    values = {
+        "stroke.at_end": "ignore",
+        "workspace.at_edge": "ignore",
+        "initial.orientation": None,
+    }
     name, kind = str(rng.choice(SCENES)), int(rng.integers(4))
     values["initial.gamma"] = tuple(rng.uniform(0.65, 0.95, 3).tolist())
     values["initial.gamma_dot"] = tuple(rng.uniform(-1.0, 1.0, 3).tolist())
@@ -23,18 +27,29 @@ def draw(number):
         values["actuators"] = {"time_constant": float(10.0 ** rng.uniform(-2.5, -1.0))}
     if kind == 2:
         level, smoothing = rng.uniform(0.01, 0.3), rng.uniform(0.3, 1.0)
-        friction = {"viscous": 0.3, "coulomb": float(level), "smoothing": float(smoothing)}
+        friction = {
+            "viscous": 0.3,
+            "coulomb": float(level),
+            "smoothing": float(smoothing),
+        }
         values["friction"] = {"gamma": friction}
     if kind == 3:
         values["moment"] = {"value": tuple(rng.uniform(-1.0, 1.0, 3).tolist())}
-    rows = rng.uniform(-2.0, 2.0, 3), rng.uniform(2.0, 20.0, 3), rng.uniform(0.0, 6.28, 3)
+    rows = (
+        rng.uniform(-2.0, 2.0, 3),
+        rng.uniform(2.0, 20.0, 3),
+        rng.uniform(0.0, 6.28, 3),
+    )
     amplitude, frequency, phase = (tuple(row.tolist()) for row in rows)
     torque = SineTorque(amplitude=amplitude, frequency=frequency, phase=phase)
     return load_scene(name).with_values(values), torque
 
 
 def compare(number):
-    """Bounds of the table and of the error of simulate, each over the true one; one rate."""
+    """Bounds of the table and of the error of simulate, each over the true one.
+
+    One rate.
+    """
     scene, torque = draw(number)
     proven = certify(scene, torque, END, t_eval=[END])
     assert proven.success and proven.until == END
@@ -43,10 +58,14 @@ def compare(number):
     error = angle(y[:4], proven.trajectory.quaternion[0])
     with mp.workdps(40):
         rates = [
-            abs(x - mpf(columns[f"body_rate_{part}"][0])) <= columns[f"body_rate_{part}_bound"][0]
+            abs(x - mpf(columns[f"body_rate_{part}"][0]))
+            <= columns[f"body_rate_{part}_bound"][0]
             for x, part in zip(y[4:7], "xyz", strict=True)
         ]
-        ratios = float(columns["angle"][0] / true), float(columns["distance"][0] / error)
+        ratios = (
+            float(columns["angle"][0] / true),
+            float(columns["distance"][0] / error),
+        )
     return *ratios, all(rates)
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damaged and cut recordings: no silent difference, no traceback, losses counted; what is kept."""
+"""Damaged and cut recordings: no silent difference, no traceback, losses counted.
+
+What is kept.
+"""
 
 import gc
 import random
@@ -50,8 +53,14 @@ def messages_of(bag):
 
 
 def check_changes(whole, path, changes):
-    """Change bytes, one at a time; return how often that made no difference, and none was told."""
-    content, expected = content_of(whole), list(McapFile(next(whole.glob("*.mcap"))).messages())
+    """Change bytes, one at a time.
+
+    Return how often that made no difference, and none was told.
+    """
+    content, expected = (
+        content_of(whole),
+        list(McapFile(next(whole.glob("*.mcap"))).messages()),
+    )
     unnoticed = 0
     for at, bits in changes:
         changed = bytearray(content)
@@ -62,12 +71,16 @@ def check_changes(whole, path, changes):
         unnoticed += not file.describe()
         assert kept == expected or file.describe(), f"byte {at}: a silent difference"
         assert set(kept) <= set(expected), f"byte {at}: an invented message"
-        assert len(expected) - len(kept) == file.lost <= CHUNK, f"byte {at}: losses not counted"
+        assert len(expected) - len(kept) == file.lost <= CHUNK, (
+            f"byte {at}: losses not counted"
+        )
     return unnoticed
 
 
 def check_cuts(whole, folder, count, seed):
-    """Cut files at random places: every chunk that lies before the cut comes back whole."""
+    """Cut files at random places: every chunk that lies before the cut comes back
+    whole.
+    """
     content, messages = content_of(whole), messages_of(whole)
     ends, position = [], 0
     for *_, data in messages:
@@ -91,17 +104,24 @@ def check_cuts(whole, folder, count, seed):
 
 
 @pytest.mark.parametrize(
-    "count", [100, pytest.param(500, marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
+    "count",
+    [100, pytest.param(500, marks=[pytest.mark.slow, pytest.mark.timeout(900)])],
 )
 def test_a_changed_byte_is_never_silent(count, whole, tmp_path):
     size, generator = len(content_of(whole)), random.Random(count)
-    changes = [(generator.randrange(size), generator.randrange(1, 256)) for _ in range(count)]
+    changes = [
+        (generator.randrange(size), generator.randrange(1, 256)) for _ in range(count)
+    ]
     assert check_changes(whole, tmp_path / "bag.mcap", changes) <= max(1, count // 250)
     check_cuts(whole, tmp_path, 3 * count // 10, seed=count)
 
 
-def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(whole, tmp_path):
-    """In the first bytes of every record: its kind, its length and what else it is known by."""
+def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(
+    whole, tmp_path
+):
+    """In the first bytes of every record: its kind, its length and what else it is
+    known by.
+    """
     content, generator = content_of(whole), random.Random(5)
     heads, position = [0], len(MCAP0_MAGIC)
     while position < len(content) - len(MCAP0_MAGIC):
@@ -116,7 +136,8 @@ def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(whole, t
 def test_an_index_with_a_wrong_checksum_says_nothing_of_what_is_lost(whole, tmp_path):
     content = bytearray(content_of(whole))
     (at,) = struct.unpack_from("<Q", content, len(content) - len(MCAP0_MAGIC) - 20)
-    content[at - 13] = 0x7F  # no end of the data: the index is read on as what comes next
+    # no end of the data: the index is read on as what comes next
+    content[at - 13] = 0x7F
     while content[at] != Opcode.STATISTICS:
         at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
     content[at + 9 + 7] ^= 0x40  # of the number of messages
@@ -156,15 +177,21 @@ def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(
 def test_a_late_flush_makes_no_large_chunk_and_the_index_of_messages_is_not_kept(
     tmp_path, monkeypatch
 ):
-    """What is held in memory is bounded: a chunk, and an entry of the index for each chunk."""
+    """What is held in memory is bounded: a chunk, and an entry of the index for each
+    chunk.
+    """
     bag = BagWriter(tmp_path / "bag")
-    topics = [bag.connect(f"/topic_{k}", "sensor_msgs/msg/JointState") for k in range(8)]
+    topics = [
+        bag.connect(f"/topic_{k}", "sensor_msgs/msg/JointState") for k in range(8)
+    ]
     for k in range(3000):  # three seconds of 1 kHz without a flush
         for topic in topics:
             bag.write(topic, k, bytes(300))
     monkeypatch.setattr(bag_writer, "FLUSH_PERIOD_S", 0.0)
     bag.save()
-    kept = [one for one in gc.get_objects() if isinstance(one, ChunkIndex | MessageIndex)]
+    kept = [
+        one for one in gc.get_objects() if isinstance(one, ChunkIndex | MessageIndex)
+    ]
     assert {type(one) for one in kept} == {ChunkIndex}
     sizes = [one.uncompressed_size for one in kept[:-1]]
     bag.close()

@@ -45,7 +45,9 @@ def motion(read, twice):
 
 @pytest.mark.parametrize("time", [2.0, 0.1000001, 4.999, [0.05, 2.0]])
 def test_a_time_in_a_gap_is_refused_with_the_gap(motion, time):
-    with pytest.raises(InputError, match=r"t = .*: nothing is known of the motion from 0.1 to 5 s"):
+    with pytest.raises(
+        InputError, match=r"t = .*: nothing is known of the motion from 0.1 to 5 s"
+    ):
         motion.at(time)
 
 

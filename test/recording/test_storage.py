@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a recording as recorders leave them: unfinished, compressed, without metadata.yaml."""
+"""Files of a recording as recorders leave them: unfinished, compressed, without
+metadata.yaml.
+"""
 
 import contextlib
 import shutil
@@ -31,16 +33,19 @@ def database_of(bag):
 
 
 def killed(bag, folder, keep, journal):
-    """What a recorder that was killed leaves: rows behind the first ones are beside the file.
+    """What a recorder that was killed leaves: rows behind the first ones are beside the
+    file.
 
-    With a write-ahead log they are only there; of a rollback journal half a transaction is in the
-    file, which SQLite takes back when it opens it.
+    With a write-ahead log they are only there; of a rollback journal half a transaction
+    is in the file, which SQLite takes back when it opens it.
     """
     folder.mkdir()
     source, target = database_of(bag), folder / "killed_0.db3"
     shutil.copyfile(source, target)
     with contextlib.closing(sqlite3.connect(target, isolation_level=None)) as database:
-        rows = database.execute("SELECT topic_id, timestamp, data FROM messages").fetchall()
+        rows = database.execute(
+            "SELECT topic_id, timestamp, data FROM messages"
+        ).fetchall()
         database.execute(f"PRAGMA journal_mode = {journal}")
         database.execute("PRAGMA wal_autocheckpoint = 0")
         database.execute("PRAGMA cache_size = 1")  # pages go to the file before the end
@@ -54,7 +59,9 @@ def killed(bag, folder, keep, journal):
         else:
             database.executemany(add, rows)
             database.execute("BEGIN")
-            database.execute("UPDATE messages SET data = zeroblob(length(data)) WHERE id > 0")
+            database.execute(
+                "UPDATE messages SET data = zeroblob(length(data)) WHERE id > 0"
+            )
             beside = "-journal"
         copy = folder.with_name("copy")
         copy.mkdir()
@@ -102,7 +109,8 @@ def test_rows_that_a_database_has_lost_are_damage(whole):
 def rewritten(bag, path, chunked, *, repeat=True, crc=True):
     """Write the messages again, those of which `chunked` is false outside of chunks.
 
-    As the specification allows it: descriptions, messages and chunks one after the other.
+    As the specification allows it: descriptions, messages and chunks one after the
+        other.
     """
     (source,) = bag.glob("*.mcap")
     with source.open("rb") as file, path.open("wb") as target:
@@ -112,7 +120,9 @@ def rewritten(bag, path, chunked, *, repeat=True, crc=True):
         )  # fmt: skip
         writer.start("ros2", "test")
         ids = {}
-        for number, (schema, channel, message) in enumerate(make_reader(file).iter_messages()):
+        for number, (schema, channel, message) in enumerate(
+            make_reader(file).iter_messages()
+        ):
             if channel.id not in ids:
                 named = schema.name, schema.encoding, schema.data
                 ids[channel.id] = writer.register_channel(
@@ -120,7 +130,10 @@ def rewritten(bag, path, chunked, *, repeat=True, crc=True):
                 )
             if not chunked(number):
                 writer.flush()
-                kept, writer._Writer__chunk_builder = writer._Writer__chunk_builder, None
+                kept, writer._Writer__chunk_builder = (
+                    writer._Writer__chunk_builder,
+                    None,
+                )
             writer.add_message(
                 ids[channel.id], message.log_time, message.data, message.publish_time
             )
@@ -132,9 +145,12 @@ def rewritten(bag, path, chunked, *, repeat=True, crc=True):
 
 @pytest.mark.parametrize("crc", [True, False])
 @pytest.mark.parametrize(
-    "chunked", [lambda k: k % 100 < 50, lambda k: k < 300, lambda k: k >= 300, lambda k: False]
+    "chunked",
+    [lambda k: k % 100 < 50, lambda k: k < 300, lambda k: k >= 300, lambda k: False],
 )
-def test_messages_outside_of_chunks_are_read(example2_bag, tmp_path, bags, chunked, crc):
+def test_messages_outside_of_chunks_are_read(
+    example2_bag, tmp_path, bags, chunked, crc
+):
     path = rewritten(example2_bag, tmp_path / "mixed.mcap", chunked, crc=crc)
     file = McapFile(path)
     assert sum(1 for _ in file.messages()) == sum(1 for _ in messages(example2_bag))
@@ -160,7 +176,9 @@ def messages(bag):
 
 
 @pytest.mark.parametrize("sqlite", [False, True])
-def test_a_folder_without_metadata_is_what_its_files_are(written, example2, bags, sqlite):
+def test_a_folder_without_metadata_is_what_its_files_are(
+    written, example2, bags, sqlite
+):
     bag = written(example2, sqlite=sqlite)
     expected = recording.read(bag)
     (bag / "metadata.yaml").unlink()
@@ -171,7 +189,9 @@ def test_a_folder_without_metadata_is_what_its_files_are(written, example2, bags
         recording.read(bag)
 
 
-def test_numbered_files_are_read_in_the_order_of_their_numbers(written, example2, bags, tmp_path):
+def test_numbered_files_are_read_in_the_order_of_their_numbers(
+    written, example2, bags, tmp_path
+):
     bag = tmp_path / "numbered"
     bag.mkdir()
     parts = [example2[k::11] for k in range(11)]

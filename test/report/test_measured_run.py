@@ -17,7 +17,9 @@ from sst_ros.state import nanoseconds
 TRUE = "/sst_simulator/true_joint_states"
 NOISE, RATE_NOISE, COUNT, DELAY, DROPPED = 1e-3, 0.05, 2.0 * np.pi / 4096, 3, 0.2
 KINDS = ("noise", "quantised", "delayed", "dropped")
-COMBINATIONS = [kinds for count in range(1, 5) for kinds in itertools.combinations(KINDS, count)]
+COMBINATIONS = [
+    kinds for count in range(1, 5) for kinds in itertools.combinations(KINDS, count)
+]
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +28,15 @@ def exact(bags):
 
 
 def measure(bags, entries, kinds, monkeypatch, *, truth):
-    """Messages as a robot with sensors sends them, with the true ones beside or without."""
+    """Messages as a robot with sensors sends them, with the true ones beside or
+    without.
+    """
     monkeypatch.setitem(bags.KINDS, TRUE, bags.KINDS[bags.JOINTS])
     random = np.random.default_rng(5)
     samples = [one for one in entries if one.topic == bags.JOINTS and one.sample >= 0]
-    others = [one for one in entries if not (one.topic == bags.JOINTS and one.sample >= 0)]
+    others = [
+        one for one in entries if not (one.topic == bags.JOINTS and one.sample >= 0)
+    ]
     found = []
     for k, entry in enumerate(samples):
         if truth:
@@ -45,7 +51,9 @@ def measure(bags, entries, kinds, monkeypatch, *, truth):
             position = COUNT * np.round(position / COUNT)
         if "dropped" in kinds and random.random() < DROPPED:
             continue
-        content = dataclasses.replace(entry.content, position=position, velocity=velocity)
+        content = dataclasses.replace(
+            entry.content, position=position, velocity=velocity
+        )
         found.append(dataclasses.replace(entry, content=content))
     return sorted([*others, *found], key=lambda one: one.received_ns)
 
@@ -58,10 +66,17 @@ def test_with_the_truth_a_measured_run_is_evaluated_as_an_exact_one(
     found = evaluate_run(run).summary
     expected = evaluate_run(read(exact)).summary
     assert found["verdict"] == "OK", found["reasons"]
-    for key in ("integration_error_gamma_rad", "energy_residual_max_J", "samples_recorded"):
+    for key in (
+        "integration_error_gamma_rad",
+        "energy_residual_max_J",
+        "samples_recorded",
+    ):
         assert found[key] == expected[key]
     assert found["motion_of"] == "true_joint_states"
-    assert any("(true_joint_states), tracking is that of the measured" in x for x in found["notes"])
+    assert any(
+        "(true_joint_states), tracking is that of the measured" in x
+        for x in found["notes"]
+    )
     kept = {nanoseconds(one.content.header.stamp) for one in exact if one.sample >= 0}
     assert len(run.time_ns) == 51 and len(run.measured.time_ns) <= len(kept)
     assert run.motion.gamma is run.gamma and run.measured.gamma is not run.gamma
@@ -87,7 +102,10 @@ def test_without_the_truth_a_measured_run_is_judged_by_what_it_can_tell(
     assert found["integration_error_gamma_rad"] < 1e-11
     assert found["integration_error_orientation_rad"] < 1e-11
     if kinds == ("dropped",):
-        assert found["motion_of"] == "joint_states" and found["energy_residual_max_J"] < 1e-9
+        assert (
+            found["motion_of"] == "joint_states"
+            and found["energy_residual_max_J"] < 1e-9
+        )
         return
     assert run.motion is None and found["motion_of"] is None
     assert found["energy_residual_max_J"] is None
@@ -99,7 +117,9 @@ def test_without_the_truth_a_measured_run_is_judged_by_what_it_can_tell(
 def test_measured_angles_alone_are_enough_to_know_the_rates_are_measured(
     read, bags, exact, monkeypatch
 ):
-    """Angles are exact, rates have noise: the energy of such rates is no fault of the run."""
+    """Angles are exact, rates have noise: the energy of such rates is no fault of the
+    run.
+    """
     random = np.random.default_rng(3)
 
     def shake(message):
@@ -117,10 +137,15 @@ def test_a_single_wrong_sample_is_an_error_and_no_measurement(read, bags, exact)
     run = read(bags.edited(exact, bags.JOINTS, 30, move))
     found = evaluate_run(run).summary
     assert run.motion is run.measured
-    assert found["verdict"] == "WARNING" and "integration error 1.0e-06 rad" in found["reasons"][0]
+    assert (
+        found["verdict"] == "WARNING"
+        and "integration error 1.0e-06 rad" in found["reasons"][0]
+    )
 
 
-def test_pictures_show_the_truth_and_what_was_measured(written, bags, exact, monkeypatch, tmp_path):
+def test_pictures_show_the_truth_and_what_was_measured(
+    written, bags, exact, monkeypatch, tmp_path
+):
     path = written(measure(bags, exact, ("noise",), monkeypatch, truth=True))
     run = read_bag(path).signals
     figure = pictures.PICTURES["joint_angles"].make(run, run.scene)

@@ -40,7 +40,9 @@ def start_of(some):
     return initial_state(some, Geometry.of(some))
 
 
-def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_its_own(integration):
+def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_its_own(
+    integration,
+):
     for deviation in (integration.error, integration.own):
         for name in ("gamma", "gamma_dot", "orientation"):
             values = getattr(deviation, name)
@@ -53,16 +55,22 @@ def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_it
 def test_the_reference_agrees_with_scipy(run):
     """The recorded torques, tick by tick, through an integrator that is not ours."""
     model, y = kernel.model_of(run.scene), start_of(run.scene)
-    for start, torque in zip(run.ticks.start_ns[:100], run.ticks.torque[:100], strict=True):
+    for start, torque in zip(
+        run.ticks.start_ns[:100], run.ticks.torque[:100], strict=True
+    ):
         torques, span = tuple(torque.tolist()), (start / 1e9, start / 1e9 + 1e-3)
         y = solve(
-            lambda t, y, torques=torques: kernel.derivative(model, tuple(y), torques), span, y
+            lambda t, y, torques=torques: kernel.derivative(model, tuple(y), torques),
+            span,
+            y,
         )
     assert angle_between(y[:4], run.quaternion[50]) < 1e-12
 
 
 def test_the_error_of_a_bad_integrator_is_told_as_it_is(run):
-    """A run whose samples are off by a known motion shows exactly that, from its start on."""
+    """A run whose samples are off by a known motion shows exactly that, from its start
+    on.
+    """
     off = 1e-6 * np.cos(10.0 * run.seconds)[:, None] * [1.0, 0.5, -0.2]
     found = reference.integration(altered(run, gamma=run.gamma + off))
     assert np.allclose(found.error.gamma, np.abs(off[:, 0]), atol=1e-12)
@@ -81,7 +89,10 @@ LOST = [
 def test_what_is_lost_is_not_compared_and_no_error(
     read, bags, example2, topic, lost, restarts, compared
 ):
-    """Where torques are lost, the reference begins again; from right states, as the errors tell."""
+    """Where torques are lost, the reference begins again.
+
+    From right states, as the errors tell.
+    """
     of = getattr(bags, topic)
     run = read([e for e in example2 if not (e.topic == of and e.sample in lost)])
     found = reference.integration(run)
@@ -98,7 +109,9 @@ def test_after_a_tick_that_no_step_resolves_the_next_sample_is_begun_at(run):
     torque[40] = 1e13
     found = reference.integration(altered(run, ticks=replace(run.ticks, torque=torque)))
     assert np.flatnonzero(np.isnan(found.error.gamma)).tolist() == [21]
-    assert (found.compared, found.restarts_ns) == (150, ()) and np.nanmax(found.error.gamma) < 1e-11
+    assert (found.compared, found.restarts_ns) == (150, ()) and np.nanmax(
+        found.error.gamma
+    ) < 1e-11
 
 
 def test_a_lost_start_is_not_taken_for_an_error(read, example2):
@@ -112,7 +125,9 @@ def test_the_ideal_is_the_motion_under_continuous_torques(run):
     found = reference.ideal(run)
     model, profile = kernel.model_of(run.scene), run.scene.torque.at
     start = start_of(run.scene)
-    end = solve(lambda t, y: kernel.derivative(model, tuple(y), profile(t)), (0.0, 0.3), start)
+    end = solve(
+        lambda t, y: kernel.derivative(model, tuple(y), profile(t)), (0.0, 0.3), start
+    )
     expected = angle_between(end[:4], run.quaternion[-1])
     assert abs(found.error.orientation.iloc[-1] - expected) < 1e-11
     assert 1e-4 < expected < 1e-2  # half a tick's delay of the hold
@@ -126,7 +141,10 @@ def test_long_ticks_are_cut_into_short_steps(run):
         run.ticks.start_ns[::10], run.ticks.end_ns[9::10], run.ticks.torque[::10]
     )
     found = reference.integration(altered(run, ticks=ticks))
-    assert found.steps >= 10 and found.own.gamma[np.isfinite(found.own.gamma)].max() < 1e-12
+    assert (
+        found.steps >= 10
+        and found.own.gamma[np.isfinite(found.own.gamma)].max() < 1e-12
+    )
 
 
 def test_a_wrong_kernel_is_seen_by_the_integration(run, wrong_kernel):
@@ -173,16 +191,23 @@ def test_loads_and_actuators_are_compared_as_they_are(recorded, some):
     integration, ideal, notes = judged(recorded(some))
     assert np.abs(integration.energy).max() < 1e-9
     assert integration.compared == 51
-    assert integration.error.gamma.max() < 1e-9 and integration.error.gamma_dot.max() < 1e-8
+    assert (
+        integration.error.gamma.max() < 1e-9
+        and integration.error.gamma_dot.max() < 1e-8
+    )
     assert ideal.error.gamma.max() < 1e-2
-    assert ("the actuators lag" in notes) == bool(some.actuators and some.actuators.time_constant)
+    assert ("the actuators lag" in notes) == bool(
+        some.actuators and some.actuators.time_constant
+    )
 
 
 def test_a_lagging_run_begins_again_from_the_efforts_of_a_sample(recorded, bags):
     def lose(entries):
         return [e for e in entries if not (e.topic == bags.APPLIED and e.sample == 20)]
 
-    run = recorded(replace(EXAMPLE2, actuators=Actuators(time_constant=0.02)), change=lose)
+    run = recorded(
+        replace(EXAMPLE2, actuators=Actuators(time_constant=0.02)), change=lose
+    )
     integration = reference.integration(run)
     assert integration.restarts_ns == (40_000_000,)
     assert integration.compared == 50 and np.nanmax(integration.error.gamma) < 1e-9
@@ -192,14 +217,18 @@ PUSHED = replace(EXAMPLE2, moment=Moment(value=(0.3, -0.2, 0.1)))
 
 
 def from_topic(entries):
-    """Turn a recording under a constant moment into one of a scene that takes it from a topic."""
+    """Turn a recording under a constant moment into one of a scene that takes it from a
+    topic.
+    """
     text = yaml_document.dump(replace(PUSHED, moment=Moment(topic=True)))
     return edited(entries, SCENE, -1, lambda message: replace(message, data=text))
 
 
 def test_a_recorded_moment_is_used(recorded):
     moment = PUSHED.moment.value
-    run = recorded(PUSHED, change=lambda entries: with_moment(from_topic(entries), moment))
+    run = recorded(
+        PUSHED, change=lambda entries: with_moment(from_topic(entries), moment)
+    )
     assert run.ticks.moment.tolist() == [list(moment)] * 100
     integration, ideal, notes = judged(run)
     assert integration.compared == 51 and integration.error.gamma.max() < 1e-9

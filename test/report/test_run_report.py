@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a recorded run: numbers, verdict, tables, pictures, tracking; lies in it."""
+"""The report of a recorded run: numbers, verdict, tables, pictures, tracking.
+
+Lies in it.
+"""
 
 import base64
 import dataclasses
@@ -37,7 +40,9 @@ PROFILE = scene.load("example2").torque.at
 
 @pytest.fixture(scope="module")
 def lively(bags, example2):
-    """Receptions with a known jitter, and the command of every tick 0.4 ms before its step."""
+    """Receptions with a known jitter, and the command of every tick 0.4 ms before its
+    step.
+    """
     entries = []
     for entry in example2:
         late = 30_000 if entry.sample > 0 and entry.sample % 10 == 0 else 0
@@ -48,7 +53,9 @@ def lively(bags, example2):
 
 
 def commands(bags, period, received_ns):
-    """A command every `period` ticks with the torque of the tick, received so much after it."""
+    """A command every `period` ticks with the torque of the tick, received so much
+    after it.
+    """
     for tick in range(0, 300, period):
         received = bags.START_NS + tick * bags.TICK_NS + received_ns
         yield bags.command_entry(received, PROFILE(tick * bags.TICK_NS / 1e9))
@@ -71,17 +78,34 @@ def more_effort(by):
 def whole(tmp_path_factory, bags, example2):
     """Report of a whole run: summary and folder."""
     folder = tmp_path_factory.mktemp("report")
-    return write_run_report(bags.record(folder / "bag", example2), folder / "out"), folder / "out"
+    return write_run_report(
+        bags.record(folder / "bag", example2), folder / "out"
+    ), folder / "out"
 
 
 def test_the_summary_is_written_whole_and_finite(whole):
     summary, out = whole
     text = (out / "summary.json").read_text(encoding="utf-8")
     assert json.loads(text, parse_constant=pytest.fail) == summary
-    counts = {"ticks": 300, "ticks_missed": 0, "samples_published": 151, "samples_recorded": 151}
+    counts = {
+        "ticks": 300,
+        "ticks_missed": 0,
+        "samples_published": 151,
+        "samples_recorded": 151,
+    }
     periods = {"sample_period_s": 0.002, "tick_period_s": 0.001, "step_mean_us": 160.5}
-    none = {"samples_lost": 0, "stamp_gaps": 0, "effort_difference_max_N_m": 0.0, "fault": ""}
-    texts = {"scene": "example2", "phase": "finished", "notes": [], "topics_missing": []}
+    none = {
+        "samples_lost": 0,
+        "stamp_gaps": 0,
+        "effort_difference_max_N_m": 0.0,
+        "fault": "",
+    }
+    texts = {
+        "scene": "example2",
+        "phase": "finished",
+        "notes": [],
+        "topics_missing": [],
+    }
     expected = counts | periods | none | texts | {"samples_recorded_percent": 100.0}
     assert {key: summary[key] for key in expected} == expected
     assert summary["integration_error_gamma_rad"] < 1e-11
@@ -93,7 +117,14 @@ def test_the_table_says_it_all_in_line(whole):
     summary, _ = whole
     bag = summary["bag"]
     text = summary_table(summary).replace(bag, "BAG")  # its folder may be long
-    for word in ("ticks done", "ticks missed", "real-time factor", "samples lost", "(a)", "(b)"):
+    for word in (
+        "ticks done",
+        "ticks missed",
+        "real-time factor",
+        "samples lost",
+        "(a)",
+        "(b)",
+    ):
         assert word in text
     assert f"{summary['integration_error_gamma_rad']:.2e}" in text
     assert f"{summary['ideal_difference_gamma_dot_rad_per_s']:.2e}" in text
@@ -135,7 +166,9 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
 def test_the_page_shows_text_as_text(whole):
     """The name of a scene is a stranger's: it must be no HTML."""
     summary = whole[0] | {"scene": "<script>", "unknown": ["<b>"]}
-    page = render("run.html", s=summary, table="<i>", overview=whole[1] / "page.png", pictures=[])
+    page = render(
+        "run.html", s=summary, table="<i>", overview=whole[1] / "page.png", pictures=[]
+    )
     assert "&lt;script&gt;" in page and not re.search("<script>|<b>|<i>", page)
 
 
@@ -171,38 +204,52 @@ def test_what_is_not_recorded_is_unknown(read, bags, example2):
         ("no diagnostics", "unknown"),
     ):
         assert any(words in line for line in summary[where])
-    line = next(line for line in summary_table(summary).splitlines() if "ticks done" in line)
+    line = next(
+        line for line in summary_table(summary).splitlines() if "ticks done" in line
+    )
     assert line.split()[-1] == "-"
 
 
 def test_a_fault_is_told_and_the_run_judged_up_to_it(tmp_path, bags, undrawn):
     start = Initial(gamma=(1.5, 0.785, 0.785), gamma_dot=(1.0, 0.0, 0.0))
-    near = dataclasses.replace(scene.load("example2_heavy"), name="near_the_end", initial=start)
+    near = dataclasses.replace(
+        scene.load("example2_heavy"), name="near_the_end", initial=start
+    )
     summary = write_run_report(
         bags.write(tmp_path / "bag", bags.simulated(near, 0.3)), tmp_path / "out"
     )
-    assert summary["phase"] == "fault" and summary["fault"].startswith("stopped at t = 0.0")
-    assert summary["ticks"] == 5 and summary["samples_recorded"] == 4  # at 0, 2, 4 and 5 ms
+    assert summary["phase"] == "fault" and summary["fault"].startswith(
+        "stopped at t = 0.0"
+    )
+    # at 0, 2, 4 and 5 ms
+    assert summary["ticks"] == 5 and summary["samples_recorded"] == 4
     assert summary["sample_period_s"] == 0.002 and summary["stamp_gaps"] == 0
     assert summary["integration_error_gamma_rad"] < 1e-11
     assert any("ended by a fault" in note for note in summary["notes"])
     assert summary["fault"] in summary_table(summary)
-    assert "path_of_E.png" in summary["pictures"]  # no figure number outside the examples
+    # no figure number outside the examples
+    assert "path_of_E.png" in summary["pictures"]
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path, written, example2):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(InputError, match=r"out = .*must be a folder that can be written"):
+    with pytest.raises(
+        InputError, match=r"out = .*must be a folder that can be written"
+    ):
         write_run_report(written(example2), tmp_path / "file")
 
 
 @pytest.fixture
 def commanded(read, bags, example2):
-    """Summary and text of a run with a command every so many ticks, received so much after it."""
+    """Summary and text of a run with a command every so many ticks, received so much
+    after it.
+    """
 
     def evaluate(period, received_ns):
         plain = bags.without(example2, bags.COMMANDS)
-        summary = evaluate_run(read([*plain, *commands(bags, period, received_ns)])).summary
+        summary = evaluate_run(
+            read([*plain, *commands(bags, period, received_ns)])
+        ).summary
         return summary, text_of(summary)
 
     return evaluate
@@ -224,7 +271,9 @@ def test_a_good_run_is_ok_in_few_lines(commanded):
 
 def test_a_slow_controller_is_warned_of_and_a_negative_delay_has_its_meaning(commanded):
     summary, said = commanded(40, 600_000)
-    assert said.startswith("WARNING: example2: commands answered 5.33 % of samples, mean age 1")
+    assert said.startswith(
+        "WARNING: example2: commands answered 5.33 % of samples, mean age 1"
+    )
     assert summary["command_age_mean_s"] == pytest.approx(0.0187, abs=0.002)
     summary, said = commanded(1, 1_900_000)
     assert summary["command_latency_min_us"] < 0.0
@@ -235,7 +284,9 @@ def test_an_altered_effort_and_lost_samples_are_reasons_and_show_when_they_were(
     read, bags, example2
 ):
     change = more_effort(1e-9 * np.eye(9)[1])
-    entries = bags.edited(bags.without(example2, bags.COMMANDS), bags.JOINTS, 75, change)
+    entries = bags.edited(
+        bags.without(example2, bags.COMMANDS), bags.JOINTS, 75, change
+    )
     run = read([e for e in entries if e.sample not in {20, 21, 60}])
     off, summary = run.effort_difference, evaluate_run(run).summary
     assert np.isnan(off[0]) and run.seconds[off > 0.0].tolist() == [0.15]
@@ -268,8 +319,12 @@ def test_the_command_prints_verdict_and_files_and_all_when_asked(
 
 
 @pytest.mark.parametrize("clock_ns", [0, -(10**15)])
-def test_periods_and_latency_are_what_they_were_made_by_any_clock(read, lively, clock_ns):
-    entries = [dataclasses.replace(e, received_ns=e.received_ns + clock_ns) for e in lively]
+def test_periods_and_latency_are_what_they_were_made_by_any_clock(
+    read, lively, clock_ns
+):
+    entries = [
+        dataclasses.replace(e, received_ns=e.received_ns + clock_ns) for e in lively
+    ]
     found = measure_timing(read(entries))
     numbers = found.numbers
     assert len(found.period_us) == 150
@@ -278,7 +333,8 @@ def test_periods_and_latency_are_what_they_were_made_by_any_clock(read, lively, 
     assert numbers["period_p99_9_us"] == pytest.approx(2030.0)
     assert numbers["commands_followed"] == 300
     assert numbers["command_latency_min_us"] == pytest.approx(400.0, abs=1e-2)
-    assert numbers["command_latency_max_us"] == pytest.approx(430.0, abs=1e-2)  # a late sample's
+    # a late sample's
+    assert numbers["command_latency_max_us"] == pytest.approx(430.0, abs=1e-2)
     assert numbers["command_latency_mean_us"] == pytest.approx(403.0, abs=0.1)
     assert numbers["command_stamp_to_tick_mean_us"] is None
     assert found.pace.to_numpy() == pytest.approx(np.ones(len(found.pace)), abs=0.02)
@@ -287,7 +343,9 @@ def test_periods_and_latency_are_what_they_were_made_by_any_clock(read, lively, 
 
 
 def test_a_dropped_tick_shows(read, bags, example2):
-    """A tick that the simulator left out: the motion goes on as if it had been, and is caught."""
+    """A tick that the simulator left out: the motion goes on as if it had been, and is
+    caught.
+    """
 
     def shortened(message):
         return dataclasses.replace(message, points=message.points[:1])
@@ -299,7 +357,9 @@ def test_a_dropped_tick_shows(read, bags, example2):
 
 def test_an_altered_torque_shows_when_it_was(read, bags, example2):
     """One torque that is not what was applied: error and energy jump at its tick."""
-    run = read(bags.edited(example2, bags.APPLIED, 75, more_effort(1e-3 * np.eye(3)[0])))
+    run = read(
+        bags.edited(example2, bags.APPLIED, 75, more_effort(1e-3 * np.eye(3)[0]))
+    )
     found = reference.integration(run)
     error, energy = found.error.gamma_dot, np.abs(found.energy)
     assert np.flatnonzero(error > 1e-9)[0] == 75 and run.seconds[75] == 0.15
@@ -307,7 +367,9 @@ def test_an_altered_torque_shows_when_it_was(read, bags, example2):
     assert np.flatnonzero(energy > 1e-9)[0] == 75
 
 
-def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(read, bags, example2):
+def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(
+    read, bags, example2
+):
     """The torque of every other tick answers the sample of two milliseconds before it."""
     entries = list(example2)
     for tick in range(2, 300, 2):
@@ -315,7 +377,9 @@ def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(read, bag
             bags.START_NS + (tick - 2) * bags.TICK_NS,
             PROFILE(tick * bags.TICK_NS / 1e9),
         )
-        command = bags.joint_state(stamp, np.zeros(3), np.zeros(3), np.array(torque)[[1, 0, 2]])
+        command = bags.joint_state(
+            stamp, np.zeros(3), np.zeros(3), np.array(torque)[[1, 0, 2]]
+        )
         command = dataclasses.replace(command, name=["gamma_2", "gamma_1", "gamma_3"])
         received = bags.START_NS + tick * bags.TICK_NS
         entries.append(bags.Entry(bags.STAMPED, received, command))
@@ -332,7 +396,9 @@ def panel_of(run, title):
     return next(axes for axes in drawn.axes if axes.get_title("left").startswith(title))
 
 
-def test_error_estimates_are_drawn_against_the_computing_time_used(read, bags, example2):
+def test_error_estimates_are_drawn_against_the_computing_time_used(
+    read, bags, example2
+):
     entries = list(example2)
     for k in (1, 2):
         said = {"phase": "running", "ticks": 100 * k, "step_mean_us": 50.0}
@@ -342,18 +408,26 @@ def test_error_estimates_are_drawn_against_the_computing_time_used(read, bags, e
     curves = {line.get_label(): line.get_xydata() for line in panel.lines}
     error = curves["integration error"]
     estimate = curves["its estimate by the simulator"]
-    assert len(error) > 100 and error[0, 0] == 0.0 and (np.diff(error[:, 0]) >= 0.0).all()
+    assert (
+        len(error) > 100 and error[0, 0] == 0.0 and (np.diff(error[:, 0]) >= 0.0).all()
+    )
     assert error[-1, 0] == pytest.approx(np.nanmax(estimate[:, 0]))
-    assert estimate[:2, 0] == pytest.approx([5.0, 10.0])  # 100 and 200 steps of 50 us, in ms
+    # 100 and 200 steps of 50 us, in ms
+    assert estimate[:2, 0] == pytest.approx([5.0, 10.0])
     assert estimate[:2, 1] == pytest.approx([1e-11, 1e-10])
-    assert curves["hold error if torques are those of the start"][1, 1] == pytest.approx(2e-3)
+    assert curves["hold error if torques are those of the start"][
+        1, 1
+    ] == pytest.approx(2e-3)
 
 
 def test_a_slow_run_shows_its_real_time_factor_beside_one(read, bags, example2):
-    """At a thousandth of real time numbers are what they are, and the line at 1 is in sight."""
+    """At a thousandth of real time numbers are what they are, and the line at 1 is in
+    sight.
+    """
     start = bags.START_NS
     slow = [
-        dataclasses.replace(e, received_ns=start + 2000 * (e.received_ns - start)) for e in example2
+        dataclasses.replace(e, received_ns=start + 2000 * (e.received_ns - start))
+        for e in example2
     ]
     panel = panel_of(read(slow), "Real-time factor")
     assert panel.lines[0].get_ydata() == pytest.approx(1 / 2000, rel=0.1)
@@ -364,13 +438,19 @@ def test_a_slow_run_shows_its_real_time_factor_beside_one(read, bags, example2):
 def test_ticks_that_were_missed_show_when_they_were(read, bags, example2):
     """At 0.1 s the simulator falls behind by seven ticks, and says so from then on."""
     entries = [
-        dataclasses.replace(e, received_ns=e.received_ns + 7 * bags.TICK_NS * (e.sample > 50))
+        dataclasses.replace(
+            e, received_ns=e.received_ns + 7 * bags.TICK_NS * (e.sample > 50)
+        )
         for e in bags.without(example2, bags.DIAGNOSTICS)
     ]
     reports = {0.04: 0, 0.08: 0, 0.12: 7, 0.16: 7, 0.2: 7}
     for seconds, missed in reports.items():
-        received = bags.START_NS + round(seconds * 1e9) + SENT_NS + missed * bags.TICK_NS
-        entries.append(bags.diagnostics_entry(received, phase="running", ticks_missed=missed))
+        received = (
+            bags.START_NS + round(seconds * 1e9) + SENT_NS + missed * bags.TICK_NS
+        )
+        entries.append(
+            bags.diagnostics_entry(received, phase="running", ticks_missed=missed)
+        )
     run = read(entries)
     found = measure_timing(run)
     at, missed = found.reported[["time_s", "ticks_missed"]].to_numpy().T
@@ -392,7 +472,9 @@ def long_run(tmp_path_factory):
 def test_a_long_run_is_reported_whole(long_run, monkeypatch):
     """The work that a report does for it, which is what its time and memory come from."""
     follow, calls = TickStepper.follow, []
-    monkeypatch.setattr(TickStepper, "follow", lambda *given: calls.append(0) or follow(*given))
+    monkeypatch.setattr(
+        TickStepper, "follow", lambda *given: calls.append(0) or follow(*given)
+    )
     integration, ideal, summary = evaluate_run(long_run)[1:]
     assert len(calls) == 2  # both references, in one call each
     assert summary["samples_recorded"] == summary["samples_compared"] == 10_001
@@ -433,7 +515,8 @@ def test_the_track_is_what_was_written(followed, written):
     assert len(track.time) == 51 and track.time[-1] == pytest.approx(0.1)
     assert track.gamma == pytest.approx(np.tile(HOME + OFF, (51, 1)))
     assert track.gamma - track.error == pytest.approx(run.gamma)
-    # The torque of a sample is that of the tick that begins there; after the last there is none.
+    # The torque of a sample is that of the tick that begins there; after the last there
+    # is none.
     begins = np.isin(run.ticks.start_ns, run.time_ns)
     assert np.array_equal(track.torque[:-1], run.ticks.torque[begins])
     assert not track.torque[-1].any()
@@ -441,7 +524,9 @@ def test_the_track_is_what_was_written(followed, written):
     assert found.metrics.largest == pytest.approx(largest)
 
 
-def test_the_error_of_the_orientation_is_the_angle_to_the_reference(bags, followed, written):
+def test_the_error_of_the_orientation_is_the_angle_to_the_reference(
+    bags, followed, written
+):
     plain = bags.without(followed, bags.DESIRED, bags.ERROR)
     found = read_tracking(written(bags.tracked(plain, lambda _: (HOME, STILL))))
     q = found.recording.quaternion
@@ -469,6 +554,8 @@ def test_a_recording_without_a_reference_or_of_other_joints_is_refused(
     with pytest.raises(InputError, match="reference"):
         write_tracking_report(written(bags.without(followed, bags.DESIRED)), tmp_path)
     names = {"name": ["a", "b", "c"]}
-    renamed = bags.edited(followed, bags.ERROR, 3, lambda one: dataclasses.replace(one, **names))
+    renamed = bags.edited(
+        followed, bags.ERROR, 3, lambda one: dataclasses.replace(one, **names)
+    )
     with pytest.raises(InputError, match="tracking_error"):
         read_tracking(written(renamed))

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a scene: absent terms cost nothing, present ones are counted; its advice."""
+"""The summary of a scene: absent terms cost nothing, present ones are counted.
+
+Its advice.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,10 @@ EXAMPLE2 = load("example2_heavy")
 QUICK = ("elastic_stops", "general")
 every_scene = pytest.mark.parametrize(
     "name",
-    [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in names()],
+    [
+        name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+        for name in names()
+    ],
 )
 
 
@@ -55,7 +61,9 @@ def test_operations_are_counted_in_the_generated_source(name):
     tree = ast.parse(ODE(Dynamics.of(load(name))).program.source("rhs"))
     assert operations(load(name)) == sum(
         isinstance(node, ast.BinOp | ast.Call | ast.IfExp)
-        or (isinstance(node, ast.UnaryOp) and not isinstance(node.operand, ast.Constant))
+        or (
+            isinstance(node, ast.UnaryOp) and not isinstance(node.operand, ast.Constant)
+        )
         for node in ast.walk(tree)
     )
 
@@ -114,7 +122,11 @@ def test_a_summary_has_all_parts_and_every_term_adds_operations_or_folds(name):
         ({"moment": Moment(topic=True)}, "~/external_moment", True),
         ({"moment": Moment(value=(0.0, 0.0, 1.0))}, "~/external_moment", False),
         ({}, "~/external_moment", False),
-        ({"actuators": Actuators(time_constant=0.1)}, "right-hand side: 10 states", True),
+        (
+            {"actuators": Actuators(time_constant=0.1)},
+            "right-hand side: 10 states",
+            True,
+        ),
     ],
     ids=["a moment from a topic", "a moment of its own", "no moment", "a lag"],
 )
@@ -147,7 +159,9 @@ def random_scenes():
             gamma_dot=tuple((0.1 * sample.gamma_dot).tolist()),
             orientation=tuple(quaternion_of(sample.rotation).tolist()),
         )
-        torque = SineTorque(amplitude=tuple(sample.torque.tolist()), frequency=(3.0, 5.0, 7.0))
+        torque = SineTorque(
+            amplitude=tuple(sample.torque.tolist()), frequency=(3.0, 5.0, 7.0)
+        )
         friction = JointFriction(gamma=Friction(viscous=viscous)) if viscous else None
         yield dataclasses.replace(
             sample.scene, initial=start, torque=torque, friction=friction, **IGNORE
@@ -155,7 +169,10 @@ def random_scenes():
 
 
 SCENES = [
-    *(pytest.param(load(name), id=name, marks=marks) for name, marks in SHIPPED.items()),
+    *(
+        pytest.param(load(name), id=name, marks=marks)
+        for name, marks in SHIPPED.items()
+    ),
     *(
         pytest.param(scene, id=f"random {k}", marks=[pytest.mark.slow] * (k == 2))
         for k, scene in enumerate(random_scenes())
@@ -170,7 +187,9 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
     assert motion.success and 0.0 < motion.step <= 0.05
     advice = step_advice(scene)
     assert (advice.method, advice.step) == (motion.method, motion.step)
-    assert f"  {advice.text}" in summary(scene).replace("\n  ", " ").replace("advice ", "  ")
+    assert f"  {advice.text}" in summary(scene).replace("\n  ", " ").replace(
+        "advice ", "  "
+    )
     monkeypatch.setattr(accuracy, "list_settings", lambda _: [])
     study = accuracy.study_scene(scene)
     assert study.advice == advice and study.measured < 1e-8
@@ -180,7 +199,10 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
 
 def test_a_stiff_scene_is_advised_the_implicit_method_and_the_rate_is_named():
     advice, rates = step_advice(load("stiff")), eigenvalues(load("stiff"))
-    assert "then rodas5p from" in advice.method and "stiff: step times fastest decay" in advice.text
+    assert (
+        "then rodas5p from" in advice.method
+        and "stiff: step times fastest decay" in advice.text
+    )
     assert f"rate at the start is {np.abs(rates).max():.3g} 1/s" in advice.text
 
 
@@ -198,5 +220,11 @@ def test_a_step_is_stable_up_to_the_largest_and_not_beyond(method):
         if method.name == "rodas5p":
             assert limit == math.inf
             continue
-        assert np.abs(stability_function(method, 0.99 * limit * np.array(inside))).max() <= 1.00001
-        assert np.abs(stability_function(method, 1.01 * limit * np.array(inside))).max() > 1.0
+        assert (
+            np.abs(stability_function(method, 0.99 * limit * np.array(inside))).max()
+            <= 1.00001
+        )
+        assert (
+            np.abs(stability_function(method, 1.01 * limit * np.array(inside))).max()
+            > 1.0
+        )

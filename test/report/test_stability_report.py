@@ -14,7 +14,12 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.report import stability
-from sst_ros.report.stability import ROWS, draw_stability, examine_stability, stability_page
+from sst_ros.report.stability import (
+    ROWS,
+    draw_stability,
+    examine_stability,
+    stability_page,
+)
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate
 
@@ -34,9 +39,12 @@ def changed(name, scene=EXAMPLE2):
 def test_every_run_ends_with_a_value_within_its_estimate_or_with_a_named_fault(found):
     assert found.runs.name.tolist() == list(FEW) and found.passed
     whole, stroke, singular = found.runs.itertuples()
-    assert whole.result == "reached the end" and 0.0 < whole.error <= 10.0 * whole.estimate
+    assert (
+        whole.result == "reached the end" and 0.0 < whole.error <= 10.0 * whole.estimate
+    )
     assert stroke.result.startswith("stopped at t = 0.0000")
-    assert singular.passed and "initial.gamma" in singular.result  # which lies beyond the stroke
+    # which lies beyond the stroke
+    assert singular.passed and "initial.gamma" in singular.result
 
 
 def careless(tolerance):
@@ -49,7 +57,11 @@ def unsure(tolerance):
 
 @pytest.mark.parametrize(
     ("kind", "only", "passes"),
-    [(careless, "as-it-is", False), (unsure, "as-it-is", False), (unsure, "stroke", True)],
+    [
+        (careless, "as-it-is", False),
+        (unsure, "as-it-is", False),
+        (unsure, "stroke", True),
+    ],
 )
 def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch, kind, only, passes):
     """A run that ends where it starts has no estimate and needs none."""
@@ -62,7 +74,9 @@ def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch, kind, only, 
         return motion
 
     monkeypatch.setattr(stability, "simulate", simulate)
-    report = examine_stability(dataclasses.replace(load("example2_stroke"), duration=0.5), [only])
+    report = examine_stability(
+        dataclasses.replace(load("example2_stroke"), duration=0.5), [only]
+    )
     assert report.runs.passed.tolist() == [report.passed] == [passes]
     assert ("| **FAILED** |" in stability_page(report)) is not passes
     assert f"1 runs, {0 if passes else 1} failed" in stability_page(report)
@@ -75,10 +89,15 @@ def test_the_numbers_are_ten_and_a_hundred_times_those_of_the_scene():
     faster = changed("rates", dataclasses.replace(EXAMPLE2, initial=moving))
     assert faster.initial.gamma_dot == pytest.approx((1.0, 2.0, -3.0))
     hung, rough = load("gravity_payload"), load("friction")
-    for before, after in zip(hung.springs, changed("stiffness", hung).springs, strict=True):
+    for before, after in zip(
+        hung.springs, changed("stiffness", hung).springs, strict=True
+    ):
         assert after.stiffness == 100.0 * before.stiffness
     bouncing = load("elastic_stops")
-    assert changed("stiffness", bouncing).stroke.stiffness == 100.0 * bouncing.stroke.stiffness
+    assert (
+        changed("stiffness", bouncing).stroke.stiffness
+        == 100.0 * bouncing.stroke.stiffness
+    )
     after = changed("friction", rough).friction
     assert after.gamma.coulomb == 100.0 * rough.friction.gamma.coulomb
     assert after.beta.viscous == 100.0 * rough.friction.beta.viscous
@@ -111,9 +130,13 @@ def test_a_run_beside_a_singularity_starts_beside_it():
 def test_the_steps_are_those_of_the_eigenvalues(found):
     assert len(found.steps) == 50 and found.steps.t_s.iloc[-1] == EXAMPLE2.duration
     assert (found.steps.rodas5p == math.inf).all()
-    stiff = examine_stability(dataclasses.replace(load("stiff"), duration=0.01), ["as-it-is"])
+    stiff = examine_stability(
+        dataclasses.replace(load("stiff"), duration=0.01), ["as-it-is"]
+    )
     for name, reach in (("rk4", 2.785), ("dopri5", 3.307)):
-        assert (stiff.steps[name] * stiff.steps.decay).to_numpy() == pytest.approx(reach, rel=3e-3)
+        assert (stiff.steps[name] * stiff.steps.decay).to_numpy() == pytest.approx(
+            reach, rel=3e-3
+        )
     assert "rodas5p: every step is stable." in stability_page(stiff)
 
 
@@ -121,12 +144,22 @@ def test_the_figure_and_the_page_show_every_method_and_run(found):
     said = stability_page(found)
     assert all(f"- {name}: " in said for name in METHODS)
     assert all(f"| {name} | {ROWS[name][0]} | yes |" in said for name in FEW)
-    lines = {line.get_label() for axes in draw_stability(found).axes for line in axes.lines}
+    lines = {
+        line.get_label() for axes in draw_stability(found).axes for line in axes.lines
+    }
     assert {"rk4", "dopri5", "dop853", "rodas5p: every step", "decay"} <= lines
 
 
 def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
-    words = ["report", "stability", "example1", "--only", "as-it-is", "friction", "--out"]
+    words = [
+        "report",
+        "stability",
+        "example1",
+        "--only",
+        "as-it-is",
+        "friction",
+        "--out",
+    ]
     assert cli.main([*words, str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert said.startswith("2 runs of 0.523599 s, each at two tolerances: about ")

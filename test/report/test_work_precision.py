@@ -78,7 +78,10 @@ def test_the_reference_is_better_than_doubles_can_be_and_what_mpmath_finds(short
     """At the same steps, so that only the arithmetic differs."""
     assert short.reference.own.orientation < 1e-16
     assert short.floor == ABOVE_REFERENCE * short.reference.own.orientation
-    problem, library = InitialValueProblem(SHORT), pytest.importorskip("mpmath").mp.clone()
+    problem, library = (
+        InitialValueProblem(SHORT),
+        pytest.importorskip("mpmath").mp.clone(),
+    )
     library.dps = 30
     names = ("sqrt", "sin", "cos", "atan2")
     slope = compile_program(
@@ -87,7 +90,12 @@ def test_the_reference_is_better_than_doubles_can_be_and_what_mpmath_finds(short
     y, h = [library.mpf(x) for x in problem.start], library.mpf(problem.interval) / 2
     for k in range(4):
         step = explicit_step(
-            lambda t, y, _: slope(t, *y, *problem.drive), EXACT_STEP, k * h, h, y, [None] * 12
+            lambda t, y, _: slope(t, *y, *problem.drive),
+            EXACT_STEP,
+            k * h,
+            h,
+            y,
+            [None] * 12,
         )
         new_y = step.state
         length = library.sqrt(sum(x * x for x in new_y[:4]))
@@ -98,7 +106,11 @@ def test_the_reference_is_better_than_doubles_can_be_and_what_mpmath_finds(short
 
 def test_methods_show_their_order(short):
     for method, order in (("rk4", 4), ("dopri5", 5), ("dop853", 8), ("rodas5p", 5)):
-        rows = [row for row in _rows(short, method) if 1e-12 < row.final_orientation_rad < 1e-4]
+        rows = [
+            row
+            for row in _rows(short, method)
+            if 1e-12 < row.final_orientation_rad < 1e-4
+        ]
         assert len(rows) > 1 or method == "dop853"
         slopes = [
             np.log(a.final_orientation_rad / b.final_orientation_rad)
@@ -141,21 +153,34 @@ def test_every_target_has_a_fastest_setting(short):
 
 @pytest.mark.slow
 def test_a_scene_that_rests_has_no_fastest_setting_and_is_drawn(tmp_path):
-    """A controller drives it; no method errs, and a logarithm of that does not exist."""
+    """A controller drives it.
+
+    No method errs, and a logarithm of that does not exist.
+    """
     resting = dataclasses.replace(scene.load("point_to_point"), duration=0.004)
     found = study_quickly(resting, 0.002)
     assert found.rests and found.best(1e-6) is None and "rests" in name_fastest(found)
     said = accuracy_page([found])
-    assert "| point_to_point | at rest |" in said and "accuracy_point_to_point.png" not in said
+    assert (
+        "| point_to_point | at rest |" in said
+        and "accuracy_point_to_point.png" not in said
+    )
     assert found.reference.own.gamma_dot == 0.0
     assert (found.rows.largest_gamma_dot_rad_per_s == 0.0).any()
     save_figure(draw_accuracy(found), tmp_path / "picture.png")
 
 
 def graded(study, *errors):
-    """A study of one method whose errors are given, coarse to fine, a millisecond more each."""
+    """A study of one method whose errors are given, coarse to fine, a millisecond more
+    each.
+    """
     rows = [
-        {"method": "dop853", "kind": FIXED, "setting": 0.5**k, "wall_min_s": 1e-3 * (k + 1)}
+        {
+            "method": "dop853",
+            "kind": FIXED,
+            "setting": 0.5**k,
+            "wall_min_s": 1e-3 * (k + 1),
+        }
         | {ERROR: error}
         for k, error in enumerate(errors)
     ]
@@ -165,7 +190,8 @@ def graded(study, *errors):
 @pytest.mark.parametrize(
     ("errors", "chosen"),
     [
-        ((1e-5, 2.8e-7, 3.1e-6, 5e-7, 1e-7), 3),  # the second is luck: its errors cancel
+        # the second is luck: its errors cancel
+        ((1e-5, 2.8e-7, 3.1e-6, 5e-7, 1e-7), 3),
         ((1e-5, 2.8e-7, 1e-8, 1e-9), 1),
         ((1e-5, 1e-5, 2.8e-7), None),  # nothing finer was tried
         ((1e-7, None, 1e-8, 1e-9), 2),  # a failure in between
@@ -174,7 +200,9 @@ def graded(study, *errors):
 )
 def test_a_setting_counts_only_if_every_finer_one_is_as_good(short, errors, chosen):
     best = graded(short, *errors).best(1e-6)
-    assert (None if best is None else best.setting) == (None if chosen is None else 0.5**chosen)
+    assert (None if best is None else best.setting) == (
+        None if chosen is None else 0.5**chosen
+    )
 
 
 def test_another_inertia_in_the_runs_is_seen(monkeypatch):
@@ -207,6 +235,8 @@ def test_a_run_that_stops_is_compared_up_to_its_end():
 
 
 def test_a_run_that_is_over_at_once_is_refused():
-    start = dataclasses.replace(SHORT.initial, gamma=(0.0, 0.5, 0.5), gamma_dot=(-1.0, 0.0, 0.0))
+    start = dataclasses.replace(
+        SHORT.initial, gamma=(0.0, 0.5, 0.5), gamma_dot=(-1.0, 0.0, 0.0)
+    )
     with pytest.raises(InputError, match="over before it can be studied"):
         InitialValueProblem(dataclasses.replace(SHORT, initial=start))

@@ -49,8 +49,9 @@ configure_middleware()
 def pytest_runtest_protocol(item):
     """End this process, with a traceback, half a minute after the time-out of a test.
 
-    Fast DDS deadlocks now and then when another node leaves (see `process._bound_time`), here in
-    the observer; rclpy holds the interpreter's lock then, and the time-out itself never comes.
+    Fast DDS deadlocks now and then when another node leaves (see
+    `process._bound_time`), here in the observer; rclpy holds the interpreter's lock
+    then, and the time-out itself never comes.
     """
     own = item.get_closest_marker("timeout")
     seconds = own.args[0] if own else float(item.config.getini("timeout"))
@@ -93,14 +94,16 @@ class Nodes:
         """Start a command in an interpreter of its own."""
         argv = executable or [sys.executable, "-m", "sst_ros", command]
         words = [*words, *(["--ros-args", *processes.words(given)] if given else [])]
-        # Ends with this process, also where that is killed: the next run has the same domains.
+        # Ends with this process, also where that is killed: the next run has the same
+        # domains.
         ends_with = {} if executable else {processes.PARENT: str(os.getpid())}
         process = subprocess.Popen(
             [*argv, *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            # To make machine code for every scene of a test would take longer than all tests.
+            # To make machine code for every scene of a test would take longer than all
+            # tests.
             env={**os.environ, **ends_with, **(env or {})},
         )
         self.running.append(process)
@@ -108,14 +111,17 @@ class Nodes:
 
     def run(self, command, *words, **given):
         """Fork a node, which starts in a third of the time."""
-        if command == "simulator":  # in lockstep by default it would end with the scene's
+        # in lockstep by default it would end with the scene's
+        if command == "simulator":
             given.setdefault("duration", 0.0)
         words = [command, *words, "--ros-args", *processes.words(given)]
         self.running.append(ForkedNode(words, dict(os.environ)))
         return self.running[-1]
 
     def line(self, process, timeout=40):
-        assert select.select([process.stdout], [], [], timeout)[0], f"no output in {timeout} s"
+        assert select.select([process.stdout], [], [], timeout)[0], (
+            f"no output in {timeout} s"
+        )
         return process.stdout.readline()
 
     def ended(self, process, timeout=40):
@@ -138,7 +144,9 @@ class Nodes:
 
 @pytest.fixture
 def run_here(domain, capfd):
-    """Run a node that ends by itself in this process: a new one takes a second to start."""
+    """Run a node that ends by itself in this process: a new one takes a second to
+    start.
+    """
 
     def run(command, *words, **given):
         handlers = {number: signal.getsignal(number) for number in signals._NUMBERS}
@@ -171,7 +179,11 @@ class Observer:
         """Messages of a topic since the first call of this, which grow."""
         if topic not in self.heard:
             heard = self.heard[topic] = []
-            durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+            durability = (
+                DurabilityPolicy.TRANSIENT_LOCAL
+                if latched
+                else DurabilityPolicy.VOLATILE
+            )
             qos = QoSProfile(depth=1000, durability=durability)
             self.node.create_subscription(kind, topic, heard.append, qos)
         return self.heard[topic]
@@ -182,7 +194,9 @@ class Observer:
 
     @property
     def phases(self):
-        return [phase.data for phase in self.listen(String, f"{NODE}/phase", latched=True)]
+        return [
+            phase.data for phase in self.listen(String, f"{NODE}/phase", latched=True)
+        ]
 
     def samples(self):
         """Those of the states that belong to a run."""
@@ -200,7 +214,9 @@ class Observer:
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(kind, topic, 1000)
         publisher = self._publishers[topic]
-        self.until(lambda: publisher.get_subscription_count() >= readers, f"readers of {topic}")
+        self.until(
+            lambda: publisher.get_subscription_count() >= readers, f"readers of {topic}"
+        )
         return publisher
 
     def command(self, *numbers, readers=1):
@@ -213,7 +229,9 @@ class Observer:
             self.executor.spin_once(timeout_sec=0.05)
 
     def publish_until(self, publisher, message, condition, what):
-        """Publish every 50 ms: a node answers no state before its commands have a subscriber."""
+        """Publish every 50 ms: a node answers no state before its commands have a
+        subscriber.
+        """
 
         def published():
             publisher.publish(message)
@@ -229,7 +247,10 @@ class Observer:
 
     def phase(self, wanted):
         """Wait for a phase, of which this is the beginning; return the whole."""
-        self.until(lambda: self.phases and self.phases[-1].startswith(wanted), f"phase {wanted}")
+        self.until(
+            lambda: self.phases and self.phases[-1].startswith(wanted),
+            f"phase {wanted}",
+        )
         return self.phases[-1]
 
     def result(self, future, what, timeout=40.0):
@@ -241,14 +262,18 @@ class Observer:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
         self.until(client.service_is_ready, f"service {name}")
-        return self.result(client.call_async(kind.Request(**fields)), f"reply of {name}")
+        return self.result(
+            client.call_async(kind.Request(**fields)), f"reply of {name}"
+        )
 
     def pause(self, paused, node=NODE):
         return self.call(SetBool, f"{node}/pause", data=paused)
 
     def set_parameter(self, name, value):
         parameter = Parameter(name, value=value).to_parameter_msg()
-        reply = self.call(SetParameters, f"{NODE}/set_parameters", parameters=[parameter])
+        reply = self.call(
+            SetParameters, f"{NODE}/set_parameters", parameters=[parameter]
+        )
         return reply.results[0]
 
     def diagnostics(self, name=""):
@@ -265,16 +290,23 @@ class Observer:
         ]
 
     def said(self, key):
-        """All values of a key; nodes have keys of their own, and one may say more often."""
+        """All values of a key.
+
+        Nodes have keys of their own, and one may say more often.
+        """
         return [status[key] for status in self.diagnostics() if key in status]
 
     def told(self, key, value, timeout=40.0):
-        """Wait until the last status with this key says so; return all that it says then."""
+        """Wait until the last status with this key says so.
+
+        Return all that it says then.
+        """
         meets = value if callable(value) else lambda said: said == str(value)
         said = []
 
         def is_told():
-            # Other nodes have keys of their own, and their last word may be the newer one.
+            # Other nodes have keys of their own, and their last word may be the newer
+            # one.
             said[:] = [status for status in self.diagnostics() if key in status][-1:]
             return said and meets(said[0][key])
 
@@ -284,7 +316,11 @@ class Observer:
     @staticmethod
     def stamp(message):
         """Of a sample [ns]; 0 for a state before the run, in a pause or in a fault."""
-        return 0 if message.header.frame_id == IDLE_FRAME_ID else nanoseconds(message.header.stamp)
+        return (
+            0
+            if message.header.frame_id == IDLE_FRAME_ID
+            else nanoseconds(message.header.stamp)
+        )
 
     def close(self):
         self.executor.shutdown()
@@ -346,8 +382,13 @@ def profile(tmp_path):
 
 
 def foreign_types(package):
-    """Make the types of a package importable, here and in nodes; yield their environment."""
+    """Make the types of a package importable, here and in nodes.
+
+    Yield their environment.
+    """
     with pytest.MonkeyPatch.context() as patch:
         folder = str(message_types.folder(package))
         patch.syspath_prepend(folder)
-        yield {"PYTHONPATH": os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])}
+        yield {
+            "PYTHONPATH": os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])
+        }

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes forked from a process that has imported them: each starts in a third of the time.
+"""Nodes forked from a process that has imported them: each starts in a third of the
+time.
 
 The server has one thread, no node and no connection; what it forks differs from
 `python -m sst_ros` in nothing but the time that its imports take.
@@ -33,18 +34,26 @@ class ForkedNode:
     """As much of `subprocess.Popen` as the tests use."""
 
     def __init__(self, words, env):
-        with pytest.MonkeyPatch.context() as patch:  # for the server, which this starts if need be
-            patch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
-            patch.setattr(tempfile, "tempdir", "/tmp")  # a socket's path has at most 107 letters
+        # for the server, which this starts if need be
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(
+                "PYTHONPATH", os.pathsep.join(path for path in sys.path if path)
+            )
+            # a socket's path has at most 107 letters
+            patch.setattr(tempfile, "tempdir", "/tmp")
             resource_tracker.ensure_running()
             forkserver.ensure_running()
         pipes = [os.pipe(), os.pipe()]
-        self._process = CONTEXT.Process(target=_Call(words, env, [end for _, end in pipes]))
+        self._process = CONTEXT.Process(
+            target=_Call(words, env, [end for _, end in pipes])
+        )
         self._process.start()
         for _, end in pipes:
             os.close(end)
         self.pid = self._process.pid
-        self.stdout, self.stderr = (os.fdopen(begin, encoding="utf-8") for begin, _ in pipes)
+        self.stdout, self.stderr = (
+            os.fdopen(begin, encoding="utf-8") for begin, _ in pipes
+        )
         self._texts = []
 
     @property
@@ -70,7 +79,9 @@ class ForkedNode:
         """Read both pipes to their ends at once, so that none is full."""
         if not self._texts:
             pool = ThreadPoolExecutor(2)
-            self._texts = [pool.submit(pipe.read) for pipe in (self.stdout, self.stderr)]
+            self._texts = [
+                pool.submit(pipe.read) for pipe in (self.stdout, self.stderr)
+            ]
         try:
             texts = tuple(text.result(timeout) for text in self._texts)
         except TimeoutError as error:
@@ -87,20 +98,27 @@ class ForkedNode:
 
 
 class _Call:
-    """What the forked process does: a node with these words, environment, stdout and stderr."""
+    """What the forked process does: a node with these words, environment, stdout and
+    stderr.
+    """
 
     def __init__(self, words, env, streams):
         self._words, self._env, self._streams = words, env, streams
 
     def __getstate__(self):
         duplicate = multiprocessing.reduction.DupFd
-        return {**vars(self), "_streams": [duplicate(stream) for stream in self._streams]}
+        return {
+            **vars(self),
+            "_streams": [duplicate(stream) for stream in self._streams],
+        }
 
     def __call__(self):
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as in a terminal, also under nohup
+        # as in a terminal, also under nohup
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         for number, stream in enumerate(self._streams, start=1):
             os.dup2(stream.detach(), number)
-        # The server ends with the tests, however they end, and this node then ends without it.
+        # The server ends with the tests, however they end, and this node then ends
+        # without it.
         os.close(forkserver._forkserver._forkserver_alive_fd)
         os.environ.clear()
         os.environ.update(self._env, **{processes.PARENT: str(os.getppid())})

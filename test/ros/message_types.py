@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Python packages of the message types that no wheel has, made by the rosidl of the wheels.
+"""Python packages of the message types that no wheel has, made by the rosidl of the
+wheels.
 
-The definitions are fields alone, as the published packages have them: type hashes (RIHS01), which
-depend on nothing else, are compared with those of control_msgs 6.8.0 and simulation_interfaces
-2.1.0.
+The definitions are fields alone, as the published packages have them: type hashes
+(RIHS01), which depend on nothing else, are compared with those of control_msgs 6.8.0
+and simulation_interfaces 2.1.0.
 """
 
 import fcntl
@@ -37,14 +38,25 @@ USED = ("action_msgs", "builtin_interfaces", "geometry_msgs", "service_msgs", "s
 
 
 def folder(package):
-    """Return the folder of a package; it is made once for these definitions and wheels."""
+    """Return the folder of a package.
+
+    It is made once for these definitions and wheels.
+    """
     if importlib.util.find_spec("rosidl_generator_py") is None:
         pytest.skip("no generator of message types: part of a ROS installation")
     if int(version("rclpy").partition(".")[0]) < KILTED:
-        pytest.skip("not with the rclpy of Jazzy: its middleware asks for introspection types too")
+        pytest.skip(
+            "not with the rclpy of Jazzy: its middleware asks for introspection"
+            " types too"
+        )
     if shutil.which("g++") is None:
         pytest.skip("no C++ compiler to make message types with")
-    made_of = (DEFINITIONS.read_text(), Path(__file__).read_text(), sys.prefix, sys.version)
+    made_of = (
+        DEFINITIONS.read_text(),
+        Path(__file__).read_text(),
+        sys.prefix,
+        sys.version,
+    )
     key = hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]
     final = Path(tempfile.gettempdir()) / f"sst_ros_{package}_{os.getuid()}_{key}"
     with final.with_suffix(".lock").open("w") as lock:
@@ -53,7 +65,9 @@ def folder(package):
             made = tempfile.mkdtemp(prefix=final.name)
             command = [sys.executable, __file__, made, package]
             env = {**os.environ, "AMENT_PREFIX_PATH": sys.prefix}
-            made_by = subprocess.run(command, env=env, text=True, capture_output=True, check=False)
+            made_by = subprocess.run(
+                command, env=env, text=True, capture_output=True, check=False
+            )
             assert made_by.returncode == 0, made_by.stdout + made_by.stderr
             Path(made).rename(final)
     return final
@@ -88,12 +102,17 @@ def _generate(root, package, definitions):
         GenerateCTypesupport("c", typesupport_implementations=only),
         GeneratePython("py", typesupport_implementations=["rosidl_typesupport_c"]),
     ):
-        generator.generate(interface_files=[str(file) for file in files], output_path=out, **shared)
+        generator.generate(
+            interface_files=[str(file) for file in files], output_path=out, **shared
+        )
     (out / "__init__.py").touch()
     for name, definition in definitions.items():
         description = json.loads((out / name).with_suffix(".json").read_text())
         full = f"{package}/{Path(name).with_suffix('')}"
-        hashes = {entry["type_name"]: entry["hash_string"] for entry in description["type_hashes"]}
+        hashes = {
+            entry["type_name"]: entry["hash_string"]
+            for entry in description["type_hashes"]
+        }
         assert hashes[full] == definition["hash"], (full, hashes[full])
 
 
@@ -118,11 +137,21 @@ def _compile(root, package):
 
     with ThreadPoolExecutor(2) as pool:
         objects = list(pool.map(compiled, alone))
-    libraries = [f"{used}__{kind}" for used in USED for kind in (*SHARED, "rosidl_generator_py")]
+    libraries = [
+        f"{used}__{kind}" for used in USED for kind in (*SHARED, "rosidl_generator_py")
+    ]
     name = f"{package}_s__rosidl_typesupport_c{sysconfig.get_config_var('EXT_SUFFIX')}"
     linked = [f"-l{library}" for library in (*libraries, *RUNTIME)]
     lib = PREFIX / "lib"
-    command = ["g++", "-shared", "-o", out / name, *objects, f"-L{lib}", f"-Wl,-rpath,{lib}"]
+    command = [
+        "g++",
+        "-shared",
+        "-o",
+        out / name,
+        *objects,
+        f"-L{lib}",
+        f"-Wl,-rpath,{lib}",
+    ]
     subprocess.run([*command, *linked], check=True)
 
 

@@ -41,18 +41,24 @@ def test_realtime():
 
 def test_bare_loops():
     pytest.importorskip("llvmlite", reason="what is measured is compiled")
-    tables = printed("bare_loops", "--seconds", "1", "--rounds", "1").strip().split("\n\n")
+    tables = (
+        printed("bare_loops", "--seconds", "1", "--rounds", "1").strip().split("\n\n")
+    )
     assert len(tables) == 2
     for text in tables:
         if "not permitted" not in text:
             _, _, *measured = (found := rows(text)).values()
             assert found["and looks for commands on 2 topics"][2] == "1.00"
-            assert len(measured) == 6 and all(float(cells[0]) > 0.0 for cells in measured)
+            assert len(measured) == 6 and all(
+                float(cells[0]) > 0.0 for cells in measured
+            )
 
 
 @pytest.mark.timeout(400)
 def test_soak():
-    """Growth counts after the first minute: until then the heap of the recorder still settles."""
+    """Growth counts after the first minute: until then the heap of the recorder still
+    settles.
+    """
     pytest.importorskip("viser", reason="what is soaked has a viewer")
     said = printed("soak", "--minutes", "1.5")
     assert "missing 0\n" in said and "WRONG" not in said

@@ -22,17 +22,27 @@ def prefix(request, tmp_path_factory):
     if shutil.which("colcon", path=Path(sys.executable).parent) is None:
         pytest.fail("colcon is missing: pip install .[test]")
     workspace = tmp_path_factory.mktemp("workspace")
-    ignored = shutil.ignore_patterns(".*", "demo_out*", "__pycache__", "*.egg-info", "build")
+    ignored = shutil.ignore_patterns(
+        ".*", "demo_out*", "__pycache__", "*.egg-info", "build"
+    )
     shutil.copytree(SOURCE, workspace / "src" / "sst_ros", ignore=ignored)
     words = ["colcon", "build", "--event-handlers", "console_direct-"]
-    python("-m", *words, *request.param.split(), cwd=workspace, env={"PATH": PATH}, timeout=110)
+    python(
+        "-m",
+        *words,
+        *request.param.split(),
+        cwd=workspace,
+        env={"PATH": PATH},
+        timeout=110,
+    )
     return workspace / "install" / "sst_ros"
 
 
 @pytest.fixture
 def overlay(prefix):
     packages = next(prefix.glob("lib/python*/site-packages"))
-    paths = f"{packages}:{prefix.parents[1] / 'build' / 'sst_ros'}"  # of links to the source
+    # of links to the source
+    paths = f"{packages}:{prefix.parents[1] / 'build' / 'sst_ros'}"
     return {"AMENT_PREFIX_PATH": str(prefix), "PYTHONPATH": paths, "PATH": PATH}
 
 
@@ -43,12 +53,16 @@ def test_all_is_installed_where_ros_looks_for_it(prefix):
     for folder in ("config", "launch"):
         for path in (SOURCE / folder).rglob("*.*"):
             if "__pycache__" not in path.parts:
-                assert (share / path.relative_to(SOURCE)).read_bytes() == path.read_bytes()
+                assert (
+                    share / path.relative_to(SOURCE)
+                ).read_bytes() == path.read_bytes()
     for name in COMMANDS:  # as `ros2 run` finds it
         assert os.access(prefix / "lib" / "sst_ros" / name, os.X_OK)
 
 
-def test_the_installed_simulator_runs_from_its_own_workspace(prefix, overlay, nodes, observer):
+def test_the_installed_simulator_runs_from_its_own_workspace(
+    prefix, overlay, nodes, observer
+):
     executable = [str(prefix / "lib" / "sst_ros" / "simulator")]
     words = ["--ros-args", "-p", "scene:=example1", "-p", "duration:=0.0"]
     process = nodes.start("", *words, executable=executable, env=overlay)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pause, step, reset and set_state of a real simulator; its speed, /clock given and followed."""
+"""Pause, step, reset and set_state of a real simulator.
+
+Its speed, /clock given and followed.
+"""
 
 import math
 import re
@@ -18,7 +21,8 @@ pytestmark = pytest.mark.ros
 
 def test_pause_step_and_resume(nodes, observer):
     """Over the services; test_run_loop.py has the state machine itself."""
-    # A tick a sample: where a busy machine ends the wait within one, that is a sample, too.
+    # A tick a sample: where a busy machine ends the wait within one, that is a sample,
+    # too.
     rates = {"rate": 500, "publish_rate": 500, "real_time_factor": 0.1}
     nodes.run("simulator", scene="example1", **rates)
     observer.until(observer.samples, "samples")
@@ -47,8 +51,12 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
         JointState(name=NAMES, position=[0.7, 0.7, 0.7], velocity=[1.0]),
     ):
         put.publish(bad)
-    put.publish(JointState(name=NAMES[::-1], position=[0.8, 0.7, 0.6], velocity=[0.0, 0.0, 0.1]))
-    observer.until(lambda: abs(observer.states[-1].position[0] - 0.6) < 1e-9, "the new state")
+    put.publish(
+        JointState(name=NAMES[::-1], position=[0.8, 0.7, 0.6], velocity=[0.0, 0.0, 0.1])
+    )
+    observer.until(
+        lambda: abs(observer.states[-1].position[0] - 0.6) < 1e-9, "the new state"
+    )
     shown = observer.states[-1]
     assert list(shown.position[:3]) == pytest.approx([0.6, 0.7, 0.8], abs=1e-9)
     assert list(shown.velocity[:3]) == pytest.approx([0.1, 0.0, 0.0], abs=1e-9)
@@ -57,7 +65,9 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
     observer.until(observer.samples, "samples")
     put.publish(JointState(name=NAMES, position=[0.7, 0.7, 0.7]))  # refused: it runs
     running = "set_state: refused: pause or reset first"
-    observer.until(lambda: any(log.msg.startswith(running) for log in logged), "the refusal")
+    observer.until(
+        lambda: any(log.msg.startswith(running) for log in logged), "the refusal"
+    )
     reply = observer.call(Trigger, f"{NODE}/reset")
     assert (reply.success, reply.message) == (True, "at the initial state, waiting")
     observer.until(lambda: observer.stamp(observer.states[-1]) == 0, "preview")
@@ -74,7 +84,8 @@ def clock(time_ns):
 
 
 def test_a_run_as_fast_as_possible_loses_no_sample(nodes, observer):
-    heard = "[joint_states, /diagnostics]"  # by this process before the run, which is short
+    # by this process before the run, which is short
+    heard = "[joint_states, /diagnostics]"
     given = {"duration": 2.0, "publish_rate": 100, "wait_for_subscribers": heard}
     observer.listen(JointState, "/joint_states")
     process = nodes.run("simulator", real_time_factor=0.0, **given)
@@ -95,7 +106,9 @@ def test_a_clock_is_given_and_a_second_one_told(nodes, observer):
 
     # Not each: a reader that was held up finds the last time only.
     nodes.run("simulator", publish_clock=True)
-    observer.until(lambda: len({*times()} & {*observer.stamps()}) > 20, "the time of the states")
+    observer.until(
+        lambda: len({*times()} & {*observer.stamps()}) > 20, "the time of the states"
+    )
     assert times() == sorted(times()) and times()[0] > 0
     assert observer.pause(True).success
     observer.until(lambda: clocks[-1] == clocks[-2], "the time of the pause, repeated")
@@ -141,7 +154,9 @@ def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
         return len(told) > 1 and told[-1] == told[-2]
 
     observer.until(stands, "a standstill")
-    said = observer.told("said", lambda said: "/clock stands still: the run waits for it" in said)
+    said = observer.told(
+        "said", lambda said: "/clock stands still: the run waits for it" in said
+    )
     assert said["level"] == b"\x01"
     settled = int(observer.said("ticks")[-1])
 

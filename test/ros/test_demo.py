@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job, end to end: the paper's examples through real nodes, judged from their bags.
+"""The main job, end to end: the paper's examples through real nodes, judged from their
+bags.
 
 And what studies make with nodes: the paper's figures, and a model that is identified.
 """
@@ -19,7 +20,13 @@ from studies.identification import identification
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(600)]
 PICTURES = {
-    "": ["fig10_path_of_E", "fig11_position_of_E", "fig12_theta", "fig13_phi", "fig14_psi"],
+    "": [
+        "fig10_path_of_E",
+        "fig11_position_of_E",
+        "fig12_theta",
+        "fig13_phi",
+        "fig14_psi",
+    ],
     "example1": ["fig08_position_of_E", "fig09_psi"],
 }
 
@@ -44,7 +51,8 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
     for quantity in ("gamma_rad", "gamma_dot_rad_per_s", "orientation_rad"):
         assert summary[f"integration_error_{quantity}"] <= 1e-9
         assert summary[f"integration_reference_error_{quantity}"] <= 1e-12
-    # 500 Hz: held from the middle of the profile; from its start example2 has 1.58e-2 rad.
+    # 500 Hz: held from the middle of the profile; from its start example2 has 1.58e-2
+    # rad.
     assert 0.0 < summary["ideal_difference_gamma_rad"] <= 5e-5
     assert are_drawn(out / part, [*PICTURES[part], "error"])
 
@@ -63,7 +71,9 @@ def test_example_2_is_the_librarys_to_the_bit_however_busy_the_machine_was(out):
 
 @pytest.mark.slow
 def test_the_papers_figures_are_drawn_and_their_curves_agree(tmp_path, domain, capsys):
-    """`make paper`: Figs. 8 to 14 with the continuous solution and an independent engine."""
+    """`make paper`: Figs. 8 to 14 with the continuous solution and an independent
+    engine.
+    """
     pytest.importorskip("pinocchio", reason="Pinocchio is missing: pip install pin")
     found = paper.paper(tmp_path / "out")
     printed = capsys.readouterr().out
@@ -77,7 +87,9 @@ def test_the_papers_figures_are_drawn_and_their_curves_agree(tmp_path, domain, c
         assert each.within and str(each) in page and str(each) in printed
     names = [*PICTURES[""], *PICTURES["example1"], "fig09_inverse_dynamics"]
     assert are_drawn(tmp_path / "out", names)
-    assert all(f"<img alt='{name}' src='data:image/png;base64," in page for name in names)
+    assert all(
+        f"<img alt='{name}' src='data:image/png;base64," in page for name in names
+    )
     assert "ssumed inertias" in page
     assert paper.main(["--out", str(tmp_path / "out")]) == 1
     assert "exists already" in capsys.readouterr().err
@@ -85,12 +97,16 @@ def test_the_papers_figures_are_drawn_and_their_curves_agree(tmp_path, domain, c
 
 @pytest.mark.slow
 def test_the_identified_model_tracks_twenty_times_better(tmp_path, domain):
-    """Record with a wrong model, identify, follow with the identified one: by the nodes."""
+    """Record with a wrong model, identify, follow with the identified one: by the
+    nodes.
+    """
     assert identification(tmp_path)
     text = (tmp_path / "identification.txt").read_text(encoding="utf-8")
     ratio = float(re.search(r"^ratio +([\d.]+)$", text, re.M)[1])
     assert ratio > 20.0
-    plant, found = (load_scene(tmp_path / f"{name}.yaml") for name in ("plant", "identified"))
+    plant, found = (
+        load_scene(tmp_path / f"{name}.yaml") for name in ("plant", "identified")
+    )
     for kind in ("gamma", "beta"):
         expected = getattr(plant.friction, kind).viscous
         assert getattr(found.friction, kind).viscous == pytest.approx(expected, rel=0.1)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""config/ against the declarations, and these against running nodes: policies, layouts, keys."""
+"""config/ against the declarations, and these against running nodes: policies, layouts,
+keys.
+"""
 
 import json
 import re
@@ -44,13 +46,21 @@ def test_the_policies_are_those_of_the_declarations_in_the_form_of_sros2(node):
     while groups[0].tag in ("enclaves", "enclave", "profiles", "profile"):
         (only,) = groups
         path, groups = [*path, only], list(only)
-    assert [one.tag for one in path] == ["policy", "enclaves", "enclave", "profiles", "profile"]
+    assert [one.tag for one in path] == [
+        "policy",
+        "enclaves",
+        "enclave",
+        "profiles",
+        "profile",
+    ]
     assert path[2].attrib["path"].startswith("/")
     assert path[4].attrib == {"ns": "/", "node": node.name}
     rights = {"topics": {"publish", "subscribe"}, "services": {"reply", "request"}}
     rights["actions"] = {"execute"}
     for group in groups:
-        assert set(group.attrib) <= rights[group.tag] and set(group.attrib.values()) == {"ALLOW"}
+        assert set(group.attrib) <= rights[group.tag] and set(
+            group.attrib.values()
+        ) == {"ALLOW"}
         assert len(group) and {entry.tag for entry in group} == {group.tag[:-1]}
         assert all(entry.text.startswith("/") and not entry.attrib for entry in group)
 
@@ -79,7 +89,9 @@ def used(graph, name):
 
 
 @pytest.mark.slow
-def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, tmp_path):
+def test_the_policies_allow_what_running_nodes_use_and_no_more(
+    nodes, observer, tmp_path
+):
     nodes.run("simulator", wait_for_command=True)
     observer.phase("waiting")
     recorder = nodes.run("recorder", output=tmp_path / "bag")
@@ -102,14 +114,19 @@ def test_the_policies_allow_what_running_nodes_use_and_no_more(nodes, observer, 
         def all_there(name=node.name, needed=needed):
             if name not in observer.node.get_node_names():
                 return False
-            return all(needed[right] <= real for right, real in used(observer.node, name).items())
+            return all(
+                needed[right] <= real
+                for right, real in used(observer.node, name).items()
+            )
 
         observer.until(all_there, f"all of {node.name}")
         for right, names in used(observer.node, node.name).items():
             assert names <= expected[right], (node.name, right)
 
 
-def test_the_diagnostics_are_those_of_the_docs_and_the_description_can_be_left_out(nodes, observer):
+def test_the_diagnostics_are_those_of_the_docs_and_the_description_can_be_left_out(
+    nodes, observer
+):
     # The scene has limits, and so distances to them.
     nodes.run("simulator", scene="example2_heavy", publish_description=False)
     observer.told("phase", "running")
@@ -121,12 +138,18 @@ def test_the_diagnostics_are_those_of_the_docs_and_the_description_can_be_left_o
 
 
 def field_type(kind, path):
-    """The type of a field of a message, given as x.y[0].z; the indices must be in range."""
+    """The type of a field of a message, given as x.y[0].z.
+
+    The indices must be in range.
+    """
     for part in path.split("."):
         name, index = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", part).groups()
         kind = kind.get_fields_and_field_types()[name]
         if index is not None:
-            assert kind.startswith("sequence<") and int(index) < len(JOINTS), (path, kind)
+            assert kind.startswith("sequence<") and int(index) < len(JOINTS), (
+                path,
+                kind,
+            )
             kind = kind.removeprefix("sequence<").removesuffix(">")
         if "/" in kind:
             package, name = kind.split("/")
@@ -152,12 +175,18 @@ def test_foxglove_plots_and_shows_what_is_published():
     for path in paths:
         topic, _, field = path.partition(".")
         assert field_type(PUBLISHED[topic], field) == "double", path
-    (model,) = (one for one in panels["3D!manipulator"]["layers"].values() if "topic" in one)
+    (model,) = (
+        one for one in panels["3D!manipulator"]["layers"].values() if "topic" in one
+    )
     assert model["topic"] == topics.SIMULATOR["robot_description"].at("/sst_simulator")
     assert PUBLISHED[model["jointStatesTopic"]] is JointState
-    assert {*values(panels, "topicToRender"), *values(panels, "topicPath")} <= set(PUBLISHED)
+    assert {*values(panels, "topicToRender"), *values(panels, "topicPath")} <= set(
+        PUBLISHED
+    )
     assert {*values(panels, "fixedFrame"), *values(panels, "frameId")} == {BASE_FRAME}
-    shown = [name for key in ("first", "second") for name in values(layout["layout"], key)]
+    shown = [
+        name for key in ("first", "second") for name in values(layout["layout"], key)
+    ]
     assert sorted(name for name in shown if isinstance(name, str)) == sorted(panels)
 
 
@@ -170,7 +199,11 @@ def test_plotjuggler_plots_what_is_published():
         (topic,) = (topic for topic in PUBLISHED if curve.startswith(f"{topic}/"))
         field = curve.removeprefix(f"{topic}/").split("/")
         if PUBLISHED[topic] is JointState:
-            assert field[0] in JOINTS and field[1] in ("position", "velocity", "effort"), curve
+            assert field[0] in JOINTS and field[1] in (
+                "position",
+                "velocity",
+                "effort",
+            ), curve
         else:
             assert field_type(PUBLISHED[topic], ".".join(field)) == "double", curve
     assert root.find("previouslyLoaded_Streamer").get("name") == "ROS2 Topic Subscriber"
@@ -179,7 +212,9 @@ def test_plotjuggler_plots_what_is_published():
 def test_rviz_shows_our_topic_and_frame():
     text = (CONFIG / "sst_ros.rviz").read_text(encoding="utf-8")
     manager = yaml.safe_load(text)["Visualization Manager"]
-    displays = {display["Class"].split("/")[1]: display for display in manager["Displays"]}
+    displays = {
+        display["Class"].split("/")[1]: display for display in manager["Displays"]
+    }
     assert set(displays) == {"Grid", "RobotModel", "TF"}
     description = displays["RobotModel"]["Description Topic"]
     assert description["Value"] == topics.SIMULATOR["robot_description"].name

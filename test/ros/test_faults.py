@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fault table, case by case, in real processes: nothing crashes, nothing is in doubt."""
+"""The fault table, case by case, in real processes: nothing crashes, nothing is in
+doubt.
+"""
 
 import math
 import signal
@@ -12,7 +14,16 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import QoSProfile
-from ros.conftest import COMMANDS, NAMES, NODE, STAMPED, children, is_running, named, torques
+from ros.conftest import (
+    COMMANDS,
+    NAMES,
+    NODE,
+    STAMPED,
+    children,
+    is_running,
+    named,
+    torques,
+)
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -41,23 +52,32 @@ NAMED = [named([math.nan, 0.0, 0.0]), named([0.0] * 2, names=NAMES[:2])]
     ],
     ids=["plain", "stamped"],
 )  # fmt: skip
-def test_bad_commands_are_dropped_whole_and_counted(nodes, observer, good, bad, because, said):
+def test_bad_commands_are_dropped_whole_and_counted(
+    nodes, observer, good, bad, because, said
+):
     process = nodes.run("simulator", wait_for_command=True, command_timeout=0.0)
     observer.preview()
     kind = type(good)
-    commands = observer.publisher(kind, COMMANDS if kind is Float64MultiArray else STAMPED)
+    commands = observer.publisher(
+        kind, COMMANDS if kind is Float64MultiArray else STAMPED
+    )
     commands.publish(good)
     observer.until(lambda: GOOD in observer.torques(), "the command")
     for message in bad:
         commands.publish(message)
     told = observer.told("commands_dropped", len(bad))
-    assert (told["commands_received"], told["commands_dropped_because"]) == ("1", because)
+    assert (told["commands_received"], told["commands_dropped_because"]) == (
+        "1",
+        because,
+    )
     assert told["level"] == b"\x01" and said in told["said"]
     assert observer.torques()[-1] == GOOD
     status, _, err = nodes.stop(process)
     warnings = [line for line in err.splitlines() if "command dropped" in line]
     # One for each report that finds new ones, however many commands.
-    assert status == 0 and len(warnings) == len({*observer.said("commands_dropped")} - {"0"})
+    assert status == 0 and len(warnings) == len(
+        {*observer.said("commands_dropped")} - {"0"}
+    )
     assert said in warnings[-1] and f"({len(bad)} in all)" in warnings[-1]
 
 
@@ -67,16 +87,22 @@ def test_limit_and_external_moment_are_those_of_the_scene(nodes, observer, tmp_p
     (path := tmp_path / "variant.yaml").write_text(dump(load_scene("example2")) + more)
     nodes.run("simulator", scene=path, command_timeout=0.0)
     observer.command(7.0, -7.0, 0.1)
-    observer.until(lambda: (0.5, -0.5, 0.1) in observer.torques(), "the clamped command")
+    observer.until(
+        lambda: (0.5, -0.5, 0.1) in observer.torques(), "the clamped command"
+    )
     said = observer.told("commands_clamped", 1)
-    assert said["level"] == b"\x01" and "clamped to the scene's torque limit" in said["said"]
+    assert (
+        said["level"] == b"\x01"
+        and "clamped to the scene's torque limit" in said["said"]
+    )
 
     moments = observer.publisher(WrenchStamped, f"{NODE}/external_moment")
     message = WrenchStamped()
     message.wrench.torque.z = 0.25
     moments.publish(message)
     observer.until(
-        lambda: any(p.effort[5] == 0.25 for m in applied for p in m.points), "the moment"
+        lambda: any(p.effort[5] == 0.25 for m in applied for p in m.points),
+        "the moment",
     )
     assert applied[-1].joint_names == [*NAMES, "moment_x", "moment_y", "moment_z"]
     message.wrench.torque.z = math.nan
@@ -106,7 +132,10 @@ def test_a_message_of_another_type_is_reported(nodes, observer):
     )
     said = observer.told("said", lambda said: text in said)
     assert said["level"] == b"\x01"
-    assert observer.listen(DiagnosticArray, "/diagnostics")[-1].status[0].hardware_id == NODE
+    assert (
+        observer.listen(DiagnosticArray, "/diagnostics")[-1].status[0].hardware_id
+        == NODE
+    )
     _, _, err = nodes.stop(process)
     assert err.count(text) == 1
 
@@ -125,7 +154,9 @@ def test_commands_that_wait_while_the_process_is_held_up_are_all_used(nodes, obs
 
 @pytest.mark.slow
 def test_a_flood_of_commands_is_bounded(nodes, observer):
-    """20 kHz for a second, 200 a tick, if the machine can: no crash, no growth, samples go on."""
+    """20 kHz for a second, 200 a tick, if the machine can: no crash, no growth, samples
+    go on.
+    """
     process = nodes.run("simulator", rate=100, publish_rate=100)
     commands = observer.publisher(Float64MultiArray, COMMANDS)
     observer.phase("running")
@@ -147,7 +178,8 @@ def test_a_flood_of_commands_is_bounded(nodes, observer):
 def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
     nodes.run("simulator")
     observer.phase("running")
-    qos = QoSProfile(depth=CALLS)  # of the replies: a client of rclpy keeps ten by default
+    # of the replies: a client of rclpy keeps ten by default
+    qos = QoSProfile(depth=CALLS)
     client = observer.node.create_client(SetBool, f"{NODE}/pause", qos_profile=qos)
     observer.until(client.service_is_ready, "the service")
     calls = [client.call_async(SetBool.Request(data=True)) for _ in range(CALLS)]
@@ -156,9 +188,14 @@ def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
 
 
 def test_kill_of_a_view_ends_its_simulator(nodes, observer):
-    looking = "from sst_ros.view.source import run_simulator\nwith run_simulator('swing'): input()"
+    looking = (
+        "from sst_ros.view.source import run_simulator\nwith run_simulator('swing'):"
+        " input()"
+    )
     viewer = subprocess.Popen([sys.executable, "-c", looking], stdin=subprocess.PIPE)
-    observer.until(lambda: "sst_simulator" in observer.node.get_node_names(), "simulator")
+    observer.until(
+        lambda: "sst_simulator" in observer.node.get_node_names(), "simulator"
+    )
     (simulator,) = children(viewer)
     viewer.kill()
     viewer.communicate()
@@ -177,7 +214,9 @@ def test_a_late_joiner_learns_what_is_simulated_and_what_it_does(nodes, observer
     assert '<link name="base_link">' in drawn[0].data
 
 
-def test_a_fault_is_held_still_until_a_reset_and_ends_the_player(nodes, observer, profile):
+def test_a_fault_is_held_still_until_a_reset_and_ends_the_player(
+    nodes, observer, profile
+):
     process = nodes.run("simulator", scene="example2_heavy", wait_for_command=True)
     observer.preview()
     player = nodes.run("torque_player", csv=profile("0,50,0,0", "60,0,0,0"))
@@ -201,8 +240,12 @@ def test_a_fault_is_held_still_until_a_reset_and_ends_the_player(nodes, observer
 @pytest.mark.parametrize("command", ["simulator", "recorder", "torque_player"])
 def test_signals_twice_end_a_node_once(nodes, observer, tmp_path, command):
     is_recorder = command == "recorder"
-    process = nodes.run(command, **({"output": tmp_path / "bag"} if is_recorder else {}))
-    observer.until(lambda: f"sst_{command}" in observer.node.get_node_names(), "the node")
+    process = nodes.run(
+        command, **({"output": tmp_path / "bag"} if is_recorder else {})
+    )
+    observer.until(
+        lambda: f"sst_{command}" in observer.node.get_node_names(), "the node"
+    )
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGINT)
     status, _, err = nodes.stop(process, signal.SIGTERM)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action ~/follow_joint_trajectory with a real client, a real controller and simulator."""
+"""The action ~/follow_joint_trajectory with a real client, a real controller and
+simulator.
+"""
 
 import signal
 from contextlib import closing
@@ -40,8 +42,13 @@ class Client:
         self.observer, self.nodes = observer, nodes
         self.reference = observer.listen(JointState, f"{NODE}/reference")
         path = written(folder, motion=None)
-        # A check of a goal takes long on a busy machine, and so do the samples of a free run.
-        run = {"lockstep_timeout": 0.0} if sync == "lockstep" else {"real_time_factor": 0.25}
+        # A check of a goal takes long on a busy machine, and so do the samples of a
+        # free run.
+        run = (
+            {"lockstep_timeout": 0.0}
+            if sync == "lockstep"
+            else {"real_time_factor": 0.25}
+        )
         nodes.run("simulator", scene=path, sync=sync, wait_for_command=True, **run)
         given = {"mode": "computed_torque", "motion": "topic", "scene": path}
         given["stamped"] = sync == "lockstep"
@@ -64,7 +71,10 @@ class Client:
     def result(self, handle):
         """Status and code, and the words of the result."""
         reply = self.observer.result(handle.get_result_async(), "the result")
-        return (reply.status, ErrorCode(reply.result.error_code)), reply.result.error_string
+        return (
+            reply.status,
+            ErrorCode(reply.result.error_code),
+        ), reply.result.error_string
 
     def moving(self, count=3):
         self.observer.until(lambda: len(self.feedback) > count, "feedback")
@@ -73,7 +83,8 @@ class Client:
         """Wait until the reference rests; return it."""
         seen = len(self.reference)
         self.observer.until(
-            lambda: len(self.reference) > seen and not any(self.reference[-1].velocity), "rest"
+            lambda: len(self.reference) > seen and not any(self.reference[-1].velocity),
+            "rest",
         )
         return np.array(self.reference[-1].position)
 
@@ -88,8 +99,14 @@ class Client:
 @pytest.fixture(scope="module", params=["lockstep", "free"])
 def client(types, tmp_path_factory, request):
     """Clients of two runs, each in a domain of its own."""
-    with own_domain() as domain, closing(Nodes()) as nodes, closing(Observer(domain)) as observer:
-        yield Client(nodes, observer, tmp_path_factory.mktemp("goals"), types, request.param)
+    with (
+        own_domain() as domain,
+        closing(Nodes()) as nodes,
+        closing(Observer(domain)) as observer,
+    ):
+        yield Client(
+            nodes, observer, tmp_path_factory.mktemp("goals"), types, request.param
+        )
 
 
 def test_a_goal_is_followed_with_feedback_and_succeeds(client):
@@ -97,9 +114,13 @@ def test_a_goal_is_followed_with_feedback_and_succeeds(client):
     assert handle.accepted
 
     def times():
-        return [1e-9 * nanoseconds(message.desired.time_from_start) for message in client.feedback]
+        return [
+            1e-9 * nanoseconds(message.desired.time_from_start)
+            for message in client.feedback
+        ]
 
-    # rclpy takes one feedback at a time, and hears none of those left when the result comes.
+    # rclpy takes one feedback at a time, and hears none of those left when the result
+    # comes.
     client.observer.until(lambda: max(times(), default=0.0) >= 0.6, "the last feedback")
     ending, said = client.result(handle)
     assert ending == SUCCEEDED, said
@@ -116,7 +137,9 @@ def test_a_goal_is_followed_with_feedback_and_succeeds(client):
 def test_what_cannot_be_followed_is_refused_with_a_reason(client):
     assert not client.send((1.0, np.add(HOME, (0.9, 0.0, 0.0)))).accepted
     client.observer.told("last_refusal", lambda reason: "gamma_1" in reason)
-    assert not client.send((1.0, HOME), path_tolerance=client.near(0.1, joint="elbow")).accepted
+    assert not client.send(
+        (1.0, HOME), path_tolerance=client.near(0.1, joint="elbow")
+    ).accepted
     elbow = "path_tolerance[0].name = 'elbow'"
     client.observer.told("last_refusal", lambda reason: elbow in reason)
 
@@ -126,7 +149,9 @@ def test_a_cancelled_goal_comes_to_rest_on_its_path(client):
     far = client.far_from(start)
     handle = client.send((20.0, far))
     client.moving(8)
-    reply = client.observer.result(handle.cancel_goal_async(), "the answer to the cancellation")
+    reply = client.observer.result(
+        handle.cancel_goal_async(), "the answer to the cancellation"
+    )
     assert len(reply.goals_canceling) == 1
     assert client.result(handle)[0] == CANCELED
     part = (client.rest() - start) / np.where(far == start, np.inf, far - start)
@@ -136,8 +161,16 @@ def test_a_cancelled_goal_comes_to_rest_on_its_path(client):
 @pytest.mark.parametrize(
     ("given", "code", "reason"),
     [
-        ({"path_tolerance": 1e-12}, ErrorCode.PATH_TOLERANCE_VIOLATED, "path tolerance 1e-12 rad"),
-        ({"goal_tolerance": 1e-15}, ErrorCode.GOAL_TOLERANCE_VIOLATED, "goal tolerance 1e-15 rad"),
+        (
+            {"path_tolerance": 1e-12},
+            ErrorCode.PATH_TOLERANCE_VIOLATED,
+            "path tolerance 1e-12 rad",
+        ),
+        (
+            {"goal_tolerance": 1e-15},
+            ErrorCode.GOAL_TOLERANCE_VIOLATED,
+            "goal tolerance 1e-15 rad",
+        ),
     ],
     ids=["path", "goal"],
 )
@@ -159,7 +192,9 @@ def test_a_new_goal_and_a_trajectory_of_the_topic_preempt_a_goal(client):
     client.moving()
     topic = client.observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     ended = second.get_result_async()
-    client.observer.publish_until(topic, trajectory((0.3, HOME)), ended.done, "the result")
+    client.observer.publish_until(
+        topic, trajectory((0.3, HOME)), ended.done, "the result"
+    )
     ending, said = client.result(second)
     assert ending == PREEMPTED and "~/joint_trajectory" in said
     # The reference never jumped.

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller against the simulator, in lockstep and running free, and against bad input."""
+"""The controller against the simulator, in lockstep and running free, and against bad
+input.
+"""
 
 import dataclasses
 import math
@@ -48,7 +50,11 @@ def written(folder, **changed):
 def twice(tmp_path_factory, forked_demos):
     """The same run of `make demo-feedforward`, two times; the folders of the bags."""
     folder = tmp_path_factory.mktemp("controller")
-    path, first, second = str(written(folder)), folder / "feedforward", folder / "second"
+    path, first, second = (
+        str(written(folder)),
+        folder / "feedforward",
+        folder / "second",
+    )
     words = ["--scene", path, "--mode", "feedforward", "--out", str(folder), "--force"]
     assert main(["demo", "feedforward", *words]) == 0
     demo.follow(path, second, "feedforward")
@@ -58,7 +64,8 @@ def twice(tmp_path_factory, forked_demos):
 def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
     """The paper's double check, through the nodes: open loop, torques held over 2 ms.
 
-    What is left is the hold, of second order (test_controller.py); at 2 ms it is as told here.
+    What is left is the hold, of second order (test_controller.py); at 2 ms it is as
+    told here.
     """
     run = tracking.read_tracking(twice[0] / "bag")
     metrics = run.metrics
@@ -69,7 +76,8 @@ def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
     feedforward, feedback = metrics.shares
     assert feedforward == pytest.approx(1.0) and not feedback.any()
     assert metrics.settling == 0.0 and metrics.limited == 0
-    assert "nan" not in (twice[0] / "tracking.txt").read_text()  # see test_run_report.py
+    # see test_run_report.py
+    assert "nan" not in (twice[0] / "tracking.txt").read_text()
     assert (twice[0] / "tracking.png").stat().st_size > 10_000
 
 
@@ -99,9 +107,15 @@ def trajectory(*points, names=NAMES, **given):
 AWAY = tuple(np.add(HOME, (0.1, -0.05, 0.0)))
 BAD = {
     "wrong names": (trajectory((1.0, AWAY), names=["a", "b", "c"]), "joint_names"),
-    "a name twice": (trajectory((1.0, AWAY), names=[NAMES[0], *NAMES[:2]]), "joint_names"),
+    "a name twice": (
+        trajectory((1.0, AWAY), names=[NAMES[0], *NAMES[:2]]),
+        "joint_names",
+    ),
     "two numbers": (trajectory((1.0, AWAY[:2])), "positions[0]"),
-    "a start elsewhere": (trajectory((0.0, np.add(HOME, 0.5)), (1.0, HOME)), "positions[0]"),
+    "a start elsewhere": (
+        trajectory((0.0, np.add(HOME, 0.5)), (1.0, HOME)),
+        "positions[0]",
+    ),
     "out of the stroke": (trajectory((1.0, np.add(HOME, (0.9, 0.0, 0.0)))), "gamma_1"),
     "out of the workspace": (trajectory((1.0, (0.35, 0.3, 1.35))), "beta_"),
     "too fast": (trajectory((0.02, AWAY)), "exceeds the limit 8 N m"),
@@ -118,8 +132,12 @@ def idle(stamp_ns=0):
 @pytest.mark.parametrize("case", BAD)  # those of points are in test_motions.py, too
 def test_a_bad_trajectory_is_refused_and_changes_nothing(case):
     message, reason = BAD[case]
-    model = dataclasses.replace(PLANT, motion=None, actuators=Actuators(torque_limit=8.0))
-    follower = TrajectoryFollower(model, ControllerNodeParameters(motion="topic", stamped=True))
+    model = dataclasses.replace(
+        PLANT, motion=None, actuators=Actuators(torque_limit=8.0)
+    )
+    follower = TrajectoryFollower(
+        model, ControllerNodeParameters(motion="topic", stamped=True)
+    )
     with pytest.raises(SstError, match=re.escape(reason)):
         follower.take(message, Measurement(HOME, (0.0, 0.0, 0.0))).outcome.result()
     assert follower.stage is Stage.WAITING
@@ -127,7 +145,9 @@ def test_a_bad_trajectory_is_refused_and_changes_nothing(case):
 
 def test_a_refusal_is_told_before_any_torque(nodes, observer, tmp_path):
     commands = observer.listen(Float64MultiArray, COMMANDS)
-    controller = nodes.run("inverse_dynamics", scene=written(tmp_path), motion="topic", timeout=1e3)
+    controller = nodes.run(
+        "inverse_dynamics", scene=written(tmp_path), motion="topic", timeout=1e3
+    )
     states = observer.publisher(JointState, "/joint_states")
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     for refused, reason in enumerate(("must come first", "points"), start=1):
@@ -135,18 +155,25 @@ def test_a_refusal_is_told_before_any_torque(nodes, observer, tmp_path):
         said = observer.told("trajectories_refused", refused)
         assert reason in said["last_refusal"] and said["samples"] == "0"
         observer.publish_until(
-            states, idle(), lambda: observer.said("stage")[-1].startswith("waiting for a"), "state"
+            states,
+            idle(),
+            lambda: observer.said("stage")[-1].startswith("waiting for a"),
+            "state",
         )
     assert commands == [] and controller.poll() is None
 
 
-def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, observer, tmp_path):
+def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(
+    nodes, observer, tmp_path
+):
     path = written(tmp_path, motion=None)
     reference = observer.listen(JointState, f"{NODE}/reference")
     # A check of a trajectory takes long on a busy machine.
     nodes.run("simulator", scene=path, sync="lockstep", lockstep_timeout=0.0)
     given = {"mode": "computed_torque", "stamped": True, "motion": "topic"}
-    controller = nodes.run("inverse_dynamics", scene=path, feedforward_at="middle", **given)
+    controller = nodes.run(
+        "inverse_dynamics", scene=path, feedforward_at="middle", **given
+    )
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     first, second = trajectory((2.0, AWAY[::-1])), trajectory((0.2, HOME))
     first.joint_names = NAMES[::-1]
@@ -154,7 +181,8 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     def off():
         return np.abs(np.subtract(reference[-1].position, HOME)).max()
 
-    # Refused before the first joint_states, where it begins; one that comes twice goes on.
+    # Refused before the first joint_states, where it begins; one that comes twice goes
+    # on.
     observer.publish_until(publisher, first, lambda: reference, "the motion")
     observer.until(lambda: off() > 2e-3, "motion away")
     publisher.publish(second)  # while it moves: goes on from there
@@ -163,24 +191,39 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(nodes, obser
     assert status == 0
     gamma = np.array([message.position for message in reference])
     rate = np.array([message.velocity for message in reference])
-    assert set(np.diff([observer.stamp(message) for message in reference])) == {2_000_000}
+    assert set(np.diff([observer.stamp(message) for message in reference])) == {
+        2_000_000
+    }
     # The reference is smooth through the change: its rate is the slope of its angles.
     slope = np.diff(gamma, axis=0) / 0.002
     assert np.abs(slope - 0.5 * (rate[1:] + rate[:-1])).max() < 1e-3
-    errors = [line.split()[-3:] for line in out.splitlines() if line.startswith("error, largest")]
+    errors = [
+        line.split()[-3:]
+        for line in out.splitlines()
+        if line.startswith("error, largest")
+    ]
     assert errors and np.array(errors, dtype=float).max() < 1e-4
 
 
-def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(nodes, observer, tmp_path):
-    """Ten points a second, each a second ahead; on a busy machine, so at a quarter of the speed."""
+def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(
+    nodes, observer, tmp_path
+):
+    """Ten points a second, each a second ahead.
+
+    On a busy machine, so at a quarter of the speed.
+    """
     path = written(tmp_path, motion=None)
     reference = observer.listen(JointState, f"{NODE}/reference")
     nodes.run("simulator", scene=path, wait_for_command=True, real_time_factor=0.25)
-    controller = nodes.run("inverse_dynamics", scene=path, mode="computed_torque", motion="topic")
+    controller = nodes.run(
+        "inverse_dynamics", scene=path, mode="computed_torque", motion="topic"
+    )
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     observer.told("stage", "waiting for a trajectory")
     publisher.publish(trajectory((0.25, HOME)))
-    observer.until(lambda: reference, "the process that checks, which may take long to start")
+    observer.until(
+        lambda: reference, "the process that checks, which may take long to start"
+    )
     begin, sent = time.monotonic(), 0
     while sent < 80:
         passed = time.monotonic() - begin
@@ -190,10 +233,13 @@ def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(nodes, observe
             sent += 1
         observer.executor.spin_once(timeout_sec=0.01)
     observer.until(
-        lambda: np.abs(np.subtract(reference[-1].position, goal)).max() < 1e-9, "the end"
+        lambda: np.abs(np.subtract(reference[-1].position, goal)).max() < 1e-9,
+        "the end",
     )
     said = observer.told("trajectories_refused", 0)
-    assert said["level"] == b"\x00" or said["said"].endswith("samples do not come at rate")
+    assert said["level"] == b"\x00" or said["said"].endswith(
+        "samples do not come at rate"
+    )
     assert observer.phase("running") and controller.poll() is None
     stamps, gamma, rate = (
         np.array(row)
@@ -201,7 +247,8 @@ def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(nodes, observe
                     [m.velocity for m in reference])
     )  # fmt: skip
     dt = 1e-9 * np.diff(stamps)[:, None]
-    # The largest acceleration of a quintic of 0.25 s is below 6 * 0.2 / 0.25^2 = 20 rad/s^2.
+    # The largest acceleration of a quintic of 0.25 s is below 6 * 0.2 / 0.25^2 = 20
+    # rad/s^2.
     assert np.abs(np.diff(rate, axis=0) / dt).max() < 20.0
     off = np.diff(gamma, axis=0) - 0.5 * dt * (rate[1:] + rate[:-1])
     assert np.abs(off / dt**2).max() < 4.0 and np.ptp(gamma[:, 0]) > 0.1
@@ -215,41 +262,59 @@ def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
     reference = observer.listen(JointState, f"{NODE}/reference")
     states = observer.states
     recorder = nodes.run("recorder", output=bag)
-    # Slowly: while a busy machine lets the controller wait, the manipulator hardly moves.
+    # Slowly: while a busy machine lets the controller wait, the manipulator hardly
+    # moves.
     slow = {"real_time_factor": 0.1, "command_timeout": 0.1}
     simulator = nodes.run("simulator", scene=path, wait_for_command=True, **slow)
     assert nodes.line(recorder).startswith("ready")
     # The recorder reads the commands and the reference before the run begins.
     waits = {"min_subscribers": 2, "wait_for_recorder": "true"}
-    controller = nodes.run("inverse_dynamics", scene=path, mode="feedforward_pd", **waits)
+    controller = nodes.run(
+        "inverse_dynamics", scene=path, mode="feedforward_pd", **waits
+    )
     observer.until(lambda: len(reference) > 100, "the motion")
     controller.send_signal(signal.SIGKILL)
-    # Ten times the timeout: a busy machine may have let go before, with commands on their way.
-    said = observer.told("command_age_s", lambda age: age != "none" and float(age) > 1.0)
-    observer.until(lambda: not np.any([s.effort[:3] for s in states[-100:]]), "100 x zero torque")
+    # Ten times the timeout: a busy machine may have let go before, with commands on
+    # their way.
+    said = observer.told(
+        "command_age_s", lambda age: age != "none" and float(age) > 1.0
+    )
+    observer.until(
+        lambda: not np.any([s.effort[:3] for s in states[-100:]]), "100 x zero torque"
+    )
     assert said["phase"] == "running" and int(said["command_timeouts"]) >= 1
     assert nodes.stop(simulator)[0] == 0 and nodes.stop(recorder)[0] == 0
     run = recording.read(bag)
     assert not run.effort[-1].any() and run.effort[:100].any()  # let go
     metrics = tracking.read_tracking(bag).metrics
-    # The last reference that was heard may have no state beside it: the controller is gone.
+    # The last reference that was heard may have no state beside it: the controller is
+    # gone.
     assert metrics.samples > 90 and metrics.largest.max() < 1e-3
 
 
 def test_a_fault_of_the_simulator_ends_it_with_the_reason(nodes, observer, tmp_path):
     """The model does not know of the ends of the plant's stroke."""
     out = DesiredMotion(to_angles=ToAngles(gamma=(1.7, HOME[1], HOME[2]), duration=0.3))
-    ignorant = {"stroke": Stroke(at_end="ignore"), "workspace": Workspace(at_edge="ignore")}
+    ignorant = {
+        "stroke": Stroke(at_end="ignore"),
+        "workspace": Workspace(at_edge="ignore"),
+    }
     model = written(tmp_path, motion=out, **ignorant).rename(tmp_path / "model.yaml")
     plant = written(tmp_path, motion=None)
     nodes.run("simulator", scene=plant, sync="lockstep", real_time_factor=0.0)
     controller = nodes.run("inverse_dynamics", scene=model, stamped="true")
     status, out, err = nodes.ended(controller, 60)
-    assert status == 1 and "the simulator stopped: fault: " in err and "error, largest" in out
+    assert (
+        status == 1
+        and "the simulator stopped: fault: " in err
+        and "error, largest" in out
+    )
 
 
 def test_a_phase_that_is_heard_late_is_no_reset(nodes, observer, tmp_path):
-    """A busy machine may find the topic of the phase after the first samples of the run."""
+    """A busy machine may find the topic of the phase after the first samples of the
+    run.
+    """
     path = written(tmp_path)
     motion = reference_motion(scene.load(str(path)))
     observer.listen(Float64MultiArray, COMMANDS)
@@ -261,13 +326,18 @@ def test_a_phase_that_is_heard_late_is_no_reset(nodes, observer, tmp_path):
     phases = observer.node.create_publisher(String, "/sst_simulator/phase", latched)
 
     def say(phase, last_ns):
-        """Tell a phase, then ten samples that are answered; return the last reference."""
+        """Tell a phase, then ten samples that are answered.
+
+        Return the last reference.
+        """
         phases.publish(String(data=phase))
         observer.until(phases.get_subscription_count, "the controller")
         assert phases.wait_for_all_acked()
         for stamp in range(last_ns - 18_000_000, last_ns + 1, 2_000_000):
             states.publish(idle(stamp))
-            observer.until(lambda stamp=stamp: observer.stamp(reference[-1]) == stamp, "answer")
+            observer.until(
+                lambda stamp=stamp: observer.stamp(reference[-1]) == stamp, "answer"
+            )
         return list(reference[-1].position)
 
     assert say("waiting", 22_000_000) == list(motion.at(0.02).gamma)
@@ -284,7 +354,10 @@ def test_what_is_not_finite_ends_it_with_zero_torque(nodes, observer, tmp_path):
     for state in (first, bad):
         state.position[0] += 0.01  # from there the feedback has a torque
     observer.publish_until(
-        states, first, lambda: reference and commands and commands[-1].data[0] != 0.0, "an answer"
+        states,
+        first,
+        lambda: reference and commands and commands[-1].data[0] != 0.0,
+        "an answer",
     )
     bad.velocity[2] = np.nan
     states.publish(bad)

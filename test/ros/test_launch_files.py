@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files by `ros2 launch`: each ends when its work has, with the right status."""
+"""The launch files by `ros2 launch`: each ends when its work has, with the right
+status.
+"""
 
 import contextlib
 import json
@@ -17,7 +19,9 @@ from rosbags.rosbag2 import Reader
 
 from sst_ros.recording import recording
 
-PREFIXES = [Path(path) for path in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
+PREFIXES = [
+    Path(path) for path in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+]
 RUN_S = 110
 ROS2 = shutil.which("ros2")
 
@@ -32,7 +36,10 @@ pytestmark = [
     pytest.mark.timeout(400),  # several launches in a test
     pytest.mark.skipif(
         not (ROS2 and installed("ros2launch") and installed("sst_ros")),
-        reason="needs `ros2 launch` of a ROS installation with this package built by colcon",
+        reason=(
+            "needs `ros2 launch` of a ROS installation with this package built by"
+            " colcon"
+        ),
     ),
 ]
 needs_rosbag2 = pytest.mark.skipif(
@@ -109,14 +116,22 @@ def counts(bag):
 
 def frames(bag, name):
     with AnyReader([bag]) as reader:
-        connections = [one for one in reader.connections if one.topic.endswith(f"/{name}")]
+        connections = [
+            one for one in reader.connections if one.topic.endswith(f"/{name}")
+        ]
         for connection, _, data in reader.messages(connections):
             yield reader.deserialize(data, connection.msgtype).header.frame_id
 
 
 @pytest.mark.parametrize("bag", ["sst", pytest.param("ros2", marks=needs_rosbag2)])
 def test_a_recorded_run_is_complete_and_ends_the_launch(launch, tmp_path, bag):
-    words = ["play:=true", "duration:=0.5", "record:=true", f"bag:={bag}", "output:=bag"]
+    words = [
+        "play:=true",
+        "duration:=0.5",
+        "record:=true",
+        f"bag:={bag}",
+        "output:=bag",
+    ]
     launch("simulate.launch.py", *words).ended()
     read = recording.read(tmp_path / "bag")
     assert (read.time_ns == [2_000_000 * k for k in range(251)]).all()
@@ -127,12 +142,16 @@ def test_a_recorded_run_is_complete_and_ends_the_launch(launch, tmp_path, bag):
 
 
 def without(package):
-    return pytest.mark.skipif(installed(package), reason=f"of an installation without {package}")
+    return pytest.mark.skipif(
+        installed(package), reason=f"of an installation without {package}"
+    )
 
 
 NEEDS = r"this needs the ROS package\(s\) .*"
 DISTRIBUTION = os.environ.get("ROS_DISTRO")
-UNPLAYED = r"(?s)(?=.*must have torque and duration).*torque_player failed with exit status 1"
+UNPLAYED = (
+    r"(?s)(?=.*must have torque and duration).*torque_player failed with exit status 1"
+)
 
 
 @pytest.mark.parametrize(
@@ -181,16 +200,25 @@ def test_feedforward_twice_and_beside_the_first_recording(launch, tmp_path):
 
 def test_namespace_params_file_and_log_level_reach_the_nodes(launch, tmp_path):
     (tmp_path / "given.yaml").write_text(
-        "/**: {ros__parameters: {duration: 0.2, scene: example1, rate: 500, sync: free}}"
+        "/**: {ros__parameters: {duration: 0.2, scene: example1, rate: 500, sync:"
+        " free}}"
     )
-    words = ["namespace:=left", "params_file:=given.yaml", "log_level:=warn", "play:=true"]
-    run = launch("simulate.launch.py", *words, "record:=true", "bag:=sst", "output:=bag").ended()
+    words = [
+        "namespace:=left",
+        "params_file:=given.yaml",
+        "log_level:=warn",
+        "play:=true",
+    ]
+    run = launch(
+        "simulate.launch.py", *words, "record:=true", "bag:=sst", "output:=bag"
+    ).ended()
     assert "[INFO] [" not in "".join(re.findall(r"\[simulator-\d\] .*", run.text))
     found = counts(tmp_path / "bag")
     assert found["/left/joint_states"] >= 101
     assert found["/left/sst_simulator/scene"] == 1
     assert recording.read(tmp_path / "bag").scene.name == "example1"
-    assert {*frames(tmp_path / "bag", "orientation")} == {"left/base_link"}  # as those of /tf
+    # as those of /tf
+    assert {*frames(tmp_path / "bag", "orientation")} == {"left/base_link"}
 
 
 def test_ctrl_c_ends_a_view_and_a_recorder_closes_its_bag(launch, tmp_path):
@@ -237,7 +265,10 @@ def generate_launch_description():
 
 @pytest.mark.parametrize("ending", ["its end", "a kill"])
 def test_the_end_of_one_of_two_robots_does_not_end_the_other(domain, tmp_path, ending):
-    """A file is included twice, in scopes of their own or not; each has its recorder and folder."""
+    """A file is included twice, in scopes of their own or not.
+
+    Each has its recorder and folder.
+    """
     left = "0.5" if ending == "its end" else "0.0"
     text = TWO_ROBOTS.replace("LEFT", left).replace("SCOPED", str(ending == "its end"))
     (tmp_path / "two.launch.py").write_text(text)
@@ -275,9 +306,14 @@ try:
 except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
     pass
 """
-"""Stands in for the real one, with the messages of its plug-ins for an effort controller."""
+"""Stands in for the real one, with the messages of its plug-ins for an effort
+controller.
+"""
 STAND_INS = {
-    "controller_manager": {"ros2_control_node": CONTROLLER_MANAGER, "spawner": "#!/bin/true\n"},
+    "controller_manager": {
+        "ros2_control_node": CONTROLLER_MANAGER,
+        "spawner": "#!/bin/true\n",
+    },
     "robot_state_publisher": {"robot_state_publisher": "#!/bin/sh\nexec sleep 60\n"},
     "joint_state_broadcaster": {},
     "joint_trajectory_controller": {},
@@ -299,7 +335,9 @@ def stand_in(monkeypatch, prefix, packages):
                 path = prefix / "lib" / package / name
                 path.write_text(text)
                 path.chmod(0o755)
-    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{prefix}:{os.environ['AMENT_PREFIX_PATH']}")
+    monkeypatch.setenv(
+        "AMENT_PREFIX_PATH", f"{prefix}:{os.environ['AMENT_PREFIX_PATH']}"
+    )
 
 
 LOSES_THE_FIRST = """#!/usr/bin/env -S --ignore-signal=INT python3
@@ -310,8 +348,12 @@ time.sleep(1000)
 """`ros2 bag record` while it starts, between the handler of rclcpp and its own."""
 
 
-def test_a_recorder_that_loses_a_signal_while_it_starts_is_ended(launch, tmp_path, monkeypatch):
-    """The controller fails at its start: what is not up yet ends as well, by the next signal."""
+def test_a_recorder_that_loses_a_signal_while_it_starts_is_ended(
+    launch, tmp_path, monkeypatch
+):
+    """The controller fails at its start: what is not up yet ends as well, by the next
+    signal.
+    """
     stand_in(monkeypatch, tmp_path, {"ros2bag": {}, "rosbag2_storage_mcap": {}})
     path = tmp_path / "bin" / "ros2"
     path.parent.mkdir()
@@ -319,13 +361,17 @@ def test_a_recorder_that_loses_a_signal_while_it_starts_is_ended(launch, tmp_pat
     path.chmod(0o755)
     monkeypatch.setenv("PATH", f"{path.parent}:{os.environ['PATH']}")
     (tmp_path / "given.yaml").write_text("/**: {ros__parameters: {mode: nosuch}}")
-    run = launch("feedforward.launch.py", "params_file:=given.yaml", "bag:=ros2").ended(1)
+    run = launch("feedforward.launch.py", "params_file:=given.yaml", "bag:=ros2").ended(
+        1
+    )
     assert "inverse_dynamics failed with exit status 1" in run.text
     assert "escalating to 'SIGTERM'" in run.text
 
 
 @pytest.mark.parametrize("words", [(), ("sync:=lockstep", "publish_rate:=100")])
-def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch, words):
+def test_ros2_control_begins_a_run_by_its_commands(
+    launch, tmp_path, monkeypatch, words
+):
     stand_in(monkeypatch, tmp_path, STAND_INS)
     run = launch("ros2_control.launch.py", *words)
     run.until("running")
@@ -336,7 +382,9 @@ def test_ros2_control_begins_a_run_by_its_commands(launch, tmp_path, monkeypatch
 
 def test_no_launch_file_is_left_out():
     text = Path(__file__).read_text(encoding="utf-8")
-    found = {path.name for path in (Path(__file__).parents[2] / "launch").glob("*.launch.py")}
+    found = {
+        path.name for path in (Path(__file__).parents[2] / "launch").glob("*.launch.py")
+    }
     assert found and all(f'"{name.partition(".")[0]}' in text for name in found)
 
 
@@ -344,20 +392,33 @@ def test_no_launch_file_is_left_out():
 def test_recorded_commands_are_played_into_a_fresh_simulator(launch, tmp_path):
     # It hardly moves by them, also where they are recorded and played for a long time.
     torques = [f"{k / 100},1e-8,2e-8,3e-8" for k in range(101)]
-    (tmp_path / "torques.csv").write_text("\n".join(["time,tau_1,tau_2,tau_3", *torques]))
+    (tmp_path / "torques.csv").write_text(
+        "\n".join(["time,tau_1,tau_2,tau_3", *torques])
+    )
     (tmp_path / "given.yaml").write_text(
-        "/**: {ros__parameters: {csv: torques.csv, wait_for_command: true, command_timeout: 0.0}}"
+        "/**: {ros__parameters: {csv: torques.csv, wait_for_command: true,"
+        " command_timeout: 0.0}}"
     )
     words = ["params_file:=given.yaml", "record:=true", "bag:=sst"]
-    launch("simulate.launch.py", "play:=true", "sync:=free", *words, "output:=bag").ended()
-    fresh = launch("simulate.launch.py", *words, "output:=again")  # has all the time it takes
+    launch(
+        "simulate.launch.py", "play:=true", "sync:=free", *words, "output:=bag"
+    ).ended()
+    # has all the time it takes
+    fresh = launch("simulate.launch.py", *words, "output:=again")
     fresh.until("waiting")
     topic = "/sst_simulator/commands"
-    # A player that keeps ten messages, as it does by itself, cannot repeat those that a busy
-    # machine has lost; the simulator keeps 50: slower than they were recorded.
+    # A player that keeps ten messages, as it does by itself, cannot repeat those that a
+    # busy machine has lost; the simulator keeps 50: slower than they were recorded.
     kept = {topic: {"reliability": "reliable", "history": "keep_last", "depth": 1000}}
     (tmp_path / "qos.yaml").write_text(json.dumps(kept))
-    options = ["--rate", "0.25", "--delay", "10", "--qos-profile-overrides-path", "qos.yaml"]
+    options = [
+        "--rate",
+        "0.25",
+        "--delay",
+        "10",
+        "--qos-profile-overrides-path",
+        "qos.yaml",
+    ]
     options += ["--wait-for-all-acked", "10000"]
     player = Launch(tmp_path, "bag", "play", "bag", "--topics", topic, *options)
     player.ended()

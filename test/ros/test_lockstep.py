@@ -22,7 +22,9 @@ pytestmark = pytest.mark.ros
 AT_ONCE = {"sync": "lockstep", "real_time_factor": 0.0}
 PERIOD_NS = 2_000_000
 EXAMPLE = Path(__file__).parents[2] / "examples" / "controller.py"
-GOAL = ast.literal_eval(re.search(r"^GOAL = (\(.*?\))", EXAMPLE.read_text(), re.MULTILINE)[1])
+GOAL = ast.literal_eval(
+    re.search(r"^GOAL = (\(.*?\))", EXAMPLE.read_text(), re.MULTILINE)[1]
+)
 
 
 def pd_torque(gamma, gamma_dot):
@@ -31,8 +33,12 @@ def pd_torque(gamma, gamma_dot):
 
 
 @pytest.mark.parametrize("loaded", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_simulate_and_the_bag_of_nodes_have_the_same_bits(nodes, observer, tmp_path, loaded):
-    """One closed loop, PD on gamma: nodes answer every sample by its stamp; then in one call.
+def test_simulate_and_the_bag_of_nodes_have_the_same_bits(
+    nodes, observer, tmp_path, loaded
+):
+    """One closed loop, PD on gamma: nodes answer every sample by its stamp.
+
+    Then in one call.
 
     In test_simulate.py the call has the bits of single steps.
     """
@@ -40,7 +46,8 @@ def test_simulate_and_the_bag_of_nodes_have_the_same_bits(nodes, observer, tmp_p
     rates = {"rate": 500, "publish_rate": 500}
     simulator = nodes.run("simulator", duration=0.3, **rates, **AT_ONCE)
     assert nodes.line(recorder).startswith("ready")
-    for _ in range(3 if loaded else 0):  # all processors are busy until the end of the test
+    # all processors are busy until the end of the test
+    for _ in range(3 if loaded else 0):
         nodes.start("", executable=[sys.executable, "-c", "while True: pass"])
     publisher = observer.node.create_publisher(JointState, STAMPED, 10)
 
@@ -49,7 +56,9 @@ def test_simulate_and_the_bag_of_nodes_have_the_same_bits(nodes, observer, tmp_p
         publisher.publish(named(torque, state.header.stamp))
 
     observer.node.create_subscription(JointState, "/joint_states", answer, 10)
-    observer.until(lambda: simulator.poll() is not None, "end of the run", timeout=100.0)
+    observer.until(
+        lambda: simulator.poll() is not None, "end of the run", timeout=100.0
+    )
     assert simulator.returncode == 0
     assert nodes.stop(recorder)[0] == 0
     recorded = recording.read(tmp_path / "bag")
@@ -76,8 +85,9 @@ def test_simulate_and_the_bag_of_nodes_have_the_same_bits(nodes, observer, tmp_p
 class ControllerManager:
     """Stands in for a controller manager with use_sim_time whose hardware is hardware/.
 
-    It is updated where /clock is a period or more after the update before, by the joint state of
-    that time, however late that comes, and answers it; before the run from the update `begins` on.
+    It is updated where /clock is a period or more after the update before, by the joint
+    state of that time, however late that comes, and answers it; before the run from the
+    update `begins` on.
     """
 
     def __init__(self, node, period_ns, begins):
@@ -113,7 +123,9 @@ class ControllerManager:
 
 
 @pytest.mark.parametrize("rate", [100, 500])
-def test_a_controller_manager_by_our_clock_has_one_update_for_each_sample(nodes, domain, rate):
+def test_a_controller_manager_by_our_clock_has_one_update_for_each_sample(
+    nodes, domain, rate
+):
     """The same bits whether its controller is there at once or later."""
     count = int(0.2 * rate) + 1
     rates = {"rate": 500, "publish_rate": rate, "duration": 0.2}
@@ -122,18 +134,24 @@ def test_a_controller_manager_by_our_clock_has_one_update_for_each_sample(nodes,
         with contextlib.closing(Observer(domain)) as observer:
             manager = ControllerManager(observer.node, 10**9 // rate, begins)
             simulator = nodes.run("simulator", publish_clock=True, **rates, **AT_ONCE)
-            observer.until(lambda heard=manager: heard.answered == count, "end of the run", 100.0)
+            observer.until(
+                lambda heard=manager: heard.answered == count, "end of the run", 100.0
+            )
             assert nodes.ended(simulator)[0] == 0
         samples = [state for state in manager.states if Observer.stamp(state)]
         assert manager.updates[-count:] == [*map(Observer.stamp, samples)]
         assert len(manager.updates) > count + begins
         assert set(np.diff(manager.updates)) == {10**9 // rate}
-        runs.append([(*state.position, *state.velocity, *state.effort) for state in samples])
+        runs.append(
+            [(*state.position, *state.velocity, *state.effort) for state in samples]
+        )
     assert runs[0] == runs[1]
     assert np.ptp(runs[0], axis=0)[:3].min() > 1e-3  # it moves
 
 
-@pytest.mark.parametrize("name", [pytest.param("example1", marks=pytest.mark.slow), "example2"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("example1", marks=pytest.mark.slow), "example2"]
+)
 def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
     """The same samples as by the default equations."""
     given = {"scene": name, "equations": "virtual_work", "duration": 0.05}
@@ -157,5 +175,7 @@ def test_the_example_of_a_controller_reaches_its_goal(nodes, observer, sync):
     nodes.run("simulator", scene="example2", sync=sync, wait_for_command=True)
     at_goal = pytest.approx(GOAL, abs=0.02)
     observer.until(
-        lambda: observer.states and observer.states[-1].position[:3] == at_goal, "goal", 90.0
+        lambda: observer.states and observer.states[-1].position[:3] == at_goal,
+        "goal",
+        90.0,
     )

@@ -12,7 +12,9 @@ RATE, PERIOD = 200, 0.005
 
 
 def measured(nodes, observer, *, sync="lockstep", seconds=1.0, **given):
-    """Stamps [ns], angles and rates as they are measured and as they are, in a run of example2."""
+    """Stamps [ns], angles and rates as they are measured and as they are, in a run of
+    example2.
+    """
     heard = observer.states, observer.listen(JointState, TRUE)
     begun = [len(messages) for messages in heard]
     waits = f"[joint_states,{TRUE}]"
@@ -24,7 +26,9 @@ def measured(nodes, observer, *, sync="lockstep", seconds=1.0, **given):
         nodes.run("torque_player", rate=RATE)
     observer.until(lambda: simulator.poll() is not None, "the end", 100.0)
     count = round(seconds * RATE) + 1
-    observer.until(lambda: len(observer.stamps(heard[1][begun[1] :])) == count, "all samples")
+    observer.until(
+        lambda: len(observer.stamps(heard[1][begun[1] :])) == count, "all samples"
+    )
     found = []
     for messages, first in zip(heard, begun, strict=True):
         run = [one for one in messages[first:] if observer.stamp(one)]
@@ -41,7 +45,8 @@ def test_noise_is_that_of_the_parameters_and_repeats_by_seed(nodes, observer):
     # The deviation of 9 x 201 numbers is known to 1 / sqrt(2 n) = 1.7 %.
     assert off[:, :9].std() == pytest.approx(1e-3, rel=0.07)
     assert off[:, 9:].std() == pytest.approx(0.1, rel=0.07)
-    assert np.abs(np.corrcoef(off.T) - np.eye(18)).max() < 0.4  # of one joint and another: 1 / 14
+    # of one joint and another: 1 / 14
+    assert np.abs(np.corrcoef(off.T) - np.eye(18)).max() < 0.4
     (_, again), (_, same) = measured(nodes, observer, **noise)
     assert np.array_equal(again, seen) and np.array_equal(same, true)
 
@@ -54,7 +59,9 @@ def test_encoders_count_and_what_is_late_is_what_was(nodes, observer):
     step = 2.0 * np.pi / counts
     angles = seen[:, :9] / step
     assert np.abs(angles - np.round(angles)).max() < 1e-9
-    assert np.abs(seen[delay:, :9] - true[:-delay, :9]).max() <= 0.5 * step * (1.0 + 1e-9)
+    assert np.abs(seen[delay:, :9] - true[:-delay, :9]).max() <= 0.5 * step * (
+        1.0 + 1e-9
+    )
     rates = np.diff(seen[:, :9], axis=0) / PERIOD
     np.testing.assert_allclose(seen[delay + 1 :, 9:], rates[delay:], rtol=0, atol=1e-9)
 

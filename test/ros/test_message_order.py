@@ -133,7 +133,9 @@ def test_the_end_of_the_run_ends_who_commands_in_every_order(make, kind):
         for message in messages:
             give(worker, message)
         worker.watch()
-        assert worker.done.is_set(), [getattr(message, "data", "state") for message in messages]
+        assert worker.done.is_set(), [
+            getattr(message, "data", "state") for message in messages
+        ]
         worker.node.destroy_node()
 
 
@@ -150,7 +152,9 @@ def test_joint_states_of_another_robot_are_no_sign_of_life(make, kind):
     assert disturbed.foreign_states == 6
     disturbed.heard_s -= 11.0
     give(disturbed, GRIPPER)
-    with pytest.raises(SstError, match=r"no joint_states for 11.*: 7 messages without gamma_1"):
+    with pytest.raises(
+        SstError, match=r"no joint_states for 11.*: 7 messages without gamma_1"
+    ):
         disturbed.watch()
 
 
@@ -170,11 +174,21 @@ def test_a_refused_parameter_is_named_with_its_node(ros):
     worker = Worker("sst_simulator", SimulatorParameters)
     (result,) = worker.node.set_parameters([Parameter("real_time_factor", value=1e-9)])
     worker.node.destroy_node()
-    assert result.reason == "/sst_simulator: real_time_factor = 1e-09: must be 0 or >= 0.001"
+    assert (
+        result.reason
+        == "/sst_simulator: real_time_factor = 1e-09: must be 0 or >= 0.001"
+    )
 
 
 @pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
 def test_a_part_of_the_actuators_is_refused_by_name(make, kind):
     worker = make(kind)
-    with pytest.raises(SstError, match=r"joint_states has no gamma_2, gamma_3.*'gamma_1', 'mu_1'"):
-        give(worker, JointState(name=["gamma_1", "mu_1"], position=[0.0] * 2, velocity=[0.0] * 2))
+    with pytest.raises(
+        SstError, match=r"joint_states has no gamma_2, gamma_3.*'gamma_1', 'mu_1'"
+    ):
+        give(
+            worker,
+            JointState(
+                name=["gamma_1", "mu_1"], position=[0.0] * 2, velocity=[0.0] * 2
+            ),
+        )

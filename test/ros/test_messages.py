@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as bytes, against what rclpy and rosbags read from them; what is shown without a run."""
+"""Messages as bytes, against what rclpy and rosbags read from them.
+
+What is shown without a run.
+"""
 
 from types import SimpleNamespace
 
@@ -50,7 +53,10 @@ def test_a_state_is_read_as_it_is(state):
     assert tuple(read.velocity) == at.gamma_dot + at.mu_dot + at.beta_dot
     assert tuple(read.effort) == state.torque + (0.0,) * 6
     q, angles = orientation.quaternion, euler.vector
-    assert ((q.x, q.y, q.z, q.w), orientation.header.frame_id) == (state.quaternion, "base_link")
+    assert ((q.x, q.y, q.z, q.w), orientation.header.frame_id) == (
+        state.quaternion,
+        "base_link",
+    )
     expected = zyz_angles(rotation_matrix(state.quaternion))
     np.testing.assert_allclose((angles.x, angles.y, angles.z), expected, atol=1e-14)
 
@@ -68,7 +74,9 @@ def test_torques_of_every_tick_are_read_as_they_were(count, moments):
         assert len(log) == 0
         more = (7.0, 8.0, 9.0) if moments else ()
         read = deserialize_message(data, JointTrajectory)
-        assert [tuple(point.effort) for point in read.points] == [(*row, *more) for row in rows]
+        assert [tuple(point.effort) for point in read.points] == [
+            (*row, *more) for row in rows
+        ]
         times = [nanoseconds(point.time_from_start) for point in read.points]
         assert times == [(i + 1) * 1_500_000_000 for i in range(count)]
         assert len(read.joint_names) == 3 + len(more)
@@ -84,7 +92,10 @@ def test_ticks_noted_at_once_are_those_noted_one_by_one():
 
 @pytest.mark.parametrize("frame_id", ["", "idle", "four"])
 def test_the_layout_is_that_of_the_middleware(state, frame_id):
-    """Byte for byte, except padding, which the middleware leaves as it is; none is left over."""
+    """Byte for byte, except padding, which the middleware leaves as it is.
+
+    None is left over.
+    """
     store = get_typestore(Stores.ROS2_JAZZY)  # rosbags refuses bytes that are left over
     states = stamped(state_messages(frame_id), 7, state)
     log = TorqueLog(1_000_000, moments=True)
@@ -96,26 +107,39 @@ def test_the_layout_is_that_of_the_middleware(state, frame_id):
         package = kind.__module__.partition(".")[0]
         store.deserialize_cdr(data, f"{package}/msg/{kind.__name__}")
         again = serialize_message(deserialize_message(data, kind))
-        assert all(ours == theirs for ours, theirs in zip(data, again, strict=False) if ours), kind
+        assert all(
+            ours == theirs for ours, theirs in zip(data, again, strict=False) if ours
+        ), kind
         assert deserialize_message(again, kind) == deserialize_message(data, kind)
 
 
 angle = st.floats(-np.pi, np.pi)
 
 
-@given(theta=angle, phi=st.floats(1e-6, np.pi - 1e-6), psi=angle, length=st.sampled_from([1, -1]))
+@given(
+    theta=angle,
+    phi=st.floats(1e-6, np.pi - 1e-6),
+    psi=angle,
+    length=st.sampled_from([1, -1]),
+)
 def test_zyz_angles_are_those_of_the_rotation(theta, phi, psi, length):
-    """Where the sine of phi is small both forms lose digits of theta and psi: compare rotations."""
+    """Where the sine of phi is small both forms lose digits of theta and psi: compare
+    rotations.
+    """
     half = phi / 2.0, (theta + psi) / 2.0, (theta - psi) / 2.0
     x, y = -np.sin(half[0]) * np.sin(half[2]), np.sin(half[0]) * np.cos(half[2])
     z, w = np.cos(half[0]) * np.sin(half[1]), np.cos(half[0]) * np.cos(half[1])
-    found = np.array(publications.zyz_angles([float(length * part) for part in (x, y, z, w)]))
+    found = np.array(
+        publications.zyz_angles([float(length * part) for part in (x, y, z, w)])
+    )
     assert np.all(np.abs(found) <= np.pi)
     apart = found - (theta, phi, psi)
     np.testing.assert_allclose(np.exp(1j * apart), 1.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("q", [(0.0, 0.0, 0.6, 0.8), (0.6, 0.8, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)])
+@pytest.mark.parametrize(
+    "q", [(0.0, 0.0, 0.6, 0.8), (0.6, 0.8, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)]
+)
 def test_at_a_pole_psi_carries_it_all(q):
     np.testing.assert_allclose(
         publications.zyz_angles(q), zyz_angles(rotation_matrix(q)), atol=1e-15
@@ -135,10 +159,14 @@ class Topic:
 
 @pytest.fixture
 def shown():
-    """A function that shows a state, and the last messages of all topics, by their names."""
+    """A function that shows a state, and the last messages of all topics, by their
+    names.
+    """
     made = []
     create = lambda *given: made.append(Topic(*given)) or made[-1]  # noqa: E731
-    node = SimpleNamespace(publishers=made, create_publisher=create, get_fully_qualified_name=str)
+    node = SimpleNamespace(
+        publishers=made, create_publisher=create, get_fully_qualified_name=str
+    )
     simulated = SimulatorTopics(node, load_scene("example2"), SimulatorParameters())
 
     def show(state, *, at_rest=False):

@@ -23,7 +23,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_what_can_change_does_and_the_rest_is_refused_with_the_reason(nodes, observer):
-    nodes.run("simulator", rate=100, publish_rate=100)  # with time to spare on a slow machine
+    # with time to spare on a slow machine
+    nodes.run("simulator", rate=100, publish_rate=100)
     observer.phase("running")
 
     def put(name, value):
@@ -33,7 +34,9 @@ def test_what_can_change_does_and_the_rest_is_refused_with_the_reason(nodes, obs
     assert put("real_time_factor", 4.0) == (True, "")
     observer.told("real_time_factor_now", lambda factor: float(factor) > 2.0)
     assert put("command_timeout", 0.0)[0]
-    refused = [("real_time_factor", value) for value in (-1.0, math.nan, math.inf, "fast")]
+    refused = [
+        ("real_time_factor", value) for value in (-1.0, math.nan, math.inf, "fast")
+    ]
     refused += [("command_timeout", -0.1), ("rate", 500), ("scene", "example1")]
     for name, value in (*refused, ("sync", "lockstep"), ("use_sim_time", True)):
         successful, reason = put(name, value)
@@ -53,7 +56,9 @@ def scheduling(process):
     return sorted(found)
 
 
-def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(nodes, observer):
+def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(
+    nodes, observer
+):
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
     except (AttributeError, OSError):
@@ -64,7 +69,9 @@ def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(nodes,
     fifo = os.SCHED_FIFO
 
     def all_are(others, run):
-        return lambda: {*scheduling(process)[:-1]} == {others} and scheduling(process)[-1] == run
+        return lambda: (
+            {*scheduling(process)[:-1]} == {others} and scheduling(process)[-1] == run
+        )
 
     observer.until(all_are((fifo, 10), (fifo, 20)), "SCHED_FIFO of all threads")
     assert observer.set_parameter("real_time_factor", 0.0).successful
@@ -73,7 +80,10 @@ def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(nodes,
 
 
 def machine_latency_us():
-    """Return what all requests together allow [us]; None where they may not be read or made."""
+    """Return what all requests together allow [us].
+
+    None where they may not be read or made.
+    """
     try:
         with Path("/dev/cpu_dma_latency").open("r+b", buffering=0) as device:
             return int.from_bytes(device.read(4), sys.byteorder, signed=True)
@@ -81,10 +91,15 @@ def machine_latency_us():
         return None
 
 
-def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(nodes, observer):
+def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(
+    nodes, observer
+):
     before = machine_latency_us()
     if not before:
-        pytest.skip("/dev/cpu_dma_latency may not be written here, or another process asks for 0")
+        pytest.skip(
+            "/dev/cpu_dma_latency may not be written here, or another process asks"
+            " for 0"
+        )
     process = nodes.run("simulator", cpu_dma_latency=0)
     observer.told("cpu_dma_latency", "0 us")
     assert machine_latency_us() == 0
@@ -105,7 +120,9 @@ def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(no
 def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
     nodes.run("simulator")
     known = SimulatorParameters.SPECS
-    reply = observer.call(DescribeParameters, f"{NODE}/describe_parameters", names=list(known))
+    reply = observer.call(
+        DescribeParameters, f"{NODE}/describe_parameters", names=list(known)
+    )
     for descriptor in reply.descriptors:
         assert descriptor.description.startswith(known[descriptor.name].doc)
         may_change = descriptor.name in SimulatorParameters.CHANGEABLE
@@ -118,20 +135,44 @@ def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
     ("command", "given", "said"),
     [
         ("simulator", {"rate": 300}, "rate = 300: must divide 1e9"),
-        ("simulator", {"publish_rate": 300}, "publish_rate = 300: must divide rate = 1000"),
+        (
+            "simulator",
+            {"publish_rate": 300},
+            "publish_rate = 300: must divide rate = 1000",
+        ),
         ("simulator", {"rate": "fast"}, "rate = 'fast': must be a whole number"),
-        ("simulator", {"duration": ".nan"}, "duration = nan: must be a finite number >= 0"),
+        (
+            "simulator",
+            {"duration": ".nan"},
+            "duration = nan: must be a finite number >= 0",
+        ),
         ("simulator", {"scene": "nowhere"}, "must be a readable .yaml file or one of"),
         ("simulator", {"scene": 3}, "scene = 3: must be text"),
-        ("simulator", {"wait_for_command": 2}, "wait_for_command = 2: must be true or false"),
-        ("simulator", {"sync": "loose"}, "sync = 'loose': must be one of free, lockstep"),
-        ("simulator", {"publish_clock": True, "use_sim_time": True}, "cannot be its source"),
+        (
+            "simulator",
+            {"wait_for_command": 2},
+            "wait_for_command = 2: must be true or false",
+        ),
+        (
+            "simulator",
+            {"sync": "loose"},
+            "sync = 'loose': must be one of free, lockstep",
+        ),
+        (
+            "simulator",
+            {"publish_clock": True, "use_sim_time": True},
+            "cannot be its source",
+        ),
         ("torque_player", {"rate": 300}, "rate = 300: must divide 1e9"),
         ("torque_player", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"torque_limit": 0.5}, "exceeds the limit 0.5 N m"),
         ("inverse_dynamics", {"stamped": "[]"}, "stamped = []: must be true or false"),
-        ("inverse_dynamics", {"stiffness": "[]"}, "stiffness = []: must be 3 finite numbers"),
+        (
+            "inverse_dynamics",
+            {"stiffness": "[]"},
+            "stiffness = []: must be 3 finite numbers",
+        ),
         ("recorder", {"topics": "[]"}, "topics = []: must name a topic"),
         ("recorder", {"output": "/"}, "must be a new folder"),
     ],
@@ -150,7 +191,15 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     defaults = SimulatorParameters()
     names = SimulatorParameters.SPECS.keys() - {"duration", "wait_for_subscribers"}
     assert given == {name: getattr(defaults, name) for name in names}
-    told = ["--ros-args", "--params-file", str(path), "-r", "__ns:=/left", "-r", "__node:=other"]
+    told = [
+        "--ros-args",
+        "--params-file",
+        str(path),
+        "-r",
+        "__ns:=/left",
+        "-r",
+        "__node:=other",
+    ]
     process = nodes.run("simulator", *told)
     observer.told("phase", "running")
     assert nodes.stop(process)[0] == 0
@@ -158,7 +207,9 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_dump_of_the_parameters_loads_again(domain, tmp_path, command):
-    """As `ros2 param dump` writes it: parameters with dots in trees, an empty list as []."""
+    """As `ros2 param dump` writes it: parameters with dots in trees, an empty list as
+    [].
+    """
     path, loaded = tmp_path / "dump.yaml", []
     for options in ([], ["--params-file", str(path)]):
         rclpy.init(args=[command, "--ros-args", *options])
@@ -169,7 +220,9 @@ def test_a_dump_of_the_parameters_loads_again(domain, tmp_path, command):
             for name, one in worker.node._parameters.items():
                 *above, last = name.split(".")
                 at = reduce(lambda inner, key: inner.setdefault(key, {}), above, tree)
-                at[last] = [*one.value] if isinstance(one.value, (array, tuple)) else one.value
+                at[last] = (
+                    [*one.value] if isinstance(one.value, (array, tuple)) else one.value
+                )
             named = {worker.node.get_fully_qualified_name(): {"ros__parameters": tree}}
             path.write_text(yaml.dump(named))
             worker.node.destroy_node()
@@ -190,7 +243,9 @@ BROKEN = {
     ("package", "node"),
     [("simulation_interfaces", "simulator"), ("control_msgs", "inverse_dynamics")],
 )
-def test_an_incomplete_package_of_messages_is_left_out(nodes, tmp_path, package, node, broken):
+def test_an_incomplete_package_of_messages_is_left_out(
+    nodes, tmp_path, package, node, broken
+):
     (folder := tmp_path / package).mkdir()
     for name, text in BROKEN[broken].items():
         (folder / name).write_text(text)

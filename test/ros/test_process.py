@@ -153,7 +153,9 @@ def test_each_generation_finds_its_own_file(
         (tmp_path / library).touch()
     monkeypatch.setenv("LD_LIBRARY_PATH", f"/nowhere:{tmp_path}")
     process.configure_middleware()
-    (given,) = {each: os.environ.pop(each) for each in NAMES if each in os.environ}.items()
+    (given,) = {
+        each: os.environ.pop(each) for each in NAMES if each in os.environ
+    }.items()
     assert given[0] == name
     assert element in Path(given[1]).read_text(encoding="utf-8")
 
@@ -167,7 +169,9 @@ def test_garbage_of_the_start_is_not_looked_through_again(domain):
 @pytest.fixture
 def looks(monkeypatch):
     made, original = [], topics.take
-    monkeypatch.setattr(topics, "take", lambda reader: made.append(reader) or original(reader))
+    monkeypatch.setattr(
+        topics, "take", lambda reader: made.append(reader) or original(reader)
+    )
     return made
 
 
@@ -178,7 +182,9 @@ def reader(node):
 
 def publish(node, *torque):
     """Publish a command and wait until it has arrived."""
-    publisher = node.create_publisher(Float64MultiArray, topics.SIMULATOR["commands"].name, 10)
+    publisher = node.create_publisher(
+        Float64MultiArray, topics.SIMULATOR["commands"].name, 10
+    )
     deadline = time.monotonic() + 30.0
     while not publisher.get_subscription_count():
         assert time.monotonic() < deadline
@@ -188,7 +194,9 @@ def publish(node, *torque):
     return publisher
 
 
-def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, reader, looks):
+def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(
+    node, reader, looks
+):
     at = time.monotonic_ns() + 10**12  # the test does not count its own time
     assert not reader.read(at)
     publisher = publish(node, 1.0, 2.0, 3.0)
@@ -205,7 +213,9 @@ def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(node, reader
 
 
 def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node, reader):
-    """Fast DDS ends a wait for an event of a subscription at once while it has a message."""
+    """Fast DDS ends a wait for an event of a subscription at once while it has a
+    message.
+    """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     assert not reader.read(time.monotonic_ns())
@@ -215,7 +225,8 @@ def test_an_executor_sleeps_while_a_message_waits_to_be_taken(node, reader):
     before = time.thread_time()
     executor.spin_once(timeout_sec=1.0)
     assert time.thread_time() - before < 0.05  # 0.002 asleep, up to 1.0 awake
-    assert len(reader.read(math.inf)) == 1  # without a time at once, not 20 ms after the last look
+    # without a time at once, not 20 ms after the last look
+    assert len(reader.read(math.inf)) == 1
     executor.shutdown()
 
 
@@ -243,7 +254,8 @@ def test_a_signal_ends_a_node_while_a_callback_waits_for_it(node, stop):
     threading.Thread(target=lambda: worker.entered.wait(60.0) and stop.add(2)).start()
     began = time.monotonic()
     process.spin(worker)
-    assert worker.closed.is_set() and time.monotonic() - began < 30.0  # it would wait for 60 s
+    # it would wait for 60 s
+    assert worker.closed.is_set() and time.monotonic() - began < 30.0
 
 
 def test_the_failure_of_a_callback_is_that_of_the_process(node, stop):

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recorder keeps, waits for and misses; cut recordings, and what comes out of them."""
+"""What a recorder keeps, waits for and misses.
+
+Cut recordings, and what comes out of them.
+"""
 
 import re
 import resource
@@ -42,7 +45,9 @@ def own_message(kind):
 def recorded(nodes, observer, bag, **given):
     """A recorder and a simulator that runs."""
     recorder = nodes.run("recorder", output=bag)
-    simulator = nodes.run("simulator", wait_for_command=True, command_timeout=0.0, **given)
+    simulator = nodes.run(
+        "simulator", wait_for_command=True, command_timeout=0.0, **given
+    )
     assert nodes.line(recorder) == "ready: 9 topics\n"
     observer.command(0.0, 0.0, 0.0, readers=2)
     return recorder, simulator
@@ -58,20 +63,32 @@ def whole(bag, more_than):
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGHUP],
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        signal.SIGHUP,
+    ],
 )
-def test_signals_leave_a_readable_bag_with_all_samples(nodes, observer, tmp_path, number):
+def test_signals_leave_a_readable_bag_with_all_samples(
+    nodes, observer, tmp_path, number
+):
     recorder, simulator = recorded(nodes, observer, tmp_path / "bag", duration=0.3)
     assert simulator.wait(timeout=60) == 0
     assert nodes.stop(recorder, number)[0] == 0
     assert len(whole(tmp_path / "bag", 150).time_ns) == 151
 
 
-def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observer, tmp_path):
-    """Who commands waits for their readers: what the recorder has not found would be lost."""
+def test_commands_are_read_when_all_that_a_simulator_says_is_heard(
+    nodes, observer, tmp_path
+):
+    """Who commands waits for their readers: what the recorder has not found would be
+    lost.
+    """
 
     def make(topic):
-        publisher = observer.node.create_publisher(topic.kind, topic.at(NODE), topic.qos())
+        publisher = observer.node.create_publisher(
+            topic.kind, topic.at(NODE), topic.qos()
+        )
         return publisher, own_message(topic.kind)
 
     own = [one for one in topics.SIMULATOR.values() if one.name in topics.SAMPLED]
@@ -88,7 +105,8 @@ def test_commands_are_read_when_all_that_a_simulator_says_is_heard(nodes, observ
         return said > times
 
     commanded = partial(observer.node.count_subscribers, COMMANDS)
-    observer.until(partial(say_all, 20), "readers of all but one")  # 20 x 0.05 s: many looks
+    # 20 x 0.05 s: many looks
+    observer.until(partial(say_all, 20), "readers of all but one")
     assert commanded() == 1
     speak.append(make(topics.SIMULATOR["orientation"]))
     observer.until(lambda: say_all(0) and commanded() == 2, "reader of the commands")
@@ -105,7 +123,9 @@ def test_a_latched_topic_is_heard_though_its_subscriber_is_seen_first(
     observer.until(lambda: observer.node.count_subscribers(phase) == 2, "the recorder")
     simulator = type(observer)(domain)  # that nobody has discovered yet
     try:
-        simulator.node.create_publisher(String, phase, LATCHED).publish(String(data="waiting"))
+        simulator.node.create_publisher(String, phase, LATCHED).publish(
+            String(data="waiting")
+        )
         assert nodes.line(recorder) == "ready: 1 topics\n"
         assert nodes.stop(recorder)[0] == 0
     finally:
@@ -117,11 +137,16 @@ def test_an_empty_bag_is_an_error_that_names_the_topics(nodes, tmp_path):
     assert "recording to" in recorder.stderr.readline()
     status, _, err = nodes.ended(recorder)
     assert status == 1 and "given up after 0.5 s" in err
-    assert "is incomplete: no message of /diagnostics, /joint_states, /sst_simulator/app" in err
+    assert (
+        "is incomplete: no message of /diagnostics, /joint_states, /sst_simulator/app"
+        in err
+    )
     assert COMMANDS not in err  # no run needs it
 
 
-def test_a_partial_bag_is_an_error_that_names_what_is_missing(nodes, observer, tmp_path):
+def test_a_partial_bag_is_an_error_that_names_what_is_missing(
+    nodes, observer, tmp_path
+):
     wanted = f"[/joint_states, {NODE}/orientation]"
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics=wanted)
     states = observer.publisher(JointState, "/joint_states")
@@ -129,12 +154,17 @@ def test_a_partial_bag_is_an_error_that_names_what_is_missing(nodes, observer, t
     assert states.wait_for_all_acked()
     status, _, err = nodes.stop(recorder)
     assert status == 1 and "given up" not in err
-    assert "no message of /sst_simulator/orientation (1 messages of 1 topics recorded)" in err
+    assert (
+        "no message of /sst_simulator/orientation (1 messages of 1 topics recorded)"
+        in err
+    )
 
 
 def test_lost_messages_are_counted(nodes, observer, tmp_path):
     if version("ros-rclpy").startswith("7."):
-        pytest.skip("sequence numbers do not reach the recorder with the rclpy of Jazzy")
+        pytest.skip(
+            "sequence numbers do not reach the recorder with the rclpy of Jazzy"
+        )
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics="[/joint_states]")
     states = observer.node.create_publisher(JointState, "/joint_states", 1)
     observer.until(states.get_subscription_count, "the recorder")
@@ -154,7 +184,9 @@ def test_lost_messages_are_counted(nodes, observer, tmp_path):
 def test_joint_states_of_another_robot_do_not_stand_for_those_of_the_simulator(
     nodes, observer, tmp_path
 ):
-    """They are recorded, as the topic is, but the recorder is not ready with them alone."""
+    """They are recorded, as the topic is, but the recorder is not ready with them
+    alone.
+    """
     wanted = f"[/joint_states, {NODE}/scene]"
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics=wanted)
     states = observer.publisher(JointState, "/joint_states")
@@ -171,13 +203,18 @@ def test_joint_states_of_another_robot_do_not_stand_for_those_of_the_simulator(
     assert nodes.stop(recorder)[0] == 0
 
 
-def test_joint_states_of_another_robot_alone_are_an_incomplete_bag(nodes, observer, tmp_path):
+def test_joint_states_of_another_robot_alone_are_an_incomplete_bag(
+    nodes, observer, tmp_path
+):
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics="[/joint_states]")
     states = observer.publisher(JointState, "/joint_states")
     states.publish(JointState(name=["finger"], position=[0.0]))
     assert states.wait_for_all_acked()
     status, _, err = nodes.stop(recorder)
-    assert status == 1 and "no message of /joint_states (1 messages of 1 topics recorded)" in err
+    assert (
+        status == 1
+        and "no message of /joint_states (1 messages of 1 topics recorded)" in err
+    )
 
 
 def test_topics_belong_to_the_nodes_whose_private_topics_are_requested():
@@ -190,25 +227,34 @@ def test_topics_belong_to_the_nodes_whose_private_topics_are_requested():
     own = own_topics(requested, ["/sst_simulator"])
     assert own["/left/joint_states"].use == own["/joint_states"].use == topics.PUBLISHES
     assert {"/left/sim/commands", "/sst_simulator/scene"} < own.keys()
-    assert not {"/effort_controller/commands", "/joint_state_broadcaster/joint_states"} & own.keys()
+    assert (
+        not {"/effort_controller/commands", "/joint_state_broadcaster/joint_states"}
+        & own.keys()
+    )
 
 
 def test_rosbag2_is_given_the_declared_qos():
     config = Path(__file__).parents[2] / "config"
     profiles = yaml.safe_load((config / "rosbag2_qos.yaml").read_text(encoding="utf-8"))
-    assert set(profiles) == set((config / "topics.txt").read_text(encoding="utf-8").split())
+    assert set(profiles) == set(
+        (config / "topics.txt").read_text(encoding="utf-8").split()
+    )
     declared = {**topics.PLAYER, **topics.SIMULATOR}
     for topic, profile in profiles.items():
         own = declared.get(topic.rpartition("/")[2])
         latched = own is not None and own.latched
-        assert profile["durability"] == ("transient_local" if latched else "volatile"), topic
+        assert profile["durability"] == (
+            "transient_local" if latched else "volatile"
+        ), topic
         assert profile["reliability"] == "reliable"
 
 
 def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path):
     states = observer.states  # from the beginning of the run
     recorder = nodes.run("recorder", output=tmp_path / "bag")
-    simulator = nodes.run("simulator", sync="lockstep", real_time_factor=0.0, duration=1.0)
+    simulator = nodes.run(
+        "simulator", sync="lockstep", real_time_factor=0.0, duration=1.0
+    )
     assert nodes.line(recorder).startswith("ready")
     nodes.run("torque_player", stamped=True, min_subscribers=2)
     observer.until(observer.samples, "the run")

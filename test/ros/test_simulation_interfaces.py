@@ -33,7 +33,9 @@ class Client:
         self.process = nodes.start("simulator", env=env, **given)
 
     def call(self, kind, **fields):
-        name = "".join(f"_{c.lower()}" if c.isupper() else c for c in kind).removeprefix("_")
+        name = "".join(
+            f"_{c.lower()}" if c.isupper() else c for c in kind
+        ).removeprefix("_")
         return self.observer.call(getattr(self.srv, kind), f"{NODE}/{name}", **fields)
 
     def code(self, kind, **fields):
@@ -68,7 +70,11 @@ def test_features_states_and_scopes(client):
     assert list(features.features) == list(FEATURES)
     client.observer.until(lambda: client.state() == PLAYING, "the run")
     assert client.code("StepSimulation", steps=1)[0] == FAILED
-    assert (client.to(PAUSED), client.state(), client.to(PAUSED)) == (OK, PAUSED, ALREADY_THERE)
+    assert (client.to(PAUSED), client.state(), client.to(PAUSED)) == (
+        OK,
+        PAUSED,
+        ALREADY_THERE,
+    )
 
     def reset(scope):
         return client.code("ResetSimulation", scope=scope)[0]
@@ -97,7 +103,9 @@ def test_steps_by_count_and_by_the_action(client):
     def send(steps):
         feedback.clear()
         goal = SimulateSteps.Goal(steps=steps)
-        sent = action.send_goal_async(goal, lambda message: feedback.append(message.feedback))
+        sent = action.send_goal_async(
+            goal, lambda message: feedback.append(message.feedback)
+        )
         return client.observer.result(sent, "the answer")
 
     def result(handle):
@@ -114,7 +122,9 @@ def test_steps_by_count_and_by_the_action(client):
     until(lambda: len(feedback) >= 7, "feedback")
     status, reply = result(handle)
     assert (status, reply.result) == (GoalStatus.STATUS_SUCCEEDED, OK)
-    counts = [(message.completed_steps, message.remaining_steps) for message in feedback]
+    counts = [
+        (message.completed_steps, message.remaining_steps) for message in feedback
+    ]
     assert counts == [(k, 7 - k) for k in range(1, 8)]
     client.to(PLAYING)
     status, reply = result(send(3))
@@ -123,7 +133,10 @@ def test_steps_by_count_and_by_the_action(client):
 
 
 def test_an_entity_state_has_the_time_at_which_it_holds(client):
-    """Between two samples of a run, on a step; before it as joint_states, which is idle."""
+    """Between two samples of a run, on a step.
+
+    Before it as joint_states, which is idle.
+    """
     until, stamps = client.observer.until, client.observer.stamps
 
     def stamp():
@@ -172,10 +185,15 @@ def test_the_star_is_read_and_set_with_its_joints(client):
     found = client.call("GetEntityState", entity="star").state
     assert found.header.frame_id == "left/base_link"
     read = found.pose.orientation
-    assert np.abs(rotation_matrix((read.x, read.y, read.z, read.w)) - rotation).max() < 1e-9
-    assert (found.twist.angular.x, found.twist.angular.y, found.twist.angular.z) == pytest.approx(
-        turning, abs=1e-9
+    assert (
+        np.abs(rotation_matrix((read.x, read.y, read.z, read.w)) - rotation).max()
+        < 1e-9
     )
+    assert (
+        found.twist.angular.x,
+        found.twist.angular.y,
+        found.twist.angular.z,
+    ) == pytest.approx(turning, abs=1e-9)
     expected = rates.of_star(geometry, rotation, turning).gamma_dot
     assert client.states[-1].velocity[:3] == pytest.approx(expected, abs=1e-7)
     listed = client.call("GetEntitiesStates")
@@ -183,7 +201,11 @@ def test_the_star_is_read_and_set_with_its_joints(client):
 
     assert client.set(EntityState(), set_twist=True)[0] == OK
     client.observer.until(lambda: not any(client.states[-1].velocity), "rest")
-    for bad in (Quaternion(w=0.5), Quaternion(x=1.0, w=0.0), Quaternion(x=float("nan"))):
+    for bad in (
+        Quaternion(w=0.5),
+        Quaternion(x=1.0, w=0.0),
+        Quaternion(x=float("nan")),
+    ):
         wrong = EntityState()
         wrong.pose.orientation = bad
         code, words = client.set(wrong, set_pose=True)
@@ -198,12 +220,18 @@ def test_the_star_is_read_and_set_with_its_joints(client):
 
 
 def test_a_fault_is_no_pause(client):
-    """There is no state for a fault; it is left by a stop or a reset, not by a start."""
+    """There is no state for a fault.
+
+    It is left by a stop or a reset, not by a start.
+    """
     pull = client.observer.publisher(Float64MultiArray, f"{NODE}/commands")
     assert client.to(STOPPED) in (OK, ALREADY_THERE)
     assert client.to(PLAYING) == OK
     client.observer.publish_until(
-        pull, torques(500.0, 0.0, 0.0), lambda: client.observer.phases[-1:] != ["running"], "fault"
+        pull,
+        torques(500.0, 0.0, 0.0),
+        lambda: client.observer.phases[-1:] != ["running"],
+        "fault",
     )
     client.observer.phase("fault")
     code, words = client.code("GetSimulationState")

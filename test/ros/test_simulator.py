@@ -35,20 +35,33 @@ def test_publishes_all_joints_at_whole_periods_from_the_start(nodes, observer):
         simulation.step((0.1, 0.2, 0.3), 1_000_000)
     expected = simulation.state.joints
     assert list(run[-1].position) == [*expected.gamma, *expected.mu, *expected.beta]
-    assert list(run[-1].velocity) == [*expected.gamma_dot, *expected.mu_dot, *expected.beta_dot]
+    assert list(run[-1].velocity) == [
+        *expected.gamma_dot,
+        *expected.mu_dot,
+        *expected.beta_dot,
+    ]
 
 
 def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
-    """Torques of every tick come every 50 ms and at the end; all are in the frame of this robot."""
+    """Torques of every tick come every 50 ms and at the end.
+
+    All are in the frame of this robot.
+    """
     orientation = observer.listen(QuaternionStamped, f"{NODE}/orientation")
     euler = observer.listen(Vector3Stamped, f"{NODE}/euler_zyz")
     applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
-    nodes.run("simulator", wait_for_command=True, duration=0.131, base_frame="left/base_link")
+    nodes.run(
+        "simulator", wait_for_command=True, duration=0.131, base_frame="left/base_link"
+    )
     observer.until(lambda: orientation and euler and applied, "preview of every topic")
     observer.command(1.0, 0.0, 0.0)
     stamps = observer.stamps
-    observer.until(lambda: len(stamps(euler)) == len(stamps(orientation)) == 67, "the 67 samples")
-    observer.until(lambda: sum(len(m.points) for m in applied) == 131, "torques of the 131 ticks")
+    observer.until(
+        lambda: len(stamps(euler)) == len(stamps(orientation)) == 67, "the 67 samples"
+    )
+    observer.until(
+        lambda: sum(len(m.points) for m in applied) == 131, "torques of the 131 ticks"
+    )
 
     start = stamps(orientation)[0]
     assert (
@@ -64,15 +77,21 @@ def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(nodes, observer, number):
-    """Otherwise it would be there for 20 s more, and a new one would not be the only one.
+def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(
+    nodes, observer, number
+):
+    """Otherwise it would be there for 20 s more, and a new one would not be the only
+    one.
 
-    Its name may stay: rmw_dds_common keeps for ever what a node that has left said at last.
+    Its name may stay: rmw_dds_common keeps for ever what a node that has left said at
+        last.
     """
     process = nodes.run("simulator")
     observer.phase("running")
     assert nodes.stop(process, number)[0] == 0
-    observer.until(lambda: not observer.node.count_publishers(f"{NODE}/phase"), "end of it", 15.0)
+    observer.until(
+        lambda: not observer.node.count_publishers(f"{NODE}/phase"), "end of it", 15.0
+    )
 
 
 def test_two_simulators_do_not_hear_each_other(nodes, observer):
@@ -82,9 +101,12 @@ def test_two_simulators_do_not_hear_each_other(nodes, observer):
         place: nodes.run("simulator", "--ros-args", "-r", f"__ns:={place}", **given)
         for place in places
     }
-    states = {place: observer.listen(JointState, f"{place}/joint_states") for place in places}
+    states = {
+        place: observer.listen(JointState, f"{place}/joint_states") for place in places
+    }
     commands = {
-        place: observer.publisher(Float64MultiArray, f"{place}{NODE}/commands") for place in places
+        place: observer.publisher(Float64MultiArray, f"{place}{NODE}/commands")
+        for place in places
     }
     observer.until(lambda: all(states.values()), "previews of both")
 
@@ -105,7 +127,9 @@ def test_two_simulators_do_not_hear_each_other(nodes, observer):
     for place in places:
         for offered in (
             observer.node.get_publisher_names_and_types_by_node("sst_simulator", place),
-            observer.node.get_subscriber_names_and_types_by_node("sst_simulator", place),
+            observer.node.get_subscriber_names_and_types_by_node(
+                "sst_simulator", place
+            ),
             observer.node.get_service_names_and_types_by_node("sst_simulator", place),
         ):
             names = {name for name, _ in offered}

@@ -42,7 +42,9 @@ def test_unknown_arguments_are_refused(run_here, tmp_path, words, refused, said)
     assert status == refused and said in err and "csv = " not in err
 
 
-def test_plain_options_are_parameters_and_a_run_goes_on_until_it_is_ended(nodes, observer):
+def test_plain_options_are_parameters_and_a_run_goes_on_until_it_is_ended(
+    nodes, observer
+):
     scene = observer.listen(String, f"{NODE}/scene", latched=True)
     words = ["--scene", "fast_spin", "--wait-for-subscribers", "/diagnostics,~/scene"]
     process = nodes.start("simulator", *words)
@@ -67,7 +69,9 @@ def test_in_lockstep_the_duration_is_that_of_the_scene(nodes, observer):
     ],
 )
 def test_a_run_that_nobody_records_ends(nodes, topics, said):
-    process = nodes.run("simulator", wait_for_subscribers=topics, subscriber_timeout=0.5)
+    process = nodes.run(
+        "simulator", wait_for_subscribers=topics, subscriber_timeout=0.5
+    )
     status, _, err = nodes.ended(process)
     assert status == 1
     assert said in err.splitlines()[-1]
@@ -78,10 +82,17 @@ def test_what_keeps_commands_and_clocks_away_is_named(nodes, observer):
     qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     observer.node.create_publisher(Float64MultiArray, COMMANDS, qos)
     other = nodes.run("simulator")
-    wanted = ("of /observer is best effort", "there is no /clock", "another node is named")
+    wanted = (
+        "of /observer is best effort",
+        "there is no /clock",
+        "another node is named",
+    )
     for words in wanted:
         observer.until(
-            lambda words=words: any(words in one["said"] for one in observer.diagnostics()), words
+            lambda words=words: any(
+                words in one["said"] for one in observer.diagnostics()
+            ),
+            words,
         )
     assert nodes.stop(other)[0] == 0
     status, _, err = nodes.stop(process)
@@ -89,9 +100,13 @@ def test_what_keeps_commands_and_clocks_away_is_named(nodes, observer):
 
 
 def handles_signals(process):
-    """Whether the node has taken over SIGTERM: what the interpreter does before is not ours."""
+    """Whether the node has taken over SIGTERM: what the interpreter does before is not
+    ours.
+    """
     status = Path(f"/proc/{process.pid}/status").read_text()
-    caught = next(line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
+    caught = next(
+        line.split()[1] for line in status.splitlines() if line.startswith("SigCgt")
+    )
     return int(caught, 16) >> (signal.SIGTERM - 1) & 1
 
 
@@ -106,7 +121,9 @@ def test_a_signal_while_a_node_starts_makes_no_traceback(nodes, observer, number
 
 @pytest.mark.parametrize("delay", [0.02, 0.1])
 def test_ctrl_c_while_python_starts_a_node_of_ros2_run_ends_it(nodes, delay):
-    """Its executable blocks SIGINT until the node handles it: Python would print a traceback."""
+    """Its executable blocks SIGINT until the node handles it: Python would print a
+    traceback.
+    """
     root = Path(sst_ros.__file__).parents[1]
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     process = nodes.start(
@@ -148,7 +165,10 @@ def test_signals_are_handled_before_what_takes_time_to_import():
 
 
 def test_a_node_under_nohup_keeps_it():
-    code = "import signal as s; s.signal(s.SIGHUP, s.SIG_IGN); from sst_ros.nodes import signals; "
+    code = (
+        "import signal as s; s.signal(s.SIGHUP, s.SIG_IGN); from sst_ros.nodes import"
+        " signals; "
+    )
     python(f"{code}signals.handle(); assert s.getsignal(s.SIGHUP) is s.SIG_IGN")
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`view --scene` in headless Chromium: it loads, it moves, its buttons do what they say."""
+"""`view --scene` in headless Chromium: it loads, it moves, its buttons do what they
+say.
+"""
 
 import io
 import os
@@ -27,7 +29,9 @@ pytestmark = [
     pytest.mark.ros,
     pytest.mark.slow,
     pytest.mark.timeout(600),
-    pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH"),
+    pytest.mark.skipif(
+        chromium() is None, reason="no chromium with chromedriver on the PATH"
+    ),
 ]
 SOURCE = Path(__file__).parents[2]
 LIMIT_S = 180.0
@@ -41,7 +45,9 @@ PANEL = 400
 def viewed(nodes_of_module, observer_of_module, browser):
     """The process, the page in a browser, and an observer of the topics."""
     process = nodes_of_module.start("view", "--scene", "swing", "--port", "18080")
-    url = re.search(r"http://127\.0\.0\.1:\S+", nodes_of_module.line(process, 60)).group()
+    url = re.search(
+        r"http://127\.0\.0\.1:\S+", nodes_of_module.line(process, 60)
+    ).group()
     browser.open(url, SIZE)
     browser.until(lambda: browser.time() is not None, "time of a run")
     assert observer_of_module.phases is not None  # it listens from now on
@@ -65,7 +71,9 @@ def test_it_loads_and_moves(viewed):
     assert before.std() > 10.0  # something is drawn
     page.until(lambda: page.time() > time + 0.3, "later time")
     page.until(lambda: shown(page, "γ1") != gamma, "other angle")
-    page.until(lambda: np.abs(canvas(page, "moving_2") - before).max() > 50.0, "other picture")
+    page.until(
+        lambda: np.abs(canvas(page, "moving_2") - before).max() > 50.0, "other picture"
+    )
     assert "error estimate" in page.text("body")
     assert page.complaints() == []
 
@@ -105,14 +113,18 @@ def test_torques_by_hand_until_a_controller_comes(viewed):
     _, page, watching = viewed
     commands = watching.listen(Float64MultiArray, COMMANDS)
     page.slide("τ₂", RIGHT * 3)
-    watching.until(lambda: commands and commands[-1].data[1] > 0.0, "torque of the slider")
+    watching.until(
+        lambda: commands and commands[-1].data[1] > 0.0, "torque of the slider"
+    )
     assert commands[-1].data[0] == commands[-1].data[2] == 0.0
     page.until(lambda: shown(page, "τ2") > 0.0, "torque on the page")
     canvas(page, "by_hand")
     page.press("Zero")
     watching.until(lambda: list(commands[-1].data) == [0.0, 0.0, 0.0], "no torque")
     rival = watching.publisher(Float64MultiArray, COMMANDS)
-    page.until(lambda: "commands come from" in page.text("body"), "name of the controller")
+    page.until(
+        lambda: "commands come from" in page.text("body"), "name of the controller"
+    )
     assert not page.enabled("Zero")
     watching.node.destroy_publisher(rival)
     page.until(lambda: page.enabled("Zero"), "sliders without the controller")
@@ -128,10 +140,13 @@ def test_ctrl_c_ends_the_page_and_the_simulator(viewed, nodes_of_module):
 
 def test_make_view_in_a_copy_that_has_nothing_yet(tmp_path, domain):
     """A page that moves within three minutes."""
-    ignored = shutil.ignore_patterns(".*", "*_out*", "__pycache__", "*.egg-info", "build", "site")
+    ignored = shutil.ignore_patterns(
+        ".*", "*_out*", "__pycache__", "*.egg-info", "build", "site"
+    )
     copy = shutil.copytree(SOURCE, tmp_path / "sst_ros", ignore=ignored)
     began = time.monotonic()
-    # A session of its own: Ctrl-C in a terminal reaches make, the page and the simulator.
+    # A session of its own: Ctrl-C in a terminal reaches make, the page and the
+    # simulator.
     process = subprocess.Popen(
         ["make", "view", f"PYTHON={sys.executable}"],
         cwd=copy,
@@ -142,7 +157,9 @@ def test_make_view_in_a_copy_that_has_nothing_yet(tmp_path, domain):
     )
     try:
         lines = iter(process.stdout.readline, "")
-        url = next(filter(None, (re.search(r"http://\S+", line) for line in lines))).group()
+        url = next(
+            filter(None, (re.search(r"http://\S+", line) for line in lines))
+        ).group()
         with browse() as page:
             page.open(url, SIZE)
             page.until(lambda: page.time() is not None, "time of a run")

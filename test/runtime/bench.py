@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run without ROS: messages as plain objects, topics on which they arrive, and its output."""
+"""A run without ROS: messages as plain objects, topics on which they arrive, and its
+output.
+"""
 
 import math
 import threading
@@ -41,7 +43,9 @@ class Arrived(list):
 
     @property
     def waiting(self):
-        return len(self) > 0 and (self.arrived_ns > 0 or len(self.asked) <= self.after_requests)
+        return len(self) > 0 and (
+            self.arrived_ns > 0 or len(self.asked) <= self.after_requests
+        )
 
     def read(self, until_ns):
         self.asked.append(until_ns)
@@ -53,7 +57,10 @@ class Arrived(list):
 
 
 class Output:
-    """Keeps what the run publishes; gives time from 1 s on, by its own clock if it has one."""
+    """Keeps what the run publishes.
+
+    Gives time from 1 s on, by its own clock if it has one.
+    """
 
     unread = False
 
@@ -111,17 +118,25 @@ class HandClock:
 
 
 class Bench:
-    """A run; a busy machine may take long for what is quick, so no command is let go of."""
+    """A run; a busy machine may take long for what is quick, so no command is let go
+    of.
+    """
 
-    def __init__(self, scene="example1", build=Simulation, clock=None, commands=(), **given):
+    def __init__(
+        self, scene="example1", build=Simulation, clock=None, commands=(), **given
+    ):
         speed = 0.0 if clock is None else 1.0
         given = {"real_time_factor": speed, "command_timeout": 0.0, **given}
         parameters = SimulatorParameters(scene=scene, **given)
         run = parameters.run
         self.queue, self.stamped = Arrived(map(plain, commands)), Arrived()
-        self.output = Output([*parameters.wait_for_subscribers], parameters.publish_clock)
+        self.output = Output(
+            [*parameters.wait_for_subscribers], parameters.publish_clock
+        )
         self.input = TorqueInput(run, None, self.queue, self.stamped)
-        self.pacer = Pacer(run.period_ns, parameters.real_time_factor, clock or SteadyTime())
+        self.pacer = Pacer(
+            run.period_ns, parameters.real_time_factor, clock or SteadyTime()
+        )
         parts = RunParts(run, self.input, self.pacer, self.output)
         self.loop = RunLoop(load_scene(scene), build, parts)
         self.thread = threading.Thread(target=self.loop.run, daemon=True)
@@ -142,7 +157,11 @@ class Bench:
 
     def to(self, phase):
         """Wait until the phase is published."""
-        self.until(lambda: self.output.phases and self.output.phases[-1].startswith(phase.value))
+        self.until(
+            lambda: (
+                self.output.phases and self.output.phases[-1].startswith(phase.value)
+            )
+        )
 
     def end(self):
         self.loop.stop()

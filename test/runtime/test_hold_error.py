@@ -24,7 +24,9 @@ def held(scene, rate, shift, seconds):
 
 
 @pytest.mark.parametrize("rate", [100, 500])
-@pytest.mark.parametrize(("name", "within"), [("example2", 1.3), ("general", 1.3), ("friction", 6)])
+@pytest.mark.parametrize(
+    ("name", "within"), [("example2", 1.3), ("general", 1.3), ("friction", 6)]
+)
 @pytest.mark.parametrize("shift", [0.0, 0.5])
 def test_the_hold_error_is_estimated_to_a_factor(name, within, shift, rate):
     """Friction damps the error, of which the estimate sees nothing."""

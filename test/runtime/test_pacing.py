@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deadlines against a clock that the test moves; parameters that may change during a run."""
+"""Deadlines against a clock that the test moves.
+
+Parameters that may change during a run.
+"""
 
 import dataclasses
 import math
@@ -55,7 +58,12 @@ def pacer(paced):
 
 
 def test_one_sleep_may_end_in_several_ticks(hand, pacer):
-    assert [Pacer(MS, speed, hand).together for speed in (0.0, 0.5, 1.0, 2.6)] == [1, 1, 2, 5]
+    assert [Pacer(MS, speed, hand).together for speed in (0.0, 0.5, 1.0, 2.6)] == [
+        1,
+        1,
+        2,
+        5,
+    ]
     assert Pacer(MS, 1.0, hand, tolerance_ns=200 * MS).together == 1
     assert pacer.wait(never, 2) and hand.now == 7 * MS
     hand.now += 3 * MS + 100_000  # 1.1 ms after the last of the next two
@@ -63,7 +71,9 @@ def test_one_sleep_may_end_in_several_ticks(hand, pacer):
     assert (pacer.missed, pacer.late_ns) == (1, 1_100_000)
 
 
-def test_an_overrun_drops_time_without_a_burst_and_less_than_a_period_is_no_miss(hand, pacer):
+def test_an_overrun_drops_time_without_a_burst_and_less_than_a_period_is_no_miss(
+    hand, pacer
+):
     hand.now += 1_900_000
     assert pacer.wait(never)
     assert (pacer.missed, pacer.late_ns) == (0, 900_000)
@@ -86,7 +96,9 @@ def test_what_is_excused_is_no_miss_and_costs_only_what_it_is_late(hand, pacer):
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 3.0, 7.0])
-def test_deadlines_are_absolute_and_stretched_by_the_speed_without_drift(hand, paced, speed):
+def test_deadlines_are_absolute_and_stretched_by_the_speed_without_drift(
+    hand, paced, speed
+):
     pacer = paced(speed=speed)
     for k in range(1, 7001):
         hand.now += 100_000  # the work of a tick

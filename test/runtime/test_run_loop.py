@@ -91,7 +91,8 @@ def test_ticks_between_samples_are_done_together_and_commands_keep_their_tick(at
     bench.queue.after_requests = 3
     bench.loop.run()
     assert bench.output.acted == 3 * [ZERO] + 17 * [torque]
-    first, second = bench.queue.asked[2:4]  # the first two are done alone, to measure them
+    # the first two are done alone, to measure them
+    first, second = bench.queue.asked[2:4]
     assert second - first == 1_000_000
 
 
@@ -152,7 +153,8 @@ def test_requests_are_served_while_a_deadline_is_far(start):
     bench.until(lambda: output.acted)  # the first of the two ticks of a sample
     assert bench.ask("pause", True) == (True, "paused")
     last = output.stamps[-1]
-    assert last - output.stamps[0] == 1_000_000  # what was done since the last sample is one
+    # what was done since the last sample is one
+    assert last - output.stamps[0] == 1_000_000
     bench.until(lambda: output.idles)
     assert last < output.idles[-1][2] < last + 100
     assert bench.ask("pause", True) == (True, "already paused")
@@ -247,7 +249,9 @@ def test_set_state_is_checked(start):
     assert bench.loop.simulation.state.joints.gamma != pytest.approx(given[0], abs=1e-3)
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError("boom"), RunStopped("boom", 0.0, None)])
+@pytest.mark.parametrize(
+    "error", [ZeroDivisionError("boom"), RunStopped("boom", 0.0, None)]
+)
 def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(start, error):
     class Broken(Simulation):
         broken = False
@@ -272,7 +276,9 @@ def test_lockstep_times_out_into_a_fault_which_requests_do_not_put_off(start, fa
     began = time.monotonic()
     bench = start(sync="lockstep", lockstep_timeout=0.5, real_time_factor=factor)
     output = bench.output
-    output.on_sample = lambda stamp: bench.stamped.extend([stamped(stamp)] * (not output.acted))
+    output.on_sample = lambda stamp: bench.stamped.extend(
+        [stamped(stamp)] * (not output.acted)
+    )
     bench.begin()
 
     def asked():
@@ -293,13 +299,16 @@ def test_a_pause_does_not_count_as_waiting_for_an_answer(start):
     bench.to(Phase.PAUSED)
     time.sleep(0.4)
     bench.until(lambda: bench.output.idles)
-    bench.stamped.append(stamped(bench.output.idles[-1][2]))  # to the sample, shown again
+    # to the sample, shown again
+    bench.stamped.append(stamped(bench.output.idles[-1][2]))
     bench.ask("pause", False)
     bench.until(lambda: len(bench.output.samples) > 1)
 
 
 def test_a_step_in_lockstep_without_a_controller_does_not_hold_other_requests(start):
-    """Its wait has a bound of its own, and an answer that comes later is used by the next step."""
+    """Its wait has a bound of its own, and an answer that comes later is used by the
+    next step.
+    """
     bench = start(sync="lockstep", lockstep_timeout=100.0)
     assert bench.ask("pause", True).success
     began = time.monotonic()
@@ -309,7 +318,10 @@ def test_a_step_in_lockstep_without_a_controller_does_not_hold_other_requests(st
     waiting.join()
     reply = bench.ask("step")
     assert time.monotonic() - began < 50.0
-    assert not reply.success and "no controller answers: no command answered" in reply.message
+    assert (
+        not reply.success
+        and "no controller answers: no command answered" in reply.message
+    )
     assert bench.loop.phase is Phase.PAUSED and not bench.loop.fault
     bench.stamped.append(stamped(bench.output.stamps[-1]))
     assert bench.ask("step").success
@@ -354,7 +366,8 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
     shown, last = len(idle_stamps()), output.stamps[-1]
     bench.until(lambda: len(idle_stamps()) > shown + 1)
     passed = np.subtract(idle_stamps()[shown:], last)
-    assert passed[0] > 0 and set(np.diff(passed)) == {1}  # none twice, and samples will follow
+    # none twice, and samples will follow
+    assert passed[0] > 0 and set(np.diff(passed)) == {1}
     assert bench.ask("step").success and output.stamps[-1] >= last + 1_000_000
     bench.ask("reset")
     output.now += 10**9
@@ -363,7 +376,9 @@ def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
 
 
 def test_the_state_is_shown_while_the_code_is_loaded(start):
-    """On a busy machine that took 20 s, and a controller gave up after 10 s without a state."""
+    """On a busy machine that took 20 s, and a controller gave up after 10 s without a
+    state.
+    """
     loaded = threading.Event()
 
     class Slow(Simulation):
@@ -402,9 +417,13 @@ def test_code_that_cannot_be_loaded_is_a_fault(start):
 
 @pytest.mark.parametrize("sync", ["free", "lockstep"])
 @pytest.mark.parametrize("publish_clock", [True, False])
-def test_no_two_states_have_one_stamp_though_the_clock_stands_still(start, publish_clock, sync):
+def test_no_two_states_have_one_stamp_though_the_clock_stands_still(
+    start, publish_clock, sync
+):
     """Before the run, in a pause, in a fault and after a reset."""
-    bench = start("swing", wait_for_command=True, sync=sync, publish_clock=publish_clock)
+    bench = start(
+        "swing", wait_for_command=True, sync=sync, publish_clock=publish_clock
+    )
     output = bench.output
 
     def show_more():
@@ -427,13 +446,19 @@ def test_no_two_states_have_one_stamp_though_the_clock_stands_still(start, publi
     assert not set(stamps) & set(output.stamps)
 
 
-@pytest.mark.parametrize(("of_the_run_before", "starts"), [(True, False), (False, True)])
-def test_after_a_reset_a_late_answer_does_not_start_the_run(start, of_the_run_before, starts):
+@pytest.mark.parametrize(
+    ("of_the_run_before", "starts"), [(True, False), (False, True)]
+)
+def test_after_a_reset_a_late_answer_does_not_start_the_run(
+    start, of_the_run_before, starts
+):
     bench = start(sync="lockstep")
     bench.begin()
     bench.ask("reset")
     shown = bench.output.idles[-1][2]
-    bench.stamped.append(stamped(bench.output.stamps[-1] if of_the_run_before else shown))
+    bench.stamped.append(
+        stamped(bench.output.stamps[-1] if of_the_run_before else shown)
+    )
     bench.until(lambda: not bench.stamped)
     if starts:
         bench.until(lambda: len(bench.output.samples) > 1)
@@ -442,7 +467,9 @@ def test_after_a_reset_a_late_answer_does_not_start_the_run(start, of_the_run_be
 
 
 def test_in_lockstep_our_clock_goes_on_before_the_run_by_whole_periods(start):
-    """So that a controller manager, which is updated by it, can have its controllers activated."""
+    """So that a controller manager, which is updated by it, can have its controllers
+    activated.
+    """
     bench = start(sync="lockstep", publish_clock=True)
     output, period_ns = bench.output, 2_000_000
 
@@ -450,7 +477,8 @@ def test_in_lockstep_our_clock_goes_on_before_the_run_by_whole_periods(start):
         return [stamp for _, _, stamp in output.idles]
 
     bench.until(lambda: len(idles()) > 3)
-    assert np.diff(idles())[1:3].tolist() == [period_ns] * 2  # the first is that of the start
+    # the first is that of the start
+    assert np.diff(idles())[1:3].tolist() == [period_ns] * 2
     bench.stamped.append(stamped(idles()[-2]))  # late: an update has been since
     bench.until(lambda: not bench.stamped)
     assert not output.samples
@@ -470,7 +498,9 @@ def test_in_lockstep_our_clock_goes_on_before_the_run_by_whole_periods(start):
     assert output.stamps[4] == output.stamps[3] + period_ns
 
 
-@pytest.mark.parametrize(("waits", "phase"), [(False, Phase.RUNNING), (True, Phase.WAITING)])
+@pytest.mark.parametrize(
+    ("waits", "phase"), [(False, Phase.RUNNING), (True, Phase.WAITING)]
+)
 def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(start, waits, phase):
     bench = start(wait_for_command=waits)
     assert bench.ask("pause", True).success and bench.ask("reset").success
@@ -479,7 +509,9 @@ def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(start, waits, 
 
 
 def test_words_and_values_of_the_diagnostics_do_not_contradict_each_other():
-    """The run goes on while they are read: what is not in the values is told the next time."""
+    """The run goes on while they are read: what is not in the values is told the next
+    time.
+    """
     bench = Bench(wait_for_command=True)
     diagnostics = RunDiagnostics(bench.loop)
     before = diagnostics.values(1)
@@ -489,5 +521,7 @@ def test_words_and_values_of_the_diagnostics_do_not_contradict_each_other():
     bench.loop.phase, bench.input.timeouts, bench.input.begun = Phase.RUNNING, 1, True
     assert diagnostics.status(before, []) == (OK, "waiting", [])
     level, text, news = diagnostics.status(diagnostics.values(1), [])
-    assert level == WARN and text.startswith("running; no command within command_timeout")
+    assert level == WARN and text.startswith(
+        "running; no command within command_timeout"
+    )
     assert len(news) == 1

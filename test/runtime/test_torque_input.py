@@ -24,7 +24,9 @@ class Bench:
         self.commands = Arrived(map(plain, commands))
         self.stamped, self.moments = Arrived(), Arrived()
         run = SimulatorParameters(**{"command_timeout": 0.0, **given}).run
-        self.board = TorqueInput(run, actuators, self.commands, self.stamped, self.moments)
+        self.board = TorqueInput(
+            run, actuators, self.commands, self.stamped, self.moments
+        )
         self.moving = Simulation(load_scene("example1"))
 
     def torque(self, *commands):
@@ -34,7 +36,10 @@ class Bench:
 
 
 def test_the_last_good_command_is_held():
-    """What comes while the node starts is not lost; with a timeout of zero it holds for ever."""
+    """What comes while the node starts is not lost.
+
+    With a timeout of zero it holds for ever.
+    """
     bench = Bench(commands=[(1.0, 2.0, 3.0), (1.0,)])
     assert bench.board.starts_run()
     assert (bench.board.received, bench.board.dropped) == (1, 1)
@@ -101,7 +106,11 @@ def test_limits_clamp_and_count_and_hold_for_the_damping_that_takes_over():
 
 def test_a_flood_is_taken_in_turns():
     bench = Bench()
-    assert bench.torque(*((float(k), 0.0, 0.0) for k in range(1000))) == (49.0, 0.0, 0.0)
+    assert bench.torque(*((float(k), 0.0, 0.0) for k in range(1000))) == (
+        49.0,
+        0.0,
+        0.0,
+    )
     assert len(bench.commands) == 950
 
 
@@ -139,13 +148,21 @@ def test_moments_are_checked_and_let_go_of():
 
 
 def test_an_effort_that_is_no_number_means_not_commanded_where_that_is_asked_for():
-    """As joint_state_topic_hardware_interface of ros2_control sends it, with a stamp of its own."""
+    """As joint_state_topic_hardware_interface of ros2_control sends it, with a stamp of
+    its own.
+    """
     bench = Bench(partial_commands=True)
     bench.stamped += [stamped(5, [NAN] * 3)]
     assert not bench.board.starts_run()
-    bench.stamped += [stamped(7, [3.0, NAN, 1.0], names=["gamma_3", "gamma_2", "gamma_1"])]
+    bench.stamped += [
+        stamped(7, [3.0, NAN, 1.0], names=["gamma_3", "gamma_2", "gamma_1"])
+    ]
     assert bench.torque() == (1.0, 0.0, 3.0)
-    bench.stamped += [stamped(8, [NAN] * 3), stamped(9, [math.inf, NAN, 0.0]), stamped(9, [NAN])]
+    bench.stamped += [
+        stamped(8, [NAN] * 3),
+        stamped(9, [math.inf, NAN, 0.0]),
+        stamped(9, [NAN]),
+    ]
     assert bench.torque() == (1.0, 0.0, 3.0)
     assert (bench.board.received, bench.board.reasons) == (1, {"not finite": 1})
     plain = Bench()
@@ -155,7 +172,13 @@ def test_an_effort_that_is_no_number_means_not_commanded_where_that_is_asked_for
 
 @pytest.mark.parametrize(
     ("frame_id", "used"),
-    [("", True), ("base_link", False), ("left/base_link", True), ("star", False), ("world", False)],
+    [
+        ("", True),
+        ("base_link", False),
+        ("left/base_link", True),
+        ("star", False),
+        ("world", False),
+    ],
 )
 def test_a_moment_in_another_frame_than_the_base_is_refused(frame_id, used):
     bench = Bench(base_frame="left/base_link")
@@ -172,9 +195,16 @@ def test_a_moment_in_another_frame_than_the_base_is_refused(frame_id, used):
 def test_a_refusal_says_how_long_a_list_was():
     bench = Bench()
     bench.torque([1.0] * 20_000)
-    said = "[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, ...] (20000 in all) must be 3 finite torques [N m]"
+    said = (
+        "[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, ...] (20000 in all) must be 3 finite torques"
+        " [N m]"
+    )
     assert bench.board.last_refusal == said
     bench.torque([1.0] * 6)
-    assert bench.board.last_refusal.startswith("[1.0, 1.0, 1.0, 1.0, 1.0, 1.0] must be 3")
-    with pytest.raises(MessageRefused, match=r"names \['a', .*\] \(7 in all\) must be gamma_1"):
+    assert bench.board.last_refusal.startswith(
+        "[1.0, 1.0, 1.0, 1.0, 1.0, 1.0] must be 3"
+    )
+    with pytest.raises(
+        MessageRefused, match=r"names \['a', .*\] \(7 in all\) must be gamma_1"
+    ):
         by_name(["a"] * 7, [0.0] * 7, "torques [N m] in effort")

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller without its node: when it begins, goes on, ends, and what it refuses; goals."""
+"""The controller without its node: when it begins, goes on, ends, and what it refuses.
+
+Goals.
+"""
 
 import contextlib
 import dataclasses
@@ -46,7 +49,9 @@ def follow(**settings):
 
 
 def answers(follower, samples, measured=HERE):
-    """What is answered to samples of these numbers, where the manipulator does not move."""
+    """What is answered to samples of these numbers, where the manipulator does not
+    move.
+    """
     return [follower.answer(START_NS + k * PERIOD_NS, measured) for k in samples]
 
 
@@ -142,7 +147,9 @@ def test_a_trajectory_beside_the_motion_of_the_scene_is_refused_for_that():
 
 def test_it_begins_only_near_the_start_of_the_motion():
     gamma = tuple(np.add(MODEL.initial.gamma, (0.0, 0.06, 0.0)))
-    off = seen(Simulation(dataclasses.replace(MODEL, initial=Initial(gamma=gamma))).state)
+    off = seen(
+        Simulation(dataclasses.replace(MODEL, initial=Initial(gamma=gamma))).state
+    )
     assert follow(start_tolerance=0.07).answer(START_NS, off) is not None
     for ask in (lambda p: p.preview(off), lambda p: p.answer(START_NS, off)):
         with pytest.raises(InputError, match="where the motion begins"):
@@ -160,14 +167,17 @@ def test_what_is_not_finite_is_nowhere_near():
 
 def test_a_stop_comes_to_rest_on_the_path_and_holds():
     follower = follow(mode="computed_torque", stop_time=0.02, hold=1.0)
-    commands, stages, state = closed_loop(follower, lambda k: k == 10 and follower.stop())
+    commands, stages, state = closed_loop(
+        follower, lambda k: k == 10 and follower.stop()
+    )
     references = [command.desired for command in commands]
     path, rest = reference_motion(MODEL), references[-1]
     assert references[9] == path.at(0.018)
     assert rest.gamma == pytest.approx(path.at(0.028).gamma, abs=1e-15)
     assert rest.gamma_dot == REST
     rates = np.array([one.gamma_dot for one in references[9:]])
-    assert (np.abs(np.diff(rates[:, 2])) < 0.2 * abs(rates[0, 2])).all()  # without a jump
+    # without a jump
+    assert (np.abs(np.diff(rates[:, 2])) < 0.2 * abs(rates[0, 2])).all()
     assert np.array(state.joints.gamma) == pytest.approx(rest.gamma, abs=1e-4)
     assert len(references) == 40 and stages[-1] is Stage.HOLDING
 
@@ -230,12 +240,19 @@ class Stream:
             self.stamp_ns += PERIOD_NS
 
     def jumps(self):
-        """Largest steps of position, velocity and acceleration beside what the others explain."""
+        """Largest steps of position, velocity and acceleration beside what the others
+        explain.
+        """
         names = "gamma", "gamma_dot", "gamma_ddot"
-        p, v, a = (np.array([getattr(one, name) for one in self.references]) for name in names)
+        p, v, a = (
+            np.array([getattr(one, name) for one in self.references]) for name in names
+        )
         dt = 1e-9 * PERIOD_NS
         mean = 0.5 * (v[1:] + v[:-1]) - dt / 12.0 * np.diff(a, axis=0)
-        off = np.diff(p, axis=0) - dt * mean, np.diff(v, axis=0) - 0.5 * dt * (a[1:] + a[:-1])
+        off = (
+            np.diff(p, axis=0) - dt * mean,
+            np.diff(v, axis=0) - 0.5 * dt * (a[1:] + a[:-1]),
+        )
         return [float(np.abs(one).max()) for one in (*off, np.diff(a, axis=0))]
 
 
@@ -251,11 +268,16 @@ def test_a_stream_is_followed_without_a_jump_however_long_its_checks_take(
         stream.samples(every)
     stream.samples(500)
     assert stream.follower.irregular == 0 and stream.follower.stage is Stage.HOLDING
-    assert np.abs(np.subtract(stream.references[-1].gamma, HERE.gamma) - off).max() < 1e-12
-    # Of a quintic of 0.5 s the jerk is below 60 * 0.2 / 0.5^3 = 96 rad/s^3, its change in 2 ms 0.2.
+    assert (
+        np.abs(np.subtract(stream.references[-1].gamma, HERE.gamma) - off).max() < 1e-12
+    )
+    # Of a quintic of 0.5 s the jerk is below 60 * 0.2 / 0.5^3 = 96 rad/s^3, its change
+    # in 2 ms 0.2.
     position, velocity, acceleration = stream.jumps()
     assert position < 1e-9 and velocity < 1e-6 and acceleration < 0.25
-    taken = [order for order in orders if not order.outcome.cancelled()]  # by a newer one
+    taken = [
+        order for order in orders if not order.outcome.cancelled()
+    ]  # by a newer one
     assert not any(order.outcome.exception() for order in taken)
     assert len(taken) >= (len(orders) if takes < every else len(orders) // 9)
 
@@ -289,7 +311,10 @@ def test_control_goes_on_beside_the_check_of_a_trajectory():
 
 @pytest.mark.timeout(20)
 def test_a_long_result_of_which_a_part_has_come_delays_no_sample():
-    """Of a process that has to let others run meanwhile; a kernel keeps 200 kB of what is sent."""
+    """Of a process that has to let others run meanwhile.
+
+    A kernel keeps 200 kB of what is sent.
+    """
     ours, theirs = multiprocessing.Pipe()
     with pytest.MonkeyPatch.context() as patch, theirs:
         patch.setattr(processes, "Pipe", lambda: (ours, multiprocessing.Pipe()[1]))
@@ -334,9 +359,12 @@ def test_a_trajectory_begins_at_its_stamp_and_another_takes_its_place(monkeypatc
     off = np.array([np.subtract(one.gamma, HERE.gamma) for one in stream.references])
     assert before > 5 and np.abs(off).max() < 1e-15
     stream.samples(1 + 50 + 1)
-    gammas = np.array([one.gamma for one in stream.references])[before:, 0] - HERE.gamma[0]
+    gammas = (
+        np.array([one.gamma for one in stream.references])[before:, 0] - HERE.gamma[0]
+    )
     assert (np.diff(gammas[:51]) > 0.0).all() and gammas[50:] == pytest.approx(0.02)
-    # While it moves: one in the future, and before that comes one for now, which replaces it.
+    # While it moves: one in the future, and before that comes one for now, which
+    # replaces it.
     begin = stream.stamp_ns
     second = stream.send(0.2, (0.0, 0.0, 0.0))
     stream.samples(40)
@@ -386,12 +414,16 @@ def test_a_check_whose_beginning_has_changed_is_repeated(monkeypatch):
     assert stream.follower.stage is Stage.WAITING
 
 
-DEFAULTS = ControllerNodeParameters(motion="topic", path_tolerance=0.1, goal_tolerance=0.01)
+DEFAULTS = ControllerNodeParameters(
+    motion="topic", path_tolerance=0.1, goal_tolerance=0.01
+)
 FREE = ControllerNodeParameters(motion="topic", stopped_velocity_tolerance=0.0)
 
 
 def tolerance(name="gamma_2", position=0.0, velocity=0.0, acceleration=0.0):
-    return Message(name=name, position=position, velocity=velocity, acceleration=acceleration)
+    return Message(
+        name=name, position=position, velocity=velocity, acceleration=acceleration
+    )
 
 
 def message(times=(0.5, 1.0), path=(), goal=(), goal_time=0.0, multi=()):
@@ -429,7 +461,10 @@ DONE = ErrorCode.SUCCESSFUL
         (None, {"time": 0.5, "off": 9.0, "path": [tolerance(position=-1.0)]}),
         (None, {"time": 0.5, "rate": 9.0}),
         (PATH, {"time": 0.5, "rate": 9.0, "path": [tolerance(velocity=8.0)]}),
-        (PATH, {"time": 0.5, "off": 0.101, "path": [tolerance("gamma_1", position=-1.0)]}),
+        (
+            PATH,
+            {"time": 0.5, "off": 0.101, "path": [tolerance("gamma_1", position=-1.0)]},
+        ),
         (None, {"time": 0.5, "path": [tolerance(acceleration=1e-9)]}),
         (DONE, {"time": 1.0, "off": 0.0099, "rate": 0.0099}),
         (None, {"time": 1.0, "off": 0.0101}),
@@ -454,22 +489,33 @@ def test_the_message_names_the_joint_and_both_numbers():
     goal, off = TrajectoryGoal(message(), DEFAULTS), (0.0, 0.0, 0.25)
     found = goal.outcome(0.2, off, REST)
     assert found[1] == "gamma_3: position error 0.25 rad, path tolerance 0.1 rad"
-    assert goal.outcome(2.5, off, REST)[1] == (
-        "gamma_3: position error 0.25 rad, goal tolerance 0.01 rad 1.500 s after the end, "
-        "goal_time_tolerance 1 s"
+    assert (
+        goal.outcome(2.5, off, REST)[1]
+        == "gamma_3: position error 0.25 rad, goal tolerance 0.01 rad 1.500 s after the"
+        " end, goal_time_tolerance 1 s"
     )
 
 
 def test_the_index_is_that_of_the_point_ahead():
     goal = TrajectoryGoal(message(times=(0.0, 0.5, 1.0)), DEFAULTS)
-    assert [goal.index(time) for time in (0.0, 0.49, 0.5, 0.99, 1.0, 9.0)] == [1, 1, 2, 2, 2, 2]
+    assert [goal.index(time) for time in (0.0, 0.49, 0.5, 0.99, 1.0, 9.0)] == [
+        1,
+        1,
+        2,
+        2,
+        2,
+        2,
+    ]
 
 
 @pytest.mark.parametrize(
     ("given", "place"),
     [
         ({"path": [tolerance("gamma_4")]}, r"path_tolerance\[0\].name = 'gamma_4'"),
-        ({"goal": [tolerance(), tolerance(velocity=-0.5)]}, r"goal_tolerance\[1\].velocity"),
+        (
+            {"goal": [tolerance(), tolerance(velocity=-0.5)]},
+            r"goal_tolerance\[1\].velocity",
+        ),
         ({"path": [tolerance(position=np.nan)]}, r"path_tolerance\[0\].position"),
         ({"goal_time": -2.0}, "goal_time_tolerance"),
         ({"multi": ["base"]}, r"multi_dof_trajectory\.joint_names"),

@@ -38,7 +38,12 @@ def read_parameters(path):
     return [*unused_files(["--params-file", str(path)], "/node")]
 
 
-READERS = {"scene": load, "study": SweepStudy.read, "bag": read_bag, "node": read_parameters}
+READERS = {
+    "scene": load,
+    "study": SweepStudy.read,
+    "bag": read_bag,
+    "node": read_parameters,
+}
 
 
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)
@@ -74,7 +79,9 @@ def test_numbers_of_a_study_are_those_of_a_scene(tmp_path):
     """A scene has YAML 1.2's: 010 is ten, and 1:30 and 1_000 are text."""
     assert study(tmp_path, "n: 4", "n: 010").n == 10
     for word in "1:30", "1_000", "0x10", "1e3":
-        with pytest.raises(InputError, match=re.escape(f"n = '{word}': must be a whole number")):
+        with pytest.raises(
+            InputError, match=re.escape(f"n = '{word}': must be a whole number")
+        ):
             study(tmp_path, "n: 4", f"n: {word}")
         if word != "1e3":
             with pytest.raises(InputError, match=r"vary\.star\.mass = "):
@@ -82,7 +89,9 @@ def test_numbers_of_a_study_are_those_of_a_scene(tmp_path):
 
 
 def test_numbers_of_every_form_are_read_in_what_varies(tmp_path):
-    (one,) = study(tmp_path, "uniform: [1.5, 2.5]", "normal: [2, 1e-1, 1, +.inf]").variations
+    (one,) = study(
+        tmp_path, "uniform: [1.5, 2.5]", "normal: [2, 1e-1, 1, +.inf]"
+    ).variations
     assert one.numbers.ravel().tolist() == [2.0, 0.1, 1.0, float("inf")]
     even = "linspace: [1, 2, 4], relative: true"
     (one,) = study(tmp_path, "uniform: [1.5, 2.5]", even).variations

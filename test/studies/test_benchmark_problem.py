@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark problem: its statement is enough to check its data, and both methods agree."""
+"""The benchmark problem: its statement is enough to check its data, and both methods
+agree.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ AXES = np.eye(3)
 W = np.roll(AXES, 1, axis=0)  # z, x, y
 STAR, ACTUATED, INTERMEDIATE = (
     np.diag([0.39, 0.39, 0.26]),
-    np.array([[0.018375, 0, -0.011697888], [0, 0.03675, 0], [-0.011697888, 0, 0.018375]]),
+    np.array(
+        [[0.018375, 0, -0.011697888], [0, 0.03675, 0], [-0.011697888, 0, 0.018375]]
+    ),
     np.diag([9e-6, 0.009609, 0.009609]),
 )
 
@@ -25,7 +29,9 @@ STAR, ACTUATED, INTERMEDIATE = (
 def rows():
     head, *lines = DATA.read_text(encoding="utf-8").splitlines()
     assert head.split(",") == list(COLUMNS)
-    assert {len(x.partition(".")[2]) for line in lines for x in line.split(",")[1:]} == {DIGITS}
+    assert {
+        len(x.partition(".")[2]) for line in lines for x in line.split(",")[1:]
+    } == {DIGITS}
     return np.array([list(map(float, line.split(","))) for line in lines])
 
 
@@ -33,7 +39,15 @@ def test_the_page_has_the_statement_of_its_generator_and_no_number_of_the_scene_
     text = (DOCS / "benchmark_problem.md").read_text(encoding="utf-8")
     statement = page(load(NAME)).partition("## Reference and results")[0]
     assert len(statement) > 2000 and text.startswith(statement)
-    for number in ("0.39", "0.26", "0.018375", "0.03675", "-0.011697888", "9e-06", "0.009609"):
+    for number in (
+        "0.39",
+        "0.26",
+        "0.018375",
+        "0.03675",
+        "-0.011697888",
+        "9e-06",
+        "0.009609",
+    ):
         assert f" {number} " in statement
     assert "5 \\sin(12\\, t + \\pi/2)" in statement
 
@@ -42,13 +56,19 @@ def test_the_start_is_that_of_the_statement(rows):
     r, s = np.array([1, 1, 0]) / np.sqrt(2), np.full(3, 1 / np.sqrt(3))
     t = np.cross(s, r) / np.linalg.norm(np.cross(s, r))
     start = Rotation.from_quat(rows[0, 4:8]).as_matrix()
-    np.testing.assert_allclose(start, np.stack([np.cross(t, s), t, s], axis=1), atol=1e-12)
+    np.testing.assert_allclose(
+        start, np.stack([np.cross(t, s), t, s], axis=1), atol=1e-12
+    )
     np.testing.assert_allclose(rows[0, 1:4], np.pi / 4, atol=1e-13)
 
 
 def test_loops_are_closed_and_the_torques_do_the_work_of_the_kinetic_energy(rows):
     """By the statement alone: frames from the rows, rates by splines of them."""
-    t, gamma, rotation = rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:8]).as_matrix()
+    t, gamma, rotation = (
+        rows[:, 0],
+        rows[:, 1:4],
+        Rotation.from_quat(rows[:, 4:8]).as_matrix(),
+    )
     turned = np.radians([0.0, 120.0, 240.0])
     e = np.stack([-np.sin(turned), np.cos(turned), 0 * turned], axis=1)
     normals = np.einsum("nij,kj->nki", rotation, e)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The studies of the error estimate and of orders: a case of each class, a method of each order."""
+"""The studies of the error estimate and of orders: a case of each class, a method of
+each order.
+"""
 
 import pickle
 
@@ -9,16 +11,28 @@ from sst_ros.errors import InputError, Problem, RunStopped, SingularConfiguratio
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.report.results import data_frame
 from studies.estimate import CLASSES, compare_bounds, measure
-from studies.orders import MOTIONS, ORDER, measure_steps, measure_tolerance, order_table, truth
+from studies.orders import (
+    MOTIONS,
+    ORDER,
+    measure_steps,
+    measure_tolerance,
+    order_table,
+    truth,
+)
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(c, marks=pytest.mark.slow) if c == "sharp_friction" else c for c in CLASSES],
+    [
+        pytest.param(c, marks=pytest.mark.slow) if c == "sharp_friction" else c
+        for c in CLASSES
+    ],
 )
 def test_the_estimate_holds_in_a_case_of_each_class(name):
     row = next(
-        row for row in (measure((name, 5, k)) for k in range(6)) if row["state"] == "resolved"
+        row
+        for row in (measure((name, 5, k)) for k in range(6))
+        if row["state"] == "resolved"
     )
     assert row["error"] <= 3.0 * row["estimate"]
     assert row["status"] == 2 or row["error"] <= 3.0 * row["tolerance"]
@@ -36,7 +50,9 @@ def test_a_case_depends_on_its_seed_and_number_alone():
 
 @pytest.mark.parametrize("method", ["rk4", "dopri5", "dop853"])
 def test_a_method_has_its_order_on_a_smooth_motion(method):
-    table = order_table(data_frame(row._asdict() for row in measure_steps(("lag", method))))
+    table = order_table(
+        data_frame(row._asdict() for row in measure_steps(("lag", method)))
+    )
     found = float(table["order, shortest steps"][0])
     assert ORDER[method] - 0.2 < found < 1.4 * ORDER[method]
 
@@ -65,4 +81,8 @@ def test_events_and_samples_have_errors_below_the_tolerance():
 )
 def test_an_error_goes_from_a_worker_to_its_parent(error):
     again = pickle.loads(pickle.dumps(error))
-    assert type(again) is type(error) and str(again) == str(error) and vars(again) == vars(error)
+    assert (
+        type(again) is type(error)
+        and str(again) == str(error)
+        and vars(again) == vars(error)
+    )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Study of control rates: orders of the hold, whatever the method, in runs of the run loop."""
+"""Study of control rates: orders of the hold, whatever the method, in runs of the run
+loop.
+"""
 
 import dataclasses
 
@@ -37,7 +39,9 @@ def test_the_orders_are_those_of_the_theory_and_the_method_does_not_matter(brief
     assert brief.order(START) == pytest.approx(1.0, abs=0.02)
     assert brief.order(MIDDLE) == pytest.approx(2.0, abs=0.02)
     assert max(brief.spread(START), brief.spread(MIDDLE)) < 1.001
-    assert advice(brief).startswith("raise the rate or command the torque of the middle")
+    assert advice(brief).startswith(
+        "raise the rate or command the torque of the middle"
+    )
     exact = brief.rows[(brief.rows.hold == EXACT) & (brief.rows.method == "dop853")]
     assert exact.largest_rad.max() < 1e-12
     rows = brief.rows
@@ -46,7 +50,8 @@ def test_the_orders_are_those_of_the_theory_and_the_method_does_not_matter(brief
     at_ticks = angle_between(states[:, :4], truth.quaternion)
     row = rows[(rows.rate_Hz == 500) & (rows.method == "rk4") & (rows.hold == EXACT)]
     assert row.largest_rad.item() == pytest.approx(at_ticks.max(), rel=1e-4)
-    assert at_ticks[::10].max() < 0.999 * at_ticks.max()  # fewer instants would show less
+    # fewer instants would show less
+    assert at_ticks[::10].max() < 0.999 * at_ticks.max()
     assert len(rows) == len(RATES) * len(METHODS) * len(HOLDS)
     assert (rows.tick_us > 0.0).all() and (rows.estimate_rad < 2e-7).all()
     assert (rows.final_rad <= rows.largest_rad).all()
@@ -59,7 +64,10 @@ def test_the_orders_are_those_of_the_theory_and_the_method_does_not_matter(brief
 
 
 def test_a_rate_counts_only_if_every_higher_one_does(brief):
-    """Of rk4 at 100 Hz the error of the method and that of the hold cancel; at 200 Hz not."""
+    """Of rk4 at 100 Hz the error of the method and that of the hold cancel.
+
+    At 200 Hz not.
+    """
     rows = brief.rows.copy()
     own = (rows.method == "rk4") & (rows.hold == EXACT)
     held = (rows.method == "rk4") & (rows.hold == MIDDLE)

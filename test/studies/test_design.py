@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The design study against random orientations, random parts, and a brute search of the front."""
+"""The design study against random orientations, random parts, and a brute search of the
+front.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ DESIGN = Design(85.0, 95.0, 80.0, 110.0, 130.0, 1.2)
 
 def test_the_workspace_is_the_share_of_random_orientations():
     geometry, found = Geometry.of(DESIGN.scene()), evaluate(DESIGN)
-    rotation = Rotation.random(200_000, random_state=np.random.default_rng(3)).as_matrix()
+    rotation = Rotation.random(
+        200_000, random_state=np.random.default_rng(3)
+    ).as_matrix()
     gamma = kinematics.inverse(geometry, rotation)[0]
     measured = workspace.measures(geometry, gamma, rotation)
     share = 100.0 * measured.admissible.mean()
@@ -32,14 +36,18 @@ def test_the_workspace_is_the_share_of_random_orientations():
 
 
 def test_the_error_is_that_of_random_parts():
-    """Assemblies of 2,000 manipulators with errors of all places, at the same measured angles."""
+    """Assemblies of 2,000 manipulators with errors of all places, at the same measured
+    angles.
+    """
     scene = DESIGN.scene()
     geometry, gamma = Geometry.of(scene), np.add(scene.initial.gamma, [0.1, -0.1, 0.05])
     rotation = kinematics.admissible(geometry, gamma).rotation
     rng, turns = np.random.default_rng(4), []
     for _ in range(2000):
         v = geometry.v + PART_ERROR / (0.35 * 1.2) * rng.normal(size=(3, 3))
-        alpha = geometry.alpha + PART_ERROR / (0.4 * 1.2) * np.append(rng.normal(size=2), 0.0)
+        alpha = geometry.alpha + PART_ERROR / (0.4 * 1.2) * np.append(
+            rng.normal(size=2), 0.0
+        )
         made = Geometry.build(v, alpha)
         angles = gamma + ENCODER_ERROR * rng.normal(size=3)
         turned = kinematics.admissible(made, angles).rotation

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The catalogue of stiff and extreme cases, and those that need mpmath or singular poses."""
+"""The catalogue of stiff and extreme cases, and those that need mpmath or singular
+poses.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,9 @@ def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
 )
 def test_three_contacts_are_three(name):
     (case,) = (case for case in CASES if case.name == name)
-    motion = simulate(case.scene(), case.torque, case.steps * case.period_ns / 1e9, samples=2000)
+    motion = simulate(
+        case.scene(), case.torque, case.steps * case.period_ns / 1e9, samples=2000
+    )
     beyond = (motion.gamma > np.pi / 2) | (motion.gamma < 0.0)
     assert (beyond[1:] & ~beyond[:-1]).sum(axis=0).tolist() == [1, 1, 1]
 
@@ -105,7 +109,9 @@ def test_an_error_estimate_that_is_far_off_fails_a_case(monkeypatch):
     assert good.passed and good.run_loop and good.loose_error > 1e-3 * LOOSE
     distance = extreme.apart
     for factor in (0.01, 100.0):
-        monkeypatch.setattr(extreme, "apart", lambda *ends, f=factor: f * distance(*ends))
+        monkeypatch.setattr(
+            extreme, "apart", lambda *ends, f=factor: f * distance(*ends)
+        )
         bad = evaluate_case(case, plain=False)
         assert not bad.passed and "of the true error" in bad.result
 
@@ -139,10 +145,16 @@ def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
     case = named("control period of 333333 ns")
     shorter = replace(case, steps=case.steps - 1)
     monkeypatch.setattr(
-        extreme, "run_case", lambda case, looped=False, **_: run_case(shorter if looped else case)
+        extreme,
+        "run_case",
+        lambda case, looped=False, **_: run_case(shorter if looped else case),
     )
     bad = evaluate_case(case, plain=False)
-    assert not bad.passed and bad.run_loop is False and "the run loop differs" in bad.result
+    assert (
+        not bad.passed
+        and bad.run_loop is False
+        and "the run loop differs" in bad.result
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4, 1e9])
@@ -150,7 +162,9 @@ def test_accelerations_at_any_ratio_of_inertias_are_those_of_mpmath(scale):
     """M is a sum of positive terms up to 1e9 apart; what counts is the largest part."""
     scene = replace(
         EXAMPLE2,
-        star=replace(EXAMPLE2.star, inertia=inertia_of(np.diag([0.39, 0.39, 0.26]) * scale)),
+        star=replace(
+            EXAMPLE2.star, inertia=inertia_of(np.diag([0.39, 0.39, 0.26]) * scale)
+        ),
     )
     simulation = Simulation(replace(scene, initial=Initial(gamma=(0.7, 0.8, 0.75))))
     y = (*simulation.state.quaternion, 0.3, -0.2, 0.4)
@@ -180,8 +194,12 @@ def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays():
 
 
 def test_a_moving_start_exactly_at_a_parallel_singularity_is_refused():
-    """From gamma_dot alone the body rate came out as (1, -2.3, 1.9) rad/s, not (0, 0, 1)."""
-    with pytest.raises(SingularConfiguration, match="does not determine the body rate") as caught:
+    """From gamma_dot alone the body rate came out as (1, -2.3, 1.9) rad/s, not (0, 0,
+    1).
+    """
+    with pytest.raises(
+        SingularConfiguration, match="does not determine the body rate"
+    ) as caught:
         started(0.0, 1.0)
     assert abs(caught.value.measure) < 1e-7
 

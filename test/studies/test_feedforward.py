@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The study of feedforward: it finds what theory predicts, and it repeats to the last bit."""
+"""The study of feedforward: it finds what theory predicts, and it repeats to the last
+bit.
+"""
 
 import csv
 import dataclasses
@@ -16,7 +18,14 @@ from sst_ros.report.results import publish
 from sst_ros.scene.scene import load
 from sst_ros.sweeps.sweep_study import SampledControl
 from studies import feedforward
-from studies.control_loop import SHARE, ControlLoop, ideal_plant, is_stable, model_errors, run_loop
+from studies.control_loop import (
+    SHARE,
+    ControlLoop,
+    ideal_plant,
+    is_stable,
+    model_errors,
+    run_loop,
+)
 from studies.feedforward import (
     COLUMNS,
     RESTLESS,
@@ -30,8 +39,12 @@ from studies.feedforward import (
 from studies.sampled_data import ORDERS, stability_limit
 
 REACH = load("reach")
-SPIRAL = dataclasses.replace(REACH.motion.spiral, phi=0.1, theta=3.0, psi=0.2, duration=0.4)
-SHORT = dataclasses.replace(REACH, motion=dataclasses.replace(REACH.motion, spiral=SPIRAL))
+SPIRAL = dataclasses.replace(
+    REACH.motion.spiral, phi=0.1, theta=3.0, psi=0.2, duration=0.4
+)
+SHORT = dataclasses.replace(
+    REACH, motion=dataclasses.replace(REACH.motion, spiral=SPIRAL)
+)
 PERIOD_NS = 1_000_000
 
 
@@ -41,7 +54,10 @@ def errors(*names):
 
 def held(scene, delay, damping=1.0):
     settings = SampledControl(
-        mode="computed_torque", damping_ratio=damping, period=1e-9 * PERIOD_NS, delay=delay
+        mode="computed_torque",
+        damping_ratio=damping,
+        period=1e-9 * PERIOD_NS,
+        delay=delay,
     )
     return ControlLoop(scene, reference_motion(scene), settings, scene)
 
@@ -64,9 +80,11 @@ def small():
 
 @pytest.mark.slow
 def test_a_small_study_finds_what_theory_says(small):
-    """Of torques that are not held, error and estimate are rounding: 1e4 operations at 1e-16 each.
+    """Of torques that are not held, error and estimate are rounding: 1e4 operations at
+    1e-16 each.
 
-    A wrong model is helped by 1 / SHARE, less what the hold adds; the curvature may take 5 %.
+    A wrong model is helped by 1 / SHARE, less what the hold adds; the curvature may
+    take 5 %.
     """
     assert small.orders() == pytest.approx(ORDERS, abs=0.1)
     error, estimate = small.unheld
@@ -113,11 +131,16 @@ def test_the_same_bits_on_any_number_of_workers():
     assert first.loops.to_csv() == second.loops.to_csv()
     assert first.holds.equals(second.holds) and first.unheld == second.unheld
     other = feedforward_study(dataclasses.replace(plan, seed=9), workers=1)
-    assert first.loops.drop(columns="seed").to_csv() != other.loops.drop(columns="seed").to_csv()
+    assert (
+        first.loops.drop(columns="seed").to_csv()
+        != other.loops.drop(columns="seed").to_csv()
+    )
 
 
 @pytest.mark.slow
-def test_what_it_writes_can_be_read_and_failures_stay_with_their_reason(small, tmp_path):
+def test_what_it_writes_can_be_read_and_failures_stay_with_their_reason(
+    small, tmp_path
+):
     drawn = draw_study(small, title(small))
     files = {".csv": small.loops, ".json": document(small), "picture.png": drawn}
     publish(tmp_path, "feedforward", files)
@@ -130,11 +153,16 @@ def test_what_it_writes_can_be_read_and_failures_stay_with_their_reason(small, t
     assert {row["seed"] for row in written["loops"]} == {8}
     assert written["report"]["numpy"] == np.__version__
     failed = small.loops[small.loops.failure != ""]
-    assert set(failed.error) == {"delay 5"} and set(failed.bandwidth_rad_per_s) == {180.0}
+    assert set(failed.error) == {"delay 5"} and set(failed.bandwidth_rad_per_s) == {
+        180.0
+    }
     assert set(failed["mode"]) == set(MODES) - {"feedforward"} and len(failed) == 4
     assert failed.failure.str.contains(f"{RESTLESS}|stopped").all()
     said = page(small)
-    assert f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed.failure.iloc[-1]}" in said
+    assert (
+        f"[{len(failed)}] delay 5, gravity_pd at 180 rad/s: {failed.failure.iloc[-1]}"
+        in said
+    )
     assert "seed 8" in said and f"NumPy {np.__version__}" in said and "theory 2" in said
     pixels = image.imread(tmp_path / "picture.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 2000

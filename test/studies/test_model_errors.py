@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sampled loops: models that are wrong, encoders, noise and delays, and the theory of stability."""
+"""Sampled loops: models that are wrong, encoders, noise and delays, and the theory of
+stability.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,10 @@ REACH, EXAMPLE2 = load("reach"), load("example2_heavy")
 
 @pytest.mark.parametrize(
     ("plant", "without"),
-    [(REACH, ["nominal"]), (EXAMPLE2, ["nominal", "friction unknown", "gravity missing"])],
+    [
+        (REACH, ["nominal"]),
+        (EXAMPLE2, ["nominal", "friction unknown", "gravity missing"]),
+    ],
 )
 def test_every_error_is_one_but_what_a_plant_has_not_cannot_be_unknown(plant, without):
     errors = list(model_errors())
@@ -74,7 +79,9 @@ def test_noise_has_its_deviation_and_repeats_by_seed():
 
 
 def matrix(product, damping, delay):
-    """The loop in state space: a double integrator sampled by scipy, and a line of delays."""
+    """The loop in state space: a double integrator sampled by scipy, and a line of
+    delays.
+    """
     a, b = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
     a, b, *_ = cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), 1.0)
     gain = -np.array([product**2, 2.0 * damping * product])
@@ -97,16 +104,25 @@ def test_the_poles_are_the_eigenvalues_of_the_sampled_loop(damping, delay):
 
 @pytest.mark.parametrize("damping", [0.1, 0.4, 0.5, 0.7, 1.0, 3.0])
 def test_without_delay_the_limit_is_that_of_jury(damping):
-    assert stability_limit(damping, 0) == pytest.approx(min(4.0 * damping, 1.0 / damping), rel=3e-6)
+    assert stability_limit(damping, 0) == pytest.approx(
+        min(4.0 * damping, 1.0 / damping), rel=3e-6
+    )
 
 
 @pytest.mark.parametrize("delay", range(6))
 def test_every_bandwidth_below_the_limit_is_stable_and_none_above(delay):
     limit = stability_limit(1.0, delay)
-    assert all(pole(share * limit, 1.0, delay) < 1.0 for share in np.linspace(0.001, 0.999, 500))
-    assert all(pole(share * limit, 1.0, delay) > 1.0 for share in np.linspace(1.001, 5.0, 500))
+    assert all(
+        pole(share * limit, 1.0, delay) < 1.0
+        for share in np.linspace(0.001, 0.999, 500)
+    )
+    assert all(
+        pole(share * limit, 1.0, delay) > 1.0 for share in np.linspace(1.001, 5.0, 500)
+    )
 
 
 def test_a_limit_is_found_and_nan_where_nothing_is_stable():
-    assert largest_stable(lambda x: x < 3.7, 1.0, 1.3, 1e-4) == pytest.approx(3.7, rel=1e-4)
+    assert largest_stable(lambda x: x < 3.7, 1.0, 1.3, 1e-4) == pytest.approx(
+        3.7, rel=1e-4
+    )
     assert np.isnan(largest_stable(lambda x: False, 1.0, 1.3))

@@ -16,7 +16,13 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.integration.point import Drive
 from sst_ros.report.scene_summary import eigenvalues
 from sst_ros.simulation.simulation import Simulation
-from studies.extreme import draw_regions, evaluate_case, limits_of_theory, page, prove_case
+from studies.extreme import (
+    draw_regions,
+    evaluate_case,
+    limits_of_theory,
+    page,
+    prove_case,
+)
 from studies.extreme_cases import catalogue
 from studies.extreme_scenes import FREE, POSE, changed, start
 
@@ -26,7 +32,10 @@ AMPLITUDE = 1e-4
 
 
 def damped(coefficient):
-    """The scene `stiff` with another viscous coefficient; its fastest eigenvalue is real."""
+    """The scene `stiff` with another viscous coefficient.
+
+    Its fastest eigenvalue is real.
+    """
     return changed({"friction": {"gamma": {"viscous": coefficient}}}, "stiff")
 
 
@@ -41,7 +50,9 @@ def oscillating(stiffness):
 
 @np.errstate(all="ignore")
 def growth(scene, method, product):
-    """Largest rate after 400 steps whose length times the fastest eigenvalue is `product`."""
+    """Largest rate after 400 steps whose length times the fastest eigenvalue is
+    `product`.
+    """
     simulation, rate = Simulation(scene), np.abs(eigenvalues(scene)).max()
     integrator = MethodSteps(ODE(simulation.dynamics), METHODS[method])
     begin = [*simulation.state.quaternion, *simulation.state.body_rate]
@@ -63,16 +74,23 @@ def growth(scene, method, product):
         ("dop853", oscillating, 1e3, 5.96),
     ],
 )
-def test_steps_are_stable_up_to_the_ends_of_the_intervals(method, family, coefficient, reach):
-    """The ends of the real and imaginary stability intervals, Hairer & Wanner, section IV.2."""
+def test_steps_are_stable_up_to_the_ends_of_the_intervals(
+    method, family, coefficient, reach
+):
+    """The ends of the real and imaginary stability intervals, Hairer & Wanner, section
+    IV.2.
+    """
     scene = family(coefficient)
     values = eigenvalues(scene)
-    # Rates of the oscillation at its amplitude; at rest the damped family has a rate of its own.
+    # Rates of the oscillation at its amplitude; at rest the damped family has a rate of
+    # its own.
     most = 10.0
     if family is oscillating:
         assert np.abs(values.real).max() < 1e-3 * np.abs(values).max()
         most *= AMPLITUDE * np.abs(values).max()
-    assert growth(scene, method, 0.98 * reach) < most < growth(scene, method, 1.02 * reach)
+    assert (
+        growth(scene, method, 0.98 * reach) < most < growth(scene, method, 1.02 * reach)
+    )
 
 
 def test_the_implicit_method_is_stable_everywhere():
@@ -105,18 +123,26 @@ def test_the_figure_shows_every_method(tmp_path):
     save_figure(figure, tmp_path / "regions.png")
     pixels = image.imread(tmp_path / "regions.png")
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.1).sum() > 2000
-    assert [axes.get_title("left").partition(":")[0] for axes in figure.axes[:4]] == list(METHODS)
+    assert [
+        axes.get_title("left").partition(":")[0] for axes in figure.axes[:4]
+    ] == list(METHODS)
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("time x 10", r"\d\.\de-12 rad"),  # passes no limit, which a first look cannot say
+        # passes no limit, which a first look cannot say
+        ("time x 10", r"\d\.\de-12 rad"),
         ("square wave of 2 N m", r"\d\.\de-1[56] rad"),
         ("stops of 1000 N m/rad", r"\d\.\de-12 rad"),
         ("start at a corner that cannot be assembled", "-: there is no motion"),
-        ("sampled PD control at 0.98 of the limit of its bandwidth", "-: its torques .*"),
+        (
+            "sampled PD control at 0.98 of the limit of its bandwidth",
+            "-: its torques .*",
+        ),
     ],
 )
 def test_a_case_is_proven_or_the_reason_is_said(name, said):
-    assert re.fullmatch(said, prove_case(next(case for case in CASES if case.name == name)))
+    assert re.fullmatch(
+        said, prove_case(next(case for case in CASES if case.name == name))
+    )

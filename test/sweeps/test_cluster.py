@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study on real `dask scheduler` and `dask worker` processes: killed, replaced, refused, full."""
+"""A study on real `dask scheduler` and `dask worker` processes: killed, replaced,
+refused, full.
+"""
 
 import dataclasses
 import json
@@ -24,10 +26,19 @@ from sst_ros.sweeps.sweep_study import SweepStudy
 for module in ("distributed", "pandas", "pyarrow"):
     pytest.importorskip(module, reason="a cluster needs it")
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.usefixtures("cache")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(300),
+    pytest.mark.usefixtures("cache"),
+]
 LIMIT_S = 60
-VARY = {"star.inertia": ("uniform", 0.9, 1.1, "relative"), "initial.gamma": ("uniform", 0.7, 0.85)}
-STUDY = SweepStudy(load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40, chunk=100)
+VARY = {
+    "star.inertia": ("uniform", 0.9, 1.1, "relative"),
+    "initial.gamma": ("uniform", 0.7, 0.85),
+}
+STUDY = SweepStudy(
+    load_scene("example2_heavy"), VARY, n=1200, seed=7, steps=40, chunk=100
+)
 WORKER = "from distributed.cli.dask_worker import main; main()"
 OLD = "from sst_ros import version; version.VERSION = '0.0.9'"
 FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))"
@@ -41,7 +52,9 @@ def patched(self, index):
 PreparedSweep.chunk = patched
 """
 POISONED = BEFORE_A_CHUNK.format("index == 3 and os.kill(os.getpid(), signal.SIGKILL)")
-NOTED = BEFORE_A_CHUNK.format("open('noted', 'a').write(f'{index}\\n'); time.sleep(0.3)")
+NOTED = BEFORE_A_CHUNK.format(
+    "open('noted', 'a').write(f'{index}\\n'); time.sleep(0.3)"
+)
 SLOW = BEFORE_A_CHUNK.format("time.sleep(0.1)")
 
 
@@ -63,7 +76,9 @@ class Processes:
 
     def __init__(self, folder):
         self.folder, self.workers = folder, []
-        self.environment = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "3"}
+        self.environment = os.environ | {
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "3"
+        }
         self.start_scheduler()
 
     def start(self, words):
@@ -147,7 +162,9 @@ def test_workers_killed_at_random_lose_nothing(processes, tmp_path):
         for _ in range(6):
             if over.wait(rng.uniform(0.5, 2.0)):
                 return
-            victim = rng.choice([one for one in processes.workers if one.poll() is None])
+            victim = rng.choice(
+                [one for one in processes.workers if one.poll() is None]
+            )
             victim.kill()
             processes.add_worker(SLOW)
 
@@ -174,7 +191,9 @@ def test_a_worker_that_stands_still_holds_no_study(processes, expected, tmp_path
         same(run_study(STUDY, tmp_path / "out", client=client), expected)
 
 
-def test_a_study_resumes_after_its_scheduler_was_killed(processes, expected, tmp_path, monkeypatch):
+def test_a_study_resumes_after_its_scheduler_was_killed(
+    processes, expected, tmp_path, monkeypatch
+):
     monkeypatch.setattr(many_runs, "NO_SCHEDULER", 3.0)
     processes.add_worker(SLOW)
     out = tmp_path / "out"
@@ -183,7 +202,9 @@ def test_a_study_resumes_after_its_scheduler_was_killed(processes, expected, tmp
         until(lambda: len(list(out.glob("part-*"))) >= 3)
         processes.scheduler.kill()
 
-    failed = pytest.raises(SweepFailed, match="scheduler does not answer; continue with --resume")
+    failed = pytest.raises(
+        SweepFailed, match="scheduler does not answer; continue with --resume"
+    )
     with processes.client(1) as client, meanwhile(kill), failed:
         run_study(STUDY, out, client=client)
     done = len(list(out.glob("part-*")))
@@ -212,7 +233,8 @@ def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
 
     with processes.client(2) as client, meanwhile(join):
         same(run_study(STUDY, tmp_path / "out", client=client), expected)
-    # What the workers that fit have begun is not begun again when another is refused, or joins.
+    # What the workers that fit have begun is not begun again when another is refused,
+    # or joins.
     assert sorted(map(int, (tmp_path / "noted").read_text().split())) == list(range(12))
     said = capsys.readouterr().err
     assert "gets no more chunks: " in said
@@ -220,10 +242,15 @@ def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
     assert not list((tmp_path / "out").glob(".part-*"))
 
 
-def test_without_a_worker_that_takes_chunks_the_study_ends(processes, tmp_path, monkeypatch):
+def test_without_a_worker_that_takes_chunks_the_study_ends(
+    processes, tmp_path, monkeypatch
+):
     monkeypatch.setattr(many_runs, "NO_WORKER", 2.0)
     processes.add_worker(OLD)
-    with processes.client(1) as client, pytest.raises(SweepFailed, match=r"in place of"):
+    with (
+        processes.client(1) as client,
+        pytest.raises(SweepFailed, match=r"in place of"),
+    ):
         run_study(STUDY, tmp_path / "out", client=client)
 
 
@@ -232,7 +259,9 @@ def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
     processes, expected, tmp_path, allowed
 ):
     processes.stop()
-    processes.environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(allowed)}
+    processes.environment |= {
+        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(allowed)
+    }
     processes.start_scheduler()
     live = threading.Event()
 
@@ -242,7 +271,9 @@ def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
             if all(one.poll() is not None for one in processes.workers):
                 processes.add_worker(POISONED)
 
-    died = pytest.raises(SweepFailed, match=r"^chunk 3: [^;]*died while running it[^;]*$")
+    died = pytest.raises(
+        SweepFailed, match=r"^chunk 3: [^;]*died while running it[^;]*$"
+    )
     with meanwhile(keep_one, live), processes.client(1) as client, died:
         run_study(STUDY, tmp_path / "out", client=client)
     assert len(list((tmp_path / "out").glob("part-*"))) == 11

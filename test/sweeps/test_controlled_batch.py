@@ -49,7 +49,9 @@ def gaussian(seed, rows, counter):
 
 
 @pytest.mark.parametrize("by", ["NumPy", "machine code"])
-@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case.values())))
+@pytest.mark.parametrize(
+    "case", CASES, ids=lambda case: "-".join(map(str, case.values()))
+)
 def test_each_torque_is_that_of_the_python_controller(monkeypatch, case, by):
     if by == "NumPy":
         monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
@@ -91,20 +93,28 @@ def test_each_torque_is_that_of_the_python_controller(monkeypatch, case, by):
             measured = encoders.measure(at[0:3], at[9:12])
             gamma, gamma_dot = measured.gamma, measured.gamma_dot
             if any(noise):
-                drawn = [gaussian(11, rows[lane : lane + 1], 6 * k + j)[0] for j in range(6)]
+                drawn = [
+                    gaussian(11, rows[lane : lane + 1], 6 * k + j)[0] for j in range(6)
+                ]
                 gamma = tuple(np.add(gamma, noise[0] * np.array(drawn[:3])).tolist())
-                gamma_dot = tuple(np.add(gamma_dot, noise[1] * np.array(drawn[3:])).tolist())
+                gamma_dot = tuple(
+                    np.add(gamma_dot, noise[1] * np.array(drawn[3:])).tolist()
+                )
             command = controller.command(k * PERIOD, Measurement(gamma, gamma_dot))
             expected = encoders.transmit(command.torque)
             scale = max(1.0, np.abs(command.feedback).max())
-            np.testing.assert_allclose(torques[k][:, lane], expected, rtol=0, atol=1e-12 * scale)
+            np.testing.assert_allclose(
+                torques[k][:, lane], expected, rtol=0, atol=1e-12 * scale
+            )
 
 
 @pytest.mark.slow
 def test_a_closed_loop_tracks_as_that_of_the_simulation():
     """Whole runs, each integrated by steps of its own."""
     control = {"mode": "feedforward_pd", "bandwidth": 40.0, "period": 0.01, "delay": 1}
-    study = SweepStudy(SCENE, {"star.mass": [2.6, 2.0]}, control=control, tolerance=1e-10)
+    study = SweepStudy(
+        SCENE, {"star.mass": [2.6, 2.0]}, control=control, tolerance=1e-10
+    )
     found = run_study(study, None)
     for row, mass in enumerate((2.6, 2.0)):
         plant = SCENE.with_values({"star.mass": mass})
@@ -132,14 +142,18 @@ def test_a_closed_loop_tracks_as_that_of_the_simulation():
 def test_gains_vary_by_row():
     control = {"mode": "pd", "period": 0.01, "bandwidth": 30.0}
     vary = {"control.bandwidth": [20.0, 40.0], "control.damping_ratio": [0.7, 1.0]}
-    both = run_study(SweepStudy(SCENE, vary, control=control, steps=400, duration=1.0), None)
+    both = run_study(
+        SweepStudy(SCENE, vary, control=control, steps=400, duration=1.0), None
+    )
     alone = SweepStudy(
         SCENE, {"star.mass": [2.6]}, steps=400, duration=1.0,
         control=control | {"bandwidth": 40.0, "damping_ratio": 0.7},
     )  # fmt: skip
     expected = run_study(alone, None)
     assert both["control.bandwidth"].tolist() == [20.0, 20.0, 40.0, 40.0]
-    assert both["error_max_1"][2] == pytest.approx(expected["error_max_1"][0], rel=1e-12)
+    assert both["error_max_1"][2] == pytest.approx(
+        expected["error_max_1"][0], rel=1e-12
+    )
     assert both["error_max_1"][0] > 1.5 * both["error_max_1"][2]
 
 
@@ -161,7 +175,9 @@ def test_noise_is_normal_and_depends_on_row_counter_and_seed_alone():
     ],
 )
 def test_a_duration_or_steps_that_fit_no_whole_periods_are_refused(period, message):
-    study = SweepStudy(SCENE, VARY, n=2, control={"period": period}, duration=1.0, steps=25)
+    study = SweepStudy(
+        SCENE, VARY, n=2, control={"period": period}, duration=1.0, steps=25
+    )
     with pytest.raises(InputError, match=message):
         PreparedSweep(study)
 
@@ -178,4 +194,6 @@ def test_the_time_at_which_a_controlled_run_leaves_does_not_depend_on_its_steps(
     assert np.all(coarse["gamma_max_1"] >= coarse["gamma_1"])
     assert coarse["reason"].tolist() == fine["reason"].tolist()
     assert coarse["status"].tolist() == [0, 1, 1, 1]
-    np.testing.assert_allclose(coarse["fault_time"], fine["fault_time"], rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(
+        coarse["fault_time"], fine["fault_time"], rtol=0.0, atol=1e-8
+    )

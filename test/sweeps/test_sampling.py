@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a study: row i depends on the seed and on i alone, and has the distribution asked."""
+"""Samples of a study: row i depends on the seed and on i alone, and has the
+distribution asked.
+"""
 
 from array import array
 
@@ -69,9 +71,13 @@ def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
     found = study.draw(0, 6)
     assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
     assert found["initial.gamma"][:, 1].tolist() == [0.7, 0.8, 0.9] * 2
-    series = SweepStudy(SCENE, vary | {KEY: array("d", [0.2, 0.3])})  # it has tolist, as in pandas
+    # it has tolist, as in pandas
+    series = SweepStudy(SCENE, vary | {KEY: array("d", [0.2, 0.3])})
     assert series.digest == study.digest
-    even = {KEY: ("linspace", 0.2, 0.3, 2), "initial.gamma": ("linspace", 0.7, [0.9, 0.7, 1.1], 3)}
+    even = {
+        KEY: ("linspace", 0.2, 0.3, 2),
+        "initial.gamma": ("linspace", 0.7, [0.9, 0.7, 1.1], 3),
+    }
     found = SweepStudy(SCENE, even).draw(0, 6)
     assert found[KEY][:, 0].tolist() == [0.2] * 3 + [0.3] * 3
     np.testing.assert_allclose(
@@ -80,34 +86,62 @@ def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
 
 
 def test_one_factor_scales_a_whole_tensor():
-    study = SweepStudy(SCENE, {"actuated_links.inertia": ("uniform", 0.5, 2.0, "relative")}, n=9)
+    study = SweepStudy(
+        SCENE, {"actuated_links.inertia": ("uniform", 0.5, 2.0, "relative")}, n=9
+    )
     (one,) = study.variations
     factor = study.draw(0, 9)[one.key]
     assert one.columns == ("actuated_links.inertia",)
     found = one.parameters(factor)
     assert len(found) == 3 * 4
     inertia = SCENE.actuated_links[1].inertia
-    np.testing.assert_array_equal(found["actuated_links[1].inertia.xz"], inertia.xz * factor[:, 0])
+    np.testing.assert_array_equal(
+        found["actuated_links[1].inertia.xz"], inertia.xz * factor[:, 0]
+    )
 
 
 REFUSED = [
-    ({"vary": {"star.weight": [1.0]}}, "vary.star.weight = .*: unknown key; allowed are"),
-    ({"vary": {KEY: ("uniform", 0.3, 0.2)}}, "the lower end must be less than the upper one"),
-    ({"vary": {KEY: ("gauss", 0.3, 0.2)}}, "must be a list of values, or one of uniform, normal"),
+    (
+        {"vary": {"star.weight": [1.0]}},
+        "vary.star.weight = .*: unknown key; allowed are",
+    ),
+    (
+        {"vary": {KEY: ("uniform", 0.3, 0.2)}},
+        "the lower end must be less than the upper one",
+    ),
+    (
+        {"vary": {KEY: ("gauss", 0.3, 0.2)}},
+        "must be a list of values, or one of uniform, normal",
+    ),
     ({"vary": {KEY: ("normal", 0.3, -0.2)}}, "the standard deviation must be > 0"),
     ({"vary": {KEY: ("uniform", np.nan, 1.0)}}, "must be finite numbers"),
-    ({"vary": {KEY: ("linspace", 0.2, 0.3, 2.5)}}, "linspace takes low, high, count .whole, 1 to"),
-    ({"vary": {KEY: bytearray(b"12")}}, "must be a list of values, or one of uniform, normal"),
-    ({"vary": {"star.mass": ("uniform", -1.0, 1.0)}}, r">= 0 \[kg\]; it reaches from -1.0 to 1.0"),
+    (
+        {"vary": {KEY: ("linspace", 0.2, 0.3, 2.5)}},
+        "linspace takes low, high, count .whole, 1 to",
+    ),
+    (
+        {"vary": {KEY: bytearray(b"12")}},
+        "must be a list of values, or one of uniform, normal",
+    ),
+    (
+        {"vary": {"star.mass": ("uniform", -1.0, 1.0)}},
+        r">= 0 \[kg\]; it reaches from -1.0 to 1.0",
+    ),
     ({"table": [1.0, 2.0]}, "table = .*: must be columns of numbers, or a .csv"),
     ({"table": [1, 2]}, "table = .*: must be columns of numbers, or a .csv"),
     ({"vary": {}, "table": {"star.mass": 2.0}}, "a column has one number for each row"),
     (
-        {"vary": {}, "table": {f"initial.gamma[{k}]": [0.5] * (1 + k) for k in range(3)}},
+        {
+            "vary": {},
+            "table": {f"initial.gamma[{k}]": [0.5] * (1 + k) for k in range(3)},
+        },
         "must have columns of equal length",
     ),
     ({"vary": {"payload.mass": [1.0]}}, "the scene has no payload"),
-    ({"vary": {"star.inertia": ("uniform", 0.8, 1.2)}}, "is a tensor: vary it with relative: true"),
+    (
+        {"vary": {"star.inertia": ("uniform", 0.8, 1.2)}},
+        "is a tensor: vary it with relative: true",
+    ),
     ({"vary": {"control.bandwidth": [20.0]}}, "acts with control only"),
     ({"vary": {}}, "vary = {}: must name at least one key"),
     ({"vary": 3}, "vary = 3: must be a mapping from keys"),
@@ -141,7 +175,9 @@ def test_a_study_refuses_what_is_no_scene():
 
 def test_a_study_keeps_its_table_when_the_one_given_changes():
     column = np.array([1.0, 2.0])
-    study = SweepStudy.from_values({"scene": SCENE, "table": {"star.mass": column}, "vary": {}})
+    study = SweepStudy.from_values(
+        {"scene": SCENE, "table": {"star.mass": column}, "vary": {}}
+    )
     column[0] = 7.0
     assert study.table["star.mass"].tolist() == [1.0, 2.0]
 
@@ -155,7 +191,9 @@ def test_an_empty_table_is_refused(table):
 
 def test_more_rows_than_anyone_can_run_are_refused():
     values = {"scene": SCENE, "vary": {KEY: ("uniform", 0.2, 0.3)}, "n": 10**14}
-    with pytest.raises(InputError, match="n = 100000000000000: must be a whole number from 1 to"):
+    with pytest.raises(
+        InputError, match="n = 100000000000000: must be a whole number from 1 to"
+    ):
         SweepStudy.from_values(values)
 
 

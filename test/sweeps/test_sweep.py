@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sweep` on this machine: rows equal runs of their own, files are whole, and studies resume."""
+"""`sweep` on this machine: rows equal runs of their own, files are whole, and studies
+resume.
+"""
 
 import dataclasses
 import sys
@@ -42,10 +44,12 @@ def test_a_row_is_a_run_of_its_scene(table):
         one = table.loc[row]
         inertia = one["star.inertia"] * np.array([0.39, 0.39, 0.26])
         values = {
-            f"star.inertia.{ii}": x for ii, x in zip(("xx", "yy", "zz"), inertia, strict=True)
+            f"star.inertia.{ii}": x
+            for ii, x in zip(("xx", "yy", "zz"), inertia, strict=True)
         }
         gamma, amplitude = (
-            [one[f"{key}[{k}]"] for k in range(3)] for key in ("initial.gamma", "torque.amplitude")
+            [one[f"{key}[{k}]"] for k in range(3)]
+            for key in ("initial.gamma", "torque.amplitude")
         )
         values |= {"initial.gamma": gamma, "torque.amplitude": amplitude}
         scene = SCENE.with_values(values)
@@ -71,7 +75,9 @@ def test_neither_chunks_nor_workers_change_a_bit(table, changes):
 def test_the_tolerance_chooses_the_number_of_steps():
     counts = []
     for tolerance in (1e-6, 1e-9):
-        ready = PreparedSweep(dataclasses.replace(STUDY, steps=None, tolerance=tolerance))
+        ready = PreparedSweep(
+            dataclasses.replace(STUDY, steps=None, tolerance=tolerance)
+        )
         assert ready.pilot_error <= tolerance
         counts.append(ready.steps)
     assert counts[0] < counts[1] < 64
@@ -82,7 +88,9 @@ def test_extremes_are_those_of_a_run():
     found, ready = run_study(study, None), PreparedSweep(study)
     scenarios, starts, _ = ready.scenarios(study.draw(0, 3))
     batch, rate = ready.batch.with_parameters(scenarios), np.zeros((3, 3))
-    runs = batch.run(starts["initial.gamma"], rate, step=1.0 / 40, count=40, keep_every=1)
+    runs = batch.run(
+        starts["initial.gamma"], rate, step=1.0 / 40, count=40, keep_every=1
+    )
     gamma = runs.kept.gamma[..., 1]
     assert gamma.shape == (41, 3)
     assert found["gamma_max_2"].tolist() == gamma.max(axis=0).tolist()
@@ -91,15 +99,24 @@ def test_extremes_are_those_of_a_run():
 
 def test_constant_torques_take_the_place_of_the_scenes():
     found = sst_ros.sweep(
-        SCENE, {"star.inertia.zz": [0.26, 0.3]}, torque=(0.1, 0.2, -0.1), duration=0.2, steps=20
+        SCENE,
+        {"star.inertia.zz": [0.26, 0.3]},
+        torque=(0.1, 0.2, -0.1),
+        duration=0.2,
+        steps=20,
     )
     simulation = Simulation(SCENE, "dop853")
     simulation.step((0.1, 0.2, -0.1), 200_000_000)
-    np.testing.assert_allclose(found["gamma_1"][0], simulation.state.joints.gamma[0], atol=1e-11)
+    np.testing.assert_allclose(
+        found["gamma_1"][0], simulation.state.joints.gamma[0], atol=1e-11
+    )
 
 
 def test_rows_that_make_no_scene_are_reported_and_stop_no_other():
-    vary = {"star.inertia.zz": ("normal", 0.26, 0.2), "star.inertia.xx": ("uniform", 0.38, 0.39)}
+    vary = {
+        "star.inertia.zz": ("normal", 0.26, 0.2),
+        "star.inertia.xx": ("uniform", 0.38, 0.39),
+    }
     found = sst_ros.sweep(SCENE, vary, n=40, steps=20)
     zz, xx = found["star.inertia.zz"], found["star.inertia.xx"]
     wrong = (zz <= 0.0) | (zz > xx + 0.39)
@@ -113,13 +130,19 @@ def test_a_table_is_checked_before_anything_runs_and_runs_row_by_row(table):
     some = table.loc[[5, 200, 17], table.attrs["inputs"]]
     again = sst_ros.sweep(SCENE, some, steps=40)
     for name in ("gamma_1", "body_rate_z", "energy"):
-        assert np.array_equal(again[name].to_numpy(), table.loc[[5, 200, 17], name], equal_nan=True)
+        assert np.array_equal(
+            again[name].to_numpy(), table.loc[[5, 200, 17], name], equal_nan=True
+        )
     with pytest.raises(InputError, match=r"makes no scene.*star\.inertia"):
-        sst_ros.sweep(SCENE, some.assign(**{"star.inertia": [1.0, -1.0, 1.0]}), steps=40)
+        sst_ros.sweep(
+            SCENE, some.assign(**{"star.inertia": [1.0, -1.0, 1.0]}), steps=40
+        )
 
 
 def test_ends_of_ranges_that_make_no_scene_are_refused_before_anything_runs():
-    with pytest.raises(InputError, match=r"makes no scene.*no principal moment may exceed"):
+    with pytest.raises(
+        InputError, match=r"makes no scene.*no principal moment may exceed"
+    ):
         sst_ros.sweep(SCENE, {"star.inertia.zz": ("uniform", 0.2, 0.9)}, n=10)
 
 
@@ -145,7 +168,9 @@ def test_resume_computes_only_what_is_missing(table, tmp_path, monkeypatch):
     (out / ".part-left").write_text("of a killed process")
     calls, compute = [], PreparedSweep.chunk
     monkeypatch.setattr(
-        PreparedSweep, "chunk", lambda self, index: calls.append(index) or compute(self, index)
+        PreparedSweep,
+        "chunk",
+        lambda self, index: calls.append(index) or compute(self, index),
     )
     same(run_study(STUDY, out, resume=True), table)
     assert sorted(calls) == [1, 3]
@@ -156,7 +181,9 @@ def test_resume_computes_only_what_is_missing(table, tmp_path, monkeypatch):
         run_study(STUDY, out)
 
 
-def test_a_full_disk_leaves_whole_files_and_the_study_resumes(table, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_whole_files_and_the_study_resumes(
+    table, tmp_path, monkeypatch
+):
     out, write, written = tmp_path / "out", engine.write_part, []
 
     def full(table, folder, index, about):

@@ -61,7 +61,9 @@ def add_a_second_name(folder):
     shutil.copy(part(folder, 0), folder / "part-0000000 (copy).parquet")
 
 
-@pytest.mark.parametrize("read", [read_sweep, lambda out: run_study(STUDY, out, resume=True)])
+@pytest.mark.parametrize(
+    "read", [read_sweep, lambda out: run_study(STUDY, out, resume=True)]
+)
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -18,7 +18,12 @@ def test_peaks_and_rms_of_runs_are_those_of_each_alone():
         "friction.gamma.viscous": [0.1, 0.3],
         "base.v": turned,
     }
-    given = {"duration": 0.3, "steps": PARTS, "outputs": ("reactions",), "progress": False}
+    given = {
+        "duration": 0.3,
+        "steps": PARTS,
+        "outputs": ("reactions",),
+        "progress": False,
+    }
     table = sweep(scene.with_values({"friction.gamma.viscous": 0.1}), vary, **given)
     assert len(table) == 16
     for row in (0, 6, 15):
@@ -34,13 +39,17 @@ def test_peaks_and_rms_of_runs_are_those_of_each_alone():
                 for part in ("peak", "rms"):
                     columns = [f"{size}_{name}_{part}_{leg}" for leg in (1, 2, 3)]
                     found = chosen[columns].to_numpy(dtype=float)
-                    assert found == pytest.approx(getattr(expected, part), rel=1e-6, abs=1e-9)
+                    assert found == pytest.approx(
+                        getattr(expected, part), rel=1e-6, abs=1e-9
+                    )
                     assert table.attrs["units"][columns[0]] == unit
 
 
 @pytest.mark.slow
 def test_motors_of_controlled_runs_give_the_torques_that_were_sent():
-    """Without friction and springs the torque about an actuator's axis is that of its motor."""
+    """Without friction and springs the torque about an actuator's axis is that of its
+    motor.
+    """
     scene = load_scene("reach").with_values({"friction": None})
     control = {"mode": "computed_torque", "bandwidth": 20.0, "period": 0.01}
     table = sweep(

@@ -37,8 +37,12 @@ def test_it_plays_every_sample_once_and_ends(example2_bag, monkeypatch):
         clock.now += 1.0 / 30.0
         seen += reel.states()
     assert [sample.time for sample in seen] == run.seconds.tolist()
-    assert np.array([sample.gamma for sample in seen]) == pytest.approx(run.gamma, abs=0.0)
-    assert np.array([sample.torque for sample in seen]) == pytest.approx(run.effort, abs=0.0)
+    assert np.array([sample.gamma for sample in seen]) == pytest.approx(
+        run.gamma, abs=0.0
+    )
+    assert np.array([sample.torque for sample in seen]) == pytest.approx(
+        run.effort, abs=0.0
+    )
 
 
 def test_hold_seek_and_speed(example2_bag, monkeypatch):
@@ -60,20 +64,34 @@ def test_hold_seek_and_speed(example2_bag, monkeypatch):
     assert reel.states()[-1].time == 0.0
 
 
-@pytest.mark.skipif(chromium() is None, reason="no chromium with chromedriver on the PATH")
+@pytest.mark.skipif(
+    chromium() is None, reason="no chromium with chromedriver on the PATH"
+)
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_page_of_a_bag(example2_bag, browser):
-    command = [sys.executable, "-m", "sst_ros", "view", str(example2_bag), "--port", "18180"]
+    command = [
+        sys.executable,
+        "-m",
+        "sst_ros",
+        "view",
+        str(example2_bag),
+        "--port",
+        "18180",
+    ]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **pipes) as process:
         try:
             assert select.select([process.stdout], [], [], 60)[0]
-            url = re.search(r"http://127\.0\.0\.1:\S+", process.stdout.readline()).group()
+            url = re.search(
+                r"http://127\.0\.0\.1:\S+", process.stdout.readline()
+            ).group()
             page = browser
             page.open(url, (960, 640))
             page.until(lambda: page.title() == "sst_ros", "title of the tab")
-            page.until(lambda: page.text("#sst-phase") == "recording, paused", "end of the bag")
+            page.until(
+                lambda: page.text("#sst-phase") == "recording, paused", "end of the bag"
+            )
             assert page.time() == 0.3
             page.slide("t [s]", HOME)
             page.until(lambda: page.time() == 0.0, "beginning of the bag")

@@ -29,20 +29,28 @@ def turned(handle):
 
 
 def test_an_arc_is_a_tube_about_its_circle(server):
-    """Pappus: the circumference of the cross-section times the length of its centre's path."""
+    """Pappus: the circumference of the cross-section times the length of its centre's
+    path.
+    """
     begin, axis = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
     add_shape(server, "/arc", Arc(begin, axis, 2.0, 0.4, 0.02, RED))
     drawn = node(server, "/arc")
     mesh = trimesh.Trimesh(drawn.vertices, drawn.faces, process=False)
     assert mesh.area == pytest.approx(2.0 * np.pi * 0.02 * 0.4 * 2.0, rel=0.01)
     circle = 0.4 * drawn.vertices / np.linalg.norm(drawn.vertices, axis=1)[:, None]
-    outwards = mesh.face_normals * (mesh.triangles_center - circle[mesh.faces].mean(axis=1))
+    outwards = mesh.face_normals * (
+        mesh.triangles_center - circle[mesh.faces].mean(axis=1)
+    )
     beside = np.abs(outwards.sum(axis=1)) > 1e-3
     assert (outwards.sum(axis=1)[beside] > 0.0).all()
     along = drawn.vertices @ np.cross(axis, begin)
-    assert np.ptp(np.linalg.norm(drawn.vertices, axis=1)) == pytest.approx(0.04, rel=0.05)
+    assert np.ptp(np.linalg.norm(drawn.vertices, axis=1)) == pytest.approx(
+        0.04, rel=0.05
+    )
     assert along.max() == pytest.approx(0.42, rel=0.01)
-    assert np.arctan2(along, drawn.vertices @ begin).max() == pytest.approx(2.0, rel=1e-5)
+    assert np.arctan2(along, drawn.vertices @ begin).max() == pytest.approx(
+        2.0, rel=1e-5
+    )
 
 
 def test_a_rod_a_ball_and_a_box(server):
@@ -50,7 +58,9 @@ def test_a_rod_a_ball_and_a_box(server):
     add_shape(server, "/rod", Rod(begin, end, 0.05, RED))
     rod = node(server, "/rod")
     half = turned(rod) @ [0.0, 0.0, 0.5 * rod.height]
-    assert rod.position + half == pytest.approx(end) and rod.position - half == pytest.approx(begin)
+    assert rod.position + half == pytest.approx(
+        end
+    ) and rod.position - half == pytest.approx(begin)
     add_shape(server, "/ball", Ball(begin, 0.5, RED))
     ball = node(server, "/ball")
     assert (ball.radius, tuple(ball.position)) == (0.5, tuple(begin))

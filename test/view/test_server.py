@@ -25,7 +25,10 @@ def parts(server):
 
 
 def handshake(server, host=None, origin=None, cookie=None, query=""):
-    """Open a websocket as a client that chooses its own headers; return what came first."""
+    """Open a websocket as a client that chooses its own headers.
+
+    Return what came first.
+    """
     own, _ = parts(server)
     address, port = own.rsplit(":", 1)
     with connect(
@@ -58,13 +61,19 @@ def test_a_browser_that_has_the_url_is_served(server):
     status, headers, body = get(server, f"/?token={token}")
     assert status == 200
     assert b"<title>sst_ros</title>" in body
-    assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
+    assert (
+        "HttpOnly" in headers["Set-Cookie"]
+        and "SameSite=Strict" in headers["Set-Cookie"]
+    )
     cookie = headers["Set-Cookie"].split(";")[0]
     assert get(server, "/", Cookie=cookie)[0] == 200
     assert handshake(server, origin=f"http://{own}", cookie=cookie)
     port = own.rsplit(":", 1)[1]
     assert handshake(
-        server, host=f"localhost:{port}", origin=f"http://localhost:{port}", cookie=cookie
+        server,
+        host=f"localhost:{port}",
+        origin=f"http://localhost:{port}",
+        cookie=cookie,
     )
     # A client without a browser sends no Origin, and may give the token in the query.
     assert handshake(server, query=f"?token={token}")
@@ -78,13 +87,20 @@ def refuse(server, **given):
 
 @pytest.mark.parametrize(
     "origin",
-    ["http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1.evil.example"],
+    [
+        "http://evil.example",
+        "null",
+        "http://127.0.0.1:1",
+        "https://127.0.0.1.evil.example",
+    ],
 )
 def test_a_page_of_another_origin_is_refused_even_with_the_token(server, origin):
     refuse(server, origin=origin, query=f"?token={parts(server)[1]}")
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:18280", "127.0.0.1.evil.example"])
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:18280", "127.0.0.1.evil.example"]
+)
 def test_a_name_that_was_rebound_to_this_machine_is_refused(server, host):
     query = f"?token={parts(server)[1]}"
     refuse(server, host=host, origin=f"http://{host}", query=query)
@@ -101,7 +117,9 @@ def test_nobody_enters_without_the_token(server, query):
 def test_two_pages_take_two_ports_and_two_tokens_and_nothing_is_shared(server):
     second = PageServer(port=18280)
     try:
-        assert re.fullmatch(rf"http://{re.escape(LOCAL)}:\d+/\?token=[\w-]{{20,}}", second.url)
+        assert re.fullmatch(
+            rf"http://{re.escape(LOCAL)}:\d+/\?token=[\w-]{{20,}}", second.url
+        )
         assert parts(server)[0] != parts(second)[0]
         assert parts(server)[1] != parts(second)[1]
         assert second.request_share_url() is None
