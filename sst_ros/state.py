@@ -259,10 +259,14 @@ class Joints(NamedTuple):
 class State(Explained):
     """The manipulator at one instant.
 
-    Attributes: time_ns: simulated time since the start [ns]. quaternion: orientation of
-        {E} in {B}, (x, y, z, w). body_rate: angular velocity of the star in {E}
-        [rad/s]. joints: angles and rates of all nine joints. torque: torques that the
-        actuators give at this instant [N m]; zero before the first step.
+    Attributes:
+        time_ns: simulated time since the start [ns].
+        quaternion: orientation of {E} in {B}, (x, y, z, w).
+        body_rate: angular velocity of the star in {E} [rad/s].
+        joints: angles and rates of all nine joints.
+        torque: torques that the actuators give at this instant [N m]; zero before the
+            first step.
+
     """
 
     time_ns: int
@@ -302,11 +306,15 @@ class Assembly:
 
     Arrays are read-only.
 
-    Attributes: rotation: R of {E} in {B}, shape (3, 3). mu: angles of the passive
-        revolute joints in (-pi, pi] [rad], shape (3,). beta: angles of the passive
-        curved prismatic joints in (-pi, pi] [rad], shape (3,). det_j2: determinant of
-        J2, zero at a parallel singularity. admissible: E lies on the base triangle (Eq.
-        4) with 0 < beta_k <= beta_max for all legs.
+    Attributes:
+        rotation: R of {E} in {B}, shape (3, 3).
+        mu: angles of the passive revolute joints in (-pi, pi] [rad], shape (3,).
+        beta: angles of the passive curved prismatic joints in (-pi, pi] [rad], shape
+            (3,).
+        det_j2: determinant of J2, zero at a parallel singularity.
+        admissible: E lies on the base triangle (Eq. 4) with 0 < beta_k <= beta_max for
+            all legs.
+
     """
 
     rotation: NDArray[np.float64]

@@ -182,9 +182,11 @@ class ControlLoop:
 def run_loop(loop: ControlLoop) -> tuple[Track, NDArray[np.bool_], str]:
     """Run a loop to its end.
 
-    Returns: The track, with the errors of the true state, not of the measured one; by
+    Returns:
+        The track, with the errors of the true state, not of the measured one; by
         sample, whether the controller limited a torque; why the loop ended early, empty
         where it did not.
+
     """
     period = loop.period_ns / NANOSECONDS
     plant = at_start(loop.plant, loop.motion, loop.offset)

@@ -83,13 +83,16 @@ class FeedforwardPlan:
 class FeedforwardStudy:
     """Result of a study.
 
-    Attributes: plan, seconds: its grid, and the length of the motion [s]. loops: a row
-        for each error, mode and bandwidth, columns as in COLUMNS. holds: feedforward
-        alone, exact model: instant `at` of the torque that is held, period_s, largest
-        error of gamma [rad]. unheld: the same with torques as a function of time:
-        error, and its estimate [rad]. limits: largest stable bandwidths of computed
-        torque [rad/s] by delay in samples: theory, ideal (the plant of the theory),
-        real (the plant as it is).
+    Attributes:
+        plan, seconds: its grid, and the length of the motion [s].
+        loops: a row for each error, mode and bandwidth, columns as in COLUMNS.
+        holds: feedforward alone, exact model: instant `at` of the torque that is held,
+            period_s, largest error of gamma [rad].
+        unheld: the same with torques as a function of time: error, and its estimate
+            [rad].
+        limits: largest stable bandwidths of computed torque [rad/s] by delay in
+            samples: theory, ideal (the plant of the theory), real (the plant as it is).
+
     """
 
     plan: FeedforwardPlan

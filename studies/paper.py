@@ -90,8 +90,10 @@ class LargestDifference(NamedTuple):
 def paper(out: Path) -> list[LargestDifference]:
     """Run both examples, draw the figures into `out` and write an index page.
 
-    Returns: The largest differences between the solutions; `within` of each is true if
-        all is well.
+    Returns:
+        The largest differences between the solutions; `within` of each is true if all
+        is well.
+
     """
     found: list[LargestDifference] = []
     paths: list[Path] = []
@@ -154,8 +156,9 @@ def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
     SciPy's DOP853 integrates Pinocchio's accelerations in the angles of the seven
     joints of the tree.
 
-    Returns: Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3), at
-        the times [s].
+    Returns:
+        Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3), at the
+        times [s].
 
     Raises:
         MissingDependency: Pinocchio is not installed.

@@ -138,9 +138,11 @@ def solve_task(task: Task) -> Reference:
 class Point:
     """A setting and what came of it; errors are infinite where it failed.
 
-    Attributes: error: of the orientation at the end [rad]. gamma: largest error of an
-        actuator angle at the end [rad]. seconds: processor time of the whole second,
-        one a round; empty for what was not timed.
+    Attributes:
+        error: of the orientation at the end [rad].
+        gamma: largest error of an actuator angle at the end [rad].
+        seconds: processor time of the whole second, one a round; empty for what was not
+            timed.
     """
 
     setting: Setting

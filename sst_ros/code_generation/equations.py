@@ -114,16 +114,18 @@ def equations(
 ) -> Equations:
     """Write the equations of motion of a scene for another program.
 
-    Args: scene: name or path of a scene, its document as a dict, or a `Scene`. target:
-        "c" (C99 with its header), "numpy", "jax", "casadi" or "mpmath" (a module of
-        Python, whose functions the result has too), "fmu" (FMI 3.0, Model Exchange and
-        Co-Simulation) or "mjcf" (the mechanism for MuJoCo). parameters: keys of numbers
-        of the scene that stay open, as "star.inertia.zz", "payload.mass" or
-        "friction.gamma.viscous", but not of its geometry; the functions take their
-        values as the last argument. A vector means each of its components, a list each
-        of its entries. outputs: which equations, of "derivative", "joints", "energies",
-        "derivative_by_state", "derivative_by_torque", "derivative_by_parameters"; by
-        default all. "fmu" and "mjcf" have what their formats ask for.
+    Args:
+        scene: name or path of a scene, its document as a dict, or a `Scene`.
+        target: "c" (C99 with its header), "numpy", "jax", "casadi" or "mpmath" (a
+            module of Python, whose functions the result has too), "fmu" (FMI 3.0, Model
+            Exchange and Co-Simulation) or "mjcf" (the mechanism for MuJoCo).
+        parameters: keys of numbers of the scene that stay open, as "star.inertia.zz",
+            "payload.mass" or "friction.gamma.viscous", but not of its geometry; the
+            functions take their values as the last argument. A vector means each of its
+            components, a list each of its entries.
+        outputs: which equations, of "derivative", "joints", "energies",
+            "derivative_by_state", "derivative_by_torque", "derivative_by_parameters";
+            by default all. "fmu" and "mjcf" have what their formats ask for.
 
     Raises:
         InputError: an argument is not allowed, or the scene has what the target lacks.

@@ -115,16 +115,17 @@ def linearize(
 ) -> LinearModel:
     """Linearize the dynamics of a scene, all its terms included, near a state and its torques.
 
-    Args: scene: name or path of a scene, its document as a dict, or a `Scene`. state: a
-        `State`, as of `equilibrium` or `Simulation`; or an initial state as `simulate`
-        takes it, None for that of the scene. Where the actuators lag, a `State` has the
-        torques that they give; otherwise they give those commanded. torque: torques
-        that are commanded [N m], shape (3,). dt: period for which they are held [s]. By
-        default the model is continuous. coordinates: "gamma" for deviations of gamma
-        [rad] and gamma_dot [rad/s]; "star" for the rotation vector from the motion's
-        {E} to the deviating one, in {E} [rad], and the deviation of the body rate
-        [rad/s], also in a parallel singularity. The torques that lagging actuators give
-        [N m] follow.
+    Args:
+        scene: name or path of a scene, its document as a dict, or a `Scene`.
+        state: a `State`, as of `equilibrium` or `Simulation`; or an initial state as
+            `simulate` takes it, None for that of the scene. Where the actuators lag, a
+            `State` has the torques that they give; otherwise they give those commanded.
+        torque: torques that are commanded [N m], shape (3,).
+        dt: period for which they are held [s]. By default the model is continuous.
+        coordinates: "gamma" for deviations of gamma [rad] and gamma_dot [rad/s]; "star"
+            for the rotation vector from the motion's {E} to the deviating one, in {E}
+            [rad], and the deviation of the body rate [rad/s], also in a parallel
+            singularity. The torques that lagging actuators give [N m] follow.
 
     Raises:
         InputError: an argument is not allowed, or no motion lasts for `dt`.

@@ -35,9 +35,11 @@ _BLOCK = 2000  # starts solved at once: their arrays fit the cache
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     """Quaternion (x, y, z, w) and body rate [rad/s] at t = 0, seven numbers.
 
-    Raises: AssemblyError: the initial gamma has no admissible assembly, or several and
-        the scene selects none. SingularConfiguration: gamma_dot does not determine the
-        body rate there.
+    Raises:
+        AssemblyError: the initial gamma has no admissible assembly, or several and the
+            scene selects none.
+        SingularConfiguration: gamma_dot does not determine the body rate there.
+
     """
     initial, gamma = scene.initial, np.array(scene.initial.gamma)
     meant = (

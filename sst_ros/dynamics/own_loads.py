@@ -318,11 +318,13 @@ def _value_of(number: Any) -> Any:
 class LoadState:
     """What the function of an own load is given: arrays of symbols.
 
-    Attributes: rotation: R of {E} in {B}, shape (3, 3); column 2 is the direction of E.
-        gamma, mu, beta: angles of the joints [rad], shape (3,). omega: angular velocity
-        of the star in {B} [rad/s], shape (3,). For a moment only, as are body_rate: the
-        same in {E}. gamma_dot, mu_dot, beta_dot: rates of the joints [rad/s], shape
-        (3,).
+    Attributes:
+        rotation: R of {E} in {B}, shape (3, 3); column 2 is the direction of E.
+        gamma, mu, beta: angles of the joints [rad], shape (3,).
+        omega: angular velocity of the star in {B} [rad/s], shape (3,). For a moment
+            only, as are body_rate: the same in {E}. gamma_dot, mu_dot, beta_dot: rates
+            of the joints [rad/s], shape (3,).
+
     """
 
     rotation: Any
@@ -372,15 +374,20 @@ def own_load(
     So all that takes a scene has the load: `simulate`, `Simulation`, `Batch`, `sweep`,
     `linearize`, controllers, `certify` and the nodes.
 
-    Args: name: short name. potential: potential energy [J]: a formula, or a function of
-        a `LoadState` and of the parameters by name. moment: moment on the star [N m]:
-        three formulas, or a function of the same that returns three numbers.
+    Args:
+        name: short name.
+        potential: potential energy [J]: a formula, or a function of a `LoadState` and
+            of the parameters by name.
+        moment: moment on the star [N m]: three formulas, or a function of the same that
+            returns three numbers.
         parameters: numbers by name, in SI units. They are numbers of the scene, as in
-        "own_loads[0].parameters[0].value". frame: axes of the moment: "base" for {B} or
-        "star" for {E}.
+            "own_loads[0].parameters[0].value".
+        frame: axes of the moment: "base" for {B} or "star" for {E}.
 
-    Raises: InputError: a function decides by a number of the state or does more than
-        formulas can, or a formula is none.
+    Raises:
+        InputError: a function decides by a number of the state or does more than
+            formulas can, or a formula is none.
+
     """
     given = dict(parameters or {})
     one = (potential is None) != (moment is None)

@@ -222,10 +222,14 @@ def reactions_of(
     Accelerations are those of the scene's equations of motion. A moment from a topic is
     no part of them.
 
-    Args: scene: what moves. t: times [s], shape (n,). quaternion: orientations (x, y,
-        z, w) of {E} in {B}, shape (n, 4). body_rate: angular velocities of the star in
-        {E} [rad/s], shape (n, 3). torque: torques that act at the actuators, without
-        friction and springs [N m], (n, 3).
+    Args:
+        scene: what moves.
+        t: times [s], shape (n,).
+        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
+        body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
+        torque: torques that act at the actuators, without friction and springs [N m],
+            (n, 3).
+
     """
     state = (*quaternion.T, *body_rate.T)
     with np.errstate(all="ignore"):

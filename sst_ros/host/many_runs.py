@@ -60,15 +60,20 @@ def run_many(
 
     Yield the number of the job and the result when it is done.
 
-    Args: function: what is called; what it raises ends all. A worker of a cluster
-        unpickles it once. jobs: its arguments. workers: threads of this process, 0 for
-        one a core; 1 for none, in the order of the jobs. client: a dask.distributed
-        client, whose workers are taken in place of threads. label: of a bar that is
-        drawn on a terminal; none is drawn without it. name: what a job is called where
-        it fails on a cluster.
+    Args:
+        function: what is called; what it raises ends all. A worker of a cluster
+            unpickles it once.
+        jobs: its arguments.
+        workers: threads of this process, 0 for one a core; 1 for none, in the order of
+            the jobs.
+        client: a dask.distributed client, whose workers are taken in place of threads.
+        label: of a bar that is drawn on a terminal; none is drawn without it.
+        name: what a job is called where it fails on a cluster.
 
-    Raises: SweepFailed: on a cluster, an SstError of a job, no worker, or no scheduler;
-        or, when all others are done, a job that ended its workers.
+    Raises:
+        SweepFailed: on a cluster, an SstError of a job, no worker, or no scheduler; or,
+            when all others are done, a job that ended its workers.
+
     """
     workers, bar = (
         min(workers or len(os.sched_getaffinity(0)), len(jobs)),

@@ -55,10 +55,13 @@ _HOMOTOPY = 8  # steps from the centre to all samples
 class ExcitingMotion:
     """A designed motion.
 
-    Attributes: scene: the scene with the motion. base: the parameters that it
-        determines. condition: of the regressor with columns of length one. deviation:
-        standard deviations of the base parameters for 1 N m of noise in each of 1000
-        samples a second, shape (b,).
+    Attributes:
+        scene: the scene with the motion.
+        base: the parameters that it determines.
+        condition: of the regressor with columns of length one.
+        deviation: standard deviations of the base parameters for 1 N m of noise in each
+            of 1000 samples a second, shape (b,).
+
     """
 
     scene: Scene

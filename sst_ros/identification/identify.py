@@ -113,15 +113,20 @@ _EDGE = 8
 class TorqueFit(Identification):
     """Constants identified by torques; its estimates are those of the base parameters.
 
-    Attributes: base: the combinations of parameters that the motion determines;
-        `estimate` is without the constraint that bodies can exist. noise: standard
-        deviations of the torques [N m], shape (3,). condition: condition number of the
-        weighted regressor with columns of length one. excess: chi^2 of `values` against
-        the estimates. vague: combinations whose standard deviation exceeds their size.
-        samples: of the torques that were fitted. band: frequency below which they were
-        [Hz]; None where angles were not filtered. delay: of the measured angles [s].
+    Attributes:
+        base: the combinations of parameters that the motion determines; `estimate` is
+            without the constraint that bodies can exist.
+        noise: standard deviations of the torques [N m], shape (3,).
+        condition: condition number of the weighted regressor with columns of length
+            one.
+        excess: chi^2 of `values` against the estimates.
+        vague: combinations whose standard deviation exceeds their size.
+        samples: of the torques that were fitted.
+        band: frequency below which they were [Hz]; None where angles were not filtered.
+        delay: of the measured angles [s].
         delay_deviation: its standard deviation [s]; None where the delay was given, or
-        is none.
+            is none.
+
     """
 
     base: BaseParameters
@@ -176,27 +181,31 @@ def identify(
     ("friction.gamma.smoothing", "actuators.time_constant", "stroke.restitution",
     "initial.gamma_dot[0]").
 
-    Args: data: a recording or its path, a `Trajectory`, or a mapping of arrays: t [s],
-        gamma [rad] (n, 3), torque [N m] (n, 3), and where they are known gamma_dot
-        [rad/s] (n, 3), quaternion (4,) at the first sample, held (torques act to the
-        next sample), mu and beta [rad] (n, 3), by which the angles are checked. Angles
-        may wrap, times may be those of an epoch, uneven, and have gaps: what was done
-        about it is in `warnings`. scene: what is known of the manipulator, and the
-        values to start from; by default the scene of the data. parameters: names of
-        unknowns, by inverse dynamics also how their names begin ("star",
-        "friction.gamma", "offset"), and by default the bodies, friction, springs and
-        rotors that the scene has. method: "inverse_dynamics" or "simulation". cutoff:
-        of the zero-phase filter of the angles [Hz]; by default none where rates were
-        measured, else ten times the bandwidth of the motion. noise: standard deviations
-        of the torques [N m], three; by default estimated. delay: how long before its
-        stamp a measured angle was what it says, against the torques [s]; by default
-        estimated where angles are filtered, else none.
+    Args:
+        data: a recording or its path, a `Trajectory`, or a mapping of arrays: t [s],
+            gamma [rad] (n, 3), torque [N m] (n, 3), and where they are known gamma_dot
+            [rad/s] (n, 3), quaternion (4,) at the first sample, held (torques act to
+            the next sample), mu and beta [rad] (n, 3), by which the angles are checked.
+            Angles may wrap, times may be those of an epoch, uneven, and have gaps: what
+            was done about it is in `warnings`.
+        scene: what is known of the manipulator, and the values to start from; by
+            default the scene of the data.
+        parameters: names of unknowns, by inverse dynamics also how their names begin
+            ("star", "friction.gamma", "offset"), and by default the bodies, friction,
+            springs and rotors that the scene has.
+        method: "inverse_dynamics" or "simulation".
+        cutoff: of the zero-phase filter of the angles [Hz]; by default none where rates
+            were measured, else ten times the bandwidth of the motion.
+        noise: standard deviations of the torques [N m], three; by default estimated.
+        delay: how long before its stamp a measured angle was what it says, against the
+            torques [s]; by default estimated where angles are filtered, else none.
 
     Returns:
         A `TorqueFit` by inverse dynamics, a `SimulationFit` by simulation.
 
-    Raises: InputError: the data are not sound, the motion determines nothing, or an
-        argument is not allowed.
+    Raises:
+        InputError: the data are not sound, the motion determines nothing, or an
+            argument is not allowed.
 
     """
     known = method in ("inverse_dynamics", "simulation")
@@ -311,9 +320,12 @@ class WeightedFit(NamedTuple):
 class RegressionEquations:
     """The equation of motion along measured segments, as a function of the delay of the angles.
 
-    Attributes: regressor: known torques, and columns of the parameters. band: frequency
-        [Hz] up to which the equations are sound, where angles are filtered; else None.
+    Attributes:
+        regressor: known torques, and columns of the parameters.
+        band: frequency [Hz] up to which the equations are sound, where angles are
+            filtered; else None.
         notes: what was done to the data.
+
     """
 
     def __init__(
@@ -630,9 +642,13 @@ class SimulationFit(Identification):
 
     `values` differ from estimates that no body has.
 
-    Attributes: relative: relative standard deviations of the combinations `directions`,
-        rising, (p,). directions: combinations as rows, relative changes of the
-        parameters, shape (p, p). error: root of the mean square of the residuals [rad].
+    Attributes:
+        relative: relative standard deviations of the combinations `directions`, rising,
+            (p,).
+        directions: combinations as rows, relative changes of the parameters, shape (p,
+            p).
+        error: root of the mean square of the residuals [rad].
+
     """
 
     relative: Array

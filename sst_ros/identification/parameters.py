@@ -171,13 +171,18 @@ def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
 class Identification(ReadOnly):
     """Identified constants of a scene, by torques or by simulation.
 
-    Attributes: scene: the scene with identified values, whose bodies can exist. names:
-        of the parameters, length p. values: their values in `scene`, shape (p,).
+    Attributes:
+        scene: the scene with identified values, whose bodies can exist.
+        names: of the parameters, length p.
+        values: their values in `scene`, shape (p,).
         labels: quantities that are estimated: parameters or combinations of them,
-        length b. before: their values in the scene that was given, shape (b,).
-        estimate: their estimates, shape (b,). covariance: of the estimates, shape (b,
-        b). undetermined: combinations that this motion leaves open, as text. warnings:
-        what else to know.
+            length b.
+        before: their values in the scene that was given, shape (b,).
+        estimate: their estimates, shape (b,).
+        covariance: of the estimates, shape (b, b).
+        undetermined: combinations that this motion leaves open, as text.
+        warnings: what else to know.
+
     """
 
     scene: Scene
@@ -269,10 +274,12 @@ class Regressor:
 class BaseParameters(NamedTuple):
     """Combinations of parameters: beta = transform parameters.
 
-    Attributes: labels: each combination as text, length b; the chosen parameter comes
-        first. chosen: indices of the parameters whose columns are independent, length
-        b. transform: shape (b, p); row i has 1 at the chosen parameter i, and the
-        coefficients of those whose columns depend on it.
+    Attributes:
+        labels: each combination as text, length b; the chosen parameter comes first.
+        chosen: indices of the parameters whose columns are independent, length b.
+        transform: shape (b, p); row i has 1 at the chosen parameter i, and the
+            coefficients of those whose columns depend on it.
+
     """
 
     labels: tuple[str, ...]

@@ -76,18 +76,22 @@ class Batch(Explained):
     With llvmlite the steps are machine code; without it NumPy takes them, slower, to
     the same bits.
 
-    Args: scene: what is simulated. method: explicit method. profile: apply the scene's
-        own torques over time on top of none given to `run`. parameters: numbers of the
-        scene that differ between scenarios, by their keys in the document, as in
-        {"star.inertia.zz": [...], "gravity.acceleration": [[...], ...]}: a row a
-        scenario. A list without an index means all of its entries.
+    Args:
+        scene: what is simulated.
+        method: explicit method.
+        profile: apply the scene's own torques over time on top of none given to `run`.
+        parameters: numbers of the scene that differ between scenarios, by their keys in
+            the document, as in {"star.inertia.zz": [...], "gravity.acceleration":
+            [[...], ...]}: a row a scenario. A list without an index means all of its
+            entries.
 
     Attributes:
         model: the traced programs.
         columns: the numbers of the scenarios.
 
-    Raises: InputError: the scene has no torque to apply, or the numbers of a scenario
-        make no scene.
+    Raises:
+        InputError: the scene has no torque to apply, or the numbers of a scenario make
+            no scene.
 
     """
 
@@ -168,14 +172,19 @@ class Batch(Explained):
     ) -> BatchResult:
         """Run all scenarios for `count` steps.
 
-        Args: gamma: initial actuator angles [rad], shape (N, 3), or (3,) where
-            parameters vary. gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
+        Args:
+            gamma: initial actuator angles [rad], shape (N, 3), or (3,) where parameters
+                vary.
+            gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
             torque: constant torques [N m], shape (N, 3) or (3,), within the actuators'
-            limit where they have one; not used with a profile. step: length of a step
-            [s]. count: number of steps. keep_every: keep the states every so many
-            steps, see `BatchResult.kept`; 0 keeps none. threads: how many; 0 takes all
-            cores. No bit depends on it. progress: draw a bar on a terminal. advance: a
-            loop of one's own in place of `Batch.advance`, see `Advance`.
+                limit where they have one; not used with a profile.
+            step: length of a step [s].
+            count: number of steps.
+            keep_every: keep the states every so many steps, see `BatchResult.kept`; 0
+                keeps none.
+            threads: how many; 0 takes all cores. No bit depends on it.
+            progress: draw a bar on a terminal.
+            advance: a loop of one's own in place of `Batch.advance`, see `Advance`.
 
         Raises:
             InputError: an argument is not allowed; names it and what is.
@@ -237,13 +246,17 @@ class Batch(Explained):
     ) -> BatchSession:
         """Start robots that are driven step by step, as by a policy.
 
-        Args: gamma: initial actuator angles [rad], shape (N, 3), or (3,) where
-            parameters vary. gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
+        Args:
+            gamma: initial actuator angles [rad], shape (N, 3), or (3,) where parameters
+                vary.
+            gamma_dot: initial rates [rad/s], shape (N, 3) or (3,).
             step: length of a step of the session, in which torques are constant [s].
             substeps: steps of the method in it.
 
-        Raises: InputError: an argument is not allowed, or the batch has a profile of
-            torques.
+        Raises:
+            InputError: an argument is not allowed, or the batch has a profile of
+                torques.
+
         """
         allowed = f"must be >= 1 and <= {_MOST:g}"
         torque = self.model.ode.drive[:3] == TORQUE
@@ -364,17 +377,22 @@ class BatchResult(MotionTable):
 
     Arrays are read-only.
 
-    Attributes: t: times of the states [s], shape (N,). quaternion: orientations (x, y,
-        z, w) of {E} in {B}, shape (N, 4). body_rate: angular velocities of the star in
-        {E} [rad/s], shape (N, 3). status: 0 where a scenario reached its end, 1 where a
-        limit ended it, -1 where it has no start or its numbers ceased to be finite,
-        shape (N,). code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0
-        without a start, shape (N,). fault_time: when a scenario passed a limit [s], the
-        end of the step in which its numbers ceased to be finite, 0 without a start, nan
-        where it reached its end, shape (N,). local_error: largest local error estimate
-        of a quaternion in a step, shape (N,). kept: the same scenarios every
-        `keep_every` steps from the start on, with an axis of samples before that of
-        scenarios in t and in all states; None unless asked for.
+    Attributes:
+        t: times of the states [s], shape (N,).
+        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (N, 4).
+        body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3).
+        status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where
+            it has no start or its numbers ceased to be finite, shape (N,).
+        code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start,
+            shape (N,).
+        fault_time: when a scenario passed a limit [s], the end of the step in which its
+            numbers ceased to be finite, 0 without a start, nan where it reached its
+            end, shape (N,).
+        local_error: largest local error estimate of a quaternion in a step, shape (N,).
+        kept: the same scenarios every `keep_every` steps from the start on, with an
+            axis of samples before that of scenarios in t and in all states; None unless
+            asked for.
+
     """
 
     def __init__(

@@ -44,8 +44,11 @@ class BatchSession:
     A robot that passes a limit, or whose numbers cease to be finite, stays in its last
     valid state until it is reset; the others go on.
 
-    Attributes: state: of all robots, see `BatchState`. fault_time: when a robot passed
-        a limit, since its last reset [s], nan where it runs on, shape (N,).
+    Attributes:
+        state: of all robots, see `BatchState`.
+        fault_time: when a robot passed a limit, since its last reset [s], nan where it
+            runs on, shape (N,).
+
     """
 
     def __init__(
@@ -81,8 +84,9 @@ class BatchSession:
     def step(self, torque: ArrayLike) -> BatchState:
         """Advance all robots by a step under constant torques.
 
-        Args: torque: of the actuators [N m], shape (N, 3) or (3,); clamped to their
-            limit.
+        Args:
+            torque: of the actuators [N m], shape (N, 3) or (3,); clamped to their
+                limit.
 
         Returns:
             The state, whose arrays are those of the step before.
@@ -113,9 +117,11 @@ class BatchSession:
     ) -> BatchState:
         """Let robots begin again.
 
-        Args: rows: indices of the robots, or a mask of shape (N,); all by default.
+        Args:
+            rows: indices of the robots, or a mask of shape (N,); all by default.
             gamma: new initial angles [rad], shape (len(rows), 3) or (3,); by default
-            the last. gamma_dot: new initial rates [rad/s], alike.
+                the last.
+            gamma_dot: new initial rates [rad/s], alike.
 
         Raises:
             InputError: a row is none of this batch, or an initial value is not allowed.

@@ -168,12 +168,16 @@ class Stepper:
     Nothing changes in it as a run goes on but what its budget has spent: the run is its
     points.
 
-    Args: scene: what is simulated. method: a method of `methods.METHODS`, or auto.
+    Args:
+        scene: what is simulated.
+        method: a method of `methods.METHODS`, or auto.
         tolerance: largest local error estimate of a step: of the quaternion, and of the
-        rate relative to its length. budget: counts evaluations, and ends a period that
-        takes too many. derivative: of the state in plain Python, in place of the traced
-        one and with its inputs; for explicit methods. limits: whether the limits of the
-        scene end the motion. max_step: longest step [s].
+            rate relative to its length.
+        budget: counts evaluations, and ends a period that takes too many.
+        derivative: of the state in plain Python, in place of the traced one and with
+            its inputs; for explicit methods.
+        limits: whether the limits of the scene end the motion.
+        max_step: longest step [s].
 
     Attributes:
         dynamics, ode: of the scene.
@@ -248,10 +252,15 @@ class Stepper:
     ) -> Point:
         """Advance through a period, by steps up to the first event in each.
 
-        Args: at: where it begins. start: when it begins [s]. h: its length [s]. torque:
-            one of `AppliedTorque.acting`. moment: from a topic. other: constant torques
-            of the second solution, by default those of the first [N m]. visit: called
-            with each step that is done.
+        Args:
+            at: where it begins.
+            start: when it begins [s].
+            h: its length [s].
+            torque: one of `AppliedTorque.acting`.
+            moment: from a topic.
+            other: constant torques of the second solution, by default those of the
+                first [N m].
+            visit: called with each step that is done.
 
         Raises:
             LimitReached: a limit of the scene ends the motion, after the last step.

@@ -280,11 +280,17 @@ def step_pair(
 ) -> Pair:
     """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
 
-    Args: step: (part, time, length, state, near) -> the new state: part 0 is the step
-        of y, and 1 and 2 are those of z. A Jacobian is that of the state `near`, which
-        is y for the first step of z: beside a kink of a force both solutions then have
-        the same. t: time at which the step begins [s]. h: its length [s]. y: first
-        solution. z: second one. lagged: numbers of the state that are lagging torques.
+    Args:
+        step: (part, time, length, state, near) -> the new state: part 0 is the step of
+            y, and 1 and 2 are those of z. A Jacobian is that of the state `near`, which
+            is y for the first step of z: beside a kink of a force both solutions then
+            have the same.
+        t: time at which the step begins [s].
+        h: its length [s].
+        y: first solution.
+        z: second one.
+        lagged: numbers of the state that are lagging torques.
+
     """
     half = 0.5 * h
     new_y, error_y = step(0, t, h, y, y)

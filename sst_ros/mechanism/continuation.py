@@ -62,10 +62,12 @@ def follow(
     of the assembly at gamma[0], by default of the admissible one. Returns R, shape (n,
     3, 3), and the least singular values of J2, shape (n,), read-only.
 
-    Raises: AssemblyError: rotation is None and there is no unique admissible assembly,
-        rotation is no assembly at gamma[0], or gamma is not (n, 3) finite numbers.
+    Raises:
+        AssemblyError: rotation is None and there is no unique admissible assembly,
+            rotation is no assembly at gamma[0], or gamma is not (n, 3) finite numbers.
         BranchEnds: a parallel singularity lies on the path (or the motion runs along
-        one so near that no number of steps would do); carries where, and how near.
+            one so near that no number of steps would do); carries where, and how near.
+
     """
     points = np.array(gamma, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):

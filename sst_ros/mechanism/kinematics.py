@@ -182,10 +182,13 @@ def admissible(
     Where several are admissible, the rotation `near` selects the only one within NEAR
     of it.
 
-    Raises: NoAdmissibleAssembly: no assembly has E on the base triangle and 0 < beta_k
-        <= beta_max. AmbiguousAssembly: more than one has, and `near` names none; the
-        error carries them. AssemblyError: gamma is not finite, or the assemblies are
-        not isolated.
+    Raises:
+        NoAdmissibleAssembly: no assembly has E on the base triangle and 0 < beta_k <=
+            beta_max.
+        AmbiguousAssembly: more than one has, and `near` names none; the error carries
+            them.
+        AssemblyError: gamma is not finite, or the assemblies are not isolated.
+
     """
     candidates = [
         assembly for assembly in direct(geometry, gamma) if assembly.admissible

@@ -180,11 +180,14 @@ class AnsweringWorker(Worker[A]):
 
     The phase and the joint states are two topics, whose messages come in any order.
 
-    Attributes: begun: a sample of the run has been answered. commanded: a torque has
-        been sent, or was about to be: the simulator is this node's concern. phase: what
-        the simulator said last of its run; empty before. heard_s: monotonic time of the
-        last joint states of this robot [s]. foreign_states: messages on joint_states of
-        other robots, which are ignored.
+    Attributes:
+        begun: a sample of the run has been answered.
+        commanded: a torque has been sent, or was about to be: the simulator is this
+            node's concern.
+        phase: what the simulator said last of its run; empty before.
+        heard_s: monotonic time of the last joint states of this robot [s].
+        foreign_states: messages on joint_states of other robots, which are ignored.
+
     """
 
     def connect(

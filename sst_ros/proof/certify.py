@@ -468,18 +468,24 @@ def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
 class ProvenMotion(Explained):
     """What is proven of a motion at the instants of a table.
 
-    Attributes: scene: what moves. columns: by name, shape (n,): t [s], none later than
-        `until`; quaternion_x to _w, an orientation, and angle [rad], how far the true
-        one can be from it; body_rate_x to _z [rad/s] and gamma_1 to beta_dot_3 [rad,
-        rad/s], each with NAME_bound; distance [rad], the most between the true
-        orientation and that of `simulate`. until: time to which the motion is proven to
-        exist and to be within the bounds [s]. reason: why it ends there; "" where that
-        is the duration. limits: for each limit of the mechanism the spans of time [s]
-        in which the motion may be on it; at all other times until `until` it is proven
-        not to be. Contacts with elastic stops and torques at their limit are among
-        them: they begin and end in these spans. trajectory: what `simulate` gives.
-        bound: what the angle was to be at most [rad]. steps: number of steps of the
-        proof.
+    Attributes:
+        scene: what moves.
+        columns: by name, shape (n,): t [s], none later than `until`; quaternion_x to
+            _w, an orientation, and angle [rad], how far the true one can be from it;
+            body_rate_x to _z [rad/s] and gamma_1 to beta_dot_3 [rad, rad/s], each with
+            NAME_bound; distance [rad], the most between the true orientation and that
+            of `simulate`.
+        until: time to which the motion is proven to exist and to be within the bounds
+            [s].
+        reason: why it ends there; "" where that is the duration.
+        limits: for each limit of the mechanism the spans of time [s] in which the
+            motion may be on it; at all other times until `until` it is proven not to
+            be. Contacts with elastic stops and torques at their limit are among them:
+            they begin and end in these spans.
+        trajectory: what `simulate` gives.
+        bound: what the angle was to be at most [rad].
+        steps: number of steps of the proof.
+
     """
 
     def __init__(
@@ -694,18 +700,24 @@ def certify(
     their limit. It ends where the motion meets an end of the scene, or where no step is
     proven: `until` and `reason` say so. One proof runs at a time, whatever the threads.
 
-    Args: scene: as `simulate` takes it. torque: as `simulate` takes it, but for
-        functions. duration: as `simulate` takes it. bound: angle [rad] within which the
-        orientation is to be proven; steps are chosen for it. ranges: how far numbers of
-        the document may be from those given, by key, as in {"star.inertia.zz": 5e-4,
-        "star.alpha_deg": (119.0, 121.0), "star.mass": "digits"}: a half-width, an
-        interval, or half a unit of the last digit that the document has. Keys may name
-        all numbers that act on the motion, those of its geometry, limits and torques
-        included; others are refused. split: number of parts that the box of ranges is
-        split into; what holds for all of them is returned. max_steps: number of steps
-        after which the proof of a part ends, some 20 ms each. progress: draw a bar on a
-        terminal. options: of `simulate`, as initial, method, tolerance, and t_eval, the
-        times of the table.
+    Args:
+        scene: as `simulate` takes it.
+        torque: as `simulate` takes it, but for functions.
+        duration: as `simulate` takes it.
+        bound: angle [rad] within which the orientation is to be proven; steps are
+            chosen for it.
+        ranges: how far numbers of the document may be from those given, by key, as in
+            {"star.inertia.zz": 5e-4, "star.alpha_deg": (119.0, 121.0), "star.mass":
+            "digits"}: a half-width, an interval, or half a unit of the last digit that
+            the document has. Keys may name all numbers that act on the motion, those of
+            its geometry, limits and torques included; others are refused.
+        split: number of parts that the box of ranges is split into; what holds for all
+            of them is returned.
+        max_steps: number of steps after which the proof of a part ends, some 20 ms
+            each.
+        progress: draw a bar on a terminal.
+        options: of `simulate`, as initial, method, tolerance, and t_eval, the times of
+            the table.
 
     Raises:
         InputError: an argument is not allowed; names it and the allowed values.

@@ -326,28 +326,42 @@ class Recording(Explained, ReadOnly):
 
     Raises InputError, which names the fault, where they are not those of a whole run.
 
-    Attributes: path: where the bag is. scene: what was simulated. start_ns: stamp of
-        the start of the run [ns]; all other times but `received_ns` are relative to it.
+    Attributes:
+        path: where the bag is.
+        scene: what was simulated.
+        start_ns: stamp of the start of the run [ns]; all other times but `received_ns`
+            are relative to it.
         time_ns, received_ns: instant of each sample, and when the recorder got it by
-        its own clock [ns], shape (n,). measured: the samples of joint_states, as the
-        robot's sensors gave them. gamma: joint angles of the actuators [rad], shape (n,
-        3): the true ones where they are recorded (true_joint_states), else those
-        measured; so all that follow. mu: joint angles of the carriages. beta: joint
-        angles of the star. gamma_dot: joint rates of the actuators [rad/s], shape (n,
-        3). mu_dot: joint rates of the carriages. beta_dot: joint rates of the star.
+            its own clock [ns], shape (n,).
+        measured: the samples of joint_states, as the robot's sensors gave them.
+        gamma: joint angles of the actuators [rad], shape (n, 3): the true ones where
+            they are recorded (true_joint_states), else those measured; so all that
+            follow.
+        mu: joint angles of the carriages.
+        beta: joint angles of the star.
+        gamma_dot: joint rates of the actuators [rad/s], shape (n, 3).
+        mu_dot: joint rates of the carriages.
+        beta_dot: joint rates of the star.
         effort: actuator torques of the tick that ends at the sample [N m], shape (n,
-        3). quaternion: orientation of {E} in {B}, (x, y, z, w), shape (n, 4); nan where
-        it was lost. euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where
-        they were lost. ticks: applied torques. idle_states: number of joint states that
-        are no samples, which are not in the arrays. foreign_states: number of joint
-        states of other robots, which are not either. commands: recorded commands of
-        both topics in order of their reception: `received_ns` and `stamp_ns`, that of
-        the sample which is answered, 0 where commands have none [ns], shape (c,);
-        `torque` [N m], shape (c, 3). reports: diagnostics of the simulator's run: when
-        received [ns], text by key. diagnostics: the last of them; may be empty.
-        missing: keys of the topics that are not in the recording. signals: those given.
+            3).
+        quaternion: orientation of {E} in {B}, (x, y, z, w), shape (n, 4); nan where it
+            was lost.
+        euler: ZYZ angles (theta, phi, psi) [rad], shape (n, 3); nan where they were
+            lost.
+        ticks: applied torques.
+        idle_states: number of joint states that are no samples, which are not in the
+            arrays.
+        foreign_states: number of joint states of other robots, which are not either.
+        commands: recorded commands of both topics in order of their reception:
+            `received_ns` and `stamp_ns`, that of the sample which is answered, 0 where
+            commands have none [ns], shape (c,); `torque` [N m], shape (c, 3).
+        reports: diagnostics of the simulator's run: when received [ns], text by key.
+        diagnostics: the last of them; may be empty.
+        missing: keys of the topics that are not in the recording.
+        signals: those given.
         table: `Signals.table`, a table as pandas by its name: samples (the default),
-        ticks, commands, commands_stamped or external_moment.
+            ticks, commands, commands_stamped or external_moment.
+
     """
 
     def __init__(self, found: Signals) -> None:
@@ -654,12 +668,16 @@ def read(
 ) -> Recording:
     """Read a rosbag2 recording of a run, MCAP or sqlite3, a folder or its file.
 
-    Args: path: of the recording. damaged: read what is intact of a damaged one;
-        `signals.bag.damage` names the rest. namespace: of the simulator, as "/left",
-        where the recording has several runs.
+    Args:
+        path: of the recording.
+        damaged: read what is intact of a damaged one; `signals.bag.damage` names the
+            rest.
+        namespace: of the simulator, as "/left", where the recording has several runs.
 
-    Raises: InputError: it is no recording of a run, or a damaged one, or it has several
-        runs and none is named.
+    Raises:
+        InputError: it is no recording of a run, or a damaged one, or it has several
+            runs and none is named.
+
     """
     if not isinstance(path, (str, Path)):
         raise refusal(Path(), "path", path, "must be a path")

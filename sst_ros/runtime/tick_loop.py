@@ -374,9 +374,11 @@ class TickLoop:
         command acts from the tick on that begins after its arrival. Without deadlines
         samples that nothing receives are passed over, up to 64 ticks.
 
-        Raises: RunStopped: the run ends before; the ticks before it are done and
-            logged. NoAnswer: in lockstep no answer came within lockstep_timeout, or
-            within 0.4 s where a paused run is stepped.
+        Raises:
+            RunStopped: the run ends before; the ticks before it are done and logged.
+            NoAnswer: in lockstep no answer came within lockstep_timeout, or within 0.4
+                s where a paused run is stepped.
+
         """
         if self._lockstep:
             self._kept = self._kept or self._answer(paced)

@@ -47,9 +47,11 @@ _NUMBERS = 256 * 19
 class Order:
     """A trajectory between its message and its motion.
 
-    Attributes: outcome: a result where the trajectory is accepted, else the SstError
-        that says why not; cancelled where a newer one came before this was checked.
+    Attributes:
+        outcome: a result where the trajectory is accepted, else the SstError that says
+            why not; cancelled where a newer one came before this was checked.
         passed: time of the trajectory at which its motion begins [s].
+
     """
 
     def __init__(self, points: Points, seen: Measurement | None, seen_ns: int) -> None:

@@ -40,8 +40,10 @@ class Samples:
 
     Those inside of steps are computed together, by the program of a step over rows.
 
-    Attributes: evaluations: that this takes; they are no part of a motion's budget, as
-        they have a bound.
+    Attributes:
+        evaluations: that this takes; they are no part of a motion's budget, as they
+            have a bound.
+
     """
 
     def __init__(self, stepper: Stepper) -> None:

@@ -98,38 +98,44 @@ def simulate(
     Where a limit of the scene ends the motion, or no step resolves it, the trajectory
     has the part that is valid, and its `status` and `message` give the reason.
 
-    Args: scene: name or path of a scene, its document as a dict, or a `Scene`. torque:
-        three torques [N m]; a profile (`SineTorque`, `TorqueTable`, `PolynomialTorque`,
-        a `scipy.interpolate.PPoly` whose values have the shape (3,)); or a function
-        f(t) or f(t, state) of the time [s] and the `State`. By default the scene's own
-        profile, or zero where it has none. duration: length of the motion [s]; by
-        default that of the scene. initial: initial state in place of the scene's:
-        (gamma [rad], gamma_dot [rad/s]), or a mapping or `Initial` with gamma,
-        gamma_dot, orientation. samples: number of even intervals of time, at whose ends
-        samples are returned; by default 200, or the control periods where there are
-        some. The steps do not depend on them. t_eval: the times of the samples instead
-        [s], ascending, in whole nanoseconds (others are rounded). method: "dopri5",
-        "dop853", "rk4" (explicit Runge-Kutta of order 5, 8, 4), "rodas5p" (Rosenbrock,
-        order 5, for stiff scenes) or "auto", which changes between them as the motion
-        asks for. tolerance: error of the orientation at the end that is allowed [rad].
-        A motion whose `error_estimate` exceeds it is run again by smaller steps, up to
-        three times; if it still does, `status` is 2. A function that may have a memory
-        runs once. control_period: a function is called once a period [s], at its
-        beginning, and its torques are held until the next, as those of a controller,
-        which may have a memory. Without it a function is part of the differential
-        equation, called in each stage of a step, and must have no memory. memoryless:
-        the function depends on its arguments alone. With `control_period` it is then
-        called a second time a period, with the state of the second solution, which
-        shows how it answers the error. Otherwise the error estimate, without this
-        answer, is ten times as large. breaks: times at which a function jumps or has a
-        kink [s], ascending. Jumps in time are found without it, unless a pulse is
-        shorter than a step. max_step: longest step [s]; by default the error alone
-        decides. sensitivities: numbers by which `Trajectory.sensitivities`
-        differentiates the motion: keys of the scene, as "star.inertia.zz",
-        "star.inertia" (its six numbers), "initial.gamma" (three), "base.v" (nine) or
-        "stroke.stiffness", and "torque" for all numbers of the torques. Not with a
-        function of the state. By "star.alpha_deg[0]" the third angle takes what the
-        first leaves. progress: draw a bar on a terminal.
+    Args:
+        scene: name or path of a scene, its document as a dict, or a `Scene`.
+        torque: three torques [N m]; a profile (`SineTorque`, `TorqueTable`,
+            `PolynomialTorque`, a `scipy.interpolate.PPoly` whose values have the shape
+            (3,)); or a function f(t) or f(t, state) of the time [s] and the `State`. By
+            default the scene's own profile, or zero where it has none.
+        duration: length of the motion [s]; by default that of the scene.
+        initial: initial state in place of the scene's: (gamma [rad], gamma_dot
+            [rad/s]), or a mapping or `Initial` with gamma, gamma_dot, orientation.
+        samples: number of even intervals of time, at whose ends samples are returned;
+            by default 200, or the control periods where there are some. The steps do
+            not depend on them.
+        t_eval: the times of the samples instead [s], ascending, in whole nanoseconds
+            (others are rounded).
+        method: "dopri5", "dop853", "rk4" (explicit Runge-Kutta of order 5, 8, 4),
+            "rodas5p" (Rosenbrock, order 5, for stiff scenes) or "auto", which changes
+            between them as the motion asks for.
+        tolerance: error of the orientation at the end that is allowed [rad]. A motion
+            whose `error_estimate` exceeds it is run again by smaller steps, up to three
+            times; if it still does, `status` is 2. A function that may have a memory
+            runs once.
+        control_period: a function is called once a period [s], at its beginning, and
+            its torques are held until the next, as those of a controller, which may
+            have a memory. Without it a function is part of the differential equation,
+            called in each stage of a step, and must have no memory.
+        memoryless: the function depends on its arguments alone. With `control_period`
+            it is then called a second time a period, with the state of the second
+            solution, which shows how it answers the error. Otherwise the error
+            estimate, without this answer, is ten times as large.
+        breaks: times at which a function jumps or has a kink [s], ascending. Jumps in
+            time are found without it, unless a pulse is shorter than a step.
+        max_step: longest step [s]; by default the error alone decides.
+        sensitivities: numbers by which `Trajectory.sensitivities` differentiates the
+            motion: keys of the scene, as "star.inertia.zz", "star.inertia" (its six
+            numbers), "initial.gamma" (three), "base.v" (nine) or "stroke.stiffness",
+            and "torque" for all numbers of the torques. Not with a function of the
+            state. By "star.alpha_deg[0]" the third angle takes what the first leaves.
+        progress: draw a bar on a terminal.
 
     Raises:
         InputError: an argument is not allowed; names it and the allowed values.

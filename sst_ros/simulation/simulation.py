@@ -104,27 +104,30 @@ class Simulation(Explained):
     one thread at a time may advance a simulation: another one is refused, for it would
     lose steps.
 
-    Args: scene: a Scene, the name of a scene that is shipped, the path of a file, or a
-        mapping with the keys of a scene. integrator: auto, or a method of
-        `integration.methods.METHODS`. tolerance: largest local error of a step: of the
-        quaternion, and of the rate relative to its length. RK4 has no error estimate;
-        it takes one step a call. equations: "quaternion", the equations of motion in
-        the quaternion and the body rate, or "virtual_work", the paper's Eqs. 1 to 92:
-        the same motion, a thousand times slower, by explicit methods in plain Python,
-        without the terms that the paper does not have. step_budget: evaluations of the
-        right-hand side that one `step` may take. The default keeps a step below about
-        0.2 s, see `default_budget`. Long steps of a stiff or fast motion may need more.
-        A Jacobian counts as 30 evaluations.
+    Args:
+        scene: a Scene, the name of a scene that is shipped, the path of a file, or a
+            mapping with the keys of a scene.
+        integrator: auto, or a method of `integration.methods.METHODS`.
+        tolerance: largest local error of a step: of the quaternion, and of the rate
+            relative to its length. RK4 has no error estimate; it takes one step a call.
+        equations: "quaternion", the equations of motion in the quaternion and the body
+            rate, or "virtual_work", the paper's Eqs. 1 to 92: the same motion, a
+            thousand times slower, by explicit methods in plain Python, without the
+            terms that the paper does not have.
+        step_budget: evaluations of the right-hand side that one `step` may take. The
+            default keeps a step below about 0.2 s, see `default_budget`. Long steps of
+            a stiff or fast motion may need more. A Jacobian counts as 30 evaluations.
 
     Attributes:
         geometry: constant vectors of the scene.
         dynamics: traced functions of the scene.
         step_budget: evaluations that one step may take.
 
-    Raises: AssemblyError: the initial gamma has no unique admissible assembly.
-        SingularConfiguration: it moves from a parallel singularity. InputError: the
-        initial gamma lies outside the stroke, an argument is not allowed, or the scene
-        has a term that the equations do not have.
+    Raises:
+        AssemblyError: the initial gamma has no unique admissible assembly.
+        SingularConfiguration: it moves from a parallel singularity.
+        InputError: the initial gamma lies outside the stroke, an argument is not
+            allowed, or the scene has a term that the equations do not have.
 
     """
 
@@ -173,15 +176,21 @@ class Simulation(Explained):
     ) -> State:
         """Advance by dt_ns [ns] in as many steps as the tolerance asks for.
 
-        Args: torque: commanded torques [N m], held constant; a `SineTorque`; or a
-            function of t [s]. dt_ns: length [ns], > 0. moment: external moment on the
-            star in {B} [N m], used where the scene takes it from a topic.
+        Args:
+            torque: commanded torques [N m], held constant; a `SineTorque`; or a
+                function of t [s].
+            dt_ns: length [ns], > 0.
+            moment: external moment on the star in {B} [N m], used where the scene takes
+                it from a topic.
 
-        Raises: InputError: an argument is not finite, or dt_ns not positive.
+        Raises:
+            InputError: an argument is not finite, or dt_ns not positive.
             StrokeExceeded, WorkspaceLeft, SingularityReached: the motion ends inside
-            the step, at the `time` of the error. StepBudgetExceeded: the step takes
-            more than `step_budget` evaluations. Diverged: no step resolves the motion.
-            In all cases the state stays as it was.
+                the step, at the `time` of the error.
+            StepBudgetExceeded: the step takes more than `step_budget` evaluations.
+            Diverged: no step resolves the motion. In all cases the state stays as it
+                was.
+
         """
         self.steps(torque, dt_ns, 1, moment)
         return self.state

@@ -68,15 +68,22 @@ class Task:
 class SteppedMotion:
     """One run of a task by steps whose local error is at most its tolerance.
 
-    Args: task: what is simulated. y: state at the begin; numbers that it lacks at its
-        end are zero. budget: evaluations that it may take, those of earlier runs of the
-        same motion included. limits: whether the limits of the scene end the motion.
+    Args:
+        task: what is simulated.
+        y: state at the begin; numbers that it lacks at its end are zero.
+        budget: evaluations that it may take, those of earlier runs of the same motion
+            included.
+        limits: whether the limits of the scene end the motion.
         progress: draw a bar on a terminal.
 
-    Attributes: samples: those that were taken. held: times of control [s] and the
-        torques from then on. start, at, time: first and last valid point, and time of
-        the last [s]. status, message: 0 at the end, 1 at a limit, -1 where no step
-        resolves the motion; why. stepper: what made the steps.
+    Attributes:
+        samples: those that were taken.
+        held: times of control [s] and the torques from then on.
+        start, at, time: first and last valid point, and time of the last [s].
+        status, message: 0 at the end, 1 at a limit, -1 where no step resolves the
+            motion; why.
+        stepper: what made the steps.
+
     """
 
     def __init__(

@@ -124,27 +124,36 @@ def _check_figures(about: dict[str, Any]) -> None:
 class Trajectory(MotionTable):
     """A motion over n instants. Arrays are its own, and read-only.
 
-    Args: scene: what moves. t: times [s], shape (n,), strictly ascending. quaternion:
-        orientations (x, y, z, w) of {E} in {B}, shape (n, 4). body_rate: angular
-        velocities of the star in {E} [rad/s], shape (n, 3). torque: torques that act at
-        the actuators [N m], shape (n, 3), as in `State.torque`. All three are computed
-        by `dense` when they are first asked for, where none is given. joints: angles
-        and rates of the joints where they are known already, shape (n, 18): gamma, mu,
-        beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default they are computed.
+    Args:
+        scene: what moves.
+        t: times [s], shape (n,), strictly ascending.
+        quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
+        body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
+        torque: torques that act at the actuators [N m], shape (n, 3), as in
+            `State.torque`. All three are computed by `dense` when they are first asked
+            for, where none is given.
+        joints: angles and rates of the joints where they are known already, shape (n,
+            18): gamma, mu, beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default
+            they are computed.
         status: 0 where the motion reached its end, 1 where a limit ended it, 2 where it
-        reached its end with an error estimate above the tolerance, -1 where no step
-        resolved it. message: the same in words. method: the integrator, and why it was
-        chosen. error_estimate: estimated error of the orientation at the end [rad], nan
-        if unknown. energy_residual: energy at the end, less that at the start, less the
-        work done [J]; a number, or a function that computes it when it is asked for.
-        evaluations: how often the derivative was evaluated. step: mean length of the
-        steps of the integrator [s], nan if unknown. law: torques that act between the
-        samples, for `at`, as `simulate` takes them; by default each is held over the
-        interval that ends at its sample. dense: a function from times (m,) [s] to
-        states (m, 7 or 10) that `at` uses instead. parameters: numbers of the scene,
-        its start or its torques that `sensitivities` are by. gaps: spans of time [s] of
-        which nothing is known, begin and end, shape (g, 2); `at` refuses times inside
-        of them.
+            reached its end with an error estimate above the tolerance, -1 where no step
+            resolved it.
+        message: the same in words.
+        method: the integrator, and why it was chosen.
+        error_estimate: estimated error of the orientation at the end [rad], nan if
+            unknown.
+        energy_residual: energy at the end, less that at the start, less the work done
+            [J]; a number, or a function that computes it when it is asked for.
+        evaluations: how often the derivative was evaluated.
+        step: mean length of the steps of the integrator [s], nan if unknown.
+        law: torques that act between the samples, for `at`, as `simulate` takes them;
+            by default each is held over the interval that ends at its sample.
+        dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses
+            instead.
+        parameters: numbers of the scene, its start or its torques that `sensitivities`
+            are by.
+        gaps: spans of time [s] of which nothing is known, begin and end, shape (g, 2);
+            `at` refuses times inside of them.
 
     Raises:
         InputError: shapes do not fit, or times do not ascend.
@@ -347,8 +356,9 @@ class Trajectory(MotionTable):
         Args:
             t: one time or times [s], shape (m,), within the trajectory.
 
-        Raises: InputError: a time lies outside, or in a gap; or between samples that
-            were loaded from a file, of a run under a function.
+        Raises:
+            InputError: a time lies outside, or in a gap; or between samples that were
+                loaded from a file, of a run under a function.
 
         """
         times = np.atleast_1d(read_numbers("at", "t", t, seconds=True))
@@ -413,11 +423,13 @@ class Trajectory(MotionTable):
 
         Others may read and write the same path meanwhile.
 
-        Args: path: ends in .parquet or .npz, which `load` reads back to the bit, units
-            (Parquet) and scene included; or in .csv, the table of `to_pandas` for other
-            programs. overwrite: replace a file that exists. reactions: append the
-            columns of `Reactions.columns` to a .csv; a trajectory that is loaded from
-            another file computes them.
+        Args:
+            path: ends in .parquet or .npz, which `load` reads back to the bit, units
+                (Parquet) and scene included; or in .csv, the table of `to_pandas` for
+                other programs.
+            overwrite: replace a file that exists.
+            reactions: append the columns of `Reactions.columns` to a .csv; a trajectory
+                that is loaded from another file computes them.
 
         Raises:
             InputError: the suffix is another, the file exists, or it cannot be written.

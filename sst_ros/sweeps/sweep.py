@@ -86,26 +86,36 @@ def sweep(
 ) -> pd.DataFrame:
     """Run a scene many times with other numbers, and return a table with a row for each run.
 
-    Args: scene: a Scene, its name, its path, or its document as a dict. vary:
-        distribution or values by key of the scene, as in {"star.inertia": ("uniform",
-        0.8, 1.2, "relative"), "initial.gamma": ("normal", 0.785, 0.05)}; or a table (a
-        DataFrame) with a row for each run. torque: None for the scene's own torques
-        over time if it has some, else zero; three constant torques [N m]; or a
-        SineTorque. duration: length of a run [s]; by default that of the scene. n:
-        number of runs; by default that of the grid or of the table. seed: of the random
-        numbers. Row i depends on the seed and on i alone. out: folder of the results as
-        Parquet files, one a chunk; nothing is written without it. client: a
-        dask.distributed client; by default threads of this process. workers: number of
-        threads without a client; 0 for one a core. resume: compute only the chunks that
-        are missing in `out`. progress: draw a bar on a terminal. options: `sampling`,
-        `tolerance`, `steps`, `control`, `outputs` and `chunk` of `SweepStudy`.
+    Args:
+        scene: a Scene, its name, its path, or its document as a dict.
+        vary: distribution or values by key of the scene, as in {"star.inertia":
+            ("uniform", 0.8, 1.2, "relative"), "initial.gamma": ("normal", 0.785,
+            0.05)}; or a table (a DataFrame) with a row for each run.
+        torque: None for the scene's own torques over time if it has some, else zero;
+            three constant torques [N m]; or a SineTorque.
+        duration: length of a run [s]; by default that of the scene.
+        n: number of runs; by default that of the grid or of the table.
+        seed: of the random numbers. Row i depends on the seed and on i alone.
+        out: folder of the results as Parquet files, one a chunk; nothing is written
+            without it.
+        client: a dask.distributed client; by default threads of this process.
+        workers: number of threads without a client; 0 for one a core.
+        resume: compute only the chunks that are missing in `out`.
+        progress: draw a bar on a terminal.
+        options: `sampling`, `tolerance`, `steps`, `control`, `outputs` and `chunk` of
+            `SweepStudy`.
 
-    Returns: Inputs, how each run ended (`status`, `reason`, `t`), `local_error`, and
-        the outputs; units in `attrs`.
+    Returns:
+        Inputs, how each run ended (`status`, `reason`, `t`), `local_error`, and the
+        outputs; units in `attrs`.
 
-    Raises: InputError: an argument or a value in the study is not allowed; nothing has
-        run then. SweepFailed: chunks could not be computed or written; those that are
-        done remain. MissingDependency: pandas or pyarrow is not installed.
+    Raises:
+        InputError: an argument or a value in the study is not allowed; nothing has run
+            then.
+        SweepFailed: chunks could not be computed or written; those that are done
+            remain.
+        MissingDependency: pandas or pyarrow is not installed.
+
     """
     fits = client is None or hasattr(client, "scheduler_info")
     named = not isinstance(vary, Iterable) or all(isinstance(key, str) for key in vary)

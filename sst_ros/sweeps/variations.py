@@ -52,11 +52,16 @@ class Target(NamedTuple):
 class Variation:
     """One key of a study.
 
-    Attributes: key: as given. kind: uniform, normal, grid, or table. numbers: (low,
-        high), (mean, standard deviation, low, high), or the values of a grid or of the
-        columns of a table, rows of as many components as the key has. targets: what it
-        sets; several where one factor scales a tensor, or a key means a list. factor:
-        the one component is a factor of the targets' values.
+    Attributes:
+        key: as given.
+        kind: uniform, normal, grid, or table.
+        numbers: (low, high), (mean, standard deviation, low, high), or the values of a
+            grid or of the columns of a table, rows of as many components as the key
+            has.
+        targets: what it sets; several where one factor scales a tensor, or a key means
+            a list.
+        factor: the one component is a factor of the targets' values.
+
     """
 
     key: str
