@@ -321,9 +321,10 @@ class LoadState:
     Attributes:
         rotation: R of {E} in {B}, shape (3, 3); column 2 is the direction of E.
         gamma, mu, beta: angles of the joints [rad], shape (3,).
-        omega: angular velocity of the star in {B} [rad/s], shape (3,). For a moment
-            only, as are body_rate: the same in {E}. gamma_dot, mu_dot, beta_dot: rates
-            of the joints [rad/s], shape (3,).
+        omega: angular velocity of the star in {B} [rad/s], shape (3,). For a moment only,
+            as are the following.
+        body_rate: the same in {E}.
+        gamma_dot, mu_dot, beta_dot: rates of the joints [rad/s], shape (3,).
 
     """
 
