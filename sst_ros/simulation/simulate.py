@@ -48,6 +48,8 @@ _LEAST_GAIN = 0.5
 """A run by a fifth of the tolerance or less that keeps more of the error is the last."""
 _FUNCTION_BUDGET = 1_000_000
 """Evaluations where each calls a function of the state: half a minute."""
+_BUDGET_PER_SECOND = 5_000
+"""Evaluations a second of motion that a long motion may take beyond that."""
 _ADVICE = (
     "; if the torque function switches with the state, give control_period, as a"
     " controller has it, or smooth the switch"
@@ -215,8 +217,10 @@ def _integrate(task: Task, *, progress: bool) -> Trajectory:
 
 def _budget_of(task: Task) -> int:
     """Return how many evaluations a motion may take: fewer where they call a function."""
-    calls = task.period is None and task.torque.feedback
-    return _FUNCTION_BUDGET if calls else WHOLE_MOTION_BUDGET
+    if task.period is None and task.torque.feedback:
+        return _FUNCTION_BUDGET
+    begin, end = task.span
+    return max(WHOLE_MOTION_BUDGET, round(_BUDGET_PER_SECOND * (end - begin)))
 
 
 def _trajectory(

@@ -110,7 +110,8 @@ class SteppedMotion:
         self._segment = task.span
         self._moment = (0.0,) * len(self.stepper.dynamics.drive[3:])
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
-        self._warn_after: float = _WARN_AFTER
+        self._spent_before = budget.spent
+        self._warn_after: float = budget.spent + _WARN_AFTER
 
     def run(self) -> SteppedMotion:
         """Go to the end or a limit."""
@@ -213,9 +214,10 @@ class SteppedMotion:
     def _warn_if_hopeless(self, share: float) -> None:
         """Warn once where the rest of the motion would take far more than the budget."""
         self._warn_after, most = math.inf, self._budget.per_period
-        if _HOPELESS * most * share < self._budget.spent:
+        spent = self._budget.spent - self._spent_before
+        if _HOPELESS * most * share < spent:
             done = (
-                f"{self._budget.spent:,} evaluations for {100.0 * share:.2g} % of the"
+                f"{spent:,} evaluations for {100.0 * share:.2g} % of the"
                 " motion"
             )
             advice = f"it stops at {most:,}: shorten it, or change its method"
