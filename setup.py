@@ -133,9 +133,7 @@ setup(
     maintainer_email=PACKAGE.find("maintainer").get("email"),
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={
-        NAME: ["py.typed", "nodes/*.xml", "host/*.mplstyle", "*/templates/*"]
-    },
+    package_data={NAME: ["py.typed", "nodes/*.xml", "*.mplstyle", "*/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

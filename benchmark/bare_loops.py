@@ -28,11 +28,11 @@ import rclpy
 
 from benchmark.measure import read_options
 from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
-from sst_ros.host import processes
 from sst_ros.nodes import process, topics
 from sst_ros.nodes.publications import LOG_NS, TorqueLog, stamp, state_messages
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
+from sst_ros.runtime import scheduling
 from sst_ros.runtime.tick_loop import Pacer, SteadyTime
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import ZERO
@@ -89,13 +89,13 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
 
 def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
     """Run a loop in this process: processor time [% of a core], deadlines missed [%]."""
-    latency = processes.CpuDmaLatency()
+    latency = scheduling.CpuDmaLatency()
     latency.request(latency_us)
     ticks, number, read = LOOPS[name]
     publish = exchange(number, read) if number else None
     time.sleep(1.0)  # until discovery is quiet
-    processes.schedule(20, threading.get_native_id())
-    processes.quiet()
+    scheduling.schedule(20, threading.get_native_id())
+    scheduling.quiet()
     missed, step_ns, used = 0, ticks * TICK_NS, time.process_time()
     began = deadline = time.monotonic_ns()
     while deadline < began + seconds * 1e9:
@@ -152,8 +152,8 @@ class Beside:
 
 def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
     pacer, ticks = Pacer(TICK_NS, 1.0, SteadyTime()), LOOPS["sleeps every sample"][0]
-    processes.schedule(priority, threading.get_native_id())
-    processes.quiet()
+    scheduling.schedule(priority, threading.get_native_id())
+    scheduling.quiet()
     pacer.start()
     while not ends.is_set():
         pacer.wait(lambda: False, ticks)
@@ -194,8 +194,8 @@ def compare(watch: Client, seconds: float, rounds: int) -> str:
     Markdown, a row for each, a table for each cpu_dma_latency.
     """
     settings = {-1: "no limit of the exit latency, the default"}
-    said = processes.CpuDmaLatency().request(0)
-    if processes.NO_LIMIT not in said:
+    said = scheduling.CpuDmaLatency().request(0)
+    if scheduling.NO_LIMIT not in said:
         settings[0] = "`cpu_dma_latency` 0"
     found: dict[tuple[int, str], list[dict[str, float]]] = {
         (latency_us, name): [] for name in (NODE, *LOOPS) for latency_us in settings

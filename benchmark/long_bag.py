@@ -27,9 +27,9 @@ import numpy as np
 from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.host.output import slices
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.nodes.publications import TorqueLog, stamp, state_messages
+from sst_ros.progress import slices
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.report.reference import TickStepper
 from sst_ros.scene import scene as scenes

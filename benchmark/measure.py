@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, TypeVar
 
-from sst_ros.host.output import slices
+from sst_ros.progress import slices
 from sst_ros.report.results import data_frame, markdown, processor
 
 Key = TypeVar("Key", bound=Hashable)

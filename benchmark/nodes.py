@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from sst_ros.host import processes
+from sst_ros.runtime import child_process
 
 EXECUTABLES = Path(__file__).parents[1] / "executables"
 _TICK = os.sysconf("SC_CLK_TCK")
@@ -28,7 +28,7 @@ def own_domain() -> Iterator[int]:
     """Give the processes that are started inside a ROS domain of their own, on
     localhost.
     """
-    number, lock = processes.lock_domain()
+    number, lock = child_process.lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:
         with patch.dict(os.environ, ours):
@@ -61,7 +61,7 @@ class Process(subprocess.Popen[str]):
         words = (
             [sys.executable, "-c", command] if python else [str(EXECUTABLES / command)]
         )
-        options = processes.words(given)
+        options = child_process.words(given)
         if namespace:
             options += ["-r", f"__ns:={namespace}"]
         if options:

@@ -32,7 +32,7 @@ from benchmark.peers.floor import find_floor
 from benchmark.peers.task import Task
 from sst_ros import Simulation, load_scene, simulate
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.host.figures import BLUE, save_figure, styled
+from sst_ros.figures import BLUE, save_figure, styled
 from sst_ros.report.results import data_frame, markdown, processor
 
 ROUNDS, STARTS = 9, 3

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros import load_scene, sweep
-from sst_ros.host.many_runs import run_many
+from sst_ros.integration.many_runs import run_many
 from sst_ros.sweeps.sweep import PreparedSweep, read_sweep, run_chunk
 from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
 

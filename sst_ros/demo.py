@@ -14,7 +14,7 @@ from pathlib import Path
 
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError
-from sst_ros.host import processes
+from sst_ros.runtime import child_process
 from sst_ros.scene.scene import load
 
 EXAMPLES = ("example1", "example2")
@@ -100,7 +100,7 @@ def _node(
     command: str, end_s: float, **given: object
 ) -> Iterator[subprocess.Popen[str]]:
     """Have a node beside a block, after which it ends within a time [s], or raise an SstError."""
-    with processes.run_beside(command, given, stdout=subprocess.PIPE) as process:
+    with child_process.run_beside(command, given, stdout=subprocess.PIPE) as process:
         yield process
         try:
             status = process.wait(end_s)

@@ -35,8 +35,8 @@ from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import explain_missing_ros, suggestion
-from sst_ros.host import processes
 from sst_ros.nodes import topics
+from sst_ros.runtime import child_process
 from sst_ros.runtime.settings import SimulatorParameters, default_topics, ros_arguments
 from sst_ros.scene.scene import load, share_directory
 from sst_ros.scene.yaml_document import read_file, read_values
@@ -171,7 +171,7 @@ def node(
             one for one in (defaults, given["params_file"]) if one
         ],  # the later goes first
         ros_arguments=["--log-level", given["log_level"]],
-        additional_env={processes.PARENT: str(os.getpid())},
+        additional_env={child_process.PARENT: str(os.getpid())},
     )
 
 

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sst_ros.errors import SstError, require
-from sst_ros.host.many_runs import run_many
-from sst_ros.host.output import require_free
+from sst_ros.files import require_free
+from sst_ros.integration.many_runs import run_many
+from sst_ros.progress import follow
+from sst_ros.sweeps.cluster import run_on_cluster
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = Path(__file__).parent / "pages"
@@ -77,11 +79,13 @@ def run_jobs(
     for 1 worker; a bar with the label is drawn. A result may depend on its job only:
     then all bits are the same for any number of workers.
     """
-    client = (
-        None if workers == 1 else _processes(workers or len(os.sched_getaffinity(0)))
-    )
-    found = dict(run_many(function, jobs, client=client, label=label))
-    return [found[number] for number in range(len(jobs))]
+    if workers == 1:
+        numbered = run_many(function, jobs, label=label)
+    else:
+        client = _processes(workers or len(os.sched_getaffinity(0)))
+        numbered = follow(run_on_cluster(client, function, jobs), len(jobs), label)
+    results = dict(numbered)
+    return [results[number] for number in range(len(jobs))]
 
 
 @cache

@@ -21,8 +21,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem
-from sst_ros.host.figures import BLUE, GREEN, INK, MARKERS, VERMILION, styled
-from sst_ros.host.many_runs import run_many
+from sst_ros.figures import BLUE, GREEN, INK, MARKERS, VERMILION, styled
+from sst_ros.integration.many_runs import run_many
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import Array
 from sst_ros.report.reference_solution import (

@@ -19,7 +19,7 @@ from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.reactions import reactions_of
 from sst_ros.errors import SstError
-from sst_ros.host.figures import BLUE, GREY, VERMILION, styled
+from sst_ros.figures import BLUE, GREY, VERMILION, styled
 from sst_ros.mechanism import kinematics, rates, workspace
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.report.results import data_frame, publish, render

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from sst_ros import Simulation, SineTorque, Trajectory, certify, load_scene, simulate
 from sst_ros.errors import AssemblyError, SstError
-from sst_ros.host.figures import BLUE, VERMILION, styled
+from sst_ros.figures import BLUE, VERMILION, styled
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.report.results import data_frame, publish, render
 from sst_ros.scene.scene import Scene

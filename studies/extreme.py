@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.host.figures import (
+from sst_ros.figures import (
     BLUE,
     GREEN,
     INK,

@@ -33,7 +33,7 @@ from matplotlib.lines import Line2D
 from sst_ros.control.controller import InverseDynamics, TrackingMetrics
 from sst_ros.control.law import INSTANTS, MODES
 from sst_ros.control.reference_motions import reference_motion
-from sst_ros.host.figures import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, styled
+from sst_ros.figures import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, styled
 from sst_ros.report.results import data_frame, publish, records, render
 from sst_ros.scene.scene import Scene, load
 from sst_ros.simulation.simulate import simulate

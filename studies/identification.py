@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from sst_ros.demo import FOLLOWED, follow
-from sst_ros.host.figures import BLUE, VERMILION, hide_zeros, legend, stack, styled
+from sst_ros.figures import BLUE, VERMILION, hide_zeros, legend, stack, styled
 from sst_ros.identification.excitation import design
 from sst_ros.identification.identify import identify
 from sst_ros.recording.recording import read as read_bag

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sst_ros import Simulation, SineTorque, Trajectory, simulate
-from sst_ros.host.figures import GREY, INK, MARKERS, styled
+from sst_ros.figures import GREY, INK, MARKERS, styled
 from sst_ros.integration.methods import METHODS
 from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET
 from sst_ros.mechanism.geometry import Array, angle_between

@@ -16,7 +16,7 @@ from benchmark.peers.pinocchio_peer import Model
 from benchmark.peers.task import KINDS, Task
 from sst_ros import demo
 from sst_ros.errors import MissingDependency, require
-from sst_ros.host.figures import (
+from sst_ros.figures import (
     BLUE,
     LINES,
     VERMILION,
@@ -27,7 +27,7 @@ from sst_ros.host.figures import (
     styled,
     widen,
 )
-from sst_ros.host.output import write_into
+from sst_ros.files import write_into
 from sst_ros.mechanism import virtual_work
 from sst_ros.mechanism.geometry import (
     Array,

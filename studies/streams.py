@@ -22,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros.host.processes import keep_domain, run_beside
+from sst_ros.runtime.child_process import keep_domain, run_beside
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene import scene
 

@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager
 from unittest.mock import patch
 
-from sst_ros.host import processes
+from sst_ros.runtime import child_process
 
 HIDDEN = """
 import sys
@@ -41,7 +41,7 @@ def own_domain():
     """Have nodes use a ROS domain that nothing else on this machine has, without the
     network.
     """
-    number, lock = processes.lock_domain()
+    number, lock = child_process.lock_domain()
     ours = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     try:
         with patch.dict(os.environ, ours):

@@ -10,7 +10,7 @@ import pytest
 
 from sst_ros import simulate
 from sst_ros.errors import InputError
-from sst_ros.host.output import load_table, write_table
+from sst_ros.simulation.tables import load_table, write_table
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import UNITS
 

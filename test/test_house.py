@@ -19,7 +19,7 @@ import sst_ros
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
     {"state", "version"},
-    {"errors", "host"},
+    {"errors", "figures", "files", "progress"},
     {"scene"},
     {"mechanism", "programs"},
     {"dynamics"},
@@ -27,10 +27,10 @@ FLOORS = (
     {"simulation"},
     {"control", "description", "proof"},
     {"code_generation", "recording"},
-    {"plot", "view"},
+    {"plot"},
     {"report"},
     {"runtime"},
-    {"identification", "sweeps"},
+    {"identification", "sweeps", "view"},
     {"nodes"},
     {"demo", "launch_parts"},
     {"cli"},

@@ -18,16 +18,14 @@ DOCUMENTS = {
     "cli",
     "description",
     "dynamics",
-    "host",
     "mechanism",
     "nodes",
     "programs",
+    "runtime",
     "scene",
 }
-"""Rooms that a command needs which prints documents.
-
-Of `nodes` the handler of signals.
-"""
+"""Rooms that a command needs which prints documents; of `nodes` and `runtime` only how signals and
+child processes are handled."""
 COMMAND = "from sst_ros.__main__ import main; main({!r})"
 RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_000_000)"
 

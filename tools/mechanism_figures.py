@@ -19,7 +19,7 @@ from matplotlib.patches import FancyBboxPatch
 from numpy.typing import ArrayLike
 
 from sst_ros import load_scene
-from sst_ros.host.figures import BLUE, GREEN, GREY, INK, VERMILION
+from sst_ros.figures import BLUE, GREEN, GREY, INK, VERMILION
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.virtual_work import link_frames, posture

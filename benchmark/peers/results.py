@@ -25,7 +25,7 @@ from benchmark.peers.floor import Floor
 from benchmark.peers.ours import ENGINE as OURS
 from benchmark.peers.ours import PUBLIC
 from benchmark.peers.study import TARGETS, Curve, Point, Reference, reach
-from sst_ros.host.figures import BLUE, GREEN, INK, VERMILION, Looks, save_figure, styled
+from sst_ros.figures import BLUE, GREEN, INK, VERMILION, Looks, save_figure, styled
 from sst_ros.report.results import markdown
 
 PACKAGES = ("numpy", "llvmlite", "mujoco", "pin", "scipy", "mpmath")

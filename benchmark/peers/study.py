@@ -26,7 +26,7 @@ from benchmark.peers.task import (
     find_relative,
     turn_between,
 )
-from sst_ros.host.output import slices
+from sst_ros.progress import slices
 from sst_ros.report.reference_solution import InitialValueProblem, solve_reference
 
 TARGETS = (1e-3, 1e-6, 1e-9)

@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sst_ros.errors import SstError, explanation, printable, require, suggestion
-from sst_ros.host.output import require_free
+from sst_ros.files import require_free
 from sst_ros.version import VERSION
 
 PROGRAM = "sst-ros"
+_BAG_SUFFIXES = (".mcap", ".db3")
 
 
 class Arg:
@@ -469,6 +470,13 @@ def function(name: str) -> Any:
     """Import the function that `module:function` names."""
     module, _, attribute = name.partition(":")
     return getattr(importlib.import_module(f"sst_ros.{module}"), attribute)
+
+
+def results_folder(bag: Path, kind: str) -> Path:
+    """Return the default folder of the results of a recording, beside it: BAG_kind."""
+    path = bag.resolve() if bag.name in ("", "..") else bag
+    name = path.stem if path.suffix in _BAG_SUFFIXES else path.name
+    return path.with_name(f"{name}_{kind}")
 
 
 def free_out(options: argparse.Namespace, default: str | Path) -> Path:

@@ -19,14 +19,14 @@ from sst_ros.control.plan import (
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.reactions import SIZES
 from sst_ros.errors import refuse_unless
-from sst_ros.host.many_runs import connect
-from sst_ros.host.output import require_free, write_into
+from sst_ros.files import require_free, write_into
 from sst_ros.identification.excitation import ExcitingMotion, design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import Identification
 from sst_ros.report.results import render
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
+from sst_ros.sweeps.cluster import connect
 from sst_ros.sweeps.sweep import read_sweep, run_study, summarize
 from sst_ros.sweeps.sweep_study import SweepStudy
 

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 from sst_ros import demo
-from sst_ros.cli.commands import free_out, function
+from sst_ros.cli.commands import free_out, function, results_folder
 from sst_ros.errors import refuse_unless
-from sst_ros.host.output import replace_file, require_free, results_folder
+from sst_ros.files import replace_file, require_free
 from sst_ros.plot import compare, pictures
 from sst_ros.recording.recording import read_signals
 from sst_ros.scene.scene import load, names

@@ -13,18 +13,19 @@ import signal
 import threading
 from pathlib import Path
 
-from sst_ros.cli.commands import free_out, function
+from sst_ros.cli.commands import free_out, function, results_folder
 from sst_ros.errors import InputError, Problem, SstError, refuse_unless, require
-from sst_ros.host import processes
-from sst_ros.host.output import SUFFIXES, require_free, results_folder
+from sst_ros.files import require_free
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.results import render
 from sst_ros.report.scene_summary import summary
+from sst_ros.runtime import child_process
 from sst_ros.scene.scene import Scene, load, text_of
 from sst_ros.scene.yaml_document import line_of, read
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
+from sst_ros.simulation.tables import SUFFIXES
 from sst_ros.view.source import Replay, run_simulator
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -102,7 +103,7 @@ def map_workspace(options: argparse.Namespace) -> None:
     chart = workspace.workspace(geometry, divisions=60, turns=180, progress=True)
     print(workspace.report_singularities(geometry, chart))
     figure = function("plot.workspace:plot_workspace")(chart, titles=[scene.name])
-    function("host.figures:save_figure")(figure, out)
+    function("figures:save_figure")(figure, out)
     print(out)
 
 
@@ -139,7 +140,7 @@ def run_simulation(options: argparse.Namespace) -> int:
         print(out)
     for picture, shown in pictures:
         figure = trajectory.plot() if shown == "motion" else trajectory.reactions.plot()
-        function("host.figures:save_figure")(figure, picture)
+        function("figures:save_figure")(figure, picture)
         print(picture)
     return 0 if trajectory.success else 1
 
@@ -183,7 +184,9 @@ def view(options: argparse.Namespace) -> int:
     }
     words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace or '/'}"]
     with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
-        status: int = function("nodes.process:run")([*words, *processes.words(given)])
+        status: int = function("nodes.process:run")(
+            [*words, *child_process.words(given)]
+        )
     return status
 
 

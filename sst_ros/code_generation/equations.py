@@ -19,7 +19,7 @@ from sst_ros.code_generation.named_programs import CALLER, SceneEquations
 from sst_ros.code_generation.python_module import LIBRARIES, python_module
 from sst_ros.description.mjcf import mjcf
 from sst_ros.errors import check_kinds, refuse_unless, require
-from sst_ros.host.output import replace_file, require_free, write_into
+from sst_ros.files import replace_file, require_free, write_into
 from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import Explained
 

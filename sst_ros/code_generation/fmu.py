@@ -23,7 +23,7 @@ from typing import Any
 from sst_ros.code_generation.c_source import c_files, identifier
 from sst_ros.code_generation.named_programs import SceneEquations
 from sst_ros.errors import SstError
-from sst_ros.host.output import load_templates
+from sst_ros.files import load_templates
 from sst_ros.integration.methods import DOP853
 from sst_ros.scene.loads import JOINTS
 from sst_ros.version import VERSION

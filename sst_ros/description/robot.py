@@ -34,7 +34,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from sst_ros.dynamics.model import limits_of, ranges_of
-from sst_ros.host.output import load_templates
+from sst_ros.files import load_templates
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene

@@ -170,7 +170,7 @@ class Reactions(Explained):
     def plot(self) -> Figure:
         """Draw bearing forces and moments and torques over time; needs matplotlib."""
         require("matplotlib")
-        from sst_ros.host.figures import draw_panels, leg_names
+        from sst_ros.figures import draw_panels, leg_names
 
         panels = []
         for name, loads in self.joints():

@@ -22,8 +22,6 @@ from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import MotionTable
 from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
 from sst_ros.errors import check_kinds, read_numbers, refuse_unless
-from sst_ros.host.many_runs import run_many
-from sst_ros.host.output import slices
 from sst_ros.integration.batch_session import BatchSession
 from sst_ros.integration.batch_step import (
     BLOCK,
@@ -35,9 +33,11 @@ from sst_ros.integration.batch_step import (
     advance_blocks,
     locate_ends,
 )
+from sst_ros.integration.many_runs import run_many
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.llvm import LANES
+from sst_ros.progress import slices
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import TURN
 from sst_ros.state import Explained, freeze

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics.model import GRAZING
 from sst_ros.dynamics.traced_dynamics import ParametricModel
-from sst_ros.host.many_runs import stop_if_asked
+from sst_ros.integration.many_runs import stop_if_asked
 from sst_ros.integration.methods import Tableau
 from sst_ros.integration.steps import explicit_step, normalise
 from sst_ros.mechanism.generic_math import (

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import check_kinds, refuse_unless
-from sst_ros.host.output import slices
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
+from sst_ros.progress import slices
 from sst_ros.scene.scene import SceneInput, scene_of
 
 _BLOCK, _BISECTIONS = 20_000, 55

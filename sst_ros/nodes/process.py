@@ -34,9 +34,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from sst_ros.errors import Check, InputError, SstError, refuse_unless
-from sst_ros.host.processes import is_orphan
 from sst_ros.nodes import signals, topics
 from sst_ros.runtime import settings
+from sst_ros.runtime.child_process import is_orphan
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.schema import Section, Spec
 from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds

@@ -16,11 +16,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from sst_ros.errors import InputError, SstError
-from sst_ros.host import processes
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
 from sst_ros.runtime.run_loop import Phase, Reply, RunDiagnostics, RunLoop, read_gauges
+from sst_ros.runtime.scheduling import CpuDmaLatency, quiet, schedule
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
@@ -66,7 +66,7 @@ class Simulator(Worker[SimulatorParameters]):
             tolerance=given.tolerance,
             equations=given.equations,
         )
-        self._latency = processes.CpuDmaLatency()
+        self._latency = CpuDmaLatency()
         parts = RunParts(run, self._input, self._pacer, self._topics)
         self._loop = RunLoop(simulated, build, parts)
         self._diagnostics = RunDiagnostics(self._loop)
@@ -76,7 +76,7 @@ class Simulator(Worker[SimulatorParameters]):
         )
         every(self.node, 1.0, self._report)
         self._read_gauges()
-        self._loop.post(processes.quiet)  # once the code of all methods is loaded
+        self._loop.post(quiet)  # once the code of all methods is loaded
         self._thread = threading.Thread(target=self._live, name="run", daemon=True)
         self._thread.start()
 
@@ -129,9 +129,7 @@ class Simulator(Worker[SimulatorParameters]):
             return
         paced, running = given.real_time_factor > 0.0, self._loop.phase is Phase.RUNNING
         try:
-            scheduling = processes.schedule(
-                given.realtime_priority if paced else 0, thread
-            )
+            scheduling = schedule(given.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
             return
         latency = self._latency.request(

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sst_ros.errors import refuse_unless
-from sst_ros.host.figures import (
+from sst_ros.figures import (
     DEGREES,
     LINES,
     SMALLEST_SHOWN,

@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import CubicHermiteSpline
 
+from sst_ros import figures
 from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
 from sst_ros.errors import refuse_unless
-from sst_ros.host import figures
-from sst_ros.host.figures import BLUE, DEGREES, GREY, LINES, VERMILION, leg_names, stack
-from sst_ros.host.output import write_into
+from sst_ros.figures import BLUE, DEGREES, GREY, LINES, VERMILION, leg_names, stack
+from sst_ros.files import write_into
 from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot import workspace

@@ -21,7 +21,7 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from sst_ros.errors import refuse_unless
-from sst_ros.host.figures import BLUE, INK, Looks, mark_ends, styled
+from sst_ros.figures import BLUE, INK, Looks, mark_ends, styled
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap

@@ -27,10 +27,10 @@ from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.motion_table import JOINTS
 from sst_ros.dynamics.traced_dynamics import MOTION, RATE, TORQUE, Dynamics
 from sst_ros.errors import check_kinds, refuse_unless, require
-from sst_ros.host.output import Bar
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.progress import Bar
 from sst_ros.proof import enclosure
 from sst_ros.proof.balls import (
     PRECISION,

@@ -21,7 +21,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import model_of
 from sst_ros.dynamics.motion_table import JOINTS
 from sst_ros.errors import InputError, Problem, refusal, require
-from sst_ros.host.output import require_free, write_into, write_table
+from sst_ros.files import require_free, write_into
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.recording import topic_tables as topics
@@ -37,6 +37,7 @@ from sst_ros.recording.topic_tables import (
 from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
+from sst_ros.simulation.tables import write_table
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, Explained, ReadOnly, freeze
 

@@ -22,8 +22,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from pandas import DataFrame, Series
 
 from sst_ros.errors import SstError
-from sst_ros.host.figures import INK, MARKERS, Looks, note, styled
-from sst_ros.host.many_runs import run_many
+from sst_ros.figures import INK, MARKERS, Looks, note, styled
+from sst_ros.integration.many_runs import run_many
 from sst_ros.integration.method_steps import steps_of
 from sst_ros.integration.methods import METHODS, RK4, Method
 from sst_ros.integration.point import Drive

@@ -25,11 +25,11 @@ import pandas as pd
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
-from sst_ros.host.output import Bar
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.point import Point
 from sst_ros.integration.stepper import CannotStep, EvaluationBudget, Stepper
 from sst_ros.mechanism.geometry import Array, Geometry, angle_between
+from sst_ros.progress import Bar
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.scene.scene import Scene

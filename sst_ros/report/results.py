@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sst_ros.errors import require
-from sst_ros.host.output import load_templates, write_into
+from sst_ros.files import load_templates, write_into
 from sst_ros.programs.llvm import llvmlite_version
 from sst_ros.state import Array
 from sst_ros.version import VERSION
@@ -90,7 +90,7 @@ def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
             if hasattr(content, "to_csv"):
                 content.to_csv(path, index=False)
             elif hasattr(content, "savefig"):
-                from sst_ros.host.figures import save_figure  # needs matplotlib
+                from sst_ros.figures import save_figure  # needs matplotlib
 
                 save_figure(content, path)
             else:

@@ -32,9 +32,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
-from sst_ros.host import figures
-from sst_ros.host.figures import BLUE, GREY, LINES, Looks, hide_zeros
-from sst_ros.host.output import write_into
+from sst_ros import figures
+from sst_ros.figures import BLUE, GREY, LINES, Looks, hide_zeros
+from sst_ros.files import write_into
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording

@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from sst_ros.dynamics import kernel
 from sst_ros.errors import SstError, refuse_unless, suggestion
-from sst_ros.host.figures import BLUE, MARKERS, VERMILION, legend, note, styled
-from sst_ros.host.many_runs import run_many
+from sst_ros.figures import BLUE, MARKERS, VERMILION, legend, note, styled
+from sst_ros.integration.many_runs import run_many
 from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.geometry import (

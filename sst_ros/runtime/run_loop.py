@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from sst_ros.dynamics.model import limits_of
 from sst_ros.errors import RunStopped, SstError
-from sst_ros.host import processes
+from sst_ros.runtime import scheduling
 from sst_ros.runtime.tick_loop import (
     IDLE_PERIOD_S,
     HeldTorques,
@@ -346,7 +346,7 @@ class RunDiagnostics:
     def __init__(self, loop: RunLoop) -> None:
         self._loop = loop
         self.gauges: dict[str, object] = {}
-        self.granted = {"scheduling": "", "cpu_dma_latency": processes.NO_LIMIT}
+        self.granted = {"scheduling": "", "cpu_dma_latency": scheduling.NO_LIMIT}
         self._noted: dict[str, Any] = {}
         self._warned: list[str] = []
         # by simulated time [s]

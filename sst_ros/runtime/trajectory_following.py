@@ -24,10 +24,10 @@ from sst_ros.control.law import Command, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError, refusal, refuse_unless
-from sst_ros.host.processes import Assistant
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.generic_math import axpy
 from sst_ros.mechanism.geometry import Geometry, quaternion_of, rotation_matrix
+from sst_ros.runtime.assistant import Assistant
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_messages import Points, plan, read_points
 from sst_ros.scene.scene import Scene

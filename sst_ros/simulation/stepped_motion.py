@@ -11,7 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.host.output import Bar
 from sst_ros.integration.methods import DOP853, Method
 from sst_ros.integration.point import Point, state_distance
 from sst_ros.integration.stepper import (
@@ -22,6 +21,7 @@ from sst_ros.integration.stepper import (
     Step,
     Stepper,
 )
+from sst_ros.progress import Bar
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque, TorqueProfile, torque_at
 from sst_ros.simulation.samples import Samples

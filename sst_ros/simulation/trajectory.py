@@ -33,7 +33,6 @@ from sst_ros.errors import (
     refuse_unless,
     require,
 )
-from sst_ros.host.output import SUFFIXES, load_table, write_table
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET, EvaluationBudget
 from sst_ros.mechanism import kinematics
@@ -50,6 +49,7 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
+from sst_ros.simulation.tables import SUFFIXES, load_table, write_table
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, TimesLike, freeze
 
 if TYPE_CHECKING:
@@ -527,7 +527,7 @@ class Trajectory(MotionTable):
         Needs matplotlib.
         """
         require("matplotlib")
-        from sst_ros.host.figures import DEGREES, draw_panels, leg_names
+        from sst_ros.figures import DEGREES, draw_panels, leg_names
 
         panels = (
             ("γ [deg]", leg_names("γ"), DEGREES * self.gamma),
@@ -555,7 +555,7 @@ class Trajectory(MotionTable):
         svg = ""
         with contextlib.suppress(MissingDependency):
             figure = self.plot()
-            from sst_ros.host.figures import encode
+            from sst_ros.figures import encode
 
             svg = encode(figure, "svg").decode()
         return super()._repr_html_() + svg[max(svg.find("<svg"), 0) :]

@@ -10,12 +10,15 @@ are there.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import itertools
 import json
 import math
+import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,21 +28,16 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics.reactions import LINK_JOINTS, SIZES, ScenarioReactions
 from sst_ros.errors import InputError, check_kinds, refusal, refuse_unless, require
-from sst_ros.host.many_runs import SweepFailed, run_many
-from sst_ros.host.output import (
-    TEMPORARY,
-    Bar,
-    compute_checksum,
-    hold_folder,
-    replace_file,
-    require_free,
-    write_into,
-)
+from sst_ros.files import TEMPORARY, replace_file, require_free, write_into
 from sst_ros.integration.batch import Batch, BatchResult
+from sst_ros.integration.many_runs import run_many
 from sst_ros.mechanism.geometry import Array, angle_between
+from sst_ros.progress import Bar
 from sst_ros.report.results import render
 from sst_ros.scene.scene import Scenarios
+from sst_ros.simulation.tables import compute_checksum
 from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints
+from sst_ros.sweeps.cluster import SweepFailed, run_on_cluster
 from sst_ros.sweeps.controlled_batch import ControlledBatch
 from sst_ros.sweeps.sweep_study import SweepStudy
 from sst_ros.version import VERSION
@@ -170,6 +168,32 @@ def run_study(
         return _compute(study, out, client=client, workers=workers, progress=progress)
 
 
+@contextmanager
+def hold_folder(out: Path, origin: str) -> Iterator[None]:
+    """Make the folder `out` for a block that alone writes into it.
+
+    Remove it if it stays empty.
+
+    Raises InputError of `origin` where another writer has it, in this process or
+    another.
+    """
+    with write_into(out, origin):
+        lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            allowed = "is being written by another run: wait until that has ended"
+            raise refusal(origin, "--out", str(out), allowed) from None
+        except OSError:  # a network file system may not lock folders
+            pass
+        yield
+    finally:
+        os.close(lock)
+        with contextlib.suppress(OSError):  # it is not empty
+            out.rmdir()
+
+
 def _compute(
     study: SweepStudy, out: Path | None, *, client: Any, workers: int, progress: bool
 ) -> pd.DataFrame:
@@ -194,7 +218,10 @@ def _compute(
         0,
     )
     work, tables = partial(run_chunk, ready, out), dict[int, Any]()
-    results = run_many(work, missing, workers=workers, client=client, name="chunk")
+    if client is None:
+        results = run_many(work, missing, workers=workers)
+    else:
+        results = run_on_cluster(client, work, missing, name="chunk")
     try:
         for number, (early, table) in results:
             index = missing[number]

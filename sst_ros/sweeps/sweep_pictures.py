@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sst_ros.host.figures import BLUE, GREY, VERMILION, styled
+from sst_ros.figures import BLUE, GREY, VERMILION, styled
 from sst_ros.report.results import publish
 from sst_ros.sweeps.sweep import correlate, list_outputs
 

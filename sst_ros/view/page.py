@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from sst_ros.description import robot
-from sst_ros.host.output import load_templates
+from sst_ros.files import load_templates
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sst_ros.host import processes
+from sst_ros.runtime import child_process
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Vector3
@@ -151,4 +151,4 @@ def run_simulator(
 ) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run a simulator of a scene to look at; `speed` is simulated time per time."""
     given = {"scene": scene, "publish_rate": _PUBLISH_RATE, "real_time_factor": speed}
-    return processes.run_beside("simulator", given, stdout=subprocess.DEVNULL)
+    return child_process.run_beside("simulator", given, stdout=subprocess.DEVNULL)

@@ -19,8 +19,8 @@ import pytest
 from matplotlib import image
 
 from sst_ros import __main__ as cli
+from sst_ros import figures
 from sst_ros.errors import InputError
-from sst_ros.host import figures
 from sst_ros.plot import compare, pictures
 from sst_ros.plot.compare import differences, draw_comparison
 from sst_ros.plot.pictures import PICTURES, draw_run
@@ -217,7 +217,7 @@ PROGRAM = """
 import resource, sys
 from pathlib import Path
 from matplotlib.figure import Figure
-from sst_ros.host.figures import save_figure
+from sst_ros.figures import save_figure
 
 figure = Figure()
 figure.subplots().plot(range(3000), [i * i % 97 for i in range(3000)])

@@ -12,7 +12,7 @@ import pytest
 from matplotlib import image
 
 from sst_ros.errors import InputError
-from sst_ros.host.figures import save_figure
+from sst_ros.figures import save_figure
 from sst_ros.integration.methods import METHODS
 from sst_ros.integration.steps import explicit_step
 from sst_ros.programs.expression import compile_program

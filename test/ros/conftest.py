@@ -28,9 +28,9 @@ from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
 from sst_ros.__main__ import main  # noqa: E402
-from sst_ros.host import processes  # noqa: E402
 from sst_ros.nodes import signals  # noqa: E402
 from sst_ros.nodes.process import configure_middleware  # noqa: E402
+from sst_ros.runtime import child_process  # noqa: E402
 from sst_ros.state import IDLE_FRAME_ID, nanoseconds  # noqa: E402
 
 NODE = "/sst_simulator"
@@ -93,10 +93,13 @@ class Nodes:
     def start(self, command, *words, executable=None, env=None, **given):
         """Start a command in an interpreter of its own."""
         argv = executable or [sys.executable, "-m", "sst_ros", command]
-        words = [*words, *(["--ros-args", *processes.words(given)] if given else [])]
+        words = [
+            *words,
+            *(["--ros-args", *child_process.words(given)] if given else []),
+        ]
         # Ends with this process, also where that is killed: the next run has the same
         # domains.
-        ends_with = {} if executable else {processes.PARENT: str(os.getpid())}
+        ends_with = {} if executable else {child_process.PARENT: str(os.getpid())}
         process = subprocess.Popen(
             [*argv, *words],
             stdout=subprocess.PIPE,
@@ -114,7 +117,7 @@ class Nodes:
         # in lockstep by default it would end with the scene's
         if command == "simulator":
             given.setdefault("duration", 0.0)
-        words = [command, *words, "--ros-args", *processes.words(given)]
+        words = [command, *words, "--ros-args", *child_process.words(given)]
         self.running.append(ForkedNode(words, dict(os.environ)))
         return self.running[-1]
 
@@ -151,7 +154,7 @@ def run_here(domain, capfd):
     def run(command, *words, **given):
         handlers = {number: signal.getsignal(number) for number in signals._NUMBERS}
         try:
-            options = ["--ros-args", *processes.words(given)] if given else []
+            options = ["--ros-args", *child_process.words(given)] if given else []
             status = main([command, *words, *options])
         finally:
             for number, handler in handlers.items():
@@ -365,7 +368,7 @@ def forked_demos(domain_of_module):
         return ForkedNode(words[words.index("sst_ros") + 1 :], env)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(processes, "Popen", start)
+        patch.setattr(child_process, "Popen", start)
         yield
 
 

@@ -20,8 +20,8 @@ from multiprocessing import forkserver, resource_tracker
 import pytest
 
 from sst_ros.__main__ import main
-from sst_ros.host import processes
 from sst_ros.nodes import inverse_dynamics, simulator, torque_player  # noqa: F401
+from sst_ros.runtime import child_process
 
 with contextlib.suppress(ImportError):  # it needs rosbags
     from sst_ros.nodes import recorder  # noqa: F401
@@ -121,7 +121,7 @@ class _Call:
         # without it.
         os.close(forkserver._forkserver._forkserver_alive_fd)
         os.environ.clear()
-        os.environ.update(self._env, **{processes.PARENT: str(os.getppid())})
+        os.environ.update(self._env, **{child_process.PARENT: str(os.getppid())})
         status = main(self._words)
         atexit._run_exitfuncs()  # multiprocessing leaves without
         sys.exit(status)

@@ -22,7 +22,7 @@ from runtime.bench import Message, duration
 from sst_ros.control.controller import BAND, ControlStopped, Measurement
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, SstError
-from sst_ros.host import processes
+from sst_ros.runtime import assistant as assistant_process
 from sst_ros.runtime import trajectory_following
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_following import Stage, TrajectoryFollower
@@ -289,7 +289,9 @@ def test_control_goes_on_beside_the_check_of_a_trajectory():
     stream.send(1.0, (0.05, 0.0, 0.0))
     stream.samples(100)
     follower = stream.follower
-    with contextlib.closing(processes.Assistant(follower._plan)) as follower._assistant:
+    with contextlib.closing(
+        assistant_process.Assistant(follower._plan)
+    ) as follower._assistant:
         for number in range(3):  # what is imported and traced first is not a check
             os.kill(follower._assistant._process.pid, signal.SIGSTOP)
             order, took = stream.send(1.0, (0.05 + 0.01 * number, 0.0, 0.0)), []
@@ -317,8 +319,10 @@ def test_a_long_result_of_which_a_part_has_come_delays_no_sample():
     """
     ours, theirs = multiprocessing.Pipe()
     with pytest.MonkeyPatch.context() as patch, theirs:
-        patch.setattr(processes, "Pipe", lambda: (ours, multiprocessing.Pipe()[1]))
-        with contextlib.closing(processes.Assistant(bytes)) as assistant:
+        patch.setattr(
+            assistant_process, "Pipe", lambda: (ours, multiprocessing.Pipe()[1])
+        )
+        with contextlib.closing(assistant_process.Assistant(bytes)) as assistant:
             long = bytes(1_000_000)
             assistant.call(long)  # nobody has taken it yet
             assert (theirs.recv(), theirs.recv()) == (bytes, (long,))
@@ -334,7 +338,7 @@ def test_a_long_result_of_which_a_part_has_come_delays_no_sample():
 
 
 def test_the_process_that_checks_ends_with_its_reason_and_another_begins():
-    with contextlib.closing(processes.Assistant(math.sqrt)) as assistant:
+    with contextlib.closing(assistant_process.Assistant(math.sqrt)) as assistant:
 
         def result(*given):
             assistant.call(*given)

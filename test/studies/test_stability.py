@@ -10,7 +10,7 @@ import pytest
 from matplotlib import image
 
 from sst_ros.dynamics.traced_dynamics import ODE
-from sst_ros.host.figures import save_figure
+from sst_ros.figures import save_figure
 from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import METHODS
 from sst_ros.integration.point import Drive

@@ -18,8 +18,8 @@ import pytest
 from sweeps.test_sweep import same
 
 from sst_ros import load_scene
-from sst_ros.host import many_runs
-from sst_ros.host.many_runs import SweepFailed, connect
+from sst_ros.sweeps import cluster
+from sst_ros.sweeps.cluster import SweepFailed, connect
 from sst_ros.sweeps.sweep import run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
@@ -194,7 +194,7 @@ def test_a_worker_that_stands_still_holds_no_study(processes, expected, tmp_path
 def test_a_study_resumes_after_its_scheduler_was_killed(
     processes, expected, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(many_runs, "NO_SCHEDULER", 3.0)
+    monkeypatch.setattr(cluster, "NO_SCHEDULER", 3.0)
     processes.add_worker(SLOW)
     out = tmp_path / "out"
 
@@ -245,7 +245,7 @@ def test_a_worker_that_cannot_do_it_gets_no_more_chunks(
 def test_without_a_worker_that_takes_chunks_the_study_ends(
     processes, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(many_runs, "NO_WORKER", 2.0)
+    monkeypatch.setattr(cluster, "NO_WORKER", 2.0)
     processes.add_worker(OLD)
     with (
         processes.client(1) as client,

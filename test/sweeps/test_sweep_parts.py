@@ -8,9 +8,8 @@ import pyarrow.parquet as parquet
 import pytest
 
 from sst_ros.errors import InputError
-from sst_ros.host.output import hold_folder
 from sst_ros.scene.scene import load
-from sst_ros.sweeps.sweep import read_sweep, run_study
+from sst_ros.sweeps.sweep import hold_folder, read_sweep, run_study
 from sst_ros.sweeps.sweep_study import SweepStudy
 
 VARY = {"star.mass": ("uniform", 1.5, 2.5)}

@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many runs of one function: in this thread, on threads, or on the workers of a Dask cluster.
+"""Many runs of one function on the workers of a Dask cluster.
 
-A result depends on its job alone. So a job may be computed again, which changes no bit:
-Dask does it where a worker dies or, by its `worker-ttl`, gives no sign of life. A
-worker that does not fit (another version, no space left) is retired.
+A result depends on its job alone. So a job may be computed again, which changes no bit: Dask does
+it where a worker dies or, by its `worker-ttl`, gives no sign of life. A worker that does not fit
+(another version, no space left) is retired.
 """
 
 from __future__ import annotations
 
-import os
 import pickle
 import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 from sst_ros.errors import SstError, refuse_errors, require
-from sst_ros.host.output import Bar
 from sst_ros.version import VERSION
 
 NO_WORKER, NO_SCHEDULER = 60.0, 15.0
@@ -30,10 +27,7 @@ GATHER = 60.0
 LOOK = 0.1  # time between two looks for jobs that are done, and for workers [s]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-
 _LOCK = threading.Lock()
-_OWN = threading.local()
-"""What belongs to a thread of a pool: `stop`, set when its results are not wanted."""
 
 
 class SweepFailed(SstError):
@@ -45,81 +39,6 @@ class SweepFailed(SstError):
 
 class UnfitWorker(SstError):
     """A worker cannot compute: its address, and why."""
-
-
-def run_many(
-    function: Callable[[Job], Result],
-    jobs: Sequence[Job],
-    *,
-    workers: int = 1,
-    client: Any = None,
-    label: str = "",
-    name: str = "run",
-) -> Iterator[tuple[int, Result]]:
-    """Call a function for each job.
-
-    Yield the number of the job and the result when it is done.
-
-    Args:
-        function: what is called; what it raises ends all. A worker of a cluster
-            unpickles it once.
-        jobs: its arguments.
-        workers: threads of this process, 0 for one a core; 1 for none, in the order of
-            the jobs.
-        client: a dask.distributed client, whose workers are taken in place of threads.
-        label: of a bar that is drawn on a terminal; none is drawn without it.
-        name: what a job is called where it fails on a cluster.
-
-    Raises:
-        SweepFailed: on a cluster, an SstError of a job, no worker, or no scheduler; or,
-            when all others are done, a job that ended its workers.
-
-    """
-    workers, bar = (
-        min(workers or len(os.sched_getaffinity(0)), len(jobs)),
-        Bar(label, bool(label)),
-    )
-    results: Iterator[tuple[int, Result]] = (
-        (k, function(job)) for k, job in enumerate(jobs)
-    )
-    if client is not None:
-        results = _on_cluster(client, function, jobs, name)
-    elif workers > 1:
-        results = _on_threads(function, jobs, workers)
-    for done, result in enumerate(results, start=1):
-        yield result
-        bar.draw(done / len(jobs))
-
-
-def _on_threads(
-    function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
-) -> Iterator[tuple[int, Result]]:
-    stop = threading.Event()
-    pool = ThreadPoolExecutor(
-        workers, initializer=setattr, initargs=(_OWN, "stop", stop)
-    )
-    futures = {pool.submit(function, job): number for number, job in enumerate(jobs)}
-    try:
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    finally:
-        stop.set()  # what still runs is of no use
-        pool.shutdown(cancel_futures=True)
-
-
-class Stopped(BaseException):
-    """The results of a job are no longer wanted: its run ends at once."""
-
-
-def stop_if_asked() -> None:
-    """Raise Stopped in a thread of `run_many` whose results are no longer wanted.
-
-    So an interrupt of the main thread, or an error, ends long jobs at once. Elsewhere
-    it does nothing.
-    """
-    stop = getattr(_OWN, "stop", None)
-    if stop is not None and stop.is_set():
-        raise Stopped
 
 
 def connect(address: str) -> Any:
@@ -137,10 +56,28 @@ def connect(address: str) -> Any:
         return distributed.Client(address, timeout=NO_SCHEDULER, set_as_default=False)
 
 
-def _on_cluster(
-    client: Any, function: Callable[[Job], Result], jobs: Sequence[Job], name: str
+def run_on_cluster(
+    client: Any,
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    name: str = "run",
 ) -> Iterator[tuple[int, Result]]:
-    """Print which workers are retired, and why."""
+    """Call a function for each job; yield the number of the job and the result when it is done.
+
+    Workers that are retired are printed, with the reason.
+
+    Args:
+        client: a dask.distributed client, whose workers compute.
+        function: what is called; each worker unpickles it once.
+        jobs: its arguments.
+        name: what a job is called in messages.
+
+    Raises:
+        SweepFailed: an SstError of a job, no worker, or no scheduler; or, when all other jobs are
+            done, a job that ended its workers.
+
+    """
     dask, sent, faults = require("distributed"), dict[Any, int](), dict[str, str]()
     work = pickle.dumps((function, jobs))
     ask = partial(

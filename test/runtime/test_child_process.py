@@ -12,12 +12,12 @@ import pytest
 from programs import own_domain
 
 from sst_ros.errors import SstError
-from sst_ros.host import processes
+from sst_ros.runtime import child_process
 
 KEEP = """
 import os, sys
-from sst_ros.host import processes
-processes.keep_domain()
+from sst_ros.runtime import child_process
+child_process.keep_domain()
 print(os.environ["ROS_DOMAIN_ID"], os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"], flush=True)
 sys.stdin.read()
 """
@@ -34,7 +34,7 @@ def test_two_at_the_same_time_differ_and_the_environment_comes_back():
         assert os.environ["ROS_DOMAIN_ID"] == str(first)
         with own_domain() as second:
             assert os.environ["ROS_DOMAIN_ID"] == str(second) != str(first)
-        processes.keep_domain()  # the environment names one
+        child_process.keep_domain()  # the environment names one
         assert os.environ["ROS_DOMAIN_ID"] == str(first)
     assert "ROS_DOMAIN_ID" not in os.environ
 
@@ -44,7 +44,7 @@ def test_a_process_keeps_its_domain_until_it_ends(monkeypatch):
     with subprocess.Popen([sys.executable, "-c", KEEP], **pipes) as process:
         number, network = process.stdout.readline().split()
         assert network == "LOCALHOST"
-        monkeypatch.setattr(processes, "_next", itertools.repeat(int(number) - 1))
+        monkeypatch.setattr(child_process, "_next", itertools.repeat(int(number) - 1))
         with pytest.raises(SstError, match="in use: set ROS_DOMAIN_ID"), own_domain():
             pass
         process.communicate()
@@ -62,11 +62,11 @@ def test_a_domain_in_which_a_node_is_left_is_not_taken(monkeypatch, participant)
     """
     with own_domain() as number:
         pass
-    monkeypatch.setattr(processes, "_next", itertools.count(number - 1))
+    monkeypatch.setattr(child_process, "_next", itertools.count(number - 1))
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as node:
         node.bind(("", 7400 + 250 * number + 10 + 2 * participant))  # RTPS 2.5, 9.6.2.3
         with own_domain() as other:
             assert other != number
-    monkeypatch.setattr(processes, "_next", itertools.count(number - 1))
+    monkeypatch.setattr(child_process, "_next", itertools.count(number - 1))
     with own_domain() as same:
         assert same == number

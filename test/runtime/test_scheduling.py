@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from sst_ros.host.processes import CpuDmaLatency
+from sst_ros.runtime.scheduling import CpuDmaLatency
 
 
 @pytest.mark.parametrize("latency_us", [0, 20])

@@ -4,8 +4,9 @@ from pathlib import Path
 import pytest
 
 from sst_ros.__main__ import main
+from sst_ros.cli.commands import results_folder
 from sst_ros.errors import InputError
-from sst_ros.host.output import require_free, results_folder
+from sst_ros.files import require_free
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process beside this one that computes what would take longer than a control period."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection, Pipe
+from queue import SimpleQueue
+from subprocess import Popen
+from typing import Any
+
+from sst_ros.errors import SstError
+
+
+class Assistant:
+    """A process of low priority that calls one function, which pickle takes.
+
+    It ends with this one.
+
+    What takes longer than a control period is computed there: a thread would share the
+    interpreter's lock with the control. A thread here waits for that process, which may
+    take long to read and to write what the kernel does not hold at once.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self._closed = function, False
+        self._calls, self._results = SimpleQueue[Any](), SimpleQueue[Any]()
+        self._begin()
+        threading.Thread(target=self._exchange, name="assistant", daemon=True).start()
+
+    def _begin(self) -> None:
+        self._connection, theirs = Pipe()
+        number = theirs.fileno()
+        code = f"from sst_ros.runtime.assistant import assist; assist({number})"
+        self._process = Popen(
+            [sys.executable, "-c", code],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[number],
+            start_new_session=True,  # no Ctrl-C comes there
+        )
+        theirs.close()
+        self._connection.send(self._function)
+
+    def call(self, *given: Any) -> None:
+        """Have the function called; not before the result of the last call is there."""
+        self._calls.put(given)
+
+    def result(self) -> Any:
+        """Return the result of the call, or the SstError why there is none.
+
+        None until it is there.
+
+        Where the process has ended another one is begun.
+        """
+        return None if self._results.empty() else self._results.get()
+
+    def _exchange(self) -> None:
+        while not self._closed:
+            given = self._calls.get()
+            try:
+                self._connection.send(given)
+                self._results.put(self._connection.recv())
+            except (EOFError, OSError):
+                if self._closed:
+                    return
+                text = (
+                    "the process beside this one has ended with status"
+                    f" {self._process.wait()}"
+                )
+                self._begin()
+                self._results.put(SstError(text))
+
+    def close(self) -> None:
+        """End the process."""
+        self._closed = True
+        self._calls.put(())  # to the thread, where that waits for a call
+        self._process.kill()  # where it waits for the process
+        self._process.wait()
+
+
+def assist(number: int) -> None:
+    """Be the process of an `Assistant` at the other end of the connection of this descriptor."""
+    with contextlib.suppress(EOFError, OSError), Connection(number) as connection:
+        # with all that it imports: nothing is checked before
+        function = connection.recv()
+        os.nice(10)
+        while True:
+            given = connection.recv()
+            try:
+                result = function(*given)
+            except Exception as error:
+                result = error if isinstance(error, SstError) else SstError(repr(error))
+            connection.send(result)

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of numbers in files: Parquet, NPZ or CSV.
+
+Parquet and NPZ hold every bit, texts about the table, and a checksum of both. Parquet also has the
+checksums of its pages, for other readers. CSV has the columns alone, for other programs.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_ros.errors import MissingDependency, check_regular, require
+from sst_ros.files import replace_file
+
+SUFFIXES = (".parquet", ".csv", ".npz")
+_CHECKSUM = "sst_ros_checksum"
+
+
+def write_table(
+    columns: Mapping[str, NDArray[Any]],
+    path: Path,
+    about: Mapping[str, Mapping[str, str]],
+    texts: Mapping[str, str] | None = None,
+) -> None:
+    """Write columns of equal length, shape (n,), whole numbers or doubles.
+
+    The suffix of the path, one of SUFFIXES, says what the file is. Parquet keeps texts
+    about each column, as its unit, and about the table, NPZ the latter; nan is no value
+    in Parquet and CSV, which need pyarrow and pandas.
+    """
+    texts = dict(texts or {})
+    texts[_CHECKSUM] = compute_checksum(texts, columns)
+    with replace_file(path) as own:
+        if path.suffix == ".npz":
+            named: dict[str, Any] = {**columns, **texts}
+            with own.open("wb") as file:
+                np.savez(file, **named)
+        elif path.suffix == ".csv":
+            # pandas writes the fewest digits that read back as the same bits.
+            require("pandas").DataFrame(columns).to_csv(
+                own, index=False, lineterminator="\n"
+            )
+        else:
+            pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
+            arrays = [
+                pyarrow.array(column, from_pandas=True) for column in columns.values()
+            ]
+            fields = [
+                pyarrow.field(name, array.type, metadata=about[name])
+                for name, array in zip(columns, arrays, strict=True)
+            ]
+            whole = pyarrow.Table.from_arrays(
+                arrays, schema=pyarrow.schema(fields, texts)
+            )
+            parquet.write_table(whole, own, write_page_checksum=True)
+
+
+def load_table(
+    path: Path, columns: Sequence[str], texts: Sequence[str]
+) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Read columns, shape (n,), and texts of a Parquet or NPZ file of any name.
+
+    Parquet of earlier versions has no checksum.
+
+    Raises:
+        KeyError: a column or a text is not in the file.
+        ValueError: it is another file, it cannot be read, or it is damaged.
+        MissingDependency: pyarrow is not installed.
+
+    """
+    try:
+        check_regular(path)
+        with path.open("rb") as file:
+            zipped = file.read(2) == b"PK"
+        if zipped:
+            with np.load(path, allow_pickle=False) as source:
+                numbers = {name: source[name] for name in columns}
+                found = {name: str(source[name]) for name in (*texts, _CHECKSUM)}
+        else:
+            parquet = require("pyarrow.parquet")
+            with parquet.ParquetFile(path, page_checksum_verification=True) as source:
+                table = source.read()
+            numbers = {name: table[name].to_numpy() for name in columns}
+            raw = table.schema.metadata or {}
+            found = {key.decode(): text.decode() for key, text in raw.items()}
+        asked = {name: found[name] for name in texts}
+    except (KeyError, MissingDependency):
+        raise
+    except Exception as error:  # pyarrow and zipfile raise anything on bad bytes
+        raise ValueError(" ".join(str(error).split())) from None
+    checksum = compute_checksum(asked, numbers)
+    if found.get(_CHECKSUM, checksum) != checksum:
+        raise ValueError("its checksum is another")
+    return numbers, asked
+
+
+def compute_checksum(
+    texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]
+) -> str:
+    """CRC-32 of texts and of the bits of columns."""
+    checksum = zlib.crc32("".join(texts.values()).encode())
+    for column in columns.values():
+        checksum = zlib.crc32(column.tobytes(), checksum)
+    return f"{checksum:08x}"
