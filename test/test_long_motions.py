@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions of many thousand seconds: they end, in time and memory, and estimates hold."""
 
+import math
 import resource
 import warnings
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from sst_ros import simulate
+from sst_ros.scene.scene import load
 
 AT_REST = [0.0, 0.0, 0.0]
 
@@ -24,6 +26,21 @@ def test_no_warning_of_a_motion_that_only_has_to_run_again():
         motion = simulate("swing", AT_REST, 100.0, tolerance=1e-4)
     assert motion.success
     assert motion.evaluations > 100_000  # where a hopeless motion is warned of
+
+
+def test_the_energy_residual_of_a_damped_motion_is_the_error_of_its_work():
+    scene = load("swing").with_values({"friction.gamma.viscous": 0.6})
+
+    def drive(t):
+        return [1.5 * math.sin(2 * t), -math.sin(3 * t), 0.8 * math.cos(2.5 * t)]
+
+    accurate = simulate(scene, drive, 30.0, tolerance=1e-11)
+    motion = simulate(scene, drive, 30.0, tolerance=1e-4)
+    error_of_energy = abs(motion.energy[-1] - accurate.energy[-1])
+    assert abs(accurate.energy_residual) < 1e-9
+    assert angle_between(motion, accurate) <= motion.error_estimate < 1e-4
+    assert error_of_energy < 1e-5
+    assert abs(motion.energy_residual) > 100.0 * error_of_energy
 
 
 @pytest.mark.slow

@@ -44,6 +44,10 @@ Parts after which limits are checked.
 """
 
 
+_REST = 1e-9
+"""A state this near to one of rest [rad], by the largest entry of A, counts as one."""
+
+
 @dataclass(frozen=True, repr=False)
 class LinearModel(Explained, ReadOnly):
     """Deviations x of a motion by deviations u of its torques: x' = A x + B u.
@@ -55,6 +59,8 @@ class LinearModel(Explained, ReadOnly):
         B: shape (n, 3).
         states: names of the coordinates x, n of them.
         dt: period for which the torques are held [s], or None.
+        at_equilibrium: whether the motion is a state of rest under the torques. Only
+            there the eigenvalues of A do not depend on the coordinates.
 
     """
 
@@ -62,20 +68,22 @@ class LinearModel(Explained, ReadOnly):
     B: Array
     states: tuple[str, ...]
     dt: float | None
+    at_equilibrium: bool = False  # whether the motion is a state of rest
 
     def __post_init__(self) -> None:
         self._freeze()
 
     def _facts(self) -> dict[str, object]:
-        return {
+        facts: dict[str, object] = {
             "x": self.states,
             "A": " x ".join(map(str, self.A.shape)),
             "B": " x ".join(map(str, self.B.shape)),
             "dt [s]": self.dt or "none: x' = A x + B u",
-            "largest abs(eigenvalue of A)": float(
-                np.abs(np.linalg.eigvals(self.A)).max()
-            ),
         }
+        if self.at_equilibrium:  # elsewhere it depends on the coordinates
+            largest = np.abs(np.linalg.eigvals(self.A)).max()
+            facts["largest abs(eigenvalue of A)"] = float(largest)
+        return facts
 
     def to_control(self) -> Any:
         """Return a `control.StateSpace` with the outputs x.
@@ -159,9 +167,10 @@ def linearize(
         InverseDynamics(given).torque(quaternion, rate, ZERO)  # refuses singularities
     now = np.array((*quaternion, *rate, *(lagged if given.lags else ())))
     try:
-        _, from_x, a, b = _differentiate(given, now, acting, by_gamma)
+        _, from_x, a, b, slope = _differentiate(given, now, acting, by_gamma)
     except (ArithmeticError, ValueError):
         raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
+    at_equilibrium = np.abs(slope).max() <= _REST * np.abs(a).max()
     if dt is not None:
         dt = float(dt)
         equations = VariationalEquations(
@@ -192,17 +201,17 @@ def linearize(
         found = _differentiate(given, end, acting, by_gamma)[0] @ flow
         a, b = found[:, :-3], found[:, -3:]
     lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []
-    return LinearModel(a, b, (*COORDINATES[coordinates], *lag), dt)
+    states = (*COORDINATES[coordinates], *lag)
+    return LinearModel(a, b, states, dt, bool(at_equilibrium))
 
 
 def _differentiate(
     scene: Scene, y: Array, torque: Sequence[float], by_gamma: bool
-) -> tuple[Array, Array, Array, Array]:
-    """Return D = dx/dy and R of the state's own changes, D R = 1.
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return D = dx/dy, R of the state's own changes (D R = 1), A, B, and the slope.
 
-    A and B of the continuous model.
-
-    Shapes are (n, n + 1), (n + 1, n), (n, n) and (n, 3).
+    A and B are those of the continuous model; the slope is the derivative of x, or of y
+    where x are deviations. Shapes are (n, n + 1), (n + 1, n), (n, n), (n, 3), (n,).
     """
     size, q = len(y), y[:4]
     turn = np.array([quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]).T
@@ -215,10 +224,13 @@ def _differentiate(
             size + 4, -1
         )
         x, x_dot = np.split(found[1:].T, 2)
+        slope = np.split(found[0], 2)[1]
         from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
-        return x[:, :size], from_gamma, x_dot[:, :size] @ from_gamma, x_dot[:, size:]
+        a = x_dot[:, :size] @ from_gamma
+        return x[:, :size], from_gamma, a, x_dot[:, size:], slope
     found = np.array(trace_derivatives(scene, (), by_torque=True)(*y.tolist(), *torque))
-    slopes = to_star @ found.reshape(size + 4, size)[1:].T
+    rows = found.reshape(size + 4, size)
+    slopes = to_star @ rows[1:].T
     a = slopes[:, :size] @ from_star
     a[:3, :3] = np.cross(y[4:7], np.eye(3))  # in the turning frame d' = dW - W x d
-    return to_star, from_star, a, slopes[:, size:]
+    return to_star, from_star, a, slopes[:, size:], rows[0]

@@ -209,3 +209,17 @@ def test_python_control_takes_the_model():
     system = model.to_control()
     assert system.state_labels == list(model.states) and system.dt == 0.01
     assert (system.A == model.A).all() and (system.B == model.B).all()
+
+
+def test_eigenvalues_are_shown_at_rest_alone():
+    state = equilibrium("gravity_payload", [0.7, 0.75, 0.8])
+    pushed = np.add(state.torque, [0.1, 0.0, 0.0])
+    for coordinates in ("gamma", "star"):
+        at_rest = linearize(
+            "gravity_payload", state, state.torque, coordinates=coordinates
+        )
+        moving = linearize("gravity_payload", state, pushed, coordinates=coordinates)
+        assert at_rest.at_equilibrium
+        assert "eigenvalue" in repr(at_rest)
+        assert not moving.at_equilibrium
+        assert "eigenvalue" not in repr(moving)
