@@ -19,11 +19,13 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar, cast
+from types import NoneType, UnionType
+from typing import Any, TypeAlias, TypeVar, Union, cast, get_args, get_origin
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from sst_ros.state import Array, NotNumbers, real_numbers
+from sst_ros.state import Array, NotNumbers, TimesLike, real_numbers
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
 SHOWN, LONGEST_PATH = 80, 4096  # characters of a value in a message, and of a path
@@ -90,45 +92,106 @@ def refuse_unless(origin: str, *checks: Check) -> None:
         raise InputError(origin, problems)
 
 
-_KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "bool": (lambda x: isinstance(x, (bool, np.bool_)), "must be True or False"),
-    "int": (
-        lambda x: (
-            isinstance(x, Integral)
-            and not isinstance(x, (bool, np.timedelta64))
-            and abs(int(x)) < 2**64
+@dataclass(frozen=True)
+class Kind:
+    """A kind of argument: whether a value is of it, and the words of a refusal."""
+
+    accepts: Callable[[Any], Any]
+    allowed: str
+
+    def find_fault(self, value: Any) -> str:
+        """Return why a value is not of this kind; "" if it is."""
+        try:
+            return "" if self.accepts(value) else self.allowed
+        except NotNumbers as error:
+            return str(error)
+        except (TypeError, ValueError, OverflowError, MemoryError):
+            return self.allowed
+
+
+def _parts(hint: Any) -> frozenset[Any]:
+    """Return the types of an annotation, without None."""
+    union = get_origin(hint) in (Union, UnionType)
+    return frozenset(get_args(hint) if union else (hint,)) - {NoneType}
+
+
+def _key(hint: Any) -> frozenset[Any]:
+    """Return the types of an annotation, without None and without their parameters."""
+    return frozenset(get_origin(part) or part for part in _parts(hint))
+
+
+def _is_whole(value: Any) -> bool:
+    number = isinstance(value, Integral)
+    excluded = isinstance(value, (bool, np.timedelta64))
+    return number and not excluded and abs(int(value)) < 2**64
+
+
+def _is_number(value: Any) -> bool:
+    if not isinstance(value, Real) or isinstance(value, (bool, np.timedelta64)):
+        return False
+    float(value)  # an OverflowError: it is none
+    return True
+
+
+def _is_path(value: Any) -> bool:
+    return isinstance(value, (str, os.PathLike)) and b"\0" not in os.fsencode(value)
+
+
+def _all_text(values: Iterable[Any]) -> bool:
+    return all(isinstance(value, str) for value in values)
+
+
+_KINDS = {
+    _key(hint): kind
+    for hint, kind in (
+        (
+            bool,
+            Kind(lambda x: isinstance(x, (bool, np.bool_)), "must be True or False"),
         ),
-        "must be a whole number",
-    ),
-    "float": (
-        lambda x: (
-            isinstance(x, Real)
-            and not isinstance(x, (bool, np.timedelta64))
-            and float(x) is not None
+        (int, Kind(_is_whole, "must be a whole number")),
+        (float, Kind(_is_number, "must be a number")),
+        (str, Kind(lambda x: isinstance(x, str), "must be text")),
+        (str | Path, Kind(_is_path, "must be a path")),
+        (ArrayLike, Kind(lambda x: real_numbers(x) is not None, "must be numbers")),
+        (
+            TimesLike,
+            Kind(
+                lambda x: real_numbers(x, seconds=True) is not None,
+                "must be times [s]",
+            ),
         ),
-        "must be a number",
-    ),
-    "str": (lambda x: isinstance(x, str), "must be text"),
-    "str | Path": (
-        lambda x: isinstance(x, (str, os.PathLike)) and b"\0" not in os.fsencode(x),
-        "must be a path",
-    ),
-    "ArrayLike": (lambda x: real_numbers(x) is not None, "must be numbers"),
-    "TimesLike": (
-        lambda x: real_numbers(x, seconds=True) is not None,
-        "must be times [s]",
-    ),
-    "Mapping": (
-        lambda x: isinstance(x, Mapping) and all(isinstance(key, str) for key in x),
-        "must be a mapping from text",
-    ),
-    "Collection": (
-        lambda x: isinstance(x, Collection) and all(isinstance(one, str) for one in x),
-        "must be a list of text",
-    ),
-    "Callable": (callable, "must be a function"),
+        (
+            Mapping,
+            Kind(
+                lambda x: isinstance(x, Mapping) and _all_text(x),
+                "must be a mapping from text",
+            ),
+        ),
+        (
+            Collection,
+            Kind(
+                lambda x: isinstance(x, Collection) and _all_text(x),
+                "must be a list of text",
+            ),
+        ),
+        (Callable, Kind(callable, "must be a function")),
+    )
 }
-"""Whether an argument is what an annotation says up to its brackets, and this in words."""
+"""Kinds by the types of an annotation."""
+
+
+def _kind_of(hint: Any) -> Kind | None:
+    """Return the kind that an annotation asks for; None if the function itself checks."""
+    kind = _KINDS.get(_key(hint))
+    if kind is not None:
+        return kind
+    parts = list(_parts(hint))
+    wanted = parts[0]
+    plain = isinstance(wanted, type) and get_origin(wanted) is None
+    if len(parts) > 1 or wanted is Any or not plain:
+        return None  # several kinds, which the function tells apart
+    return Kind(lambda x: isinstance(x, wanted), f"must be a {wanted.__name__}")
+
 
 _FAILURES = (
     TypeError,
@@ -149,37 +212,28 @@ def check_kinds(function: F, *, late: bool = False) -> F:
     Annotations are those of `_KINDS`, and classes, with or without `| None`. What else
     an argument must be is checked by the function itself.
     """
-    names = inspect.signature(function).parameters
-    texts = {name: str(function.__annotations__.get(name, "")) for name in names}
+    names = list(inspect.signature(function).parameters)
     origin = function.__qualname__.removesuffix(".__init__").rpartition(".")[2].lower()
 
-    def find_fault(text: str, value: Any) -> str:
-        kind = text.removesuffix(" | None")
-        if value is None and kind != text:
+    @functools.cache
+    def kinds() -> dict[str, tuple[Kind | None, bool]]:
+        """Return the kind of each argument, and whether it may be None."""
+        hints = inspect.get_annotations(function, eval_str=True)
+        return {
+            name: (_kind_of(hint), NoneType in get_args(hint))
+            for name, hint in hints.items()
+        }
+
+    def find_fault(name: str, value: Any) -> str:
+        kind, optional = kinds().get(name, (None, False))
+        if kind is None or (optional and value is None):
             return ""
-        known = function.__globals__.get(kind)
-        good, allowed = _KINDS.get(kind.partition("[")[0], (None, f"must be a {kind}"))
-        if good is None:
-            wrong = (
-                isinstance(known, type)
-                and known is not Any
-                and not isinstance(value, known)
-            )
-            return allowed if wrong else ""
-        try:
-            return "" if good(value) else allowed
-        except NotNumbers as error:
-            return str(error)
-        except (TypeError, ValueError, OverflowError, MemoryError):
-            return allowed
+        return kind.find_fault(value)
 
     def check(args: tuple[Any, ...], options: dict[str, Any]) -> None:
-        given = [*zip(texts, args, strict=False), *options.items()]
-        found = [
-            (name, value, find_fault(texts.get(name, ""), value))
-            for name, value in given
-        ]
-        if problems := [Problem(*one) for one in found if one[2]]:
+        values = [*zip(names, args, strict=False), *options.items()]
+        faults = [(name, value, find_fault(name, value)) for name, value in values]
+        if problems := [Problem(*fault) for fault in faults if fault[2]]:
             raise InputError(origin, problems)
 
     @functools.wraps(function)

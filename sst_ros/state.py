@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, Union
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ TorqueFunction: TypeAlias = Callable[[float], Vector3]
 """Actuator torques [N m] at a simulated time [s]."""
 
 
-TimesLike: TypeAlias = ArrayLike
+TimesLike: TypeAlias = Union[ArrayLike, timedelta]  # noqa: UP007 (at run time)
 """Times [s], as numbers or as durations of NumPy, pandas or `datetime`."""
 
 SI_UNITS = frozenset(

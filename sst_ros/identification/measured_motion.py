@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Known: TypeAlias = NDArray[np.bool_]
 """Of each interval between samples whether its torque is known."""
 
-Measured: TypeAlias = "Recording | Trajectory | Mapping[str, Any]"
+Measured: TypeAlias = Union["Recording", Trajectory, Mapping[str, Any]]
 
 # samples to identify anything: filters and splines have transients at both ends
 FEWEST = 20

@@ -38,7 +38,8 @@ from sst_ros.files import write_into
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import reference, tracking
+from sst_ros.report import findings, reference, tracking
+from sst_ros.report.findings import Severity
 from sst_ros.report.reference import QUANTITIES, Comparison
 from sst_ros.report.results import largest, made_on, provenance, publish, render
 from sst_ros.state import NANOSECONDS, Array
@@ -109,19 +110,13 @@ def evaluate_run(run: Recording) -> RunEvaluation:
     numbers = (
         _count(run, measured) | summarise(run, integration, ideal) | measured.numbers
     )
-    given = {"run": run, "integration": integration, "ideal": ideal, "s": numbers}
-    said = render(
-        "run.txt", part="findings", begins=reference.begins(run), **given
-    ).splitlines()
-    notes = [line.removeprefix("Note: ") for line in said if line.startswith("Note: ")]
-    wrong = [
-        line for line in said if not line.startswith("Note: ")
-    ]  # in order of weight
+    found = findings.find_all(run, integration, ideal, numbers)
     summary = {
-        "verdict": "WARNING" if wrong else "OK",
-        "reasons": wrong,
-        "notes": notes,
-    } | numbers
+        "verdict": findings.verdict(found),
+        "reasons": findings.texts(found, Severity.WARNING),
+        "notes": findings.texts(found, Severity.NOTE),
+        **numbers,
+    }
     return RunEvaluation(measured, integration, ideal, summary)
 
 

@@ -561,7 +561,7 @@ class Trajectory(MotionTable):
         return super()._repr_html_() + svg[max(svg.find("<svg"), 0) :]
 
 
-def _own(name: str, value: ArrayLike) -> Array:
+def _own(name: str, value: TimesLike) -> Array:
     """Return an array that nothing can change, of times in seconds where it is `t`."""
     return freeze(read_numbers("trajectory", name, value, seconds=name == "t"))
 

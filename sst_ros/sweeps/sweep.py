@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+Table: TypeAlias = "pd.DataFrame"  # evaluated with the annotations of `sweep`
 # extremes are those of the states at the ends of at most so many equal parts of a run
 PARTS = 64
 # runs whose reactions are computed at once: their arrays fit the cache
@@ -81,7 +82,7 @@ def sweep(
     resume: bool = False,
     progress: bool = True,
     **options: Any,
-) -> pd.DataFrame:
+) -> Table:
     """Run a scene many times with other numbers, and return a table with a row for each run.
 
     Args:
