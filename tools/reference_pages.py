@@ -243,7 +243,7 @@ def _names(node: Described, use: str) -> Iterator[str]:
 
 
 def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
-    defaults, changeable = cls(), getattr(cls, "CHANGEABLE", ())
+    defaults, changeable = cls(), cls.CHANGEABLE
     for name, spec in cls.SPECS.items():
         value = getattr(defaults, name)
         shown = str(value).lower() if isinstance(value, bool) else value

@@ -38,7 +38,7 @@ from sst_ros.nodes import signals, topics
 from sst_ros.runtime import settings
 from sst_ros.runtime.child_process import is_orphan
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.scene.schema import Section, Spec
+from sst_ros.scene.schema import Spec
 from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -70,7 +70,7 @@ _WIDEST = 1e300
 
 Defaults: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 """Defaults of some parameters, by the values that others are given."""
-P = TypeVar("P", bound=Section)
+P = TypeVar("P", bound=settings.NodeParameters)
 A = TypeVar("A", bound=settings.AnsweringParameters)
 
 
@@ -131,10 +131,14 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
         # None is what rcl has for []
         elif value is None or isinstance(value, (array, tuple)):
             value = [float(x) if type(x) is int else x for x in value or ()]
-        values[name], descriptor = value, _descriptor(name, spec)
-        descriptor.read_only = name not in getattr(cls, "CHANGEABLE", ())
+        values[name] = value
+        read_only = name not in cls.CHANGEABLE
         try:
-            node.declare_parameter(name, value, descriptor, ignore_override=True)
+            if value == []:
+                _declare_empty_list(node, name, spec, read_only=read_only)
+            else:
+                descriptor = _descriptor(name, spec, read_only=read_only)
+                node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
             checks.append((name, value, False, spec.describe()))
     ours = {
@@ -155,22 +159,44 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
         raise InputError(origin, error.problems) from None
 
 
-def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(name=name, additional_constraints=spec.describe())
-    descriptor.type = (
-        Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]
-    ).value
-    descriptor.description = spec.doc + (f" [{spec.unit}]" if spec.unit else "")
-    low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
+def _declare_empty_list(node: Node, name: str, spec: Spec, *, read_only: bool) -> None:
+    """Declare a parameter whose value is an empty list, with its type.
+
+    rclpy takes the type of a list from its entries, and an empty one for bytes.
+    """
+    kind = _type_of(spec)
+    changeable = _descriptor(name, spec, read_only=False)
+    node.declare_parameter(name, kind, changeable, ignore_override=True)
+    node.set_parameters([Parameter(name, kind, [])])
+    if read_only:
+        node.set_descriptor(name, _descriptor(name, spec, read_only=True))
+
+
+def _type_of(spec: Spec) -> Parameter.Type:
+    return Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]
+
+
+def _descriptor(name: str, spec: Spec, *, read_only: bool) -> ParameterDescriptor:
+    """Describe a parameter: its type, words, range and whether it can be set."""
+    descriptor = ParameterDescriptor(
+        name=name,
+        type=_type_of(spec).value,
+        description=spec.doc + (f" [{spec.unit}]" if spec.unit else ""),
+        additional_constraints=spec.describe(),
+        read_only=read_only,
+    )
+    least = max(spec.least, -_WIDEST)
+    most = min(spec.most, _WIDEST)
     if spec.kind == "number" and not spec.shape:
         # Only a parameter with a range refuses NaN.
-        low = math.nextafter(spec.above, math.inf) if math.isfinite(spec.above) else low
+        if math.isfinite(spec.above):
+            least = math.nextafter(spec.above, math.inf)
         descriptor.floating_point_range = [
-            FloatingPointRange(from_value=low, to_value=high)
+            FloatingPointRange(from_value=least, to_value=most)
         ]
     if spec.kind == "integer":
         descriptor.integer_range = [
-            IntegerRange(from_value=int(low), to_value=int(high))
+            IntegerRange(from_value=int(least), to_value=int(most))
         ]
     return descriptor
 

@@ -38,7 +38,14 @@ def _whole(doc: str, unit: str, default: int, least: int, most: int) -> Any:
     return entry(doc, unit, default=default, least=least, most=most)
 
 
-class SimulatorParameters(Section):
+class NodeParameters(Section):
+    """Parameters of a node."""
+
+    CHANGEABLE: ClassVar[tuple[str, ...]] = ()
+    """Those that can be set while the node runs."""
+
+
+class SimulatorParameters(NodeParameters):
     """Parameters of sst_simulator."""
 
     CHANGEABLE: ClassVar = ("real_time_factor", "command_timeout", "lockstep_timeout")
@@ -211,7 +218,7 @@ class SimulatorParameters(Section):
         return None if channel == plain and not self.dropped_samples else channel
 
 
-class AnsweringParameters(Section):
+class AnsweringParameters(NodeParameters):
     """Parameters of the nodes that answer joint states with torques."""
 
     rate: int = _whole(
@@ -322,7 +329,7 @@ def default_topics() -> tuple[str, ...]:
     return tuple((share_directory() / "config" / "topics.txt").read_text().split())
 
 
-class RecorderParameters(Section):
+class RecorderParameters(NodeParameters):
     """Parameters of sst_recorder."""
 
     output: str = entry(
@@ -341,7 +348,7 @@ class RecorderParameters(Section):
         yield not any(self.topics), "topics", [*self.topics], "must name a topic"
 
 
-class ViewerParameters(Section):
+class ViewerParameters(NodeParameters):
     """Parameters of sst_viewer."""
 
     simulator: str = entry("name of the simulator's node", default="sst_simulator")
@@ -363,7 +370,7 @@ USE_SIM_TIME = "use_sim_time"
 FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Parameters (or their beginning) that rclpy itself declares."""
 
-COMMANDS: dict[str, tuple[str, type[Section]]] = {
+COMMANDS: dict[str, tuple[str, type[NodeParameters]]] = {
     "simulator": ("Simulator", SimulatorParameters),
     "torque_player": ("TorquePlayer", PlayerParameters),
     "inverse_dynamics": ("InverseDynamicsController", ControllerNodeParameters),
