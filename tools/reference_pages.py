@@ -255,6 +255,8 @@ def _parameter_rows(cls: type[NodeParameters]) -> Iterator[tuple[str, ...]]:
             shown = "those of config/topics.txt" if value else "none"
         elif (cls, name) == (SimulatorParameters, "duration"):
             shown = "0.0, in lockstep that of the scene"
+        elif name.startswith("state_gamma"):
+            shown = "that of the scene"
         elif isinstance(value, tuple):
             shown = list(value)
         may = "yes" if name in changeable else "no"

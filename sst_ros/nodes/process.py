@@ -66,6 +66,7 @@ _TYPES = {
     "choice": Parameter.Type.STRING,
     "texts": Parameter.Type.STRING_ARRAY,
 }
+_LISTS = (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.STRING_ARRAY)
 _WIDEST = 1e300
 
 Defaults: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
@@ -97,23 +98,40 @@ class Worker(Generic[P]):
         """
 
     def change(self, changed: P) -> None:
-        """Take over values that were set at run time, all of which are checked."""
+        """Take over values that were set at run time, each of which is allowed.
+
+        An InputError refuses them, with the reason; then nothing has changed.
+        """
         self.parameters = changed
 
-    def _set(self, given: list[Parameter[Any]]) -> Result:
-        known, values = self.parameters.SPECS, {one.name: one.value for one in given}
-        if "use_sim_time" in values:
-            reason = "use_sim_time is read when the node starts, and cannot be changed"
-            return Result(successful=False, reason=reason)
-        mine = {name: value for name, value in values.items() if name in known}
+    def _set(self, parameters: list[Parameter[Any]]) -> Result:
+        """Take over what is set; refuse it with the reason where it is not allowed."""
+        specs = self.parameters.SPECS
+        changes = {}
+        for parameter in parameters:
+            if parameter.name == "use_sim_time":
+                reason = "use_sim_time is read when the node starts, and cannot change"
+                return Result(successful=False, reason=reason)
+            if parameter.name in specs:
+                spec = specs[parameter.name]
+                changes[parameter.name] = _plain_value(spec, parameter.value)
         try:
-            changed = dataclasses.replace(self.parameters, **mine)
+            if changes:
+                self.change(dataclasses.replace(self.parameters, **changes))
         except InputError as error:
             named = InputError(self.node.get_fully_qualified_name(), error.problems)
             return Result(successful=False, reason=str(named))
-        if mine:
-            self.change(changed)
         return Result(successful=True)
+
+
+def _plain_value(spec: Spec, value: Any) -> Any:
+    """Return the value of a parameter as a field of its section takes it."""
+    if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
+        return float(value)
+    if value is None or isinstance(value, (array, tuple, list)):
+        # None is what rcl has for []
+        return [float(x) if type(x) is int else x for x in value or ()]
+    return value
 
 
 def _declare(node: Node, cls: type[P], more: Defaults) -> P:
@@ -125,16 +143,11 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
     defaults, values = {**vars(cls()), **more(given)}, dict[str, Any]()
     origin, checks = node.get_fully_qualified_name(), list[Check]()
     for name, spec in cls.SPECS.items():
-        value = given.get(name, defaults[name])
-        if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
-            value = float(value)
-        # None is what rcl has for []
-        elif value is None or isinstance(value, (array, tuple)):
-            value = [float(x) if type(x) is int else x for x in value or ()]
+        value = _plain_value(spec, given.get(name, defaults[name]))
         values[name] = value
         read_only = name not in cls.CHANGEABLE
         try:
-            if value == []:
+            if value == [] and _type_of(spec) in _LISTS:
                 _declare_empty_list(node, name, spec, read_only=read_only)
             else:
                 descriptor = _descriptor(name, spec, read_only=read_only)

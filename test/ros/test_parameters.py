@@ -191,6 +191,8 @@ def test_descriptors_carry_type_words_bounds_and_read_only(domain, command, text
             {"publish_clock": True, "use_sim_time": True},
             "cannot be its source",
         ),
+        ("simulator", {"reaction": "wrist"}, "reaction = 'wrist': must be one of none"),
+        ("simulator", {"imu_position": "[0.0, 1.0]"}, "must be 3 finite numbers"),
         ("torque_player", {"rate": 300}, "rate = 300: must divide 1e9"),
         ("torque_player", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"timeout": 0.5}, "no joint_states for"),
@@ -217,8 +219,11 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     document = yaml.safe_load(path.read_text())
     given = document["/**"]["ros__parameters"]
     defaults = SimulatorParameters()
-    names = SimulatorParameters.SPECS.keys() - {"duration", "wait_for_subscribers"}
-    assert given == {name: getattr(defaults, name) for name in names}
+    of_scene = {"duration", "state_gamma", "state_gamma_dot"}
+    names = SimulatorParameters.SPECS.keys() - of_scene - {"wait_for_subscribers"}
+    values = {name: getattr(defaults, name) for name in names}
+    values["imu_position"] = [*defaults.imu_position]
+    assert given == values
     told = [
         "--ros-args",
         "--params-file",
