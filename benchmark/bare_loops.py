@@ -29,7 +29,8 @@ import rclpy
 from benchmark.measure import read_options
 from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.nodes import process, topics
-from sst_ros.nodes.publications import LOG_NS, TorqueLog, stamp, state_messages
+from sst_ros.nodes.publications import LOG_NS
+from sst_ros.nodes.state_messages import Numbers, TorqueLog, state_messages, time_of
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
 from sst_ros.runtime import scheduling
@@ -64,9 +65,9 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
     publishers = [topics.SIMULATOR[name].publisher(node, 1000) for name in names]
     inputs = ("commands", "commands_stamped")[:read]
     readers = [Reader(node, topics.SIMULATOR[name]) for name in inputs]
-    states, log = state_messages(), TorqueLog(TICK_NS)
-    y, joints, torque = Simulation("swing").sample
-    numbers = y[:4], joints, torque
+    messages, log = [*state_messages().values()], TorqueLog(TICK_NS)
+    (x, y, z, w, *_), joints, torque = Simulation("swing").sample
+    numbers = Numbers((x, y, z, w), joints[:9], joints[9:], torque)
     wait_for(
         lambda: all(one.get_subscription_count() for one in publishers),
         "recorder",
@@ -80,9 +81,9 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
             log.append(ZERO, ZERO, 2)
             if len(log) == LOG_TICKS:
                 publishers[3].publish(log.take(stamp_ns))
-        at = stamp(stamp_ns)
-        for one, message in zip(publishers, states, strict=False):
-            one.publish(message(at, numbers))
+        stamp = time_of(stamp_ns)
+        for publisher, message in zip(publishers, messages, strict=False):
+            publisher.publish(message.fill(stamp, numbers))
 
     return publish
 

@@ -14,28 +14,32 @@ import dataclasses
 import json
 import math
 import resource
-import struct
 import subprocess
 import sys
 import tempfile
 import time
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from std_msgs.msg import Float64MultiArray, String
 
 from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.nodes.publications import TorqueLog, stamp, state_messages
+from sst_ros.nodes.state_messages import Numbers, TorqueLog, state_messages, time_of
 from sst_ros.progress import slices
+from sst_ros.recording.bag_reader import message_types
 from sst_ros.recording.bag_writer import BagWriter
 from sst_ros.report.reference import TickStepper
 from sst_ros.scene import scene as scenes
 from sst_ros.scene import yaml_document
 from sst_ros.scene.loads import Friction, JointFriction, Spring
 from sst_ros.scene.scene import Scene
+from sst_ros.state import ZERO
 
 AT_MOST_S, AT_MOST_GB = 60.0, 1.5
 START_NS, TICK_NS, TICKS_A_SAMPLE = 1_700_000_000_000_000_000, 1_000_000, 2
@@ -43,6 +47,7 @@ SAMPLE_NS = TICKS_A_SAMPLE * TICK_NS
 SENT_NS, ANSWER_NS = 150_000, 400_000
 """Receptions of a sample, and of the command that answers it, after the sample's stamp."""
 
+STORE = message_types()
 TOPICS = {
     "/sst_simulator/scene": "std_msgs/msg/String",
     "/joint_states": "sensor_msgs/msg/JointState",
@@ -51,8 +56,6 @@ TOPICS = {
     "/sst_simulator/applied_torques": "trajectory_msgs/msg/JointTrajectory",
     "/sst_simulator/commands": "std_msgs/msg/Float64MultiArray",
 }
-CDR = b"\x00\x01\x00\x00"
-"""Begin of every message: little-endian CDR."""
 _CHUNK = 5000
 SHOWN = (
     *("samples_recorded", "ticks_recorded", "samples_compared"),
@@ -77,39 +80,59 @@ def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
     """Write the bag of a run of the endless scene; its folder must not exist."""
     scene, samples = endless(), round(seconds * 1e9 / SAMPLE_NS)
     writer, log = BagWriter(path), TorqueLog(TICK_NS)
-    joint_states, orientation, euler_zyz = state_messages()
+    states = state_messages()
+    topics = {
+        "joint_states": "/joint_states",
+        "orientation": "/sst_simulator/orientation",
+        "euler_zyz": "/sst_simulator/euler_zyz",
+    }
     connections = {topic: writer.connect(topic, kind)
                    for topic, kind in TOPICS.items()}  # fmt: skip
 
-    def send(topic: str, received_ns: int, data: bytes) -> None:
-        writer.write(connections[topic], received_ns, data)
+    def send(topic: str, received_ns: int, message: Any) -> None:
+        data = STORE.serialize_cdr(_of_rosbags(message), TOPICS[topic])
+        writer.write(connections[topic], received_ns, bytes(data))
 
-    text = yaml_document.dump(scene).encode() + b"\x00"
-    send("/sst_simulator/scene", START_NS, CDR + struct.pack("<I", len(text)) + text)
+    text = String(data=yaml_document.dump(scene))
+    send("/sst_simulator/scene", START_NS, text)
     for rows, *arrays in _run(scene, samples, shown):
         columns = zip(
             range(rows.start, rows.stop), *(a.tolist() for a in arrays), strict=True
         )
         for number, y, joints, torque in columns:
             at_ns = START_NS + number * SAMPLE_NS
+            received_ns = at_ns + SENT_NS
             if number:  # a start has no torques before it
                 asked_ns = at_ns - SAMPLE_NS
-                data = CDR + struct.pack("<3I4x3d", 0, 0, 3, *torque)
-                send("/sst_simulator/commands", asked_ns + ANSWER_NS, data)
+                command = Float64MultiArray(data=torque)
+                send("/sst_simulator/commands", asked_ns + ANSWER_NS, command)
                 log.append(torque, (), TICKS_A_SAMPLE)
-                received_ns = at_ns + SENT_NS
-                send("/sst_simulator/applied_torques", received_ns, log.take(asked_ns))
-            at, numbers = (
-                stamp(at_ns),
-                (y, joints, torque if number else (0.0, 0.0, 0.0)),
-            )
-            send("/joint_states", at_ns + SENT_NS, joint_states(at, numbers))
-            send(
-                "/sst_simulator/orientation", at_ns + SENT_NS, orientation(at, numbers)
-            )
-            send("/sst_simulator/euler_zyz", at_ns + SENT_NS, euler_zyz(at, numbers))
+                applied = log.take(asked_ns)
+                send("/sst_simulator/applied_torques", received_ns, applied)
+            acted = torque if number else ZERO
+            numbers = Numbers(y[:4], joints[:9], joints[9:], acted)
+            for key, topic in topics.items():
+                message = states[key].fill(time_of(at_ns), numbers)
+                send(topic, received_ns, message)
     writer.close()
     return path
+
+
+def _of_rosbags(value: Any) -> Any:
+    """Turn a message of rclpy into one of rosbags, which writes no bytes behind its end.
+
+    `rclpy.serialization` does, for sequences of messages; `publish` does not.
+    """
+    if isinstance(value, array):
+        return np.array(value)
+    if isinstance(value, list) and value and not isinstance(value[0], str):
+        return [_of_rosbags(entry) for entry in value]
+    if not hasattr(value, "get_fields_and_field_types"):
+        return value
+    package = type(value).__module__.partition(".")[0]
+    kind = STORE.types[f"{package}/msg/{type(value).__name__}"]
+    names = value.get_fields_and_field_types()
+    return kind(**{name: _of_rosbags(getattr(value, name)) for name in names})
 
 
 def _run(

@@ -36,7 +36,11 @@ from sst_ros.nodes.topics import (
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
 from sst_ros.report.results import markdown
 from sst_ros.runtime import run_loop, settings
-from sst_ros.runtime.settings import SimulatorParameters, default_topics
+from sst_ros.runtime.settings import (
+    NodeParameters,
+    SimulatorParameters,
+    default_topics,
+)
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import REQUIRED, Section, Spec
 
@@ -55,7 +59,7 @@ class Described(NamedTuple):
 
     command: str
     name: str
-    parameters: type[Section]
+    parameters: type[NodeParameters]
     endpoints: tuple[Endpoint, ...]
 
 
@@ -242,8 +246,8 @@ def _names(node: Described, use: str) -> Iterator[str]:
             yield endpoint.at(f"/{node.name}").format(simulator=SIMULATOR)
 
 
-def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
-    defaults, changeable = cls(), getattr(cls, "CHANGEABLE", ())
+def _parameter_rows(cls: type[NodeParameters]) -> Iterator[tuple[str, ...]]:
+    defaults, changeable = cls(), cls.CHANGEABLE
     for name, spec in cls.SPECS.items():
         value = getattr(defaults, name)
         shown = str(value).lower() if isinstance(value, bool) else value
@@ -251,6 +255,8 @@ def _parameter_rows(cls: type[Section]) -> Iterator[tuple[str, ...]]:
             shown = "those of config/topics.txt" if value else "none"
         elif (cls, name) == (SimulatorParameters, "duration"):
             shown = "0.0, in lockstep that of the scene"
+        elif name.startswith("state_gamma"):
+            shown = "that of the scene"
         elif isinstance(value, tuple):
             shown = list(value)
         may = "yes" if name in changeable else "no"

@@ -238,7 +238,13 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
     return found
 
 
-def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) -> str:
+def urdf(
+    scene: Scene,
+    topics: Sequence[str] = (),
+    *,
+    lockstep: bool = False,
+    mounts: Mapping[str, Vector3] | None = None,
+) -> str:
     """Write a scene as a URDF document.
 
     With topics of commands by name and of joint states it has the ros2_control tags of
@@ -246,6 +252,9 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
     actuators have the initial state of the scene: without it
     joint_trajectory_controller, activated before, holds nan, and no command starts the
     run.
+
+    Mounts are frames of sensors that are fixed to the star, by name: where they are in
+    {E} [m]; their axes are those of {E}.
     """
     geometry, drawn = Geometry.of(scene), shapes(scene)
     joints, own = joints_of(geometry), {body.name: body for body in bodies_of(scene)}
@@ -280,6 +289,7 @@ def urdf(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) ->
                 dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))
             ),
             bodies=bodies,
+            mounts=mounts or {},
             visuals={
                 link: [*chain(*map(solids, some))] for link, some in drawn.items()
             },

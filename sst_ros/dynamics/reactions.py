@@ -34,7 +34,13 @@ import numpy as np
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import LegMotion
 from sst_ros.dynamics.model import Model
-from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
+from sst_ros.dynamics.traced_dynamics import (
+    BODY_ACCELERATION,
+    MOTION,
+    TORQUE,
+    Dynamics,
+    Function,
+)
 from sst_ros.errors import require
 from sst_ros.mechanism.generic_math import (
     Rows,
@@ -51,7 +57,12 @@ from sst_ros.mechanism.generic_math import (
     triple,
 )
 from sst_ros.mechanism.geometry import Array
-from sst_ros.programs.expression import compile_for_arrays, mark_present, trace
+from sst_ros.programs.expression import (
+    compile_for_arrays,
+    compile_program,
+    mark_present,
+    trace,
+)
 from sst_ros.scene.bodies import entries_of
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import leaves, rebuild
@@ -235,6 +246,31 @@ def reactions_of(
     with np.errstate(all="ignore"):
         legs = _legs(scene, Dynamics.of(scene).model, state, triple(torque.T))
     return _collect(t, _flatten(legs), rotation_rows(_quadruple(state)))
+
+
+def reaction_at(scene: Scene, joint: str, leg: int) -> Function:
+    """Return a function for what one joint exerts on the link that is nearer the star.
+
+    It gives force through O [N] and moment about O [N m], six numbers in the axes of
+    the joint's frame, see `JointLoads`. Its arguments are the quaternion (x, y, z, w),
+    the body rate [rad/s], the torques that act at the actuators [N m] and the angular
+    acceleration in {E} [rad/s^2], 13 numbers.
+
+    Args:
+        scene: what moves.
+        joint: one of LINK_JOINTS.
+        leg: 0, 1 or 2.
+
+    """
+    model = Dynamics.of(scene).model
+
+    def wrench(*inputs: Any) -> tuple[Scalar, ...]:
+        torque, acceleration = triple(inputs[7:10]), triple(inputs[10:13])
+        legs = _solve(scene, model, inputs[:7], acceleration, torque)
+        force, moment = getattr(legs[leg], joint)
+        return (*force, *moment)
+
+    return compile_program(trace(wrench, (*MOTION, *TORQUE, *BODY_ACCELERATION)))
 
 
 class ScenarioReactions:

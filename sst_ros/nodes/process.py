@@ -38,7 +38,7 @@ from sst_ros.nodes import signals, topics
 from sst_ros.runtime import settings
 from sst_ros.runtime.child_process import is_orphan
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.scene.schema import Section, Spec
+from sst_ros.scene.schema import Spec
 from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -66,11 +66,12 @@ _TYPES = {
     "choice": Parameter.Type.STRING,
     "texts": Parameter.Type.STRING_ARRAY,
 }
+_LISTS = (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.STRING_ARRAY)
 _WIDEST = 1e300
 
 Defaults: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 """Defaults of some parameters, by the values that others are given."""
-P = TypeVar("P", bound=Section)
+P = TypeVar("P", bound=settings.NodeParameters)
 A = TypeVar("A", bound=settings.AnsweringParameters)
 
 
@@ -97,23 +98,40 @@ class Worker(Generic[P]):
         """
 
     def change(self, changed: P) -> None:
-        """Take over values that were set at run time, all of which are checked."""
+        """Take over values that were set at run time, each of which is allowed.
+
+        An InputError refuses them, with the reason; then nothing has changed.
+        """
         self.parameters = changed
 
-    def _set(self, given: list[Parameter[Any]]) -> Result:
-        known, values = self.parameters.SPECS, {one.name: one.value for one in given}
-        if "use_sim_time" in values:
-            reason = "use_sim_time is read when the node starts, and cannot be changed"
-            return Result(successful=False, reason=reason)
-        mine = {name: value for name, value in values.items() if name in known}
+    def _set(self, parameters: list[Parameter[Any]]) -> Result:
+        """Take over what is set; refuse it with the reason where it is not allowed."""
+        specs = self.parameters.SPECS
+        changes = {}
+        for parameter in parameters:
+            if parameter.name == "use_sim_time":
+                reason = "use_sim_time is read when the node starts, and cannot change"
+                return Result(successful=False, reason=reason)
+            if parameter.name in specs:
+                spec = specs[parameter.name]
+                changes[parameter.name] = _plain_value(spec, parameter.value)
         try:
-            changed = dataclasses.replace(self.parameters, **mine)
+            if changes:
+                self.change(dataclasses.replace(self.parameters, **changes))
         except InputError as error:
             named = InputError(self.node.get_fully_qualified_name(), error.problems)
             return Result(successful=False, reason=str(named))
-        if mine:
-            self.change(changed)
         return Result(successful=True)
+
+
+def _plain_value(spec: Spec, value: Any) -> Any:
+    """Return the value of a parameter as a field of its section takes it."""
+    if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
+        return float(value)
+    if value is None or isinstance(value, (array, tuple, list)):
+        # None is what rcl has for []
+        return [float(x) if type(x) is int else x for x in value or ()]
+    return value
 
 
 def _declare(node: Node, cls: type[P], more: Defaults) -> P:
@@ -125,16 +143,15 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
     defaults, values = {**vars(cls()), **more(given)}, dict[str, Any]()
     origin, checks = node.get_fully_qualified_name(), list[Check]()
     for name, spec in cls.SPECS.items():
-        value = given.get(name, defaults[name])
-        if type(value) is int and spec.kind == "number":  # "-p duration:=1" means 1.0
-            value = float(value)
-        # None is what rcl has for []
-        elif value is None or isinstance(value, (array, tuple)):
-            value = [float(x) if type(x) is int else x for x in value or ()]
-        values[name], descriptor = value, _descriptor(name, spec)
-        descriptor.read_only = name not in getattr(cls, "CHANGEABLE", ())
+        value = _plain_value(spec, given.get(name, defaults[name]))
+        values[name] = value
+        read_only = name not in cls.CHANGEABLE
         try:
-            node.declare_parameter(name, value, descriptor, ignore_override=True)
+            if value == [] and _type_of(spec) in _LISTS:
+                _declare_empty_list(node, name, spec, read_only=read_only)
+            else:
+                descriptor = _descriptor(name, spec, read_only=read_only)
+                node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
             checks.append((name, value, False, spec.describe()))
     ours = {
@@ -155,22 +172,44 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
         raise InputError(origin, error.problems) from None
 
 
-def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(name=name, additional_constraints=spec.describe())
-    descriptor.type = (
-        Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]
-    ).value
-    descriptor.description = spec.doc + (f" [{spec.unit}]" if spec.unit else "")
-    low, high = max(spec.least, -_WIDEST), min(spec.most, _WIDEST)
+def _declare_empty_list(node: Node, name: str, spec: Spec, *, read_only: bool) -> None:
+    """Declare a parameter whose value is an empty list, with its type.
+
+    rclpy takes the type of a list from its entries, and an empty one for bytes.
+    """
+    kind = _type_of(spec)
+    changeable = _descriptor(name, spec, read_only=False)
+    node.declare_parameter(name, kind, changeable, ignore_override=True)
+    node.set_parameters([Parameter(name, kind, [])])
+    if read_only:
+        node.set_descriptor(name, _descriptor(name, spec, read_only=True))
+
+
+def _type_of(spec: Spec) -> Parameter.Type:
+    return Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]
+
+
+def _descriptor(name: str, spec: Spec, *, read_only: bool) -> ParameterDescriptor:
+    """Describe a parameter: its type, words, range and whether it can be set."""
+    descriptor = ParameterDescriptor(
+        name=name,
+        type=_type_of(spec).value,
+        description=spec.doc + (f" [{spec.unit}]" if spec.unit else ""),
+        additional_constraints=spec.describe(),
+        read_only=read_only,
+    )
+    least = max(spec.least, -_WIDEST)
+    most = min(spec.most, _WIDEST)
     if spec.kind == "number" and not spec.shape:
         # Only a parameter with a range refuses NaN.
-        low = math.nextafter(spec.above, math.inf) if math.isfinite(spec.above) else low
+        if math.isfinite(spec.above):
+            least = math.nextafter(spec.above, math.inf)
         descriptor.floating_point_range = [
-            FloatingPointRange(from_value=low, to_value=high)
+            FloatingPointRange(from_value=least, to_value=most)
         ]
     if spec.kind == "integer":
         descriptor.integer_range = [
-            IntegerRange(from_value=int(low), to_value=int(high))
+            IntegerRange(from_value=int(least), to_value=int(most))
         ]
     return descriptor
 

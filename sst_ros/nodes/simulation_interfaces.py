@@ -127,14 +127,10 @@ class SimulationInterfaces:
         if requested == PAUSED and self._state() == STOPPED:
             text = "a stopped simulation can be started, not paused"
             return answer(response, INCORRECT_TRANSITION, text)
-        pause = partial(self._loop.pause, requested != PLAYING)
         if requested == STOPPED:
-            paused = self._loop.ask(pause).success
-            self._ask(response, self._loop.reset)
-            if not paused:  # out of a fault a reset comes first
-                self._loop.ask(pause)
-            return response
+            return self._ask(response, self._loop.halt)
         if requested in (PLAYING, PAUSED):
+            pause = partial(self._loop.pause, requested != PLAYING)
             return self._ask(response, pause)
         if requested == QUITTING:
             self._leave()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import threading
 import time
@@ -15,7 +16,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from sst_ros.errors import InputError, SstError
+from sst_ros.errors import InputError, SstError, refuse_unless
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
@@ -25,11 +26,11 @@ from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime
 from sst_ros.runtime.torque_input import MessageRefused, TorqueInput, by_name
 from sst_ros.scene import scene
+from sst_ros.scene.loads import Moment
+from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
 
-_DELAY_S = 5.0
-"""Delay of the compiler: the first seconds of a real-time run have the processor alone."""
 _END_S = 0.5  # wait for the thread of the run, where a step does not end
 FOLLOWED_STEP_NS = 200_000_000
 """Steps of a followed clock up to this length are simulated.
@@ -44,15 +45,15 @@ class Simulator(Worker[SimulatorParameters]):
     """Worker of the process `simulator`: connects the parts, reports once a second."""
 
     def __init__(self) -> None:
-        super().__init__("sst_simulator", SimulatorParameters, _lockstep_duration)
+        super().__init__("sst_simulator", SimulatorParameters, _defaults_of_scene)
         given = self.parameters
-        simulated = scene.load(given.scene)
+        simulated = _load_scene(given)
         self._topics = SimulatorTopics(self.node, simulated, given)
         run = self._run = given.run
         names = ["commands", "commands_stamped"]
         if simulated.moment is not None and simulated.moment.topic:
             names.append("external_moment")
-        self._subscribed = (*names, "set_state")
+        self._subscribed = (*names, "set_state_topic")
         readers = [topics.Reader(self.node, topics.SIMULATOR[name]) for name in names]
         self._input = TorqueInput(run, simulated.actuators, *readers)
         followed = follows_clock(self.node)
@@ -70,7 +71,7 @@ class Simulator(Worker[SimulatorParameters]):
         parts = RunParts(run, self._input, self._pacer, self._topics)
         self._loop = RunLoop(simulated, build, parts)
         self._diagnostics = RunDiagnostics(self._loop)
-        serve(self.node, self._loop)
+        RunServices(self.node, self._loop, lambda: self.parameters)
         simulation_interfaces.offer(
             self.node, self._loop, self.done.set, given.base_frame
         )
@@ -199,55 +200,97 @@ class Simulator(Worker[SimulatorParameters]):
             yield f"another node is named {own}, too"
 
 
-def _lockstep_duration(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the scene's duration as a default.
+def _defaults_of_scene(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the defaults that are those of the scene.
 
-    Faults of the scene are reported later.
+    They are its initial state, and in lockstep its duration. Faults of the scene are
+    reported later.
     """
-    if given.get("sync") != "lockstep":
-        return {}
     try:
         simulated = scene.load(given.get("scene", SimulatorParameters().scene))
     except (InputError, TypeError):
         return {}
-    return {"duration": simulated.duration or 0.0}
+    defaults: dict[str, Any] = {
+        "state_gamma": simulated.initial.gamma,
+        "state_gamma_dot": simulated.initial.gamma_dot,
+    }
+    if given.get("sync") == "lockstep":
+        defaults["duration"] = simulated.duration or 0.0
+    return defaults
 
 
-def serve(node: Node, loop: RunLoop) -> None:
-    """Offer the services and the topic by which a run is controlled.
+def _load_scene(settings: SimulatorParameters) -> Scene:
+    """Load the scene; with `external_moment` its moment is that of the topic.
 
-    The run loop decides.
+    Raises InputError where the scene cannot be read, or has a constant moment.
+    """
+    simulated = scene.load(settings.scene)
+    if not settings.external_moment:
+        return simulated
+    is_constant = simulated.moment is not None and not simulated.moment.topic
+    allowed = f"must be false: scene {simulated.name} has a constant moment"
+    refuse_unless("simulator", ("external_moment", True, not is_constant, allowed))
+    return dataclasses.replace(simulated, moment=Moment(topic=True))
+
+
+class RunServices:
+    """The services and the topic by which a run is controlled; the run decides.
+
+    Args:
+        node: whose services they are.
+        loop: the run.
+        settings: returns the present parameters.
+
     """
 
-    def answer(request: Any, response: Any, act: Callable[[Any], Reply]) -> Any:
-        response.success, response.message = loop.ask(lambda: act(request))
+    def __init__(
+        self, node: Node, loop: RunLoop, settings: Callable[[], SimulatorParameters]
+    ) -> None:
+        self._log, self._loop, self._settings = node.get_logger(), loop, settings
+        for name in ("pause", "step", "reset", "set_state"):
+            service = topics.SIMULATOR[name]
+            node.create_service(
+                service.kind,
+                service.name,
+                getattr(self, f"_{name}"),
+                qos_profile=topics.SERVICE_QOS,
+            )
+        topics.subscribe(
+            node, topics.SIMULATOR, set_state_topic=self._take_state_message
+        )
+
+    def _pause(self, request: Any, response: Any) -> Any:
+        return self._answer(response, partial(self._loop.pause, request.data))
+
+    def _step(self, _: Any, response: Any) -> Any:
+        return self._answer(response, self._loop.step)
+
+    def _reset(self, _: Any, response: Any) -> Any:
+        return self._answer(response, self._loop.reset)
+
+    def _set_state(self, _: Any, response: Any) -> Any:
+        settings = self._settings()
+        gamma, gamma_dot = settings.state_gamma, settings.state_gamma_dot
+        return self._answer(response, partial(self._loop.set_state, gamma, gamma_dot))
+
+    def _answer(self, response: Any, request: Callable[[], Reply]) -> Any:
+        response.success, response.message = self._loop.ask(request)
         return response
 
-    def set_state(message: JointState) -> None:
+    def _take_state_message(self, message: JointState) -> None:
         """Take the angles and rates of the actuators; the log has the reply."""
         try:
             gamma = by_name(message.name, message.position, "angles [rad] in position")
             rates = message.velocity or [0.0] * len(message.name)
             gamma_dot = by_name(message.name, rates, "rates [rad/s] in velocity")
         except MessageRefused as refused:
-            node.get_logger().warning(f"set_state refused: {refused}")
+            self._log.warning(f"set_state refused: {refused}")
             return
-        reply = loop.ask(partial(loop.set_state, gamma, gamma_dot))
+        reply = self._loop.ask(partial(self._loop.set_state, gamma, gamma_dot))
         if reply.success:  # rclpy refuses two severities from one line
-            node.get_logger().info(f"set_state: {reply.message}")
+            self._log.info(f"set_state: {reply.message}")
         else:
-            node.get_logger().warning(f"set_state: {reply.message}")
-
-    for name, act in {
-        "pause": lambda request: loop.pause(request.data),
-        "step": lambda _: loop.step(),
-        "reset": lambda _: loop.reset(),
-    }.items():
-        one, qos = topics.SIMULATOR[name], topics.SERVICE_QOS
-        node.create_service(
-            one.kind, one.name, partial(answer, act=act), qos_profile=qos
-        )
-    topics.subscribe(node, topics.SIMULATOR, set_state=set_state)
+            self._log.warning(f"set_state: {reply.message}")
 
 
 class FollowedClock(SteadyTime):

@@ -10,9 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import math
-import re
 import time
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -32,111 +30,6 @@ from sst_ros.runtime.torque_input import MOST_WAITING
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 EXECUTES = "executes"
 
-# Use, name, type; how many messages are kept for slow readers, 0 for two seconds of
-# them; `latched` where the last one is kept for late joiners. Then what it carries, and
-# the condition under which it exists. In names ~ stands for the name of the node,
-# {simulator} for the parameter.
-_TABLE = """
-[simulator]
-publishes joint_states sensor_msgs/msg/JointState 0
-    gamma_1..3, mu_1..3, beta_1..3: position [rad], velocity [rad/s]; effort: torque over the step
-    that ended [N m]; frame_id `idle` where it is no sample of a run
-publishes ~/true_joint_states sensor_msgs/msg/JointState 0
-    joint_states without noise, delay and gaps
-    if encoder_counts, angle_noise, rate_noise, measurement_delay or dropped_samples is set
-publishes ~/orientation geometry_msgs/msg/QuaternionStamped 0
-    orientation of {E} in {B}, the frame_id is base_frame
-publishes ~/euler_zyz geometry_msgs/msg/Vector3Stamped 0
-    the same as ZYZ angles theta, phi, psi [rad]
-publishes ~/applied_torques trajectory_msgs/msg/JointTrajectory 0
-    torques of every step since the last message [N m], with the sample after 50 ms of simulated
-    time and when the run pauses or ends; where the scene takes a moment from a topic also moment_x,
-    moment_y, moment_z in {B}
-publishes ~/scene std_msgs/msg/String 1 latched
-    the scene, as YAML
-publishes ~/phase std_msgs/msg/String 1 latched
-    waiting, running, paused, finished, or `fault: ` with the reason
-publishes /diagnostics diagnostic_msgs/msg/DiagnosticArray 10
-    diagnostics of the run, at 1 Hz
-publishes /clock rosgraph_msgs/msg/Clock 1
-    simulated time
-    if publish_clock is true
-publishes robot_description std_msgs/msg/String 1 latched
-    the scene as URDF
-    if publish_description is true, the default
-subscribes ~/commands std_msgs/msg/Float64MultiArray MOST_WAITING
-    torques of gamma_1..3 [N m], held until the next
-subscribes ~/commands_stamped sensor_msgs/msg/JointState MOST_WAITING
-    the same by name, in effort [N m]; the stamp is that of the joint_states it answers
-subscribes ~/external_moment geometry_msgs/msg/WrenchStamped MOST_WAITING
-    moment on the star, torque in {B} [N m]; the force is not used
-    if the scene has moment: {topic: true}
-subscribes ~/set_state sensor_msgs/msg/JointState 10
-    state to continue from: position [rad] and velocity [rad/s] (none for zero) of gamma_1..3;
-    refused while running, in fault, and where it is not admissible
-serves ~/pause std_srvs/srv/SetBool
-    pause the run, or resume it; idempotent
-serves ~/step std_srvs/srv/Trigger
-    advance a paused run by one sample; refused while running
-serves ~/reset std_srvs/srv/Trigger
-    back to the initial state, also out of a fault; stamps continue
-
-[torque_player inverse_dynamics]
-publishes {simulator}/commands std_msgs/msg/Float64MultiArray 1000
-    torques [N m] that answer each joint_states
-    if stamped is false
-publishes {simulator}/commands_stamped sensor_msgs/msg/JointState 1000
-    the same, by name and stamp
-    if stamped is true
-calls {simulator}/get_parameters rcl_interfaces/srv/GetParameters
-    whether it runs in lockstep, where a command without a stamp is of no use: then the node ends
-    if stamped is false
-
-[torque_player]
-subscribes joint_states sensor_msgs/msg/JointState 1000
-    samples that are answered, from the first on
-subscribes {simulator}/phase std_msgs/msg/String 10 latched
-    ends the player at a fault and at the end of the run
-
-[inverse_dynamics]
-publishes ~/reference sensor_msgs/msg/JointState 1000
-    desired gamma [rad] and gamma_dot [rad/s]; effort: feedforward [N m]; the stamp is that of the
-    joint_states it belongs to
-publishes ~/tracking_error sensor_msgs/msg/JointState 1000
-    desired - measured [rad], [rad/s]; effort: feedback [N m]; stamp as of ~/reference
-publishes /diagnostics diagnostic_msgs/msg/DiagnosticArray 10
-    diagnostics of the control, at 1 Hz
-subscribes joint_states sensor_msgs/msg/JointState 1
-    samples that are answered; the newest counts
-subscribes {simulator}/phase std_msgs/msg/String 10 latched
-    begins anew at a reset, ends at a fault and at the end of the run
-subscribes ~/joint_trajectory trajectory_msgs/msg/JointTrajectory 10
-    motion to follow, from its stamp on or at once and in place of the present one; refused as a
-    whole where it cannot be followed, and where motion is not topic
-executes ~/follow_joint_trajectory control_msgs/action/FollowJointTrajectory
-    the same with tolerances, feedback and a result
-    if control_msgs is installed
-
-[viewer]
-subscribes joint_states sensor_msgs/msg/JointState 64
-    states that are shown
-subscribes {simulator}/scene std_msgs/msg/String 1 latched
-    manipulator that is drawn
-subscribes {simulator}/phase std_msgs/msg/String 1 latched
-    phase of the run
-subscribes /diagnostics diagnostic_msgs/msg/DiagnosticArray 10
-    diagnostics of the run
-publishes {simulator}/commands std_msgs/msg/Float64MultiArray 10
-    torques of the page's sliders [N m], 20 times a second
-    if a slider was moved and no other node publishes commands
-calls {simulator}/pause std_srvs/srv/SetBool
-    the button Pause, or Resume
-calls {simulator}/step std_srvs/srv/Trigger
-    the button Step
-calls {simulator}/reset std_srvs/srv/Trigger
-    the button Reset
-"""
-
 SERVICE_QOS = QoSProfile(depth=1000)
 """Of services and of our clients: with ten, the default, the eleventh request that
 waits displaces the first, and so does the eleventh reply. All clients of a service
@@ -150,15 +43,15 @@ UNNAMED = "a node whose name is not known yet"
 
 
 class Endpoint(NamedTuple):
-    """One topic, service or action of a node: a row of the table."""
+    """One topic, service or action of a node."""
 
     use: str  # PUBLISHES, SUBSCRIBES, SERVES, CALLS or EXECUTES, the last of an action
     name: str
     type_name: str
-    depth: int  # messages kept for slow readers; 0 for two seconds of them
-    latched: bool  # the last message is kept for late joiners
-    when: str  # condition under which it exists; always where empty
     doc: str
+    depth: int = 10  # messages kept for slow readers; 0 for two seconds of them
+    latched: bool = False  # the last message is kept for late joiners
+    when: str = ""  # condition under which it exists; always where empty
 
     @property
     def kind(self) -> Any:
@@ -187,29 +80,338 @@ class Endpoint(NamedTuple):
         return QoSProfile(depth=self.depth or depth, durability=durability)
 
 
-_ROW = re.compile(
-    r"(\w+) (\S+) (\S+) ?(\w*)( latched)?\n((?:    (?!if ).*\n)*)(?:    if (.*)\n)?"
-)
+# In names ~ stands for the name of the node, {simulator} for the parameter. The keys are
+# the last parts of the names, but for a topic and a service of one name.
 
+SIMULATOR: dict[str, Endpoint] = {
+    "joint_states": Endpoint(
+        PUBLISHES,
+        "joint_states",
+        "sensor_msgs/msg/JointState",
+        "gamma_1..3, mu_1..3, beta_1..3: position [rad], velocity [rad/s];"
+        " effort: torque over the step that ended [N m]; frame_id `idle` where"
+        " it is no sample of a run",
+        depth=0,
+    ),
+    "true_joint_states": Endpoint(
+        PUBLISHES,
+        "~/true_joint_states",
+        "sensor_msgs/msg/JointState",
+        "joint_states without noise, delay and gaps",
+        depth=0,
+        when="encoder_counts, angle_noise, rate_noise, measurement_delay or"
+        " dropped_samples is set",
+    ),
+    "orientation": Endpoint(
+        PUBLISHES,
+        "~/orientation",
+        "geometry_msgs/msg/QuaternionStamped",
+        "orientation of {E} in {B}, the frame_id is base_frame",
+        depth=0,
+    ),
+    "euler_zyz": Endpoint(
+        PUBLISHES,
+        "~/euler_zyz",
+        "geometry_msgs/msg/Vector3Stamped",
+        "the same as ZYZ angles theta, phi, psi [rad]",
+        depth=0,
+    ),
+    "applied_torques": Endpoint(
+        PUBLISHES,
+        "~/applied_torques",
+        "trajectory_msgs/msg/JointTrajectory",
+        "torques of every step since the last message [N m], with the sample"
+        " after 50 ms of simulated time and when the run pauses or ends; where"
+        " the scene takes a moment from a topic also moment_x, moment_y,"
+        " moment_z in {B}",
+        depth=0,
+    ),
+    "imu": Endpoint(
+        PUBLISHES,
+        "~/imu",
+        "sensor_msgs/msg/Imu",
+        "inertial measurement unit on the star: orientation in {B}, angular"
+        " velocity [rad/s], specific force [m/s^2] in its own frame (REP 145);"
+        " samples of a run only",
+        depth=0,
+        when="imu is true",
+    ),
+    "reaction": Endpoint(
+        PUBLISHES,
+        "~/reaction",
+        "geometry_msgs/msg/WrenchStamped",
+        "force through O [N] and moment about O [N m] that a joint exerts on"
+        " the link nearer the star, in the joint's frame; samples of a run only",
+        depth=0,
+        when="reaction names a joint",
+    ),
+    "scene": Endpoint(
+        PUBLISHES,
+        "~/scene",
+        "std_msgs/msg/String",
+        "the scene, as YAML",
+        depth=1,
+        latched=True,
+    ),
+    "phase": Endpoint(
+        PUBLISHES,
+        "~/phase",
+        "std_msgs/msg/String",
+        "waiting, running, paused, finished, or `fault: ` with the reason",
+        depth=1,
+        latched=True,
+    ),
+    "diagnostics": Endpoint(
+        PUBLISHES,
+        "/diagnostics",
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "diagnostics of the run, at 1 Hz",
+    ),
+    "clock": Endpoint(
+        PUBLISHES,
+        "/clock",
+        "rosgraph_msgs/msg/Clock",
+        "simulated time",
+        depth=1,
+        when="publish_clock is true",
+    ),
+    "robot_description": Endpoint(
+        PUBLISHES,
+        "robot_description",
+        "std_msgs/msg/String",
+        "the scene as URDF",
+        depth=1,
+        latched=True,
+        when="publish_description is true, the default",
+    ),
+    "commands": Endpoint(
+        SUBSCRIBES,
+        "~/commands",
+        "std_msgs/msg/Float64MultiArray",
+        "torques of gamma_1..3 [N m], held until the next",
+        depth=MOST_WAITING,
+    ),
+    "commands_stamped": Endpoint(
+        SUBSCRIBES,
+        "~/commands_stamped",
+        "sensor_msgs/msg/JointState",
+        "the same by name, in effort [N m]; the stamp is that of the"
+        " joint_states it answers",
+        depth=MOST_WAITING,
+    ),
+    "external_moment": Endpoint(
+        SUBSCRIBES,
+        "~/external_moment",
+        "geometry_msgs/msg/WrenchStamped",
+        "moment on the star, torque in {B} [N m]; the force is not used",
+        depth=MOST_WAITING,
+        when="the scene has moment: {topic: true}, or external_moment is true",
+    ),
+    "set_state_topic": Endpoint(
+        SUBSCRIBES,
+        "~/set_state",
+        "sensor_msgs/msg/JointState",
+        "as the service ~/set_state, which answers: position [rad] and velocity"
+        " [rad/s] (none for zero) of gamma_1..3; the log has the reply;"
+        " deprecated",
+    ),
+    "pause": Endpoint(
+        SERVES,
+        "~/pause",
+        "std_srvs/srv/SetBool",
+        "pause the run, or resume it; idempotent",
+    ),
+    "step": Endpoint(
+        SERVES,
+        "~/step",
+        "std_srvs/srv/Trigger",
+        "advance a paused run by one sample; refused while running",
+    ),
+    "reset": Endpoint(
+        SERVES,
+        "~/reset",
+        "std_srvs/srv/Trigger",
+        "back to the initial state, also out of a fault; stamps continue",
+    ),
+    "set_state": Endpoint(
+        SERVES,
+        "~/set_state",
+        "std_srvs/srv/Trigger",
+        "put a run that waits or is paused into the state of the parameters"
+        " state_gamma and state_gamma_dot; refused while running, in fault, and"
+        " where it is not admissible",
+    ),
+}
 
-def _read(table: str) -> dict[str, dict[str, Endpoint]]:
-    """Return the endpoints by node and by the last part of their names."""
-    nodes: dict[str, dict[str, Endpoint]] = defaultdict(dict)
-    for part in table.replace("MOST_WAITING", str(MOST_WAITING)).split("\n[")[1:]:
-        sharing, _, rows = part.partition("]\n")
-        for use, name, kind, depth, latched, doc, when in _ROW.findall(rows):
-            text = " ".join(doc.split())
-            one = Endpoint(use, name, kind, int(depth or 10), bool(latched), when, text)
-            for node in sharing.split():
-                nodes[node][name.rpartition("/")[2]] = one
-    return nodes
+_COMMANDS: dict[str, Endpoint] = {
+    "commands": Endpoint(
+        PUBLISHES,
+        "{simulator}/commands",
+        "std_msgs/msg/Float64MultiArray",
+        "torques [N m] that answer each joint_states",
+        depth=1000,
+        when="stamped is false",
+    ),
+    "commands_stamped": Endpoint(
+        PUBLISHES,
+        "{simulator}/commands_stamped",
+        "sensor_msgs/msg/JointState",
+        "the same, by name and stamp",
+        depth=1000,
+        when="stamped is true",
+    ),
+    "get_parameters": Endpoint(
+        CALLS,
+        "{simulator}/get_parameters",
+        "rcl_interfaces/srv/GetParameters",
+        "whether it runs in lockstep, where a command without a stamp is of no"
+        " use: then the node ends",
+        when="stamped is false",
+    ),
+}
 
+PLAYER: dict[str, Endpoint] = {
+    **_COMMANDS,
+    "joint_states": Endpoint(
+        SUBSCRIBES,
+        "joint_states",
+        "sensor_msgs/msg/JointState",
+        "samples that are answered, from the first on",
+        depth=1000,
+    ),
+    "phase": Endpoint(
+        SUBSCRIBES,
+        "{simulator}/phase",
+        "std_msgs/msg/String",
+        "ends the player at a fault and at the end of the run",
+        latched=True,
+    ),
+}
 
-NODES = _read(_TABLE)
-SIMULATOR, PLAYER = NODES["simulator"], NODES["torque_player"]
-CONTROLLER, VIEWER = NODES["inverse_dynamics"], NODES["viewer"]
+CONTROLLER: dict[str, Endpoint] = {
+    **_COMMANDS,
+    "reference": Endpoint(
+        PUBLISHES,
+        "~/reference",
+        "sensor_msgs/msg/JointState",
+        "desired gamma [rad] and gamma_dot [rad/s]; effort: feedforward [N m];"
+        " the stamp is that of the joint_states it belongs to",
+        depth=1000,
+    ),
+    "tracking_error": Endpoint(
+        PUBLISHES,
+        "~/tracking_error",
+        "sensor_msgs/msg/JointState",
+        "desired - measured [rad], [rad/s]; effort: feedback [N m]; stamp as of"
+        " ~/reference",
+        depth=1000,
+    ),
+    "diagnostics": Endpoint(
+        PUBLISHES,
+        "/diagnostics",
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "diagnostics of the control, at 1 Hz",
+    ),
+    "joint_states": Endpoint(
+        SUBSCRIBES,
+        "joint_states",
+        "sensor_msgs/msg/JointState",
+        "samples that are answered; the newest counts",
+        depth=1,
+    ),
+    "phase": Endpoint(
+        SUBSCRIBES,
+        "{simulator}/phase",
+        "std_msgs/msg/String",
+        "begins anew at a reset, ends at a fault and at the end of the run",
+        latched=True,
+    ),
+    "joint_trajectory": Endpoint(
+        SUBSCRIBES,
+        "~/joint_trajectory",
+        "trajectory_msgs/msg/JointTrajectory",
+        "motion to follow, from its stamp on or at once and in place of the"
+        " present one; refused as a whole where it cannot be followed, and where"
+        " motion is not topic",
+    ),
+    "follow_joint_trajectory": Endpoint(
+        EXECUTES,
+        "~/follow_joint_trajectory",
+        "control_msgs/action/FollowJointTrajectory",
+        "the same with tolerances, feedback and a result",
+        when="control_msgs is installed",
+    ),
+}
+
+VIEWER: dict[str, Endpoint] = {
+    "joint_states": Endpoint(
+        SUBSCRIBES,
+        "joint_states",
+        "sensor_msgs/msg/JointState",
+        "states that are shown",
+        depth=64,
+    ),
+    "scene": Endpoint(
+        SUBSCRIBES,
+        "{simulator}/scene",
+        "std_msgs/msg/String",
+        "manipulator that is drawn",
+        depth=1,
+        latched=True,
+    ),
+    "phase": Endpoint(
+        SUBSCRIBES,
+        "{simulator}/phase",
+        "std_msgs/msg/String",
+        "phase of the run",
+        depth=1,
+        latched=True,
+    ),
+    "diagnostics": Endpoint(
+        SUBSCRIBES,
+        "/diagnostics",
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "diagnostics of the run",
+    ),
+    "commands": Endpoint(
+        PUBLISHES,
+        "{simulator}/commands",
+        "std_msgs/msg/Float64MultiArray",
+        "torques of the page's sliders [N m], 20 times a second",
+        when="a slider was moved and no other node publishes commands",
+    ),
+    "pause": Endpoint(
+        CALLS,
+        "{simulator}/pause",
+        "std_srvs/srv/SetBool",
+        "the button Pause, or Resume",
+    ),
+    "step": Endpoint(
+        CALLS,
+        "{simulator}/step",
+        "std_srvs/srv/Trigger",
+        "the button Step",
+    ),
+    "reset": Endpoint(
+        CALLS,
+        "{simulator}/reset",
+        "std_srvs/srv/Trigger",
+        "the button Reset",
+    ),
+}
+
+NODES = {
+    "simulator": SIMULATOR,
+    "torque_player": PLAYER,
+    "inverse_dynamics": CONTROLLER,
+    "recorder": {},
+    "viewer": VIEWER,
+}
+"""Topics, services and actions of each node but those that the user names."""
 SAMPLED = tuple(
-    one.name for one in SIMULATOR.values() if one.use == PUBLISHES and not one.when
+    endpoint.name
+    for endpoint in SIMULATOR.values()
+    if endpoint.use == PUBLISHES and not endpoint.when
 )
 """Topics that a simulator publishes in every run."""
 

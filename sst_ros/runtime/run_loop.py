@@ -197,6 +197,17 @@ class RunLoop(TickLoop):
             self._to(Phase.WAITING)
         return Reply(True, f"at the initial state, {self.phase.value}")
 
+    def halt(self) -> Reply:
+        """Go back to the initial state and pause there, also out of a fault.
+
+        As two requests a run that waits for nothing would begin between them.
+        """
+        if self.phase is not Phase.FAULT:
+            self._rest(Phase.PAUSED)
+        self.reset()
+        self._to(Phase.PAUSED)
+        return Reply(True, f"at the initial state, {self.phase.value}")
+
     def set_state(self, gamma: Vector3, gamma_dot: Vector3) -> Reply:
         """Put a run that waits or is paused into another state [rad], [rad/s]."""
         if self.phase not in (Phase.WAITING, Phase.PAUSED):

@@ -20,14 +20,17 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from sst_ros.control.law import ControlChannel, ControllerSettings
+from sst_ros.dynamics.reactions import LINK_JOINTS
 from sst_ros.errors import Check, refuse_errors, refuse_unless, suggestion
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
-from sst_ros.scene.schema import Rules, Section, Spec, accept, choice, entry
+from sst_ros.scene.schema import TURN, Rules, Section, Spec, accept, choice, entry
 from sst_ros.scene.yaml_document import read_file, read_values
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
-from sst_ros.state import BASE_FRAME, NANOSECONDS
+from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Vector3
 
+REACTION_JOINTS = tuple(f"{joint}_{leg}" for joint in LINK_JOINTS for leg in (1, 2, 3))
+"""Joints that ~/reaction can be of."""
 _OF_A_GOAL = ", where the goal does not give it; 0 for none"
 
 _number = partial(entry, least=0.0, most=1e6)
@@ -38,10 +41,23 @@ def _whole(doc: str, unit: str, default: int, least: int, most: int) -> Any:
     return entry(doc, unit, default=default, least=least, most=most)
 
 
-class SimulatorParameters(Section):
+class NodeParameters(Section):
+    """Parameters of a node."""
+
+    CHANGEABLE: ClassVar[tuple[str, ...]] = ()
+    """Those that can be set while the node runs."""
+
+
+class SimulatorParameters(NodeParameters):
     """Parameters of sst_simulator."""
 
-    CHANGEABLE: ClassVar = ("real_time_factor", "command_timeout", "lockstep_timeout")
+    CHANGEABLE: ClassVar = (
+        "real_time_factor",
+        "command_timeout",
+        "lockstep_timeout",
+        "state_gamma",
+        "state_gamma_dot",
+    )
 
     scene: str = entry("scene, by name or by path of a .yaml file", default="example2")
     rate: int = _whole(
@@ -149,6 +165,44 @@ class SimulatorParameters(Section):
     measurement_seed: int = _whole(
         "seed of the noise, and of the samples that are dropped", "1", 0, 0, 2**31 - 1
     )
+    imu: bool = entry(
+        "publish ~/imu, an inertial measurement unit on the star; angle_noise and"
+        " rate_noise act on its orientation and rate, measurement_delay on all",
+        default=False,
+    )
+    imu_position: Vector3 = entry(
+        "where it is in {E}, whose axes it has", "m", default=ZERO, least=-1e3, most=1e3
+    )
+    imu_frame: str = entry(
+        "its frame, which is part of robot_description, too", default="imu_link"
+    )
+    acceleration_noise: float = _number(
+        "standard deviation of noise on its acceleration", "m/s^2", 0.0, most=1e3
+    )
+    reaction: str = choice(
+        "joint whose force and moment ~/reaction has, by kind and leg: base to actuated"
+        " link, that to the intermediate link, that to the star",
+        ("none", *REACTION_JOINTS),
+    )
+    external_moment: bool = entry(
+        "take a moment on the star from ~/external_moment, as a scene with moment:"
+        " {topic: true} does; refused where the scene has a constant one",
+        default=False,
+    )
+    state_gamma: Vector3 = entry(
+        "angles of the actuators that ~/set_state puts the run at",
+        "rad",
+        default=ZERO,
+        least=-TURN,
+        most=TURN,
+    )
+    state_gamma_dot: Vector3 = entry(
+        "rates of the actuators that ~/set_state puts the run at",
+        "rad/s",
+        default=ZERO,
+        least=-1e6,
+        most=1e6,
+    )
     realtime_priority: int = _whole(
         "SCHED_FIFO priority of the run's thread where that is permitted, the other"
         " threads of the node get half of it; 0 for none",
@@ -176,7 +230,7 @@ class SimulatorParameters(Section):
         waits = self.sync == "lockstep" and self.dropped_samples
         allowed = "must be 0 in lockstep, where each sample is answered"
         yield waits, "dropped_samples", self.dropped_samples, allowed
-        for name in self.CHANGEABLE:
+        for name in ("real_time_factor", "command_timeout", "lockstep_timeout"):
             value = getattr(self, name)
             yield 0.0 < value < 1e-3, name, value, "must be 0 or >= 0.001"
 
@@ -211,7 +265,7 @@ class SimulatorParameters(Section):
         return None if channel == plain and not self.dropped_samples else channel
 
 
-class AnsweringParameters(Section):
+class AnsweringParameters(NodeParameters):
     """Parameters of the nodes that answer joint states with torques."""
 
     rate: int = _whole(
@@ -322,7 +376,7 @@ def default_topics() -> tuple[str, ...]:
     return tuple((share_directory() / "config" / "topics.txt").read_text().split())
 
 
-class RecorderParameters(Section):
+class RecorderParameters(NodeParameters):
     """Parameters of sst_recorder."""
 
     output: str = entry(
@@ -341,7 +395,7 @@ class RecorderParameters(Section):
         yield not any(self.topics), "topics", [*self.topics], "must name a topic"
 
 
-class ViewerParameters(Section):
+class ViewerParameters(NodeParameters):
     """Parameters of sst_viewer."""
 
     simulator: str = entry("name of the simulator's node", default="sst_simulator")
@@ -363,7 +417,7 @@ USE_SIM_TIME = "use_sim_time"
 FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Parameters (or their beginning) that rclpy itself declares."""
 
-COMMANDS: dict[str, tuple[str, type[Section]]] = {
+COMMANDS: dict[str, tuple[str, type[NodeParameters]]] = {
     "simulator": ("Simulator", SimulatorParameters),
     "torque_player": ("TorquePlayer", PlayerParameters),
     "inverse_dynamics": ("InverseDynamicsController", ControllerNodeParameters),

@@ -31,11 +31,19 @@ from sst_ros.integration.stepper import (
     Stepper,
 )
 from sst_ros.mechanism import kinematics
+from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.programs.llvm import llvmlite_version
 from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.scene.torque_profile import SineTorque, Torque, count_arguments
-from sst_ros.state import NANOSECONDS, Explained, State, Vector3, finite_vector
+from sst_ros.state import (
+    NANOSECONDS,
+    ZERO,
+    Explained,
+    State,
+    Vector3,
+    finite_vector,
+)
 
 AUTO = "auto"
 INTEGRATORS = (AUTO, *METHODS)
@@ -335,6 +343,18 @@ class Simulation(Explained):
         """Numbers of `state`: quaternion and body rate first, nine angles and rates, torques."""
         now = self._now
         return now.point.y, now.point.joints, self._torque(now)
+
+    @property
+    def body_acceleration(self) -> Vector3:
+        """Angular acceleration of the star in {E} [rad/s^2].
+
+        That under the torques and the moment of the last step; the next one may have others.
+        """
+        now = self._now
+        moment = (now.moment or ZERO) if self.dynamics.has_moment_topic else ()
+        state = now.point.y[: len(self.dynamics.state)]
+        slope = self.dynamics.derivative(*state, *self._torque(now), *moment)
+        return triple(slope[4:7])
 
     @property
     def time_ns(self) -> int:

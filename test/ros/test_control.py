@@ -8,7 +8,7 @@ import math
 import re
 
 import pytest
-from rcl_interfaces.msg import Log
+from rcl_interfaces.msg import Log, SetParametersResult
 from ros.conftest import NAMES, NODE
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -75,6 +75,39 @@ def test_reset_set_state_and_what_is_refused(nodes, observer):
     assert observer.told("resets", 1)["states_set"] == "1"
     _, _, err = nodes.stop(process)
     assert err.count("set_state refused: ") + err.count("set_state: refused: ") == 5
+
+
+def test_set_state_answers(nodes, observer):
+    nodes.run("simulator", wait_for_command=True, command_timeout=0.0)
+    name = f"{NODE}/set_state"
+
+    def replies(**values):
+        for parameter, value in values.items():
+            assert observer.set_parameter(parameter, value) == SetParametersResult(
+                successful=True
+            )
+        reply = observer.call(Trigger, name)
+        return reply.success, reply.message
+
+    start = list(observer.preview().position)
+    assert replies() == (True, "the state is set, waiting")  # by default the scene's
+    gamma, gamma_dot = [0.6, 0.7, 0.8], [0.1, 0.0, -0.2]
+    assert replies(state_gamma=gamma, state_gamma_dot=gamma_dot)[0]
+    observer.until(lambda: list(observer.states[-1].position) != start, "the state")
+    shown = observer.states[-1]
+    assert list(shown.position[:3]) == pytest.approx(gamma, abs=1e-9)
+    assert list(shown.velocity[:3]) == pytest.approx(gamma_dot, abs=1e-9)
+    success, reason = replies(state_gamma=[3.0, 0.7, 0.7])  # outside the stroke
+    assert not success and reason.startswith("refused: ") and "gamma" in reason
+    for bad in ([9.0, 0.7, 0.7], [0.7, 0.7], [0.7, math.nan, 0.7], [], ["a"], 0.7):
+        refused = observer.set_parameter("state_gamma", bad)
+        assert not refused.successful and refused.reason, bad
+    assert replies(state_gamma=gamma)[0]
+    observer.command(0.1, 0.0, 0.0)
+    observer.until(observer.samples, "samples")
+    success, reason = replies()
+    assert not success and reason.startswith("refused: pause or reset first")
+    assert observer.told("states_set", 3)
 
 
 def clock(time_ns):

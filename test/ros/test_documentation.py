@@ -23,7 +23,8 @@ CONFIG = Path(__file__).parents[2] / "config"
 RIGHTS = ("publish", "subscribe", "reply", "request")
 WITHOUT_REASON = {
     *("/clock", "/sst_simulator/external_moment", "/sst_simulator/commands_stamped"),
-    "/sst_simulator/true_joint_states",
+    *("/sst_simulator/true_joint_states", "/sst_simulator/imu"),
+    "/sst_simulator/reaction",
 }
 """Topics that exist under conditions only: a parameter, or the scene."""
 PUBLISHED = {

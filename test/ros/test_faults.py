@@ -110,6 +110,24 @@ def test_limit_and_external_moment_are_those_of_the_scene(nodes, observer, tmp_p
     observer.told("commands_dropped_because", "not finite 1")
 
 
+def test_a_moment_is_taken_in_a_scene_without_one_where_that_is_asked_for(
+    nodes, observer
+):
+    applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
+    scenes = observer.listen(String, f"{NODE}/scene", latched=True)
+    nodes.run("simulator", scene="example2", external_moment=True)
+    moments = observer.publisher(WrenchStamped, f"{NODE}/external_moment")
+    message = WrenchStamped()
+    message.wrench.torque.y = 0.25
+    observer.publish_until(
+        moments,
+        message,
+        lambda: any(0.25 in p.effort[4:5] for m in applied for p in m.points),
+        "the moment",
+    )
+    assert read(Scene, scenes[-1].data, "scene").moment.topic  # for who reads the run
+
+
 def test_two_publishers_are_told_and_moments_not_taken(nodes, observer):
     process = nodes.run("simulator")
     observer.publisher(Float64MultiArray, COMMANDS)

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 import rclpy
 import yaml
-from rcl_interfaces.srv import DescribeParameters
-from ros.conftest import NODE
+from rcl_interfaces.msg import ParameterType
 
 from sst_ros.nodes.process import Worker
 from sst_ros.runtime.settings import COMMANDS, SimulatorParameters
@@ -117,18 +116,47 @@ def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(
     assert machine_latency_us() == before
 
 
-def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
-    nodes.run("simulator")
-    known = SimulatorParameters.SPECS
-    reply = observer.call(
-        DescribeParameters, f"{NODE}/describe_parameters", names=list(known)
+TYPES = {
+    "number": ParameterType.PARAMETER_DOUBLE,
+    "integer": ParameterType.PARAMETER_INTEGER,
+    "flag": ParameterType.PARAMETER_BOOL,
+    "text": ParameterType.PARAMETER_STRING,
+    "choice": ParameterType.PARAMETER_STRING,
+    "texts": ParameterType.PARAMETER_STRING_ARRAY,
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("texts", ["", "[]", "[joint_states]"])
+def test_descriptors_carry_type_words_bounds_and_read_only(domain, command, texts):
+    """As `ros2 param describe` and `ros2 param get` read them; an empty list, too."""
+    settings = COMMANDS[command][1]
+    lists = [name for name, spec in settings.SPECS.items() if spec.kind == "texts"]
+    if command == "recorder" and texts == "[]":
+        pytest.skip("a recorder of no topic ends at once")
+    given = [f"{name}:={texts}" for name in lists if texts]
+    rclpy.init(
+        args=[command, "--ros-args", *(word for one in given for word in ("-p", one))]
     )
-    for descriptor in reply.descriptors:
-        assert descriptor.description.startswith(known[descriptor.name].doc)
-        may_change = descriptor.name in SimulatorParameters.CHANGEABLE
-        assert descriptor.read_only == (not may_change)
-        if known[descriptor.name].kind == "number":
-            assert len(descriptor.floating_point_range) == 1
+    try:
+        node = Worker(f"sst_{command}", settings).node
+        for name, spec in settings.SPECS.items():
+            descriptor, value = node.describe_parameter(name), node.get_parameter(name)
+            kind = ParameterType.PARAMETER_DOUBLE_ARRAY
+            assert descriptor.type == (kind if spec.shape else TYPES[spec.kind]), name
+            assert value.type_.value == descriptor.type, name
+            assert value.get_parameter_value().type == descriptor.type, name
+            assert descriptor.description.startswith(spec.doc)
+            assert descriptor.read_only == (name not in settings.CHANGEABLE)
+            assert descriptor.additional_constraints == spec.describe()
+            ranges = len(descriptor.floating_point_range), len(descriptor.integer_range)
+            bounded = spec.kind == "number" and not spec.shape, spec.kind == "integer"
+            assert ranges == bounded
+            if descriptor.read_only:
+                assert not node.set_parameters([value])[0].successful
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
 
 
 @pytest.mark.parametrize(
@@ -163,6 +191,8 @@ def test_descriptors_carry_words_bounds_and_read_only(nodes, observer):
             {"publish_clock": True, "use_sim_time": True},
             "cannot be its source",
         ),
+        ("simulator", {"reaction": "wrist"}, "reaction = 'wrist': must be one of none"),
+        ("simulator", {"imu_position": "[0.0, 1.0]"}, "must be 3 finite numbers"),
         ("torque_player", {"rate": 300}, "rate = 300: must divide 1e9"),
         ("torque_player", {"timeout": 0.5}, "no joint_states for"),
         ("inverse_dynamics", {"timeout": 0.5}, "no joint_states for"),
@@ -189,8 +219,11 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     document = yaml.safe_load(path.read_text())
     given = document["/**"]["ros__parameters"]
     defaults = SimulatorParameters()
-    names = SimulatorParameters.SPECS.keys() - {"duration", "wait_for_subscribers"}
-    assert given == {name: getattr(defaults, name) for name in names}
+    of_scene = {"duration", "state_gamma", "state_gamma_dot"}
+    names = SimulatorParameters.SPECS.keys() - of_scene - {"wait_for_subscribers"}
+    values = {name: getattr(defaults, name) for name in names}
+    values["imu_position"] = [*defaults.imu_position]
+    assert given == values
     told = [
         "--ros-args",
         "--params-file",

@@ -223,6 +223,22 @@ def test_a_fault_is_latched_until_a_reset(start):
     bench.until(lambda: output.acted[-1] == ZERO)  # the command is forgotten
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_run_that_waits_for_nothing_does_not_begin_between_a_reset_and_a_stop(
+    start, fails
+):
+    bench = start(HEAVY)
+    bench.until(lambda: bench.output.samples)
+    if fails:
+        bench.queue.append(plain(HIT))
+        bench.to(Phase.FAULT)
+    assert bench.ask("halt") == Reply(True, "at the initial state, paused")
+    loop, samples = bench.loop, len(bench.output.samples)
+    assert loop.phase is Phase.PAUSED and not loop.begun and not loop.fault
+    assert loop.simulation.time_ns == 0
+    assert bench.ask("halt").success and len(bench.output.samples) == samples
+
+
 def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick_and_ends_a_run_with_a_duration():
     given = {"publish_rate": 10, "wait_for_command": True, "duration": 10.0}
     bench = run_here(HEAVY, commands=[HIT], **given)
