@@ -2,10 +2,10 @@
 """The equations of a scene as C99: a file and its header, with nothing but libm.
 
 The functions do the operations of the package in its order, so they give its bits where
-the functions of libm do. A compiler must neither fuse a multiplication and an addition
-nor reorder them: the source switches the former off for GCC, Clang and all others that
-know the pragma of C99; the latter happens only with -ffast-math, which must not be
-given.
+the functions of libm do; tanh is written out. A compiler must neither fuse a
+multiplication and an addition nor reorder them: the source switches the former off for
+GCC, Clang and all others that know the pragma of C99; the latter happens only with
+-ffast-math, which must not be given.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from sst_ros.code_generation.named_programs import (
     NamedProgram,
     SceneEquations,
 )
+from sst_ros.programs.expression import Program, tanh_program
 
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 PATTERNS = {
@@ -25,6 +26,10 @@ PATTERNS = {
     "positive": "0.0 > {0} ? 0.0 : {0}",
     "step": "{} > 0.0 ? 1.0 : 0.0",
     "atan2": "atan2({}, {})",
+    "abs": "fabs({})",
+    "select": "{} > 0.0 ? {} : {}",
+    "tanh": "tanh_steps({})",
+    "power_of_two": "ldexp(1.0, {0} == {0} ? (int){0} : 0)",
 }
 NO_FUSION = """\
 /* A fused multiplication and addition rounds once where the package rounds twice. */
@@ -82,6 +87,8 @@ def c_source(equations: SceneEquations) -> str:
     lines += _constant(f"{name}_initial_state", equations.initial)
     if equations.parameters:
         lines += _constant(f"{name}_scene_parameters", equations.values)
+    if any(named.program.operations["tanh"] for named in equations.programs):
+        lines += ["", *_tanh_function()]
     for named in equations.programs:
         lines += ["", f"{_signature(name, named)}", "{", *_body(named), "}"]
     return "\n".join([*lines, ""])
@@ -113,12 +120,22 @@ def _signature(name: str, named: NamedProgram) -> str:
     return f"void {name}_{named.name}({arguments})"
 
 
+def _tanh_function() -> Iterator[str]:
+    """Write the hyperbolic tangent of the package; that of libm has other bits."""
+    program = tanh_program()
+    yield "static double tanh_steps(double x)"
+    yield "{"
+    yield from _statements(program)
+    yield f"    return v{program.outputs[0] - len(program.inputs)};"
+    yield "}"
+
+
 def _body(named: NamedProgram) -> Iterator[str]:
     """Write the statements: arguments are read, then computed with, then results stored."""
     program = named.program
     used = {
         operand
-        for operands in (*(step[1] for step in named.steps), program.outputs)
+        for operands in (*(step[1] for step in program.steps), program.outputs)
         for operand in operands
         if isinstance(operand, int)
     }
@@ -129,12 +146,22 @@ def _body(named: NamedProgram) -> Iterator[str]:
             argument, [number - first for number in numbers if number in used]
         )
         first += argument.size
-    words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
-    for i, (operation, operands) in enumerate(named.steps):
-        expression = _expression(operation, [_word(x, words) for x in operands])
-        yield f"    const double v{i} = {expression};"
+    yield from _statements(program)
+    words = _words(program)
     for i, output in enumerate(program.outputs):
         yield f"    result[{i}] = {_word(output, words)};"
+
+
+def _statements(program: Program) -> Iterator[str]:
+    words = _words(program)
+    for i, (operation, operands) in enumerate(program.steps):
+        assert isinstance(operation, str)  # equations call no routine
+        expression = _expression(operation, [_word(x, words) for x in operands])
+        yield f"    const double v{i} = {expression};"
+
+
+def _words(program: Program) -> list[str]:
+    return [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
 
 
 def _reads(argument: Argument, used: list[int]) -> Iterator[str]:

@@ -274,17 +274,31 @@ class Batch(Explained):
         return BatchSession(self, gamma, gamma_dot, float(step), int(substeps))
 
     def initial(
-        self, gamma: ArrayLike, gamma_dot: ArrayLike
+        self,
+        gamma: ArrayLike,
+        gamma_dot: ArrayLike,
+        rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, NDArray[np.int64]]:
-        """States at t = 0, a column a scenario, and codes: 0, or why one cannot start."""
-        count, columns = self._scenarios.count, self.columns
+        """States at t = 0, a column a scenario, and codes: 0, or why one cannot start.
+
+        Only the scenarios `rows` start, all by default.
+        """
+        columns = self.columns
+        count = self._scenarios.count if rows is None else len(rows)
         # One start for all is solved once.
         alike = (
-            np.ndim(gamma) == np.ndim(gamma_dot) == columns.geometries.alpha.ndim == 1
+            rows is None
+            and np.ndim(gamma)
+            == np.ndim(gamma_dot)
+            == columns.geometries.alpha.ndim
+            == 1
         )
         angles = _rows("gamma", gamma, 1 if alike and count else count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
-        which = np.broadcast_to(columns.geometry[: len(angles)], len(angles))
+        which = columns.geometry
+        if rows is not None and len(which) > 1:
+            which = which[rows]
+        which = np.broadcast_to(which[: len(angles)], len(angles))
         start, code = initial_states(columns.geometries, which, angles, rates)
         if self.scene.stroke.at_end == "stop":
             outside = (angles < 0.0) | (angles > columns.geometries.of_rows(which).arc)

@@ -16,8 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_ros.errors import check_kinds, refuse_unless
-from sst_ros.integration.batch_step import EARLIEST, Block, locate_ends
+from sst_ros.errors import check_kinds, check_kinds_late, refuse_unless
+from sst_ros.integration.batch_step import (
+    EARLIEST,
+    Block,
+    locate_ends,
+    spaced_rows,
+)
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
@@ -65,22 +70,27 @@ class BatchSession:
         number = len(code)
         self._angles, self._rates = self._spread(gamma), self._spread(gamma_dot)
         self._given = batch.drives((0.0, 0.0, 0.0), number)
+        self._torque_limit = batch.columns.torque_limit
         self.fault_time = np.full(number, np.nan)
         self._error, self._done = np.zeros(number), 0
-        # steps that were done at the last reset
-        self._begun = np.zeros(number, dtype=np.int64)
-        self._joints = np.zeros((6, number))
-        self.state = BatchState(
-            self._joints[:3].T, self._joints[3:].T, self._y[:4].T, self._y[4:7].T, code
-        )
+        self._begun = np.zeros(number, dtype=np.int64)  # steps done at the last reset
         workers = min(len(os.sched_getaffinity(0)), max(1, number // _WORTH_A_THREAD))
         width = math.ceil(math.ceil(number / workers) / LANES) * LANES
         parts = [slice(begin, begin + width) for begin in range(0, number, width)]
-        self._robots = [_Robots(batch, part, width, self._joints) for part in parts]
+        joints = spaced_rows(6, width * len(parts))
+        self.state = BatchState(
+            joints[:3, :number].T,
+            joints[3:, :number].T,
+            self._y[:4].T,
+            self._y[4:7].T,
+            code,
+        )
+        self._columns = self._y, self._given, code, self.fault_time, self._error
+        self._robots = [_Robots(batch, part, joints[:, part]) for part in parts]
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
         self._each(lambda robots: robots.load(*self._columns))
 
-    @check_kinds
+    @check_kinds_late
     def step(self, torque: ArrayLike) -> BatchState:
         """Advance all robots by a step under constant torques.
 
@@ -95,7 +105,7 @@ class BatchSession:
             InputError: a torque is not finite, or there is not one for each robot.
 
         """
-        self._given[:3] = self._batch.drives(torque, len(self.state.code))[:3]
+        self._take_torques(torque)
         first = self._done * self._substeps
 
         def advance(robots: _Robots) -> None:
@@ -107,6 +117,16 @@ class BatchSession:
             self._locate(ended)
         self._done += 1
         return self.state
+
+    def _take_torques(self, torque: Any) -> None:
+        """Write torques into the columns, clamped to the limit of the actuators."""
+        rows = self._given[:3]
+        plain = type(torque) is np.ndarray and torque.dtype == float
+        if plain and torque.shape == rows.T.shape and np.isfinite(torque).all():
+            np.minimum(torque.T, self._torque_limit, out=rows)
+            np.maximum(rows, -self._torque_limit, out=rows)
+        else:
+            rows[:] = self._batch.drives(torque, rows.shape[1])[:3]  # or refuses them
 
     @check_kinds
     def reset(
@@ -127,35 +147,42 @@ class BatchSession:
             InputError: a row is none of this batch, or an initial value is not allowed.
 
         """
+        index = self._read_rows(rows)
+        if gamma is not None or gamma_dot is not None:
+            angles = self._angles[index] if gamma is None else gamma
+            rates = self._rates[index] if gamma_dot is None else gamma_dot
+            y, code = self._batch.initial(angles, rates, index)
+            self._start[:, index], self._start_code[index] = y, code
+            self._angles[index], self._rates[index] = angles, rates
+        code = self._start_code[index]
+        self._y[:, index] = self._start[:, index]
+        self.state.code[index] = code
+        self._error[index] = 0.0
+        self.fault_time[index] = np.where(code < 0, 0.0, np.nan)
+        self._begun[index] = self._done
+        for robots in self._robots:
+            robots.replace(index, self._start, self._start_code)
+        return self.state
+
+    def _read_rows(self, rows: Any) -> NDArray[np.intp]:
+        """Return the indices of robots."""
         number = len(self.state.code)
         index = np.arange(number) if rows is None else np.asarray(rows)
         if index.dtype == bool and index.shape == (number,):
             index = np.flatnonzero(index)
-        whole = index.ndim == 1 and (
-            index.size == 0 or np.issubdtype(index.dtype, np.integer)
+        whole = np.issubdtype(index.dtype, np.integer) or index.size == 0
+        inside = bool(whole and ((index >= 0) & (index < number)).all())
+        refuse_unless(
+            "batch",
+            (
+                "rows",
+                rows,
+                index.ndim == 1 and inside,
+                f"must be whole numbers from 0 to {number - 1}, or a mask of shape"
+                f" ({number},)",
+            ),
         )
-        fits = bool(
-            whole and (index.size == 0 or (index.min() >= 0 and index.max() < number))
-        )
-        allowed = (
-            f"must be whole numbers from 0 to {number - 1}, or a mask of shape"
-            f" ({number},)"
-        )
-        refuse_unless("batch", ("rows", rows, fits, allowed))
-        index = index.astype(np.intp)
-        if gamma is not None or gamma_dot is not None:
-            angles, rates = self._angles.copy(), self._rates.copy()
-            angles[index] = angles[index] if gamma is None else gamma
-            rates[index] = rates[index] if gamma_dot is None else gamma_dot
-            self._start, self._start_code = self._batch.initial(angles, rates)
-            self._angles, self._rates = angles, rates
-        self._y[:, index] = self._start[:, index]
-        self.state.code[index] = self._start_code[index]
-        self.fault_time[index], self._error[index] = np.nan, 0.0
-        self.fault_time[index[self._start_code[index] < 0]] = 0.0
-        self._begun[index] = self._done
-        self._each(lambda robots: robots.load(*self._columns))
-        return self.state
+        return index.astype(np.intp)
 
     def result(self) -> Any:
         """Return a copy of all robots' states with every quantity of a `BatchResult`."""
@@ -178,10 +205,6 @@ class BatchSession:
         self.fault_time[rows] = time - self._begun[rows] * self._substeps * self._h
         self._begun[rows] = -1
 
-    @property
-    def _columns(self) -> tuple[NDArray[Any], ...]:
-        return self._y, self._given, self.state.code, self.fault_time, self._error
-
     def _spread(self, values: ArrayLike) -> Array:
         spread: Array = np.broadcast_to(
             np.asarray(values, dtype=float), (self._y.shape[1], 3)
@@ -198,39 +221,58 @@ class BatchSession:
 
 
 class _Robots:
-    """Robots of one thread: a block and the joints of its columns."""
+    """Robots of one thread: a block and the joints of its columns.
 
-    def __init__(self, batch: Any, part: slice, width: int, joints: Array) -> None:
-        programs = batch.programs
-        self._part, self._block = part, Block(programs, width)
-        self._number = len(range(*part.indices(joints.shape[1])))
-        self._whole, self._found = joints, np.zeros((6, width))
-        measure = joints_of(batch)
-        varied = [*self._block.given[programs.varied]]
+    Args:
+        batch: whose robots they are.
+        part: their columns.
+        joints: where their actuator angles and rates go, shape (6, width of the block).
+
+    """
+
+    def __init__(self, batch: Any, part: slice, joints: Array) -> None:
+        self._part, self._joints = part, joints
+        self._block = Block(batch.programs, joints.shape[1])
+        self._varied = self._block.given[batch.programs.varied]
+        self._program = joints_of(batch)
         self._measure = [
-            measure.bind([*self._block.states(which)[:7], *varied], [*self._found])
+            self._program.bind(
+                [*self._block.states(which)[:7], *self._varied], [*joints]
+            )
             for which in (0, 1)
         ]
 
     def load(self, *columns: NDArray[Any]) -> None:
         """Take over states."""
         self._block.load(self._part, *columns)
-        self._tell()
+        self._measure[self._block.now]()
+
+    def replace(
+        self, rows: NDArray[np.intp], start: Array, code: NDArray[np.int64]
+    ) -> None:
+        """Begin again in those of the rows that are here, from columns of states."""
+        here = rows[(rows >= self._part.start) & (rows < self._part.stop)]
+        if len(here) == 0:
+            return
+        places = here - self._part.start
+        y = np.ascontiguousarray(start[:, here])
+        self._block.replace(places, y, code[here])
+        varied = np.ascontiguousarray(self._varied[:, places])
+        joints = np.empty((6, len(here)))
+        self._program((), [*y[:7], *varied], [*joints])
+        self._joints[:, places] = joints
 
     def advance(self, first: int, count: int, h: float, *columns: NDArray[Any]) -> None:
         """Advance by some steps under the torques in the columns."""
-        self._block.given[:3, : self._number] = columns[1][:3, self._part]
+        torques = columns[1][:3, self._part]
+        self._block.given[:3, : torques.shape[1]] = torques
         self._block.run(self._part, first, count, h, *columns)
         self._block.store(self._part, *columns)
-        self._tell()
-
-    def _tell(self) -> None:
         self._measure[self._block.now]()
-        self._whole[:, self._part] = self._found[:, : self._number]
 
 
 def joints_of(batch: Any) -> Any:
-    """Return the program of actuator angles and rates, of the first seven numbers of a state."""
+    """Return the program of actuator angles and rates, of seven numbers of a state."""
     model = batch.model
 
     def angles(*inputs: Any) -> Sequence[Any]:

@@ -47,6 +47,9 @@ BLOCK = 192
 """Columns of a block at most: their numbers fit the cache of a core, and a step of all
 takes a hundred times as long as the interpreter between two steps."""
 
+CACHE_LINE = 8
+"""Doubles."""
+
 NOT_FINITE = 1000
 """Code of a scenario whose numbers are no longer finite.
 
@@ -134,6 +137,15 @@ class ColumnStep:
         return self._model.distances(*inputs)
 
 
+def spaced_rows(count: int, width: int) -> Array:
+    """Return rows of zeros, shape (count, width), an odd number of cache lines apart.
+
+    Rows that are a power of two apart have the same few places in the cache.
+    """
+    lines = -(-width // CACHE_LINE) | 1
+    return np.zeros((count, lines * CACHE_LINE))[:, :width]
+
+
 class Block:
     """Columns that are advanced together, in arrays of their own.
 
@@ -151,10 +163,10 @@ class Block:
         self._step, self.width = step, width
         self._size, self._limits = step.size, step.limits
         rows = step.size + 2 * step.limits + 1
-        self._states = np.zeros((rows, width)), np.zeros((rows, width))
+        self._states = spaced_rows(rows, width), spaced_rows(rows, width)
         self._now = 0  # which of the two has the state
         self.running, self._flag = np.zeros(width), np.zeros(width)
-        self.given = np.zeros((step.given, width))
+        self.given = spaced_rows(step.given, width)
         first, second = self._states
         fixed = [self.running, *self.given]
         self._advance = (
@@ -191,6 +203,27 @@ class Block:
         self.running[len(own) :] = 0.0
         if self._limits:
             self._measure(0.0, 0.0)
+
+    def replace(
+        self, places: NDArray[np.intp], y: Array, code: NDArray[np.int64]
+    ) -> None:
+        """Begin again in some columns.
+
+        Args:
+            places: which.
+            y: their states, contiguous rows, shape (size, len(places)).
+            code: 0 for one that can run, shape (len(places),).
+
+        """
+        now = self._states[self._now]
+        now[: self._size, places] = y
+        now[-1, places] = 0.0
+        self.running[places] = code == 0
+        varied = np.ascontiguousarray(self.given[self._step.varied][:, places])
+        distances = np.empty((2 * self._limits, len(places)))
+        if self._limits:
+            self._step.distances((0.0, 0.0), [*y[:7], *varied], [*distances])
+        now[self._size : -1, places] = distances
 
     def store(self, part: slice, *columns: NDArray[Any]) -> None:
         """Put states and errors back."""

@@ -15,18 +15,26 @@ import re
 from collections import Counter
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from sst_ros.mechanism.generic_math import power_of_two, tanh_steps
 from sst_ros.scene.schema import Place, leaves, rebuild
 
 Value = Any  # an Expression, a Number or a float
 
+
+def tanh_of_float(x: float) -> float:
+    """Hyperbolic tangent of a float, see `generic_math.tanh_steps`."""
+    result: float = _flat_tanh()(x)[0]
+    return result
+
+
 FUNCTIONS: dict[str, Callable[..., float]] = {
-    name: getattr(math, name)
-    for name in ("sqrt", "tanh", "exp", "log", "sin", "cos", "atan2")
-}
+    name: getattr(math, name) for name in ("sqrt", "exp", "log", "sin", "cos", "atan2")
+} | {"tanh": tanh_of_float}
 _TEMPLATES = {
     "add": "{} + {}",
     "sub": "{} - {}",
@@ -40,6 +48,7 @@ _TEMPLATES = {
     "abs": "abs({})",
     "max": "max({}, {})",
     "select": "({1} if {0} > 0.0 else {2})",
+    "power_of_two": "power_of_two({})",  # of `tanh_program` alone
 }
 _ON_ARRAYS = _TEMPLATES | {
     "step": "where({} > 0.0, 1.0, 0.0)",
@@ -514,6 +523,29 @@ def compile_program(
     return function
 
 
+@lru_cache(maxsize=1)
+def tanh_program() -> Program:
+    """Trace the hyperbolic tangent: what writers of machine code and C put for "tanh"."""
+    return trace(lambda x: (tanh_steps(x),), ("x",))
+
+
+@lru_cache(maxsize=1)
+def _flat_tanh() -> Callable[..., tuple[Any, ...]]:
+    return compile_program(tanh_program(), {"power_of_two": power_of_two})
+
+
+def _tanh_of_array(x: Any) -> Any:
+    """Hyperbolic tangent of an array, with the bits of `tanh_of_float`."""
+    names: dict[str, Any] = {"where": np.where, "power_of_two": _powers_of_two}
+    exec(tanh_program().source("function", templates=_ON_ARRAYS), names)
+    (result,) = names["function"](x)
+    return result
+
+
+def _powers_of_two(k: Any) -> Any:
+    return np.ldexp(1.0, np.nan_to_num(k).astype(np.int32))
+
+
 def compile_for_arrays(
     program: Program, *, exact: bool = False
 ) -> Callable[..., tuple[Any, ...]]:
@@ -527,6 +559,8 @@ def compile_for_arrays(
         of_arrays = getattr(np, {"atan2": "arctan2"}.get(name, name))
         if name != "sqrt":  # IEEE 754 leaves it no choice
             names[name] = _by_element(of_floats) if exact else of_arrays
+    if exact:
+        names["tanh"] = _tanh_of_array
     exec(program.source("function", templates=_ON_ARRAYS), names)
     function: Callable[..., tuple[Any, ...]] = names["function"]
     return function

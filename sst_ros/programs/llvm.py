@@ -26,7 +26,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros.programs.expression import FUNCTIONS, Number, Program, Routine, Slots
+from sst_ros.mechanism.generic_math import TO_WHOLE
+from sst_ros.programs.expression import (
+    FUNCTIONS,
+    Number,
+    Program,
+    Routine,
+    Slots,
+    tanh_program,
+)
 
 LANES = 8
 """Columns at a time, at most.
@@ -44,6 +52,9 @@ _OPTIMISATION = 2
 _ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 _INTRINSIC = ("sqrt", "abs")
 """Functions that LLVM computes itself, exactly as IEEE 754 asks; others are libm's."""
+
+_TANH = "tanh_steps"
+"""Name of the own hyperbolic tangent in a module."""
 
 Function = Callable[..., "list[float]"]
 
@@ -210,6 +221,8 @@ def write_module(
     }
     narrow = set() if rows else set(programs)
     parts = [_DECLARATIONS]
+    if any(program.operations["tanh"] for program in programs.values()):
+        parts += [_write_tanh(width) for width in sorted({1, lanes})]
     for name, program in programs.items():
         if name in narrow:
             parts.append(_write_function(name, program, slots, width=1))
@@ -268,7 +281,7 @@ def _declare() -> str:
         for name in ("sqrt", "fabs"):
             lines.append(f"declare {kind} @llvm.{name}.{suffix}({kind})")
     for name in FUNCTIONS:
-        if name not in _INTRINSIC:
+        if name not in (*_INTRINSIC, "tanh"):
             arguments = "double, double" if name == "atan2" else "double"
             lines.append(f"declare double @{name}({arguments})")
     return "\n".join(lines) + "\n"
@@ -293,6 +306,13 @@ def _constant(value: float, width: int) -> str:
     return "<" + ", ".join([f"double {bits}"] * width) + ">"
 
 
+def _whole_constant(value: int, width: int) -> str:
+    """Return a whole number as an operand."""
+    if width == 1:
+        return str(value)
+    return "<" + ", ".join([f"i64 {value}"] * width) + ">"
+
+
 def _pointer(kind: str) -> str:
     return f"{kind}*"
 
@@ -314,6 +334,18 @@ def _write_function(
     head = f"define {kind}void {_function_name(name, width)}"
     head += f"({array} %x, double* noalias %p, {array} %o){end} {{"
     return "\n".join([head, *writer.first_lines, *writer.lines, "  ret void", "}", ""])
+
+
+def _write_tanh(width: int) -> str:
+    """Write the hyperbolic tangent as a function that becomes part of its callers."""
+    program = tanh_program()
+    writer = _Writer(program, Slots(), width)
+    for number, (op, operands) in enumerate(program.steps):
+        writer.write_step(f"%v{number}", op, operands)
+    kind = _type_of(width)
+    head = f"define internal {kind} {_function_name(_TANH, width)}({kind} %a0)"
+    end = f"  ret {kind} {writer.word(program.outputs[0])}"
+    return "\n".join([f"{head} alwaysinline {{", *writer.lines, end, "}", ""])
 
 
 class _Writer:
@@ -359,6 +391,11 @@ class _Writer:
         elif op in _INTRINSIC:
             name = f"@llvm.{'fabs' if op == 'abs' else op}.{_suffix(self._width)}"
             self._put(result, f"call {kind} {name}({kind} {words[0]})")
+        elif op == "tanh":
+            name = _function_name(_TANH, self._width)
+            self._put(result, f"call {kind} {name}({kind} {words[0]})")
+        elif op == "power_of_two":
+            self._write_power_of_two(result, words[0])
         elif op == "positive":
             self._choose(result, self.word(0.0), words[0], self.word(0.0), words[0])
         elif op == "step":
@@ -389,6 +426,22 @@ class _Writer:
             result,
             f"select {truth} {condition}, {self._kind} {yes}, {self._kind} {no}",
         )
+
+    def _write_power_of_two(self, result: str, word: str) -> None:
+        """Write 2^k: k is added to the exponent of 1.
+
+        The low bits of k + TO_WHOLE are those of k as a whole number. A conversion
+        would have no value where k is no number.
+        """
+        kind = self._kind
+        whole = "i64" if self._width == 1 else f"<{self._width} x i64>"
+        place, one = (_whole_constant(n, self._width) for n in (52, 1023 << 52))
+        name = f"%w{result[1:]}"
+        self._put(f"{name}.k", f"fadd {kind} {word}, {self.word(TO_WHOLE)}")
+        self._put(f"{name}.i", f"bitcast {kind} {name}.k to {whole}")
+        self._put(f"{name}.e", f"shl {whole} {name}.i, {place}")
+        self._put(f"{name}.b", f"add {whole} {name}.e, {one}")
+        self._put(result, f"bitcast {whole} {name}.b to {kind}")
 
     def _call_libm(self, result: str, name: str, words: Sequence[str]) -> None:
         """Call a function of libm, lane by lane: so each lane has the bits of Python."""

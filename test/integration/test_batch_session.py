@@ -83,6 +83,12 @@ def test_threads_and_other_numbers_of_robots_change_no_bit():
         (lambda of: of.step((np.nan, 0.0, 0.0)), "(?s)torque = .*must be finite"),
         (lambda of: of.reset([9]), r"rows = \[9\]: must be whole numbers from 0 to 8"),
         (lambda of: of.reset([0], gamma=(np.nan,) * 3), "(?s)gamma = .*must be finite"),
+        (
+            lambda of: of.reset([0, 1], gamma=np.ones((3, 3))),
+            r"gamma = \(3, 3\): must have the shape \(3,\) or \(2, 3\)",
+        ),
+        (lambda of: of.reset(4), "rows = 4: must be whole numbers"),
+        (lambda of: of.reset(["a"]), r"rows = \['a'\]: must be whole numbers"),
     ],
 )
 def test_bad_arguments_are_refused_by_name(call, said):
@@ -96,3 +102,42 @@ def test_bad_arguments_are_refused_by_name(call, said):
 def test_a_batch_with_its_own_torques_takes_no_others():
     with pytest.raises(InputError, match="profile = True: must be False"):
         Batch(load_scene("example2_heavy"), profile=True).start(starts(2), step=0.01)
+
+
+@pytest.mark.parametrize("by", ["machine code", "NumPy"])
+def test_robots_that_begin_again_have_the_bits_of_a_new_session(by, monkeypatch):
+    if by == "NumPy":
+        monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+    number = 1500 if by == "machine code" else 40
+    gamma, later = starts(number), starts(number)[::-1] + 0.01
+    rows = np.arange(3, number, 7)
+    session = Batch(SCENE).start(gamma, step=2e-3)
+    fresh = Batch(SCENE).start(later[rows], step=2e-3)
+    torque = np.random.default_rng(1).uniform(-0.3, 0.3, (number, 3))
+    for _ in range(4):
+        session.step(torque)
+    state = session.reset(rows, gamma=later[rows])
+    for name in ("gamma", "gamma_dot", "quaternion", "body_rate"):
+        assert np.array_equal(getattr(state, name)[rows], getattr(fresh.state, name))
+    for _ in range(3):
+        state, expected = session.step(torque), fresh.step(torque[rows])
+    for name in ("gamma", "gamma_dot", "quaternion", "body_rate"):
+        assert np.array_equal(getattr(state, name)[rows], getattr(expected, name))
+    untouched = Batch(SCENE).start(gamma[:3], step=2e-3)
+    for _ in range(7):
+        expected = untouched.step(torque[:3])
+    assert np.array_equal(state.quaternion[:3], expected.quaternion)
+
+
+@pytest.mark.parametrize("limit", [None, 0.2])
+def test_torques_of_any_kind_act_alike_and_are_clamped(limit):
+    scene = SCENE.with_values({"actuators": {"torque_limit": limit} if limit else None})
+    torque = np.float64(np.float32(np.linspace(-0.5, 0.5, 27).reshape(9, 3)))
+    ends = []
+    for kind in (torque, torque.astype(np.float32), torque.tolist(), torque.T.copy().T):
+        session = Batch(scene).start(starts(9), step=2e-3)
+        ends.append(session.step(kind).quaternion.copy())
+        clamped = np.clip(torque, -limit, limit) if limit else torque
+        assert np.array_equal(session.result().torque, clamped)
+    for end in ends[1:]:
+        assert np.array_equal(end, ends[0])
