@@ -78,6 +78,7 @@ ANGLES, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
 _UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 AT_START = "the posture at the start is not proven to be the only one near"
 MOST_PARTS = 10_000  # of the box of ranges
+ORDER = -1.6
 ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
 # proofs by which the width of ranges is looked for that would do, each by half
 NARROWER = 8
@@ -388,7 +389,7 @@ class Follower:
         self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar
     ) -> None:
         """Prove step by step from one break in time to the next, as far as that goes."""
-        order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
+        order = max(14, math.ceil(ORDER * math.log10(tolerance)))
         try:
             here = self._equations.start()
             for begin, end in pairwise(breaks):

@@ -54,6 +54,7 @@ TIGHT = 1.1  # room of a tube around what a step was proven to reach
 # of a set in a step, relative to it: more is tried to be avoided by shorter steps
 LOSS = 1e-4
 KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
+REGAIN = 1.25  # longest next step by the last one, after a step was refused
 KINK_STEPS = 400  # steps across one kink before the proof ends
 # of a set in a step across a kink, below which the next is twice as long
 KINK_LOSS = 0.02
@@ -86,6 +87,12 @@ def _first(x: Any) -> Any:
 
 
 def _tanh(x: Any) -> Any:
+    """Return tanh(x) by the exponential that is small.
+
+    The widths of a series are multiplied in a division by one with large coefficients.
+    """
+    if arb(_first(x)).mid() > 0:
+        return 2 / ((-2 * x).exp() + 1) - 1
     return 1 - 2 / ((2 * x).exp() + 1)
 
 
@@ -776,7 +783,7 @@ class ProvenSteps:
             return
         self._usual = max(taken, 0.1 * self._usual)
         if self._most < math.inf:
-            self._most = 1.1 * taken
+            self._most = REGAIN * taken
         if not is_free:
             return
         self._cruise = self._usual
