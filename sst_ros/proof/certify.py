@@ -11,6 +11,7 @@ this file makes a motion of steps.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -48,7 +49,13 @@ from sst_ros.proof.balls import (
     write_up,
 )
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
-from sst_ros.proof.scene_balls import Parts, SceneBalls, WrittenDocument, range_balls
+from sst_ros.proof.scene_balls import (
+    Parts,
+    Reading,
+    SceneBalls,
+    WrittenDocument,
+    range_balls,
+)
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Place
 from sst_ros.scene.torque_profile import (
@@ -71,6 +78,7 @@ ANGLES, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
 _UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 AT_START = "the posture at the start is not proven to be the only one near"
 MOST_PARTS = 10_000  # of the box of ranges
+ORDER = -1.6
 ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
 # proofs by which the width of ranges is looked for that would do, each by half
 NARROWER = 8
@@ -119,43 +127,53 @@ class BallEquations:
         unknown, initial = (*TURN, *RATE), (*ANGLES, *ANGLE_RATES)
         by = (*unknown, *initial, *self.balls.inputs)
         run = self.balls.compile(equations, (*unknown, *initial), by)
-        given = [*self.balls.initial("gamma"), *self.balls.initial("gamma_dot")]
+        initial_numbers = [
+            *self.balls.initial("gamma"),
+            *self.balls.initial("gamma_dot"),
+        ]
+        given = [x.ball if isinstance(x, Reading) else x for x in initial_numbers]
         given += self.balls.varied_balls
         root = krawczyk(run, [0.0, 0.0, 0.0, *rate], given, AT_START)
-        # q is linear in the turn.
-        columns = [quaternion_product((x, y, z, w), unit) for unit in _UNITS]
         size, n = len(self.state), len(self.inputs)
-        slopes = [[arb(0)] * n for _ in range(n)]
-        rest = [arb(0)] * n
-        # of what is given, among the columns
-        places = [*range(len(initial)), *range(size, n)]
+        # Columns of the set: a range of an initial number has one, in place of a number of the
+        # state; how numbers are read, and all other ranges, have that of their own input.
+        by_column = [[arb(0)] * n for _ in unknown]
+        off = [arb(0)] * len(unknown)
+        radii = [arb(0)] * n
+        for j, ball in enumerate(given):
+            place = j if j < len(initial) else size + j - len(initial)
+            factor, radius = arb(1), ball.rad()
+            if j < len(initial) and isinstance(reading := initial_numbers[j], Reading):
+                place, factor, radius = n - 1, reading.half, arb(0)
+                missing = abs(reading.middle - ball.mid())
+                for i in range(len(unknown)):
+                    off[i] += abs(root.slopes[i, j]) * missing
+            for i in range(len(unknown)):
+                by_column[i][place] += root.slopes[i, j] * factor
+            radii[place] = arb.max(radii[place], radius)
+        rest = [x + more for x, more in zip(root.rest, off, strict=True)]
+        # q is linear in the turn.
+        units = [quaternion_product((x, y, z, w), unit) for unit in _UNITS]
+        slopes = []
+        errors = [arb(0)] * n
         for i in range(4):
-            parts = [arb(columns[k][i]) for k in range(3)]
-            rest[i] = sum(
-                (abs(x) * r for x, r in zip(parts, root.rest[:3], strict=True)), arb(0)
+            parts = [arb(units[k][i]) for k in range(3)]
+            rows = zip(*by_column[:3], strict=True)
+            slopes.append([sum(map(operator.mul, parts, row), arb(0)) for row in rows])
+            errors[i] = sum(
+                (abs(a) * b for a, b in zip(parts, rest[:3], strict=True)), arb(0)
             )
-            for j, place in enumerate(places):
-                slopes[i][place] = sum(
-                    (parts[k] * root.slopes[k, j] for k in range(3)), arb(0)
-                )
-        for i in range(3):
-            rest[4 + i] = root.rest[3 + i]
-            for j, place in enumerate(places):
-                slopes[4 + i][place] = root.slopes[3 + i, j]
-        for place in range(size, n):
-            slopes[place][place] = arb(1)
+        slopes += by_column[3:]
+        errors[4:7] = rest[3:]
+        for place in range(len(slopes), n):
+            row = [arb(0)] * n
+            row[place] = arb(int(place >= size))
+            slopes.append(row)
         turned = quaternion_product((x, y, z, w), (*root.middle[:3], arb(1)))
         lagged = [arb(0)] * (size - len(MOTION))
-        centre = [
-            *turned,
-            *root.middle[3:],
-            *lagged,
-            *(arb(x.mid()) for x in given[6:]),
-        ]
-        radii = [arb(0)] * n
-        for ball, place in zip(given, places, strict=True):
-            radii[place] = ball.rad()
-        return Region.linear(0.0, centre, arb_mat(slopes), radii, rest, n - size)
+        varied = [arb(x.mid()) for x in given[len(initial) :]]
+        centre = [*turned, *root.middle[3:], *lagged, *varied]
+        return Region.linear(0.0, centre, arb_mat(slopes), radii, errors, n - size)
 
     def _unlimited(self, parts: Parts, time: Any, command: Sequence[Any]) -> list[Any]:
         """Return the torques that are commanded: those given, or sines of the time."""
@@ -371,7 +389,7 @@ class Follower:
         self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar
     ) -> None:
         """Prove step by step from one break in time to the next, as far as that goes."""
-        order = max(14, math.ceil(-1.2 * math.log10(tolerance)))
+        order = max(14, math.ceil(ORDER * math.log10(tolerance)))
         try:
             here = self._equations.start()
             for begin, end in pairwise(breaks):

@@ -22,6 +22,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
+from itertools import islice
 from operator import methodcaller
 from typing import Any, NamedTuple, NoReturn
 
@@ -53,6 +54,7 @@ TIGHT = 1.1  # room of a tube around what a step was proven to reach
 # of a set in a step, relative to it: more is tried to be avoided by shorter steps
 LOSS = 1e-4
 KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
+REGAIN = 1.25  # longest next step by the last one, after a step was refused
 KINK_STEPS = 400  # steps across one kink before the proof ends
 # of a set in a step across a kink, below which the next is twice as long
 KINK_LOSS = 0.02
@@ -85,6 +87,12 @@ def _first(x: Any) -> Any:
 
 
 def _tanh(x: Any) -> Any:
+    """Return tanh(x) by the exponential that is small.
+
+    The widths of a series are multiplied in a division by one with large coefficients.
+    """
+    if arb(_first(x)).mid() > 0:
+        return 2 / ((-2 * x).exp() + 1) - 1
     return 1 - 2 / ((2 * x).exp() + 1)
 
 
@@ -568,7 +576,7 @@ def _check_tube(step: Advance, tolerance: float) -> Advance:
     pairs = list(zip(reached, step.tube, strict=True))[: step.begin.moving]
     if all(x.is_finite() and x < e.rad() for x, e in pairs):
         return step._replace(tube=[arb(0, x.upper()) for x in reached])
-    widest = max(map(float, entries(step.begin.spread())))
+    widest = max(map(float, entries(step.begin.spread())[: step.begin.moving]))
     grows = max(map(float, entries(step.w)))
     is_slow = grows < 10.0 * tolerance + GROWTH * widest
     wider = None
@@ -606,13 +614,17 @@ def region_at_end(step: Advance) -> Region:
 
 
 def _loss(step: Advance) -> float:
-    """Return how much of the set at the end of a step is new, in the norm of the step."""
-    sizes = [entries(x) for x in (step.w, step.begin.spread(step.flow(step.length)))]
-    new, known = (
-        max(float(x / weight) for x, weight in zip(row, step.weights, strict=True))
-        for row in sizes
-    )
-    return new / known if known else 0.0
+    """Return how much of the set at the end of a step is new, in the norm of the step.
+
+    What never changes is not new, and its size says nothing of the others.
+    """
+
+    def size(spread: Any) -> float:
+        rows = zip(entries(spread), step.weights, strict=True)
+        return max(float(x / weight) for x, weight in islice(rows, step.begin.moving))
+
+    old = size(step.begin.spread(step.flow(step.length)))
+    return size(step.w) / old if old else 0.0
 
 
 def fit_axes(moved: Any, b: Any, scale: Sequence[float]) -> Any:
@@ -736,32 +748,32 @@ class ProvenSteps:
         In a stiff contact the Jacobian turns within a step, and its series is what
         widens.
         """
-        loss = _loss(step)
-        if loss > LOSS + 10.0 * self._tolerance:
-            moving = [TIGHT * x for x in step.tube[: step.begin.moving]]
-            tight = step._replace(tube=[*moving, *step.tube[step.begin.moving :]])
-            try:
-                step = prove(
-                    self._f, self._jacobian, tight, self._order, self._tolerance
-                )
-                loss = _loss(step)
-            except (ArithmeticError, ValueError):
-                pass
-        while loss > LOSS + 10.0 * self._tolerance:
+        if not self._is_lossy(step):
+            return step
+        moving = [TIGHT * x for x in step.tube[: step.begin.moving]]
+        tight = [*moving, *step.tube[step.begin.moving :]]
+        with contextlib.suppress(ArithmeticError, ValueError):
+            step = self._prove(step._replace(tube=tight))
+        while self._is_lossy(step):
             h = 0.6 * (step.end - step.begin.time)
             tube = _tube(step.begin, 3, self._tolerance)
             shorter = step._replace(end=step.begin.time + h, tube=tube)
             try:
-                shorter = prove(
-                    self._f, self._jacobian, shorter, self._order, self._tolerance
-                )
+                shorter = self._prove(shorter)
             except (ArithmeticError, ValueError):
                 return step
-            before, loss = loss, _loss(shorter)
-            if loss > 0.2 * before:
+            if _loss(shorter) > 0.2 * _loss(step):
                 return step
             step = shorter
         return step
+
+    def _is_lossy(self, step: Advance) -> bool:
+        """Whether a step widens the set by more than its tolerance, and by much."""
+        widened = max(map(float, entries(step.w)))
+        return widened > self._tolerance and _loss(step) > LOSS
+
+    def _prove(self, step: Advance) -> Advance:
+        return prove(self._f, self._jacobian, step, self._order, self._tolerance)
 
     def _plan(
         self, taken: float, longest: float, defect: float, *, is_free: bool
@@ -771,7 +783,7 @@ class ProvenSteps:
             return
         self._usual = max(taken, 0.1 * self._usual)
         if self._most < math.inf:
-            self._most = 1.1 * taken
+            self._most = REGAIN * taken
         if not is_free:
             return
         self._cruise = self._usual

@@ -10,7 +10,9 @@ document is the same number wherever it acts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
+from itertools import islice
 from typing import Any, NamedTuple
 
 from sst_ros.dynamics import kernel
@@ -39,6 +41,7 @@ from sst_ros.scene.yaml_document import find_fields
 Range = float | tuple[float, float] | str
 """A half-width, an interval, or "digits": half a unit of the last digit that is written."""
 
+READING = "r"  # input of programs: how numbers are taken, see `SceneBalls`
 DEGREE: Place = ("degree",)  # place of pi / 180 among the constants
 DAMPING: Place = ("stroke", "damping")
 RESTITUTION: tuple[Place, Place] = (
@@ -300,11 +303,76 @@ def _balls_of(
         yield place, number_ball(numbers[place], digits) + arb(0, float(width))
 
 
+class Reading(NamedTuple):
+    """A number as the program reads it and as the document writes it, as balls.
+
+    What stands between them is middle + half r, with r from -1 (read) to 1 (written).
+    """
+
+    read: Any
+    written: Any
+
+    @classmethod
+    def of(cls, number: float, text: str | None) -> Reading:
+        """Return the double and the decimal number of a text, or its shortest one."""
+        written = Fraction(text or repr(number))
+        if written == Fraction(number):
+            return cls(arb(number), arb(number))
+        return cls(arb(number), arb(written.numerator) / arb(written.denominator))
+
+    @property
+    def differs(self) -> bool:
+        """Whether there are two numbers."""
+        return not (self.read - self.written).is_zero()
+
+    @property
+    def middle(self) -> Any:
+        """Return the number between both."""
+        return (self.read + self.written) / 2
+
+    @property
+    def half(self) -> Any:
+        """Return half of what the written number has more; exactly 0 if it is the other."""
+        return (self.written - self.read) / 2
+
+    @property
+    def ball(self) -> Any:
+        """Return a ball of both."""
+        return self.read.union(self.written)
+
+
+class _Constants:
+    """Numbers of a program that no range touches, by place: balls, one for r = 0 and a slope."""
+
+    def __init__(self, letter: str, readings: Mapping[Place, Reading]) -> None:
+        self.balls: list[Any] = []
+        self._slopes: dict[Place, bool] = {}
+        for place, reading in readings.items():
+            self._slopes[place] = reading.differs
+            self.balls.append(reading.middle)
+            if reading.differs:
+                self.balls.append(reading.half)
+        self.names = [f"{letter}{i}" for i in range(len(self.balls))]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def expressions(self, symbols: Iterable[Any], reading: Any) -> dict[Place, Any]:
+        """Return the numbers by place, in symbols of their names and of r."""
+        rest = iter(symbols)
+        numbers = {}
+        for place, has_slope in self._slopes.items():
+            number = next(rest)
+            numbers[place] = number + next(rest) * reading if has_slope else number
+        return numbers
+
+
 class SceneBalls:
     """A scene in balls, and functions of it as programs.
 
-    The numbers that are ranges, `varied`, are inputs of the programs; those of the
-    start are not.
+    The numbers that are ranges, `varied`, are inputs of the programs; those of the start are not.
+    One more input, READING, says how all other numbers are taken: from -1, as the doubles that the
+    document is read as, to 1, as the decimal numbers that it has.
 
     Args:
         scene: what moves.
@@ -314,78 +382,104 @@ class SceneBalls:
     """
 
     def __init__(
-        self, scene: Scene, profile: TorqueProfile | None, ranges: Mapping[Place, Any]
+        self,
+        scene: Scene,
+        profile: TorqueProfile | None,
+        ranges: Mapping[Place, Any],
     ) -> None:
         document = WrittenDocument.of(scene)
         written = document.scene
         texts = dict(document.texts)
         if isinstance(profile, SineTorque) and profile != scene.torque:
             written = rebuild(written, {("torque",): profile})
-            texts = {
-                place: text for place, text in texts.items() if place[0] != "torque"
-            }
-        balls: dict[Place, Any] = {}
+            texts = {place: x for place, x in texts.items() if place[0] != "torque"}
+        readings: dict[Place, Reading] = {}
         for place, number in leaves(written).items():
-            balls[place] = number_ball(number, texts.get(place))
-        balls |= ranges
+            readings[place] = Reading.of(number, texts.get(place))
         varied = [place for place in ranges if place[0] != "initial"]
+        ranges = dict(ranges)
         if written.stroke.restitution is not None:
-            rate = [balls.pop(place) for place in RESTITUTION]
-            balls[DAMPING] = damping_ball(*rate)
+            impact = [readings.pop(place) for place in RESTITUTION]
             if any(place in ranges for place in RESTITUTION):
                 varied = [*(p for p in varied if p not in RESTITUTION), DAMPING]
+                rates = zip(RESTITUTION, impact, strict=True)
+                ranges[DAMPING] = damping_ball(
+                    *(ranges.get(p, x.ball) for p, x in rates)
+                )
+            else:
+                as_read, as_written = zip(*impact, strict=True)
+                readings[DAMPING] = Reading(
+                    damping_ball(*as_read), damping_ball(*as_written)
+                )
             written = rebuild(written, dict.fromkeys(RESTITUTION))
-        self.scene, self.balls, self.varied = scene, balls, varied
-        self.inputs = tuple(f"p{i}" for i in range(len(varied)))
+        self.scene = scene
+        self._varied = {place: ranges[place] for place in varied}
         self._document = written
-        present = (p for p, x in balls.items() if p in varied or not x.is_zero())
-        self._symbols: dict[Place, Any] = {
-            p: balls[p] for p in present if p[0] != "initial"
+        self._initial = {}
+        for place, reading in readings.items():
+            if place[0] == "initial":
+                self._initial[place] = ranges.get(place, reading)
+        settled = {
+            p: x for p, x in readings.items() if p not in ranges and p[0] != "initial"
         }
-        self._symbols[DEGREE] = arb.pi() / 180
+        settled = {
+            p: x for p, x in settled.items() if not (x.read.is_zero() and not x.differs)
+        }
+        settled[DEGREE] = Reading(arb.pi() / 180, arb.pi() / 180)
+        self._symbols = settled
         self._settled = self._convert_in_balls()
+        two = any(x.differs for x in settled.values())
+        two = two or any(
+            isinstance(x, Reading) and x.differs for x in self._initial.values()
+        )
+        names = [f"p{i}" for i in range(len(varied))]
+        self.inputs = (*names, READING) if two else tuple(names)
 
     @property
     def varied_balls(self) -> list[Any]:
-        """Balls of the numbers that are ranges."""
-        return [self.balls[place] for place in self.varied]
+        """Balls of the numbers that are ranges, and of READING where it is an input."""
+        balls = list(self._varied.values())
+        return [*balls, arb(0, 1)] if READING in self.inputs else balls
 
     def initial(self, name: str) -> list[Any]:
-        """Return the balls of gamma or gamma_dot at the start."""
-        return [self.balls["initial", name, k] for k in range(3)]
+        """Return gamma or gamma_dot at the start: a ball of a range, or a `Reading`."""
+        return [self._initial["initial", name, k] for k in range(3)]
 
-    def _convert_in_balls(self) -> dict[Place, Any]:
-        """Convert in balls.
-
-        Return what no range touches: balls, or floats where exactly 0, +-1.
-        """
+    def _convert_in_balls(self) -> dict[Place, Reading | float]:
+        """Convert in balls; return what no range touches, floats where exactly 0, +-1."""
         places: list[Place] = []
-        names = [*self.inputs, *(f"c{i}" for i in range(len(self._symbols)))]
+        varied = [f"p{i}" for i in range(len(self._varied))]
+        names = [*varied, *(f"c{i}" for i in range(len(self._symbols)))]
 
         def traced(*symbols: Any) -> list[Any]:
-            derived = self._convert(symbols)
-            rows = [(p, x) for p, x in walk(derived) if isinstance(x, Expression)]
-            places[:] = [place for place, _ in rows]
-            return [x for _, x in rows]
+            numbers = dict(zip(self._varied, symbols, strict=False))
+            numbers |= zip(self._symbols, symbols[len(varied) :], strict=True)
+            rows = walk(self._convert(numbers))
+            found = [(p, x) for p, x in rows if isinstance(x, Expression)]
+            places[:] = [place for place, _ in found]
+            return [x for _, x in found]
 
         program = trace(traced, names)
-        function = enclosure.compile_on_balls(program, list(self._symbols.values()))
-        values = function(*self.varied_balls)
-        late = _depend_on_first(program, len(self.inputs))
-        settled: dict[Place, Any] = {}
-        for place, value, touched in zip(places, values, late, strict=True):
-            if not touched:
-                settled[place] = float(value) if value in (-1, 0, 1) else value
+        ranges = list(self._varied.values())
+        as_read = enclosure.compile_on_balls(
+            program, [x.read for x in self._symbols.values()]
+        )
+        as_written = enclosure.compile_on_balls(
+            program, [x.written for x in self._symbols.values()]
+        )
+        pairs = map(Reading, as_read(*ranges), as_written(*ranges))
+        touched = _depend_on_first(program, len(varied))
+        settled: dict[Place, Reading | float] = {}
+        for place, reading, is_touched in zip(places, pairs, touched, strict=True):
+            if is_touched:
+                continue
+            settled[place] = reading
+            if reading.read in (-1, 0, 1) and not reading.differs:
+                settled[place] = float(reading.read)
         return settled
 
-    def _convert(self, symbols: Sequence[Any]) -> Derived:
-        """Convert the document.
-
-        Its symbols are the varied numbers, then the constants.
-        """
-        count = len(self.inputs)
-        numbers = dict(zip(self._symbols, symbols[count:], strict=False))
-        numbers |= zip(self.varied, symbols[:count], strict=True)
+    def _convert(self, numbers: Mapping[Place, Any]) -> Derived:
+        """Convert the document with numbers in symbols."""
         marked = {place: mark_present(x) for place, x in numbers.items()}
         return convert(rebuild(self._document, marked), numbers[DEGREE])
 
@@ -397,37 +491,39 @@ class SceneBalls:
     ) -> enclosure.Function:
         """Compile function(parts, *inputs), whose `Parts` depend on the inputs `self.inputs`.
 
-        The compiled function has the inputs, then the varied numbers; with `by` it
-        returns the derivatives by these inputs, too.
+        The compiled function has the inputs, then `self.inputs`; with `by` it returns the
+        derivatives by these inputs, too.
         """
-        constants = {
-            place: x for place, x in self._settled.items() if not isinstance(x, float)
+        derived_readings = {
+            p: x for p, x in self._settled.items() if isinstance(x, Reading)
         }
-        folded = {
-            place: x for place, x in self._settled.items() if isinstance(x, float)
-        }
-        size, count = len(inputs), len(self.inputs)
-        names = [f"c{i}" for i in range(len(self._symbols))]
-        derived_names = [f"d{i}" for i in range(len(constants))]
+        folded = {p: x for p, x in self._settled.items() if isinstance(x, float)}
+        symbols, derived = (
+            _Constants("c", self._symbols),
+            _Constants("d", derived_readings),
+        )
 
         def traced(*values: Any) -> Any:
-            given, symbols = values[:size], values[size : size + count + len(names)]
-            known = dict(
-                zip(constants, values[size + count + len(names) :], strict=True)
-            )
+            rest = iter(values)
+            given = list(islice(rest, len(inputs)))
+            varied = dict(zip(self.inputs, islice(rest, len(self.inputs)), strict=True))
+            reading = varied.pop(READING, 0.0)
+            numbers = symbols.expressions(islice(rest, len(symbols)), reading)
+            numbers |= zip(self._varied, varied.values(), strict=True)
+            known = derived.expressions(rest, reading)
             marked = {place: mark_present(x) for place, x in (known | folded).items()}
-            derived = rebuild(self._convert(symbols), marked)
-            model = kernel.model_of(derived.scene, derived.axes)
+            parts = rebuild(self._convert(numbers), marked)
+            model = kernel.model_of(parts.scene, parts.axes)
             present = {
                 p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)
             }
             return function(
-                Parts(rebuild(model, present), derived.axes, derived.scene), *given
+                Parts(rebuild(model, present), parts.axes, parts.scene), *given
             )
 
-        program = trace(traced, (*inputs, *self.inputs, *names, *derived_names), by)
-        balls = [*self._symbols.values(), *constants.values()]
-        return enclosure.compile_on_balls(program, balls)
+        names = (*inputs, *self.inputs, *symbols.names, *derived.names)
+        program = trace(traced, names, by)
+        return enclosure.compile_on_balls(program, [*symbols.balls, *derived.balls])
 
 
 def _depend_on_first(program: Program, count: int) -> list[bool]:
