@@ -45,6 +45,7 @@ SI_UNITS = frozenset(
 )
 """Units that an array may carry, as those of `to_xarray` do: its numbers are taken as they are."""
 
+_DOUBLE = np.dtype(float)
 _DEEPEST = 32
 """Levels of lists that are looked into: NumPy allows 64 dimensions, a list in itself has more."""
 
@@ -68,6 +69,8 @@ def real_numbers(value: Any, *, seconds: bool = False) -> Array:
         NotNumbers: names what is allowed, and what would be lost.
 
     """
+    if type(value) is np.ndarray and value.dtype is _DOUBLE:
+        return value
     if reason := find_lost_meaning(value, seconds=seconds):
         raise LostMeaning(reason)
     try:

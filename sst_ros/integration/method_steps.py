@@ -132,12 +132,12 @@ class MethodSteps:
         """Return the derivative of the state."""
         return self._functions["slope"](t, *y, *drive.numbers)
 
-    def eigenvalues(self, t: float, y: Sequence[float], drive: Drive) -> Array:
-        """Eigenvalues of the exact Jacobian [1/s], shape (size,).
+    def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
+        """Return the exact Jacobian, shape (size, size).
 
-        ArithmeticError: not finite.
+        Raises ArithmeticError where it is not finite.
         """
-        return self._ode.eigenvalues(t, y, drive.numbers)
+        return self._ode.matrix(t, y, drive.numbers)
 
 
 class FunctionSteps:
@@ -238,12 +238,12 @@ class FunctionSteps:
         torque = self._torque.of_drive(drive, t, y)
         return self._rhs(t, *y, *torque, *drive.numbers[3:])
 
-    def eigenvalues(self, t: float, y: Sequence[float], drive: Drive) -> Array:
-        """See `MethodSteps.eigenvalues`."""
+    def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
+        """See `MethodSteps.jacobian`."""
         columns: Array = np.array(self._linearise(t, y, drive).columns)
         if not np.isfinite(columns).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return np.asarray(np.linalg.eigvals(columns.T))
+        return columns.T
 
     def _is_of_time(self, drive: Drive) -> bool:
         return (
@@ -403,10 +403,14 @@ def _read_pair(numbers: Sequence[float], at: Point, size: int) -> tuple[Point, f
     """Read the outputs of `pair`."""
     *_, error, total = numbers
     finite = total - total == 0.0
-    after = at._replace(
-        y=[*numbers[:size]],
-        z=[*numbers[size : 2 * size]],
-        joints=tuple(numbers[2 * size : 2 * size + _JOINTS]),
-        steps=at.steps + 1,
+    after = Point(  # a call of `_replace` takes three times as long
+        [*numbers[:size]],
+        [*numbers[size : 2 * size]],
+        tuple(numbers[2 * size : 2 * size + _JOINTS]),
+        at.method,
+        at.h,
+        at.attempts,
+        at.steps + 1,
+        at.changes,
     )
     return after, error if finite else math.inf

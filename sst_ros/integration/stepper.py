@@ -272,8 +272,10 @@ class Stepper:
         second = None if other is None else Drive((*other, *moment))
         self.budget.begin()
         x, stops = 0.0, list[float]()
+        steps = self._steps_of(drive, at.method)
         while x < h:
-            step = self._take_step(x, h, at, drive, second, stops)
+            step = self._take_step(x, h, at, drive, second, stops, steps)
+            steps = step.steps
             event = None
             if not all_far(self._ranges, step.begin.joints, step.end.joints, step.h):
                 try:
@@ -338,29 +340,38 @@ class Stepper:
         drive: Drive,
         other: Drive | None,
         stops: list[float],
+        steps: Steps,
     ) -> Step:
         """Take one step that is accepted, from t to `end` at most.
 
         `stops` are the times just before and after a jump that was found, where steps
-        end.
+        end; `steps` those that the last step was taken by.
         """
         rejected = 0
         while True:
+            if steps.method is not at.method:
+                steps = self._steps_of(drive, at.method)
             left = end - t
             h = min(at.h, self._max_step, left)
             if left - h < _LAST_SLIVER * h:
                 h = left
             if stops:  # a step ends before a jump, the next one steps over it
                 h = min(h, stops[0] - t)
-            steps = self._steps_of(drive, at.method)
             self.budget.charge((3 if other is None else 6) * steps.cost)
             after, size = steps.pair(t, h, at, drive, other)
             error = size / self._tolerance
             if size <= self._tolerance:
                 stopped = bool(stops) and h == stops[0] - t
                 longest = _next_length(at, h, error, cut=stopped or h == left)
-                end_point = after._replace(h=longest, attempts=at.attempts)
-                if h < left or isinstance(at.method, Rosenbrock):
+                looks = self._chooses and (
+                    h < left or isinstance(at.method, Rosenbrock)
+                )
+                attempts = at.attempts + 1 if looks else at.attempts
+                end_point = Point(
+                    after.y, after.z, after.joints, at.method, longest, attempts,
+                    after.steps, at.changes,
+                )  # fmt: skip
+                if looks:
                     end_point = self._choose_method(
                         steps, t + h, h, end_point, drive, 0
                     )
@@ -373,7 +384,9 @@ class Stepper:
             if at.h < _SHORTEST_STEP * max(abs(t), end - t) or at.h < 1e-200:
                 raise CannotStep(f"steps of {at.h:.1e} s do not resolve it")
             rejected += 1
-            at = self._choose_method(steps, t, h, at, drive, rejected)
+            if self._chooses:
+                at = at._replace(attempts=at.attempts + 1)
+                at = self._choose_method(steps, t, h, at, drive, rejected)
 
     def _choose_method(
         self, steps: Steps, t: float, h: float, at: Point, drive: Drive, rejected: int
@@ -382,19 +395,25 @@ class Stepper:
 
         `rejected` counts the attempts in a row that were rejected.
         """
-        at = at._replace(attempts=at.attempts + 1)
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(
             at.method, Rosenbrock
         )
-        if not self._chooses or (at.attempts < _CHOOSE_EVERY and not early):
+        if at.attempts < _CHOOSE_EVERY and not early:
             return at
         if not early:
             at = at._replace(attempts=0)
         self.budget.charge(JACOBIAN_COST)
         try:
-            eigenvalues = steps.eigenvalues(t, at.y, drive)
+            jacobian = steps.jacobian(t, at.y, drive)
         except ArithmeticError:
             return at  # no finite Jacobian here; the step size has to do
+        # Nothing depends on the work, the last number, which adds an eigenvalue of zero.
+        if (
+            at.method is DOP853
+            and h * bound_of_eigenvalues(jacobian[:-1, :-1]) <= _STIFF
+        ):
+            return at
+        eigenvalues = np.linalg.eigvals(jacobian)
         method, reason = better_method(
             at.method, self._tolerance, h * eigenvalues, only_stiff=early
         )
@@ -487,6 +506,12 @@ def better_method(
     if method is DORMAND_PRINCE and tolerance < ACCURATE and decay <= _STIFF:
         return DOP853, "many small steps that accuracy asks for"
     return method, ""
+
+
+def bound_of_eigenvalues(matrix: Array) -> float:
+    """Return a number that no eigenvalue exceeds, at a fraction of their cost."""
+    sizes = np.abs(matrix)
+    return float(min(sizes.sum(axis=0).max(), sizes.sum(axis=1).max()))
 
 
 def _next_length(at: Point, h: float, error: float, *, cut: bool) -> float:
