@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 from benchmark.measure import describe_machine, join_line, time_in_turn
 from sst_ros import Simulation, Trajectory, load_scene, simulate
-from sst_ros.integration.method_steps import FunctionSteps, MethodSteps
+from sst_ros.integration.function_steps import FeedbackSteps, FunctionSteps, TimeSteps
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.point import Drive, Point
 from sst_ros.state import State
 
@@ -82,7 +83,10 @@ def own_steps(**options: Any) -> Callable[[], None]:
     `simulate`.
     """
     calls: list[StepCall] = []
-    originals = {kind: kind.pair for kind in (MethodSteps, FunctionSteps)}
+    originals = {
+        kind: kind.pair
+        for kind in (MethodSteps, FunctionSteps, TimeSteps, FeedbackSteps)
+    }
 
     def record(kind: Any) -> Any:
         def pair(

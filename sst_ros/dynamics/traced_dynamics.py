@@ -234,6 +234,11 @@ class ODE:
         return flat.reshape(size, size).T
 
     @cached_property
+    def slope(self) -> Function:
+        """The program as a function of floats; nan where it has no value."""
+        return compile_functions({"slope": self.program}, ("slope",))["slope"]
+
+    @cached_property
     def linearised(self) -> Function:
         """The program of `jacobian` as a function; nan where it has no value."""
         return compile_functions({"jacobian": self.jacobian}, ("jacobian",))["jacobian"]

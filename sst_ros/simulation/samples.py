@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
-from sst_ros.integration.stepper import Step, Stepper
+from sst_ros.integration.point import Step
+from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import Array
 
@@ -71,7 +73,7 @@ class Samples:
         """
         if self._times and self._times[-1] >= times[0]:
             return
-        if isinstance(step.steps, MethodSteps):
+        if isinstance(step.steps, (MethodSteps, TimeSteps)):
             self.evaluations += len(times) * step.steps.cost
             self._runs.append(_Run(len(self._times), step, begin, len(times)))
             self._note(times, torque)
@@ -103,20 +105,14 @@ class Samples:
         for run in self._runs:
             by_steps.setdefault(id(run.step.steps), []).append(run)
         for runs in by_steps.values():
-            steps = runs[0].step.steps
-            assert isinstance(steps, MethodSteps)
+            taken = [run.step for run in runs]
             counts = [run.count for run in runs]
             begins = np.array([run.begin for run in runs]).repeat(counts)
-            rows = [
-                (s.t, 0.0, *s.begin.y, *s.drive.numbers)
-                for s in (run.step for run in runs)
-            ]
-            inputs = np.array(rows).repeat(counts, axis=0)
             numbers = np.concatenate(
                 [np.arange(run.first, run.first + run.count) for run in runs]
             )
-            inputs[:, 1] = t[numbers] - begins
-            states[numbers] = steps.states_after(inputs)
+            x = t[numbers] - begins
+            states[numbers] = taken[0].steps.states_inside(taken, counts, x)
 
     def _torque_at(self, t: Array, states: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""

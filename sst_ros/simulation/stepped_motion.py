@@ -6,21 +6,21 @@ from __future__ import annotations
 import math
 import warnings
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from sst_ros.integration.method_steps import FunctionSteps
+from sst_ros.integration.function_steps import TimeSteps
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, Method
-from sst_ros.integration.point import Point, state_distance
+from sst_ros.integration.point import Point, Step, state_distance
 from sst_ros.integration.stepper import (
     ACCURATE,
     CannotStep,
     EvaluationBudget,
     LimitReached,
-    Step,
     Stepper,
 )
 from sst_ros.progress import Bar
@@ -38,13 +38,6 @@ half a minute.
 """
 _HOPELESS = 3.0
 """...by so many times its budget."""
-
-_MANY = 8
-"""Samples in a step from which on a polynomial costs less than a step for each, where a
-function gives the torques.
-"""
-_WORST = 0.07
-"""Share of the step at which the error of that polynomial is largest."""
 
 
 @dataclass(frozen=True)
@@ -211,12 +204,10 @@ class SteppedMotion:
         step, begin = self._last, self._last_begin
         if times[0] <= begin:  # the time of its begin, but for rounding
             self._take(times.pop(0), step.begin.y)
-        polynomial = None
-        if len(times) >= _MANY and isinstance(step.steps, FunctionSteps):
-            polynomial = self._interpolate(step)
-        if polynomial is not None:
-            for time in times:
-                self._take(time, polynomial(time - begin).tolist())
+        states = self._interpolate(step, [time - begin for time in times])
+        if states is not None:
+            for time, y in zip(times, states, strict=True):
+                self._take(time, y)
         elif times:
             self.samples.add_inside(times, self._torque, step, begin)
 
@@ -233,28 +224,26 @@ class SteppedMotion:
             text = f"{self._task.scene.name}: {done}; {advice}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
 
-    def _interpolate(self, step: Step) -> Callable[[float], Array] | None:
-        """Return a polynomial of the time in a step, through states and slopes at its quarters.
+    def _interpolate(self, step: Step, x: list[float]) -> list[list[float]] | None:
+        """Return the states at times x after the begin of a step [s], by a polynomial.
 
-        None where it misses the state by more than the tolerance, where its error is
-        largest.
+        None where a step for each costs less, and where the polynomial misses the state
+        by more than the tolerance, where its error is largest.
         """
-        from scipy.interpolate import KroghInterpolator  # many runs have few samples
-
-        times = [0.25 * k * step.h for k in range(5)]
-        states = [step.begin.y, *(step.inside(x) for x in times[1:-1]), step.end.y]
-        slopes = [
-            step.steps.slope(step.t + x, y, step.drive)
-            for x, y in zip(times, states, strict=True)
-        ]
-        data = [row for pair in zip(states, slopes, strict=True) for row in pair]
-        self._budget.charge(4 * step.steps.cost + len(times))
-        if not np.isfinite(data).all():
+        steps = step.steps
+        if isinstance(steps, (MethodSteps, TimeSteps)):  # computed together, at the end
             return None
-        polynomial = KroghInterpolator(np.repeat(times, 2), data)
-        worst = _WORST * step.h
-        distance = state_distance(polynomial(worst).tolist(), step.inside(worst))
-        return polynomial if distance <= self._task.tolerance else None
+        cost = steps.interpolation_cost + steps.cost
+        if cost > len(x) * steps.cost:
+            return None
+        self._budget.charge(cost)
+        polynomial = steps.interpolate(step)
+        if polynomial is None:
+            return None
+        worst = steps.worst * step.h
+        *states, checked = polynomial(np.array([*x, worst])).tolist()
+        distance = state_distance(checked, step.inside(worst))
+        return states if distance <= self._task.tolerance else None
 
     def _take_if_wanted(self, time: float, y: Sequence[float]) -> None:
         if self._next < len(self._times) and self._times[self._next] == time:
