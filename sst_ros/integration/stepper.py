@@ -387,8 +387,10 @@ class Stepper:
         except ArithmeticError:
             return at  # no finite Jacobian here; the step size has to do
         # Nothing depends on the work, the last number, which adds an eigenvalue of zero.
+        only_stiff = early or at.method is DOP853 or self._tolerance >= ACCURATE
         if (
-            at.method is DOP853
+            only_stiff
+            and not isinstance(at.method, Rosenbrock)
             and h * bound_of_eigenvalues(jacobian[:-1, :-1]) <= _STIFF
         ):
             return at

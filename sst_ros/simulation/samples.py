@@ -107,11 +107,10 @@ class Samples:
         for runs in by_steps.values():
             taken = [run.step for run in runs]
             counts = [run.count for run in runs]
-            begins = np.array([run.begin for run in runs]).repeat(counts)
-            numbers = np.concatenate(
-                [np.arange(run.first, run.first + run.count) for run in runs]
-            )
-            x = t[numbers] - begins
+            before = np.cumsum([0, *counts[:-1]])
+            offsets = np.array([run.first for run in runs]) - before
+            numbers = np.arange(sum(counts)) + offsets.repeat(counts)
+            x = t[numbers] - np.array([run.begin for run in runs]).repeat(counts)
             states[numbers] = taken[0].steps.states_inside(taken, counts, x)
 
     def _torque_at(self, t: Array, states: Array) -> Array:

@@ -255,7 +255,7 @@ def _trajectory(
         message=message,
         method=", then ".join([motion.start.method.name, *changes]),
         error_estimate=error,
-        energy_residual=energy(point.y) - energy(motion.start.y) - point.y[-1],
+        energy_residual=lambda: energy(point.y) - energy(motion.start.y) - point.y[-1],
         evaluations=spent + motion.samples.evaluations,
         step=motion.time / max(point.steps, 1),
         law=(

@@ -216,10 +216,7 @@ class SteppedMotion:
         self._warn_after, most = math.inf, self._budget.per_period
         spent = self._budget.spent - self._spent_before
         if _HOPELESS * most * share < spent:
-            done = (
-                f"{spent:,} evaluations for {100.0 * share:.2g} % of the"
-                " motion"
-            )
+            done = f"{spent:,} evaluations for {100.0 * share:.2g} % of the motion"
             advice = f"it stops at {most:,}: shorten it, or change its method"
             text = f"{self._task.scene.name}: {done}; {advice}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
