@@ -71,33 +71,35 @@ class AppliedTorque:
             None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
         )
 
-    def at(
-        self,
-        torque: Torque,
-        time: float,
-        y: Sequence[float],
-        joints: Sequence[float] | None = None,
-    ) -> Vector3:
+    def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m].
 
-        In the state that a function is given are the lagged torques of the actuators;
-        without lag zero, for torques of this instant are what it returns. Where the
-        state is not finite, as in a trial step that is too long, the function is not
-        called, and the torques are nan. `joints` are those of y, where they are known.
-
         Raises:
-            InputError: what the function returns is not three numbers.
+            InputError: what a function returns is not three numbers.
 
         """
-        arguments: tuple[Any, ...] = (time,)
         if has_feedback(torque):
-            if not math.isfinite(sum(y)):
-                return _NOT_FINITE
-            lagged = (y[7], y[8], y[9]) if self._lags else (0.0, 0.0, 0.0)
-            if joints is None:
-                joints = self._dynamics.joints(*y[:7])
-            arguments = time, State.of(round(time * NANOSECONDS), y, joints, lagged)
-        return clamp(_three_numbers(torque_at(torque, *arguments), time), self.limit)
+            return self.of_state(torque, time, y, self._dynamics.joints(*y[:7]))
+        return clamp(_three_numbers(torque_at(torque, time), time), self.limit)
+
+    def of_state(
+        self, function: Any, time: float, y: Sequence[float], joints: Sequence[float]
+    ) -> Vector3:
+        """Torques of a function at a time [s] and a state y with its joints [N m].
+
+        In the state that it is given are the lagged torques of the actuators; without
+        lag zero, for torques of this instant are what it returns. Where the state is
+        not finite, as in a trial step that is too long, it is not called, and the
+        torques are nan.
+        """
+        if not math.isfinite(sum(y)):
+            return _NOT_FINITE
+        lagged = (y[7], y[8], y[9]) if self._lags else (0.0, 0.0, 0.0)
+        state = State.of(round(time * NANOSECONDS), y, joints, lagged)
+        torque = function(time, state)
+        if not isinstance(function, FunctionTorque):  # it checks what it returns
+            torque = _three_numbers(torque, time)
+        return clamp(torque, self.limit)
 
     def of_time(self, drive: Drive) -> Callable[[float], Vector3]:
         """Return the torques of a drive as a function of the time of the steps [s]."""
@@ -113,15 +115,9 @@ class AppliedTorque:
 
         return evaluate
 
-    def of_drive(
-        self,
-        drive: Drive,
-        t: float,
-        y: Sequence[float],
-        joints: Sequence[float] | None = None,
-    ) -> Vector3:
+    def of_drive(self, drive: Drive, t: float, y: Sequence[float]) -> Vector3:
         """Torques of a drive with a function at a time of the steps [s] and a state [N m]."""
-        return self.at(drive.function, drive.start + t, y, joints)
+        return self.at(drive.function, drive.start + t, y)
 
     def locate_jump(
         self, drive: Drive, begin: float, end: float, y: Sequence[float]

@@ -411,13 +411,13 @@ class FeedbackSteps(FunctionSteps):
         `joints` are those of y.
         """
         functions, size, moment = self._functions, self._size, drive.numbers[3:]
-        evaluate = self._torque.of_drive
+        evaluate, function, start = self._torque.of_state, drive.function, drive.start
         slopes: list[float] = []
         point = y
         numbers: list[float] = []
         for number, node in enumerate(self.method.c):
             time = t + node * h if node else t
-            torque = evaluate(drive, time, point, joints)
+            torque = evaluate(function, start + time, point, joints)
             numbers = functions[f"stage{number}"](
                 time, h, *y, *slopes, *point, *torque, *moment
             )

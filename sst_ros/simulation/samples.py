@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sst_ros.integration.applied_torque import has_feedback
 from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
-from sst_ros.integration.point import Step
+from sst_ros.integration.point import Drive, Step
 from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import Array
@@ -125,6 +126,9 @@ class Samples:
             if isinstance(torque, SineTorque):
                 sines += range(first, end)
                 sine = torque  # one, traced into the program
+            elif callable(torque) and not has_feedback(torque):
+                evaluate = self._stepper.torque.of_time(Drive((), torque))
+                torques[first:end] = [evaluate(time) for time in t[first:end].tolist()]
             elif callable(torque):
                 for k in range(first, end):
                     torques[k] = self._stepper.torque.at(
