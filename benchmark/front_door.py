@@ -1,31 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user's call costs beside the steps that it contains.
 
-python -m benchmark.front_door [--rounds 9]
+python -m benchmark.front_door [--rounds 9] [--write]
 
-One second of each class of scene, its 200 samples read; the first call in a new
-process, a later one, and the calls of its compiled steps alone. MuJoCo's best setting
-for Example 2 stands beside.
+One second of each class of scene, its 200 samples read. For each call: its first in a new
+process, imports not counted; a later one; the calls of its compiled steps alone; the calls
+of a user's function alone; and MuJoCo's best setting for the same second. All in time of
+the processor. With --write the table becomes the first of docs/peers.md and README.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from statistics import median
 from typing import Any, NamedTuple
+from unittest import mock
 
-from benchmark.measure import describe_machine, join_line, time_in_turn
+from benchmark.measure import DOCS, describe_machine, fill_page, join_line, time_in_turn
 from sst_ros import Simulation, Trajectory, load_scene, simulate
-from sst_ros.integration.method_steps import FunctionSteps, MethodSteps
-from sst_ros.integration.point import Drive, Point
+from sst_ros.integration import function_steps
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.state import State
 
 PERIOD = 0.001
 TICK_NS = 1_000_000
+
+ALLOWED_MS = 0.15
+"""What a call may take besides four times its compiled steps, and twice its functions."""
+
+
+class MuJoCo(NamedTuple):
+    """MuJoCo's best setting for an error, by `benchmark.peers`."""
+
+    steps: int
+    settle: float  # solref [s]
+    mobility: float  # [1/kg]
+    python: bool = False  # whether the torques are a function in Python
 
 
 class Call(NamedTuple):
@@ -34,78 +50,119 @@ class Call(NamedTuple):
     name: str
     scene: str
     options: dict[str, Any]
+    mujoco: MuJoCo | None = None
 
 
 def follow_time(t: float) -> tuple[float, float, float]:
-    return 2.0 * t, 1.0 - t, 0.5
+    """Return torques that change with the time."""
+    return 0.5 * t, 0.3 - t, 0.2
 
 
 def damp(t: float, state: State) -> tuple[float, float, float]:
+    """Return constant torques, less some of the rates."""
     first, second, third = state.joints.gamma_dot
-    return -0.5 * first, -0.5 * second, -0.5 * third
+    return 0.4 - 0.5 * first, -0.2 - 0.5 * second, 0.3 - 0.5 * third
 
 
+HEAVY = "example2_heavy"
 CALLS = (
-    Call("example2_heavy, auto, 1e-6", "example2_heavy", {"tolerance": 1e-6}),
-    Call("example2_heavy, auto, 1e-9", "example2_heavy", {}),
+    Call("Example 2 to 1e-6 rad", HEAVY, {"tolerance": 1e-6}, MuJoCo(160, 0.01, 10.0)),
+    Call("Example 2 to 1e-9 rad", HEAVY, {}, MuJoCo(3460, 0.003, 0.1)),
     *(
-        Call(f"example2_heavy, {method}", "example2_heavy", {"method": method})
+        Call(f"Example 2, {method}", HEAVY, {"method": method})
         for method in ("dop853", "dopri5", "rk4", "rodas5p")
     ),
-    Call("torque as a function of time", "example2_heavy", {"torque": follow_time}),
-    Call("torque as a function of the state", "example2_heavy", {"torque": damp}),
-    Call("elastic_stops, auto", "elastic_stops", {}),
+    Call(
+        "torque as a function of time, 1e-6 rad",
+        HEAVY,
+        {"torque": follow_time, "tolerance": 1e-6},
+        MuJoCo(160, 0.01, 10.0, python=True),
+    ),
+    Call("torque as a function of time, 1e-9 rad", HEAVY, {"torque": follow_time}),
+    Call("torque as a function of the state", HEAVY, {"torque": damp}),
+    Call("elastic stops, auto", "elastic_stops", {}),
     Call("friction, auto", "friction", {}),
     Call("friction, dop853", "friction", {"method": "dop853"}),
     Call("stiff, auto", "stiff", {}),
     Call(
-        "a controller, 1000 periods",
-        "example2_heavy",
-        {"torque": damp, "control_period": PERIOD},
+        "a controller, 1000 periods", HEAVY, {"torque": damp, "control_period": PERIOD}
     ),
 )
 
 
-class StepCall(NamedTuple):
-    """A call of compiled steps that a motion has made."""
+class Recorder:
+    """A function whose calls are noted."""
 
-    steps: MethodSteps | FunctionSteps
-    t: float
-    h: float
-    at: Point
-    drive: Drive
-    other: Drive | None
+    def __init__(self, function: Callable[..., Any], calls: list[Any]) -> None:
+        self._function, self._calls = function, calls
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        self._calls.append((self._function, arguments))
+        return self._function(*arguments)
+
+
+class OwnCalls(NamedTuple):
+    """The calls that a call of `simulate` has made of what it cannot do without."""
+
+    steps: list[Any]  # of compiled steps
+    functions: list[Any]  # of the user's function
+
+
+def record_calls(**options: Any) -> OwnCalls:
+    """Note the calls of compiled steps, and of a user's function, of `simulate`."""
+    own = OwnCalls([], [])
+    pair = MethodSteps.pair
+
+    def record_pair(self: MethodSteps, *arguments: Any) -> Any:
+        own.steps.append((partial(pair, self), arguments))
+        return pair(self, *arguments)
+
+    def record_compiled(compiler: Any) -> Any:
+        def compile_it(*arguments: Any) -> dict[str, Any]:
+            compiled = compiler(*arguments)
+            return {name: Recorder(one, own.steps) for name, one in compiled.items()}
+
+        return compile_it
+
+    torque = options.get("torque")
+    if callable(torque):
+        options = options | {"torque": _record_function(torque, own.functions)}
+    by_stage = record_compiled(function_steps.compile_by_stage)
+    stages = record_compiled(function_steps.compile_stages)
+    with (
+        mock.patch.object(MethodSteps, "pair", record_pair),
+        mock.patch.object(function_steps, "compile_by_stage", by_stage),
+        mock.patch.object(function_steps, "compile_stages", stages),
+    ):
+        simulate(**options)
+    return own
+
+
+def _record_function(function: Callable[..., Any], calls: list[Any]) -> Any:
+    """Return a function that is called as another one, whose calls are noted."""
+
+    @functools.wraps(function)
+    def recorded(*arguments: Any) -> Any:
+        calls.append((function, arguments))
+        return function(*arguments)
+
+    return recorded
+
+
+def repeat(calls: Sequence[Any]) -> Callable[[], None]:
+    """Return a function that makes calls again."""
+
+    def run() -> None:
+        for function, arguments in calls:
+            function(*arguments)
+
+    return run
 
 
 def own_steps(**options: Any) -> Callable[[], None]:
-    """Return a function that repeats the calls of compiled steps of a call of
-    `simulate`.
-    """
-    calls: list[StepCall] = []
-    originals = {kind: kind.pair for kind in (MethodSteps, FunctionSteps)}
-
-    def record(kind: Any) -> Any:
-        def pair(
-            self: Any, t: float, h: float, at: Point, drive: Drive, other: Any = None
-        ) -> Any:
-            calls.append(StepCall(self, t, h, at, drive, other))
-            return originals[kind](self, t, h, at, drive, other)
-
-        return pair
-
-    try:
-        for kind in originals:
-            kind.pair = record(kind)  # type: ignore[method-assign]
-        simulate(**options)
-    finally:
-        for kind, pair in originals.items():
-            kind.pair = pair  # type: ignore[method-assign]
-
-    def repeat() -> None:
-        for call in calls:
-            call.steps.pair(call.t, call.h, call.at, call.drive, call.other)
-
-    return repeat
+    """Return a function that repeats the compiled steps of a call of `simulate`."""
+    return repeat(record_calls(**options).steps)
 
 
 def read_all(motion: Trajectory) -> None:
@@ -113,47 +170,112 @@ def read_all(motion: Trajectory) -> None:
     _ = motion.quaternion, motion.gamma, motion.gamma_dot, motion.torque
 
 
+class Row(NamedTuple):
+    """Processor times of a call [ms]."""
+
+    name: str
+    first: float  # in a new process
+    later: float
+    steps: float  # its compiled steps alone
+    functions: float  # calls of the user's function alone
+    mujoco: float | None
+
+    @property
+    def ratio(self) -> float:
+        """The call without what is allowed besides, over its compiled steps."""
+        return (self.later - ALLOWED_MS - 2.0 * self.functions) / self.steps
+
+    def __str__(self) -> str:
+        functions = f"{self.functions:.3f}" if self.functions else "-"
+        mujoco = "-" if self.mujoco is None else f"{self.mujoco:.2f}"
+        times = f"{self.first:.0f} | {self.later:.2f} | {self.steps:.3f}"
+        return f"| {self.name} | {times} | {functions} | {self.ratio:.1f} | {mujoco} |"
+
+
+HEAD = """\
+| one second, 200 samples read [ms] | first call | later | its steps alone \
+| its functions alone | ratio | MuJoCo |
+| --- | ---: | ---: | ---: | ---: | ---: | ---: |"""
+"""The ratio is that of `Row.ratio`, which is to be at most 4."""
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print; the exit status is 0."""
     parser = argparse.ArgumentParser("front_door", description=__doc__)
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--write", action="store_true", help="docs/peers.md, README.md")
+    parser.add_argument(
+        "--first", type=int, help="time the first call of one row alone"
+    )
     options = parser.parse_args(arguments)
-    print("| call | first [ms] | later [ms] | its steps [ms] | ratio |")
-    print("| --- | --- | --- | --- | --- |")
-    for call in CALLS:
-        print(measure(call, options.rounds), flush=True)
-    print()
-    print("\n".join(measure_steps(options.rounds)))
-    print("\n" + join_line(describe_machine("numpy", "llvmlite")))
+    if options.first is not None:
+        print(time_first(CALLS[options.first]))
+        return 0
+    lines = [HEAD]
+    print(HEAD)
+    for number, call in enumerate(CALLS):
+        lines.append(str(measure(number, call, options.rounds)))
+        print(lines[-1], flush=True)
+    lines += ["", *measure_steps(options.rounds), ""]
+    lines.append(join_line(describe_machine("numpy", "llvmlite", "mujoco")))
+    print("\n".join(lines[-4:]))
+    if options.write:
+        for page in (DOCS / "peers.md", DOCS.parent / "README.md"):
+            fill_page(page, {"calls": "\n".join(lines)})
     return 0
 
 
-def measure(call: Call, rounds: int) -> str:
-    """Return a row of the table: processor time of a call, and of its steps alone."""
-    given: dict[str, Any] = {"duration": 1.0, **call.options}
+def measure(number: int, call: Call, rounds: int) -> Row:
+    """Return a row of the table."""
     scene = load_scene(call.scene)
+    options: dict[str, Any] = {"scene": scene, "duration": 1.0, **call.options}
 
     def whole() -> None:
-        read_all(simulate(scene, **given))
+        read_all(simulate(**options))
 
-    began = time.process_time()
+    command = [sys.executable, "-m", "benchmark.front_door", "--first", str(number)]
+    child = subprocess.run(command, check=True, capture_output=True, text=True)
+    first = float(child.stdout)
     whole()
-    first = time.process_time() - began
-    calls = {"call": whole, "steps": own_steps(scene=scene, **given)}
-    taken = time_in_turn(calls, rounds, clock=time.process_time)
-    later, steps = median(taken["call"]), median(taken["steps"])
-    figures = f"{1e3 * first:.1f} | {1e3 * later:.2f} | {1e3 * steps:.3f}"
-    return f"| {call.name} | {figures} | {later / steps:.1f} |"
+    own = record_calls(**options)
+    calls = {"later": whole, "steps": repeat(own.steps)}
+    if own.functions:
+        calls["functions"] = repeat(own.functions)
+    if call.mujoco is not None:
+        calls["mujoco"] = _prepare_mujoco(call.mujoco)
+    times = time_in_turn(calls, rounds, shortest=0.02, clock=time.process_time)
+    taken = {name: 1e3 * median(seconds) for name, seconds in times.items()}
+    later, steps = taken["later"], taken["steps"]
+    functions, mujoco = taken.get("functions", 0.0), taken.get("mujoco")
+    return Row(call.name, 1e3 * first, later, steps, functions, mujoco)
+
+
+def time_first(call: Call) -> float:
+    """Return the processor time of a call in a process that has called nothing [s]."""
+    scene = load_scene(call.scene)
+    began = time.process_time()
+    read_all(simulate(scene, **{"duration": 1.0, **call.options}))
+    return time.process_time() - began
+
+
+def _prepare_mujoco(setting: MuJoCo) -> Callable[[], Any]:
+    """Return MuJoCo's run of the second, of which it hands out the end alone."""
+    from benchmark.peers import mujoco_peer
+    from benchmark.peers.task import Task
+
+    kind = mujoco_peer.Python if setting.python else mujoco_peer.Compiled
+    arguments = Task(), "RK4", setting.mobility, setting.settle, setting.steps
+    return kind(*arguments).run
 
 
 def measure_steps(rounds: int) -> Sequence[str]:
     """Return lines on single steps of a `Simulation`."""
-    run = Simulation("example2_heavy")
+    run = Simulation(HEAVY)
     run.load_code()
     taken = time_in_turn(
         {"step": partial(_ticks, run, 100)}, rounds, clock=time.process_time
     )
-    return [f"Simulation.step, 1 ms: {1e6 * median(taken['step']) / 100:.1f} us"]
+    return [f"`Simulation.step`, 1 ms: {1e6 * median(taken['step']) / 100:.1f} us"]
 
 
 def _ticks(run: Simulation, count: int) -> None:

@@ -45,6 +45,7 @@ SI_UNITS = frozenset(
 )
 """Units that an array may carry, as those of `to_xarray` do: its numbers are taken as they are."""
 
+_DOUBLE = np.dtype(float)
 _DEEPEST = 32
 """Levels of lists that are looked into: NumPy allows 64 dimensions, a list in itself has more."""
 
@@ -68,6 +69,8 @@ def real_numbers(value: Any, *, seconds: bool = False) -> Array:
         NotNumbers: names what is allowed, and what would be lost.
 
     """
+    if type(value) is np.ndarray and value.dtype is _DOUBLE:
+        return value
     if reason := find_lost_meaning(value, seconds=seconds):
         raise LostMeaning(reason)
     try:
@@ -195,19 +198,24 @@ def clamp(torque: Vector3, limit: float | None) -> Vector3:
 
 def finite_vector(value: Any) -> Vector3 | None:
     """Return three finite numbers as floats; None where `value` is something else."""
+    if type(value) is tuple and len(value) == 3:  # as in each step of a run
+        first, second, third = value
+        if type(first) is type(second) is type(third) is float:
+            finite = math.isfinite(first + second + third)
+            if finite or all(map(math.isfinite, value)):
+                return value
+            return None
     if isinstance(value, (str, bytes)):
         return None
     try:
         first, second, third = value
-        # as in each step of a run
-        floats = type(first) is type(second) is type(third) is float
-        plain = floats or (type(value) is np.ndarray and value.dtype.kind in "fiu")
+        plain = type(value) is np.ndarray and value.dtype.kind in "fiu"
         if not plain and find_lost_meaning([value, first, second, third]):
             return None
-        finite = math.isfinite(first) and math.isfinite(second) and math.isfinite(third)
+        numbers = float(first), float(second), float(third)
+        return numbers if all(map(math.isfinite, numbers)) else None
     except (TypeError, ValueError, OverflowError):
         return None
-    return (float(first), float(second), float(third)) if finite else None
 
 
 class Explained:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -190,3 +191,43 @@ def test_a_star_too_heavy_for_its_mass_is_warned_of(tmp_path, capsys):
 def test_thin_arcs_are_at_the_bound():
     assert implausible(load("example2").with_values({"star.mass": 2.6})) == ""
     assert implausible(load("example2").with_values({"star.mass": 2.59})) != ""
+
+
+def test_a_file_is_parsed_once_for_each_of_its_texts(tmp_path, monkeypatch):
+    """What is read is the file as it is now, and each scene is one of its own."""
+    path, parsed = tmp_path / "scene.yaml", []
+    original = scenes.read
+
+    def count(*arguments):
+        parsed.append(arguments)
+        return original(*arguments)
+
+    monkeypatch.setattr(scenes, "read", count)
+    text = scenes.text_of("example2")[0]
+    path.write_text(text, encoding="utf-8")
+    first, second = load(path), load(path)
+    assert len(parsed) == 1
+    assert first == second
+    assert first is not second
+    assert first.star is not second.star
+    vars(first)["name"] = "another"  # by force: scenes are read-only
+    assert load(path) == second
+    stamp = path.stat()
+    changed = text.replace("name: example2", "name: changed!", 1)
+    path.write_text(changed, encoding="utf-8")
+    os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    assert load(path).name == "changed!"
+    path.write_text(text, encoding="utf-8")
+    assert load(path).name == "example2"
+    assert len(parsed) == 2
+
+
+def test_a_text_that_is_refused_is_refused_each_time(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_text("name: nothing else\n", encoding="utf-8")
+    messages = []
+    for _ in range(2):
+        with pytest.raises(InputError) as refused:
+            load(path)
+        messages.append(str(refused.value))
+    assert messages[0] == messages[1]

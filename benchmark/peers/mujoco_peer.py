@@ -67,7 +67,7 @@ def series(task: Task, quick: bool) -> list[Series]:
     few = [pair for pair in grid if pair[1] <= 0.03]
     found = []
 
-    def add(name: str, kind: type[_Steps], integrator: str, last: int,
+    def add(name: str, kind: type[Python], integrator: str, last: int,
             pairs: list[tuple[float, float]]) -> None:  # fmt: skip
         settings, gates = [], []
         for mobility, settle in pairs:
@@ -82,12 +82,12 @@ def series(task: Task, quick: bool) -> list[Series]:
 
         found.append(Series(ENGINE, name, kind.PYTHON, TOLERANCE, find_worst, settings))
 
-    add("RK4, compiled torques", _Compiled, "RK4", 6400 if quick else 16000, grid)
-    add("RK4, Python torques", _Steps, "RK4", 3200, few)
+    add("RK4, compiled torques", Compiled, "RK4", 6400 if quick else 16000, grid)
+    add("RK4, Python torques", Python, "RK4", 3200, few)
     add("RK4, rollout", Rollout, "RK4", 6400, few)
     for integrator in ("EULER", "IMPLICIT", "IMPLICITFAST"):
         name = f"{integrator.lower()}, compiled torques"
-        add(name, _Compiled, integrator, 16000, grid[:: 1 if quick else 3])
+        add(name, Compiled, integrator, 16000, grid[:: 1 if quick else 3])
     return found
 
 
@@ -186,7 +186,7 @@ def _numbers(values: Iterable[float]) -> str:
 model_of = cache(Model)
 
 
-class _Steps(Engine):
+class Python(Engine):
     """Steps with torques by a callback in Python."""
 
     PYTHON, MOTORS = "the torques", False
@@ -224,7 +224,7 @@ class _Steps(Engine):
         return self.model.pose()
 
 
-class _Compiled(_Steps):
+class Compiled(Python):
     """The same in C."""
 
     PYTHON = "nowhere"
@@ -264,7 +264,7 @@ def _compile(
     return library, kind(("torques", library))
 
 
-class Rollout(_Steps):
+class Rollout(Python):
     """MuJoCo's own loop over a table of torques."""
 
     PYTHON, MOTORS = "nowhere", True

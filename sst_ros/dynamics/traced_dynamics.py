@@ -220,11 +220,23 @@ class ODE:
 
         Raises ArithmeticError where the Jacobian is not finite.
         """
+        return np.asarray(np.linalg.eigvals(self.matrix(t, y, d)))
+
+    def matrix(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
+        """Return the exact Jacobian at time [s], state and drive, shape (size, size).
+
+        Raises ArithmeticError where it is not finite.
+        """
         size = len(self.state)
         flat = np.array(self.linearised(t, *y, *d)[2 * size :])
         if not np.isfinite(flat).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return np.asarray(np.linalg.eigvals(flat.reshape(size, size).T))
+        return flat.reshape(size, size).T
+
+    @cached_property
+    def slope(self) -> Function:
+        """The program as a function of floats; nan where it has no value."""
+        return compile_functions({"slope": self.program}, ("slope",))["slope"]
 
     @cached_property
     def linearised(self) -> Function:

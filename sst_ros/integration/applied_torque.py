@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +14,12 @@ from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError, Problem
 from sst_ros.integration.point import Drive
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.torque_profile import SineTorque, Torque, torque_at
+from sst_ros.scene.torque_profile import (
+    FunctionTorque,
+    SineTorque,
+    Torque,
+    torque_at,
+)
 from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 
 _SEARCHED = 8
@@ -69,23 +74,46 @@ class AppliedTorque:
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m].
 
-        In the state that a function is given are the lagged torques of the actuators;
-        without lag zero, for torques of this instant are what it returns. Where the
-        state is not finite, as in a trial step that is too long, the function is not
-        called, and the torques are nan.
-
         Raises:
-            InputError: what the function returns is not three numbers.
+            InputError: what a function returns is not three numbers.
 
         """
-        arguments: tuple[Any, ...] = (time,)
         if has_feedback(torque):
-            if not math.isfinite(sum(y)):
-                return _NOT_FINITE
-            lagged = (y[7], y[8], y[9]) if self._lags else (0.0, 0.0, 0.0)
-            joints = self._dynamics.joints(*y[:7])
-            arguments = time, State.of(round(time * NANOSECONDS), y, joints, lagged)
-        return clamp(_three_numbers(torque_at(torque, *arguments), time), self.limit)
+            return self.of_state(torque, time, y, self._dynamics.joints(*y[:7]))
+        return clamp(_three_numbers(torque_at(torque, time), time), self.limit)
+
+    def of_state(
+        self, function: Any, time: float, y: Sequence[float], joints: Sequence[float]
+    ) -> Vector3:
+        """Torques of a function at a time [s] and a state y with its joints [N m].
+
+        In the state that it is given are the lagged torques of the actuators; without
+        lag zero, for torques of this instant are what it returns. Where the state is
+        not finite, as in a trial step that is too long, it is not called, and the
+        torques are nan.
+        """
+        if not math.isfinite(sum(y)):
+            return _NOT_FINITE
+        lagged = (y[7], y[8], y[9]) if self._lags else (0.0, 0.0, 0.0)
+        state = State.of(round(time * NANOSECONDS), y, joints, lagged)
+        torque = function(time, state)
+        if not isinstance(function, FunctionTorque):  # it checks what it returns
+            torque = _three_numbers(torque, time)
+        return clamp(torque, self.limit)
+
+    def of_time(self, drive: Drive) -> Callable[[float], Vector3]:
+        """Return the torques of a drive as a function of the time of the steps [s]."""
+        function, start, limit = drive.function, drive.start, self.limit
+        if isinstance(function, FunctionTorque):  # it checks what it returns
+            if limit is None:
+                return lambda t: function(start + t)
+            return lambda t: clamp(function(start + t), limit)
+
+        def evaluate(t: float) -> Vector3:
+            time = start + t
+            return clamp(_three_numbers(function(time), time), limit)
+
+        return evaluate
 
     def of_drive(self, drive: Drive, t: float, y: Sequence[float]) -> Vector3:
         """Torques of a drive with a function at a time of the steps [s] and a state [N m]."""

@@ -4,23 +4,21 @@
 `steps.py` has the steps as ordinary functions. Here they are traced, as programs that
 call the derivative of the scene, and become machine code where llvmlite is installed,
 else flat Python with the same bits. Torques that are numbers, or a function of time, go
-in as inputs. A function of the state is called in each stage: those steps run as they
-are read.
+in as inputs; see `function_steps.py`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import LAG, ODE
-from sst_ros.integration.applied_torque import AppliedTorque, has_feedback
-from sst_ros.integration.methods import Method, Rosenbrock, Tableau
-from sst_ros.integration.point import Drive, Point
+from sst_ros.integration.methods import Method, Rosenbrock
+from sst_ros.integration.point import Drive, Outcome, Point, Step
 from sst_ros.integration.steps import (
     Linearisation,
     NewState,
@@ -35,7 +33,6 @@ from sst_ros.programs.compiled import (
     RowsFunction,
     compile_functions,
     compile_rows,
-    without_errors,
 )
 from sst_ros.programs.expression import Program, Routine, trace
 from sst_ros.programs.llvm import Function
@@ -43,7 +40,7 @@ from sst_ros.programs.llvm import Function
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
-_JOINTS = 18
+JOINTS = 18
 """Numbers of `joints`: nine angles and nine rates."""
 
 
@@ -73,7 +70,7 @@ class MethodSteps:
         programs = {
             "slope": ode.program,
             "joints": ode.dynamics.joints_program,
-            **trace_steps(method, self._size, len(ode.drive), _lagged(ode)),
+            **trace_steps(method, self._size, len(ode.drive), lagged_torques(ode)),
         }
         if isinstance(method, Rosenbrock):
             programs["linearise"] = ode.jacobian
@@ -93,7 +90,7 @@ class MethodSteps:
 
     def pair(
         self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
-    ) -> tuple[Point, float]:
+    ) -> Outcome:
         """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
 
         The second one has the drive `other`, by default that of the first. Returns
@@ -104,7 +101,7 @@ class MethodSteps:
         numbers = self._functions["pair"](
             t, h, *at.y, *at.z, *drive.numbers, *second.numbers
         )
-        return _read_pair(numbers, at, self._size)
+        return read_outcome(numbers, at, self._size)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -128,170 +125,32 @@ class MethodSteps:
         """Return what `single` gives for rows of t, h, state and drive, shape (n, size)."""
         return self._single_of_rows(rows)
 
+    def states_inside(
+        self, steps: Sequence[Step], counts: Sequence[int], x: Array
+    ) -> Array:
+        """Return states inside steps, each by a shorter step from the begin, (n, size).
+
+        Args:
+            steps: those of this method in a run.
+            counts: how many states are asked for in each.
+            x: their times after the begin of their step [s], shape (n,).
+
+        """
+        rows = [(step.t, 0.0, *step.begin.y, *step.drive.numbers) for step in steps]
+        inputs = np.array(rows).repeat(counts, axis=0)
+        inputs[:, 1] = x
+        return self.states_after(inputs)
+
     def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
         """Return the derivative of the state."""
         return self._functions["slope"](t, *y, *drive.numbers)
 
-    def eigenvalues(self, t: float, y: Sequence[float], drive: Drive) -> Array:
-        """Eigenvalues of the exact Jacobian [1/s], shape (size,).
+    def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
+        """Return the exact Jacobian, shape (size, size).
 
-        ArithmeticError: not finite.
+        Raises ArithmeticError where it is not finite.
         """
-        return self._ode.eigenvalues(t, y, drive.numbers)
-
-
-class FunctionSteps:
-    """Steps of an ODE under torques that are a function, or whose derivative is given.
-
-    Args:
-        ode: what is integrated; the first three numbers of its drive are the torques.
-        method: how.
-        torque: evaluates the functions.
-        derivative: of the state in place of that of the ODE, with the same inputs.
-
-    Attributes: see `MethodSteps`.
-
-    """
-
-    def __init__(
-        self,
-        ode: ODE,
-        method: Method,
-        torque: AppliedTorque,
-        derivative: Callable[..., Sequence[float]] | None = None,
-    ) -> None:
-        if derivative is not None and isinstance(method, Rosenbrock):
-            raise ValueError(
-                "a derivative of its own has no Jacobian, which the method needs"
-            )
-        self.method, self._ode, self._torque, self._given = (
-            method,
-            ode,
-            torque,
-            derivative,
-        )
-        self.cost = len(method.a) + (
-            JACOBIAN_COST if isinstance(method, Rosenbrock) else 0
-        )
-        self._size = len(ode.state)
-
-    @cached_property
-    def _rhs(self) -> Function:
-        """The derivative under torques that are numbers."""
-        if self._given is not None:
-            return without_errors(self._given, self._size)
-        return compile_functions({"slope": self._ode.program}, ("slope",))["slope"]
-
-    @cached_property
-    def _by_stage(self) -> dict[str, Function]:
-        """Steps that take the torques of each stage, as functions of time give them."""
-        assert isinstance(self.method, Tableau)
-        ode = self._ode
-        programs = {
-            "slope": ode.program,
-            "joints": ode.dynamics.joints_program,
-            **trace_steps(
-                self.method, self._size, len(ode.drive), _lagged(ode), by_stage=True
-            ),
-        }
-        return compile_functions(programs, ("pair", "single"))
-
-    def load(self) -> None:
-        """Have the code compiled that a run calls."""
-        _ = self._rhs
-
-    def pair(
-        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
-    ) -> tuple[Point, float]:
-        """See `MethodSteps.pair`."""
-        if self._is_of_time(drive) and other is None:
-            half = 0.5 * h
-            stages = [
-                *self._stage_drives(t, h, drive),
-                *self._stage_drives(t, half, drive),
-                *self._stage_drives(t + half, half, drive),
-            ]
-            numbers = self._by_stage["pair"](t, h, *at.y, *at.z, *stages)
-            return _read_pair(numbers, at, self._size)
-        drives = (drive, other or drive, other or drive)
-
-        def step(
-            part: int, t: float, h: float, y: Sequence[float], near: Any
-        ) -> NewState:
-            return self._step(t, h, y, near, drives[part])
-
-        pair = step_pair(step, t, h, at.y, at.z, _lagged(self._ode))
-        joints = self._ode.dynamics.joints(*pair.y[:7])
-        total = pair.total + add_up(joints)
-        return _read_pair([*pair.y, *pair.z, *joints, pair.size, total], at, self._size)
-
-    def single(
-        self, t: float, h: float, y: Sequence[float], drive: Drive
-    ) -> list[float]:
-        """See `MethodSteps.single`."""
-        if self._is_of_time(drive):
-            return self._by_stage["single"](t, h, *y, *self._stage_drives(t, h, drive))
-        return normalise(self._step(t, h, y, y, drive).state)
-
-    def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
-        """See `MethodSteps.slope`."""
-        torque = self._torque.of_drive(drive, t, y)
-        return self._rhs(t, *y, *torque, *drive.numbers[3:])
-
-    def eigenvalues(self, t: float, y: Sequence[float], drive: Drive) -> Array:
-        """See `MethodSteps.eigenvalues`."""
-        columns: Array = np.array(self._linearise(t, y, drive).columns)
-        if not np.isfinite(columns).all():
-            raise ArithmeticError("the Jacobian is not finite")
-        return np.asarray(np.linalg.eigvals(columns.T))
-
-    def _is_of_time(self, drive: Drive) -> bool:
-        return (
-            self._given is None
-            and isinstance(self.method, Tableau)
-            and callable(drive.function)
-            and not has_feedback(drive.function)
-        )
-
-    def _stage_drives(self, t: float, h: float, drive: Drive) -> list[float]:
-        """Return what acts in each stage of a step, one stage after the other."""
-        assert isinstance(self.method, Tableau)
-        numbers: list[float] = []
-        for node in self.method.c:
-            time = t + node * h if node else t
-            numbers += [*self._torque.of_drive(drive, time, ()), *drive.numbers[3:]]
-        return numbers
-
-    def _step(
-        self,
-        t: float,
-        h: float,
-        y: Sequence[float],
-        near: Sequence[float],
-        drive: Drive,
-    ) -> NewState:
-        method = self.method
-        if isinstance(method, Tableau):
-            return explicit_step(self.slope, method, t, h, y, [drive] * len(method.a))
-        linearisation = self._linearise(t, near, drive)
-        return rosenbrock_step(self.slope, linearisation, method, t, h, y, drive)
-
-    def _linearise(self, t: float, y: Sequence[float], drive: Drive) -> Linearisation:
-        """Linearise: exact by the state, by differences of the torque."""
-        size, torque = self._size, self._torque.of_drive(drive, t, y)
-        numbers = self._ode.linearised_by_torque(t, *y, *torque, *drive.numbers[3:])
-        rows = np.array(numbers).reshape(size + 5, size)
-        slope, by_time, by_state, by_torque = (
-            rows[0],
-            rows[1],
-            rows[2 : size + 2],
-            rows[size + 2 :],
-        )
-        rate = self._torque.rate(drive, t, y, torque)
-        columns = by_state + self._torque.by_state(drive, t, y, torque).T @ by_torque
-        return Linearisation(
-            slope.tolist(), (by_time + rate @ by_torque).tolist(), columns.tolist()
-        )
+        return self._ode.matrix(t, y, drive.numbers)
 
 
 @lru_cache(maxsize=64)
@@ -323,7 +182,7 @@ def trace_steps(
     """
     implicit = isinstance(method, Rosenbrock)
     slope = Routine("slope", 1 + size + drive, size)
-    joints = Routine("joints", 7, _JOINTS)
+    joints = Routine("joints", 7, JOINTS)
     stages = len(method.a) if by_stage else 1
     state = [f"y{i}" for i in range(size)]
     near = [f"near{i}" for i in range(size)] if implicit else []
@@ -333,7 +192,7 @@ def trace_steps(
     step = Routine(
         "step",
         2 + size + len(near) + len(drives),
-        size * (2 if _has_error(method) else 1),
+        size * (2 if has_error(method) else 1),
     )
 
     def derivative(t: Any, y: Sequence[Any], numbers: Sequence[Any]) -> Sequence[Any]:
@@ -390,23 +249,30 @@ def trace_steps(
     }
 
 
-def _has_error(method: Method) -> bool:
+def has_error(method: Method) -> bool:
+    """Return whether a method estimates the error of its steps."""
     return isinstance(method, Rosenbrock) or bool(method.error)
 
 
-def _lagged(ode: ODE) -> int:
+def lagged_torques(ode: ODE) -> int:
     """Numbers of the state that are lagging torques."""
     return 3 if set(LAG) <= set(ode.state) else 0
 
 
-def _read_pair(numbers: Sequence[float], at: Point, size: int) -> tuple[Point, float]:
+def read_outcome(
+    numbers: Sequence[float], at: Point, size: int, stages: Sequence[Any] = ()
+) -> Outcome:
     """Read the outputs of `pair`."""
     *_, error, total = numbers
     finite = total - total == 0.0
-    after = at._replace(
-        y=[*numbers[:size]],
-        z=[*numbers[size : 2 * size]],
-        joints=tuple(numbers[2 * size : 2 * size + _JOINTS]),
-        steps=at.steps + 1,
+    after = Point(  # a call of `_replace` takes three times as long
+        [*numbers[:size]],
+        [*numbers[size : 2 * size]],
+        tuple(numbers[2 * size : 2 * size + JOINTS]),
+        at.method,
+        at.h,
+        at.attempts,
+        at.steps + 1,
+        at.changes,
     )
-    return after, error if finite else math.inf
+    return Outcome(after, error if finite else math.inf, stages)

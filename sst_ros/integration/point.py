@@ -89,3 +89,36 @@ class Drive(NamedTuple):
     """
     function: Any = None  # torques as a function of the time, or of it and the state
     start: float = 0.0  # time of the run at which that of the steps is zero [s]
+
+
+class Outcome(NamedTuple):
+    """What a step from a point has given."""
+
+    point: Point
+    size: float  # of the local error, in units of the tolerance; infinite if not finite
+    stages: Sequence[Any] = ()  # what was evaluated on the way, for states inside
+
+
+class Step(NamedTuple):
+    """An accepted step, or the part of it before an event."""
+
+    t: float  # when it begins, from the begin of the period [s]
+    h: float  # its length [s]
+    begin: Point
+    end: Point
+    drive: Drive  # what acts
+    other: Drive | None  # on the second solution, None where it is the same
+    steps: Any  # what has taken it: `MethodSteps` or `FunctionSteps`
+    last: bool  # whether it ends with the period
+    stages: Sequence[Any] = ()  # see `Outcome`
+
+    @property
+    def cost(self) -> int:
+        """Evaluations of both solutions."""
+        cost: int = self.steps.cost
+        return (3 if self.other is None else 6) * cost
+
+    def inside(self, x: float) -> list[float]:
+        """Return the state x [s] after its begin, by a shorter step; nan if not finite."""
+        state: list[float] = self.steps.single(self.t, x, self.begin.y, self.drive)
+        return state

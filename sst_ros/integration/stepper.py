@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,14 +32,14 @@ from sst_ros.dynamics.model import (
     ranges_of,
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
-from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.applied_torque import AppliedTorque, has_feedback
 from sst_ros.integration.events import all_far, first_event, may_occur
-from sst_ros.integration.method_steps import (
-    JACOBIAN_COST,
+from sst_ros.integration.function_steps import (
+    FeedbackSteps,
     FunctionSteps,
-    MethodSteps,
-    steps_of,
+    TimeSteps,
 )
+from sst_ros.integration.method_steps import JACOBIAN_COST, MethodSteps, steps_of
 from sst_ros.integration.methods import (
     DOP853,
     DORMAND_PRINCE,
@@ -48,7 +48,7 @@ from sst_ros.integration.methods import (
     Method,
     Rosenbrock,
 )
-from sst_ros.integration.point import Drive, MethodChange, Point
+from sst_ros.integration.point import Drive, MethodChange, Point, Step
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque
@@ -135,31 +135,6 @@ class EvaluationBudget:
                 f"{self.per_period} evaluations do not reach the end of the {span}"
             )
         self.spent += evaluations
-
-
-class Step(NamedTuple):
-    """An accepted step, or the part of it before an event."""
-
-    t: float  # when it begins, from the begin of the period [s]
-    h: float  # its length [s]
-    begin: Point
-    end: Point
-    drive: Drive  # what acts
-    other: Drive | None  # on the second solution, None where it is the same
-    steps: Steps  # what has taken it
-    last: bool  # whether it ends with the period
-
-    @property
-    def cost(self) -> int:
-        """Evaluations of both solutions."""
-        return (3 if self.other is None else 6) * self.steps.cost
-
-    def inside(self, x: float) -> list[float]:
-        """Return the state x [s] after its begin, by one shorter step.
-
-        Nan where not finite.
-        """
-        return self.steps.single(self.t, x, self.begin.y, self.drive)
 
 
 class Stepper:
@@ -272,8 +247,10 @@ class Stepper:
         second = None if other is None else Drive((*other, *moment))
         self.budget.begin()
         x, stops = 0.0, list[float]()
+        steps = self._steps_of(drive, at.method)
         while x < h:
-            step = self._take_step(x, h, at, drive, second, stops)
+            step = self._take_step(x, h, at, drive, second, stops, steps)
+            steps = step.steps
             event = None
             if not all_far(self._ranges, step.begin.joints, step.end.joints, step.h):
                 try:
@@ -311,24 +288,27 @@ class Stepper:
 
     def _steps_of(self, drive: Drive, method: Method) -> Steps:
         """Return the steps of a method under a drive."""
-        sine = drive.function if isinstance(drive.function, SineTorque) else None
-        kind: object = sine if drive.function is None or sine else "function"
-        key = kind, method.name
+        function = drive.function
+        is_sine = function is None or isinstance(function, SineTorque)
+        key = function if is_sine else has_feedback(function), method.name
         if key not in self._steps:
-            if kind == "function":
-                steps: Steps = FunctionSteps(
-                    self.ode, method, self.torque, self._derivative
-                )
-            elif sine is None:
-                steps = steps_of(self.ode, method)
-            else:
-                limit = self.torque.limit_of(sine)
-                ode = recent_ode(
-                    self.dynamics, sine, limit=limit, work=True, phases=True
-                )
-                steps = steps_of(ode, method)
-            self._steps[key] = steps
+            self._steps[key] = self._make_steps(function, method)
         return self._steps[key]
+
+    def _make_steps(self, function: Any, method: Method) -> Steps:
+        """Make the steps of a method under numbers, where None is given, or a function."""
+        if function is None:
+            return steps_of(self.ode, method)
+        if isinstance(function, SineTorque):
+            limit = self.torque.limit_of(function)
+            ode = recent_ode(
+                self.dynamics, function, limit=limit, work=True, phases=True
+            )
+            return steps_of(ode, method)
+        if self._derivative is not None or isinstance(method, Rosenbrock):
+            return FunctionSteps(self.ode, method, self.torque, self._derivative)
+        kind = FeedbackSteps if has_feedback(function) else TimeSteps
+        return kind(self.ode, method, self.torque)
 
     def _take_step(
         self,
@@ -338,33 +318,43 @@ class Stepper:
         drive: Drive,
         other: Drive | None,
         stops: list[float],
+        steps: Steps,
     ) -> Step:
         """Take one step that is accepted, from t to `end` at most.
 
         `stops` are the times just before and after a jump that was found, where steps
-        end.
+        end; `steps` those that the last step was taken by.
         """
         rejected = 0
         while True:
+            if steps.method is not at.method:
+                steps = self._steps_of(drive, at.method)
             left = end - t
             h = min(at.h, self._max_step, left)
             if left - h < _LAST_SLIVER * h:
                 h = left
             if stops:  # a step ends before a jump, the next one steps over it
                 h = min(h, stops[0] - t)
-            steps = self._steps_of(drive, at.method)
             self.budget.charge((3 if other is None else 6) * steps.cost)
-            after, size = steps.pair(t, h, at, drive, other)
+            after, size, stages = steps.pair(t, h, at, drive, other)
             error = size / self._tolerance
             if size <= self._tolerance:
                 stopped = bool(stops) and h == stops[0] - t
                 longest = _next_length(at, h, error, cut=stopped or h == left)
-                end_point = after._replace(h=longest, attempts=at.attempts)
-                if h < left or isinstance(at.method, Rosenbrock):
+                looks = self._chooses and (
+                    h < left or isinstance(at.method, Rosenbrock)
+                )
+                attempts = at.attempts + 1 if looks else at.attempts
+                end_point = Point(
+                    after.y, after.z, after.joints, at.method, longest, attempts,
+                    after.steps, at.changes,
+                )  # fmt: skip
+                if looks:
                     end_point = self._choose_method(
                         steps, t + h, h, end_point, drive, 0
                     )
-                return Step(t, h, at, end_point, drive, other, steps, h == left)
+                last = h == left
+                return Step(t, h, at, end_point, drive, other, steps, last, stages)
             stops[:] = self._jump_in(t, h, at.y, drive)
             if stops:
                 at = at._replace(h=h)
@@ -373,7 +363,9 @@ class Stepper:
             if at.h < _SHORTEST_STEP * max(abs(t), end - t) or at.h < 1e-200:
                 raise CannotStep(f"steps of {at.h:.1e} s do not resolve it")
             rejected += 1
-            at = self._choose_method(steps, t, h, at, drive, rejected)
+            if self._chooses:
+                at = at._replace(attempts=at.attempts + 1)
+                at = self._choose_method(steps, t, h, at, drive, rejected)
 
     def _choose_method(
         self, steps: Steps, t: float, h: float, at: Point, drive: Drive, rejected: int
@@ -382,19 +374,27 @@ class Stepper:
 
         `rejected` counts the attempts in a row that were rejected.
         """
-        at = at._replace(attempts=at.attempts + 1)
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(
             at.method, Rosenbrock
         )
-        if not self._chooses or (at.attempts < _CHOOSE_EVERY and not early):
+        if at.attempts < _CHOOSE_EVERY and not early:
             return at
         if not early:
             at = at._replace(attempts=0)
         self.budget.charge(JACOBIAN_COST)
         try:
-            eigenvalues = steps.eigenvalues(t, at.y, drive)
+            jacobian = steps.jacobian(t, at.y, drive)
         except ArithmeticError:
             return at  # no finite Jacobian here; the step size has to do
+        # Nothing depends on the work, the last number, which adds an eigenvalue of zero.
+        only_stiff = early or at.method is DOP853 or self._tolerance >= ACCURATE
+        if (
+            only_stiff
+            and not isinstance(at.method, Rosenbrock)
+            and h * bound_of_eigenvalues(jacobian[:-1, :-1]) <= _STIFF
+        ):
+            return at
+        eigenvalues = np.linalg.eigvals(jacobian)
         method, reason = better_method(
             at.method, self._tolerance, h * eigenvalues, only_stiff=early
         )
@@ -448,18 +448,19 @@ class Stepper:
         if event.error is None:
             beyond = x + _BEHIND_A_KINK / max(abs(event.slope(joints(x))), 1e-200)
             x = min(beyond, x + _LARGEST_SHARE_BEHIND * step.h, step.h)
-        last = step.last and x == step.h
-        return step._replace(h=x, end=self._part(step, x), last=last), event
+        return self._part(step, x), event
 
-    def _part(self, step: Step, x: float) -> Point:
-        """Return the point x [s] after the begin of an accepted step, by a shorter one."""
+    def _part(self, step: Step, x: float) -> Step:
+        """Return the first x [s] of an accepted step, by a shorter one."""
         if x == 0.0:
-            return step.begin
+            return step._replace(h=0.0, end=step.begin, last=False)
         if x == step.h:
-            return step.end
+            return step
         self.budget.charge(step.cost)
-        part, _ = step.steps.pair(step.t, x, step.begin, step.drive, step.other)
-        return step.end._replace(y=part.y, z=part.z, joints=part.joints)
+        part = step.steps.pair(step.t, x, step.begin, step.drive, step.other)
+        after = part.point
+        end = step.end._replace(y=after.y, z=after.z, joints=after.joints)
+        return step._replace(h=x, end=end, last=False, stages=part.stages)
 
 
 def methods_of(name: str) -> tuple[Method, ...]:
@@ -487,6 +488,12 @@ def better_method(
     if method is DORMAND_PRINCE and tolerance < ACCURATE and decay <= _STIFF:
         return DOP853, "many small steps that accuracy asks for"
     return method, ""
+
+
+def bound_of_eigenvalues(matrix: Array) -> float:
+    """Return a number that no eigenvalue exceeds, at a fraction of their cost."""
+    sizes = np.abs(matrix)
+    return float(min(sizes.sum(axis=0).max(), sizes.sum(axis=1).max()))
 
 
 def _next_length(at: Point, h: float, error: float, *, cut: bool) -> float:

@@ -59,13 +59,20 @@ def explicit_step(
     slopes: list[Numbers] = []
     for node, weights, drive in zip(method.c, method.a, drives, strict=True):
         time = t + node * h if node else t
-        point = _move(y, h, weights, slopes) if slopes else y
+        point = move(y, h, weights, slopes) if slopes else y
         slopes.append(derivative(time, point, drive))
-    state = _move(y, h, method.b, slopes)
+    return end_step(method, h, y, slopes)
+
+
+def end_step(
+    method: Tableau, h: Number, y: Numbers, slopes: Sequence[Numbers]
+) -> NewState:
+    """Return where an explicit step ends, of the slopes in all of its stages."""
+    state = move(y, h, method.b, slopes)
     return NewState(state, _estimate_error(method, h, slopes))
 
 
-def _move(
+def move(
     y: Numbers, h: Number, weights: Sequence[float], slopes: Sequence[Numbers]
 ) -> list[Any]:
     """Return y + h (sum of weights times slopes)."""
@@ -293,9 +300,21 @@ def step_pair(
 
     """
     half = 0.5 * h
-    new_y, error_y = step(0, t, h, y, y)
+    first = step(0, t, h, y, y)
     middle, _ = step(1, t, half, z, y)
-    new_z, error_z = step(2, t + half, half, middle, middle)
+    second = step(2, t + half, half, middle, middle)
+    return compare(h, y, z, first, second, lagged)
+
+
+def compare(
+    h: Number, y: Numbers, z: Numbers, first: NewState, second: NewState, lagged: int
+) -> Pair:
+    """Return both solutions after a step of h from y and z, and the error of the first.
+
+    See `step_pair` for the arguments.
+    """
+    new_y, error_y = first
+    new_z, error_z = second
     if error_y is None:  # the method has no estimate of its own
         error_y = [
             (after_z - before_z) - (after_y - before_y)

@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.programs.expression import FUNCTIONS, Program, compile_program
-from sst_ros.programs.llvm import Function, RowFunction, llvmlite_version, write_module
+from sst_ros.programs.llvm import (
+    LANES,
+    Function,
+    RowFunction,
+    llvmlite_version,
+    write_module,
+)
 
 Array: TypeAlias = NDArray[np.float64]
 RowsFunction: TypeAlias = Callable[[Array], Array]
@@ -61,9 +67,14 @@ def compile_rows(programs: Mapping[str, Program], name: str) -> RowsFunction:
     columns = RowFunction(write_module(programs, rows=(name,)), name)
 
     def compute(rows: Array) -> Array:
-        results: Array = np.empty((columns.outputs, len(rows)))
-        columns((), [*np.ascontiguousarray(rows.T)], [*results])
-        by_row: Array = results.T
+        count = len(rows)
+        width = -(-count // LANES) * LANES
+        inputs = np.empty((columns.rows, width))
+        inputs[:, :count] = rows.T
+        inputs[:, count:] = inputs[:, :1]  # any numbers do: nobody reads their results
+        results = np.empty((columns.outputs, width))
+        columns.compute_table(inputs, results)
+        by_row: Array = results[:, :count].T
         return by_row
 
     return compute

@@ -154,6 +154,26 @@ class RowFunction:
             for row, result in zip(outputs, results, strict=True):
                 row[whole:end] = result[:count]
 
+    def compute_table(
+        self, inputs: NDArray[np.float64], outputs: NDArray[np.float64]
+    ) -> None:
+        """Compute a table of outputs from one of inputs, where no input is shared.
+
+        Args:
+            inputs: shape (inputs, n), contiguous; n is a multiple of `LANES`.
+            outputs: where the results go, shape (outputs, n), contiguous.
+
+        """
+        self._check_rows(inputs, outputs)
+        count = outputs.shape[1]
+        if count % LANES:
+            raise ValueError(f"{count} columns: must be a multiple of {LANES}")
+        if count == 0:  # the loop is made for one column at least
+            return
+        ins, outs = _row_addresses(inputs), _row_addresses(outputs)
+        scalars = np.zeros(1)
+        self._run(count, scalars, ins.ctypes.data, outs.ctypes.data)
+
     def bind(
         self,
         inputs: Sequence[NDArray[np.float64]],
@@ -194,6 +214,13 @@ def _addresses(rows: Sequence[NDArray[np.float64]], first: int) -> Any:
     """Return the addresses of an element of each row, as an array for C."""
     addresses = [row.ctypes.data + first * row.itemsize for row in rows]
     return (ctypes.c_void_p * len(rows))(*addresses)
+
+
+def _row_addresses(table: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return the addresses of the rows of a contiguous table."""
+    rows, step = table.shape[0], table.strides[0]
+    first = table.ctypes.data
+    return np.arange(first, first + rows * step, step, dtype=np.uint64)
 
 
 # The text of a module.

@@ -9,8 +9,10 @@ rotor without inertia.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -233,8 +235,18 @@ def with_initial(scene: Scene, initial: Any) -> Scene:
 
 
 def load(name_or_path: str | Path) -> Scene:
-    """Read a scene by its path or name; see `scene_of`."""
-    return read(Scene, *text_of(name_or_path))
+    """Read a scene by its path or name; see `scene_of`.
+
+    The file is read in each call. A text that was read before is not parsed again.
+    """
+    scene: Scene = pickle.loads(_parse(*text_of(name_or_path)))
+    return scene
+
+
+@lru_cache(maxsize=64)
+def _parse(text: str, origin: str) -> bytes:
+    """Return the scene of a text, pickled: so each call of `load` has one of its own."""
+    return pickle.dumps(read(Scene, text, origin), pickle.HIGHEST_PROTOCOL)
 
 
 def text_of(name_or_path: str | Path) -> tuple[str, str]:

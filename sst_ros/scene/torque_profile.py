@@ -126,7 +126,7 @@ class SineTorque(TorqueProfile, Section):
 
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
-        found = [np.empty(0)]
+        found: list[Array] = []
         for amplitude, f, phase in zip(
             self.amplitude, self.frequency, self.phase, strict=True
         ):
@@ -142,6 +142,8 @@ class SineTorque(TorqueProfile, Section):
                 np.floor(phase / np.pi) - 1, np.ceil((phase + f * end) / np.pi) + 2
             )
             found += [(np.pi * turns + shift - phase) / f for shift in (angle, -angle)]
+        if not found:
+            return np.empty(0)
         times = np.unique(np.concatenate(found))
         return np.asarray(times[(times > 0.0) & (times < end)])
 
@@ -233,7 +235,9 @@ class FunctionTorque(TorqueProfile):
 
     def __call__(self, t: float, *state: State) -> Vector3:
         """Torques [N m] at a time [s], and a state where it is an argument."""
-        return _three(self._function(t, *state), f"torque({t:g})")
+        value = self._function(t, *state)
+        vector = finite_vector(value)
+        return _three(value, f"torque({t:g})") if vector is None else vector
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""

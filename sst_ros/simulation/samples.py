@@ -8,8 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sst_ros.integration.applied_torque import has_feedback
+from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
-from sst_ros.integration.stepper import Step, Stepper
+from sst_ros.integration.point import Drive, Step
+from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import Array
 
@@ -27,12 +30,13 @@ class SampleTable(NamedTuple):
     joints: Array  # nine angles [rad] and nine rates [rad/s], (n, 18)
 
 
-class _Inside(NamedTuple):
-    """A sample inside a step: the state is one shorter step from its begin."""
+class _Run(NamedTuple):
+    """Consecutive samples inside one step: each state is one shorter step from its begin."""
 
-    number: int
+    first: int  # number of the first sample
     step: Step
-    x: float  # after the begin of the step [s]
+    begin: float  # time at which the step begins [s]
+    count: int
 
 
 class Samples:
@@ -49,74 +53,89 @@ class Samples:
     def __init__(self, stepper: Stepper) -> None:
         self._stepper = stepper
         self._times: list[float] = []
-        self._torques: list[Torque] = []
-        self._states: list[Sequence[float]] = []
-        self._inside: list[_Inside] = []
-        self._no_state = (0.0,) * len(stepper.ode.state)
+        self._torques: list[tuple[int, Torque]] = []  # each from its sample on
+        self._states: list[tuple[int, Sequence[float]]] = []
+        self._runs: list[_Run] = []
         self.evaluations = 0
 
     def add(self, time: float, torque: Torque, y: Sequence[float]) -> None:
         """Note a state at a time [s], unless the last sample is not earlier."""
         if self._times and self._times[-1] >= time:
             return
-        self._times.append(time)
-        self._torques.append(torque)
-        self._states.append(y)
+        self._states.append((len(self._times), y))
+        self._note((time,), torque)
 
-    def add_inside(self, time: float, torque: Torque, step: Step, x: float) -> None:
-        """Note a time [s] that is x [s] after the begin of a step."""
-        if self._times and self._times[-1] >= time:
+    def add_inside(
+        self, times: Sequence[float], torque: Torque, step: Step, begin: float
+    ) -> None:
+        """Note times [s] that lie inside a step which begins at `begin` [s].
+
+        Raises BudgetSpent where the torque is a function, which is called for each.
+        """
+        if self._times and self._times[-1] >= times[0]:
             return
-        if isinstance(step.steps, MethodSteps):
-            self.evaluations += step.steps.cost
-            self._inside.append(_Inside(len(self._times), step, x))
-            self.add(time, torque, self._no_state)
-        else:
+        if isinstance(step.steps, (MethodSteps, TimeSteps)):
+            self.evaluations += len(times) * step.steps.cost
+            self._runs.append(_Run(len(self._times), step, begin, len(times)))
+            self._note(times, torque)
+            return
+        for time in times:
             self._stepper.budget.charge(step.steps.cost)
-            self.add(time, torque, step.inside(x))
+            self.add(time, torque, step.inside(time - begin))
+
+    def _note(self, times: Sequence[float], torque: Torque) -> None:
+        if not self._torques or self._torques[-1][1] is not torque:
+            self._torques.append((len(self._times), torque))
+        self._times += times
 
     def table(self) -> SampleTable:
         """Compute all samples."""
-        states = np.array(self._states).reshape(len(self._times), -1)
-        self._step_to(states)
-        joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE])
         t = np.array(self._times)
+        states = np.empty((len(t), len(self._stepper.ode.state)))
+        if self._states:
+            rows, known = zip(*self._states, strict=True)
+            states[list(rows)] = known
+        self._step_to(t, states)
+        joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE])
         torque = self._torque_at(t, states)
         return SampleTable(t, states[:, :4], states[:, 4:_STATE], torque, joints)
 
-    def _step_to(self, states: Array) -> None:
+    def _step_to(self, t: Array, states: Array) -> None:
         """Fill in the states inside of steps."""
-        by_steps: dict[int, list[_Inside]] = {}
-        for sample in self._inside:
-            by_steps.setdefault(id(sample.step.steps), []).append(sample)
-        for samples in by_steps.values():
-            steps = samples[0].step.steps
-            assert isinstance(steps, MethodSteps)
-            rows = [
-                (s.step.t, s.x, *s.step.begin.y, *s.step.drive.numbers) for s in samples
-            ]
-            states[[s.number for s in samples]] = steps.states_after(np.array(rows))
+        by_steps: dict[int, list[_Run]] = {}
+        for run in self._runs:
+            by_steps.setdefault(id(run.step.steps), []).append(run)
+        for runs in by_steps.values():
+            taken = [run.step for run in runs]
+            counts = [run.count for run in runs]
+            before = np.cumsum([0, *counts[:-1]])
+            offsets = np.array([run.first for run in runs]) - before
+            numbers = np.arange(sum(counts)) + offsets.repeat(counts)
+            x = t[numbers] - np.array([run.begin for run in runs]).repeat(counts)
+            states[numbers] = taken[0].steps.states_inside(taken, counts, x)
 
     def _torque_at(self, t: Array, states: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""
         # the actuators lag: they are part of the state
         if states.shape[1] > _STATE + 1:
             return states[:, _STATE : _STATE + 3]
-        times, rows = t.tolist(), list[Sequence[float]]()
-        for time, torque, y in zip(times, self._torques, states.tolist(), strict=True):
+        torques = np.empty((len(t), 3))
+        ends = [first for first, _ in self._torques[1:]]
+        sines: list[int] = []
+        for (first, torque), end in zip(self._torques, [*ends, len(t)], strict=True):
             if isinstance(torque, SineTorque):
-                rows.append(())
+                sines += range(first, end)
+                sine = torque  # one, traced into the program
+            elif callable(torque) and not has_feedback(torque):
+                evaluate = self._stepper.torque.of_time(Drive((), torque))
+                torques[first:end] = [evaluate(time) for time in t[first:end].tolist()]
             elif callable(torque):
-                rows.append(self._stepper.torque.at(torque, time, y))
+                for k in range(first, end):
+                    torques[k] = self._stepper.torque.at(
+                        torque, float(t[k]), states[k].tolist()
+                    )
             else:
-                rows.append(torque)
-        sines = [
-            k
-            for k, torque in enumerate(self._torques)
-            if isinstance(torque, SineTorque)
-        ]
-        if sines:  # one, traced into the program
-            values = self._torques[sines[0]].values(t[sines])  # type: ignore[union-attr]
-            for k, row in zip(sines, values.tolist(), strict=True):
-                rows[k] = row
-        return np.array(rows).reshape(-1, 3)
+                torques[first:end] = torque
+        if sines:
+            torques[sines] = sine.values(t[sines])
+        return torques

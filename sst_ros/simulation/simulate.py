@@ -196,7 +196,7 @@ def _integrate(task: Task, *, progress: bool) -> Trajectory:
     remembers = task.period is not None and not task.memoryless
     local, kept, last = task.tolerance, None, math.inf
     for _ in range(_ATTEMPTS):
-        attempt = replace(task, tolerance=local)
+        attempt = task if local == task.tolerance else replace(task, tolerance=local)
         motion = SteppedMotion(
             attempt, start_of(task.scene), budget, progress=progress
         ).run()
@@ -255,7 +255,7 @@ def _trajectory(
         message=message,
         method=", then ".join([motion.start.method.name, *changes]),
         error_estimate=error,
-        energy_residual=energy(point.y) - energy(motion.start.y) - point.y[-1],
+        energy_residual=lambda: energy(point.y) - energy(motion.start.y) - point.y[-1],
         evaluations=spent + motion.samples.evaluations,
         step=motion.time / max(point.steps, 1),
         law=(

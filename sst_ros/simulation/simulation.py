@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import operator
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -161,7 +160,8 @@ class Simulation(Explained):
         )  # fmt: skip
         self.scene = scene = scene_of(scene)
         self._settings = integrator, tolerance, equations
-        self._running, self._thread = threading.Lock(), ""
+        self._running = threading.Lock()
+        self._thread = 0  # that advances the simulation
         derivative = derive_by_paper(scene) if equations == "virtual_work" else None
         self.geometry = Geometry.of(scene)
         self.dynamics = Dynamics.of(scene)
@@ -212,21 +212,22 @@ class Simulation(Explained):
         at `time_ns`.
         """
         length, number = _whole(dt_ns), _whole(count)
-        known = 0 < number <= _MOST and length > 0
-        if not (known and finite_vector(torque) and finite_vector(moment)):
-            acts = (
-                callable(torque)
-                or isinstance(torque, SineTorque)
-                or finite_vector(torque)
-            )
+        numbers, field = finite_vector(torque), finite_vector(moment)
+        is_whole = 0 < number <= _MOST and length > 0
+        if not (is_whole and numbers and field):
+            acts = callable(torque) or isinstance(torque, SineTorque) or numbers
             refuse_unless(
                 "step",
                 ("torque", torque, bool(acts), _TORQUE),
-                ("moment", moment, finite_vector(moment) is not None, _THREE),
+                ("moment", moment, field is not None, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
                 ("count", count, 0 < number <= _MOST, _COUNT),
             )
-        self.advance(self.acting(torque), length, number, moment)
+        if numbers:
+            acting = self._stepper.torque.acting(numbers)
+        else:
+            acting = self.acting(torque)
+        self.advance(acting, length, number, moment)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy the arguments, and where the run is."""
@@ -234,20 +235,15 @@ class Simulation(Explained):
         spent = self._stepper.budget.spent
         return _continue_simulation, (arguments, (self._before, self._now), spent)
 
-    @contextlib.contextmanager
-    def _advancing(self) -> Iterator[None]:
-        """Refuse another thread while one advances the simulation."""
+    def _claim(self) -> None:
+        """Begin to advance; refuse another thread until `_running` is released."""
         if not self._running.acquire(blocking=False):
-            here, allowed = (
-                threading.current_thread().name,
-                "must wait: {} advances the simulation",
-            )
-            raise refusal("step", "thread", here, allowed.format(self._thread))
-        self._thread = threading.current_thread().name
-        try:
-            yield
-        finally:
-            self._running.release()
+            names = {thread.ident: thread.name for thread in threading.enumerate()}
+            here = threading.current_thread().name
+            other = names.get(self._thread, "another thread")
+            allowed = f"must wait: {other} advances the simulation"
+            raise refusal("step", "thread", here, allowed)
+        self._thread = threading.get_ident()
 
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
@@ -268,8 +264,11 @@ class Simulation(Explained):
 
         Torque is of `acting`.
         """
-        with self._advancing():
+        self._claim()
+        try:
             self._advance(torque, dt_ns, count, moment)
+        finally:
+            self._running.release()
 
     def _advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         h, began = dt_ns / NANOSECONDS, self._now
@@ -316,10 +315,13 @@ class Simulation(Explained):
 
     def reset(self) -> State:
         """Go back to the initial state at time zero."""
-        with self._advancing():
+        self._claim()
+        try:
             self._now = self._before = _Instant(0, self._start)
             self._shown = self._now, self._as_state(self._now)
             self._energy = self.dynamics.total_energy(self._start.y)
+        finally:
+            self._running.release()
         return self.state
 
     def load_code(self) -> None:

@@ -5,25 +5,27 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from sst_ros.integration.function_steps import TimeSteps
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, Method
-from sst_ros.integration.point import Point, state_distance
+from sst_ros.integration.point import Point, Step, state_distance
 from sst_ros.integration.stepper import (
     ACCURATE,
     CannotStep,
     EvaluationBudget,
     LimitReached,
-    Step,
     Stepper,
 )
 from sst_ros.progress import Bar
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import SineTorque, Torque, TorqueProfile, torque_at
+from sst_ros.scene.torque_profile import Torque, TorqueProfile, torque_at
 from sst_ros.simulation.samples import Samples
 from sst_ros.state import NANOSECONDS, Array, State, Vector3, clamp
 
@@ -36,13 +38,6 @@ half a minute.
 """
 _HOPELESS = 3.0
 """...by so many times its budget."""
-
-_MANY = 8
-"""Samples in a step from which on a polynomial costs less than a step for each, where a
-function gives the torques.
-"""
-_WORST = 0.07
-"""Share of the step at which the error of that polynomial is largest."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +99,8 @@ class SteppedMotion:
         self.time, self.status, self.message = task.span[0], 0, "reached the end"
         self.held: list[tuple[float, Vector3]] = []
         self.samples = Samples(self.stepper)
-        self._wanted: list[float] = task.times[::-1].tolist()
+        self._times: list[float] = task.times.tolist()
+        self._next = 0  # of the times that are not taken yet
         self._torque: Torque = (0.0, 0.0, 0.0)
         self._other: Vector3 | None = None  # on the second solution, where they differ
         self._segment = task.span
@@ -124,7 +120,7 @@ class SteppedMotion:
         except LimitReached as reached:
             self.status, stop = 1, reached.limit.reason
             end = math.floor(reached.time * NANOSECONDS) / NANOSECONDS
-            self._take_inside(end)
+            self._take_between([end])
             self.time = reached.time
         except CannotStep as error:
             self.status, stop = -1, str(error)
@@ -144,7 +140,9 @@ class SteppedMotion:
     def _follow_profile(self) -> None:
         """Go through segments in each of which the torque is smooth."""
         task, (begin, end) = self._task, self._task.span
-        kinks = np.union1d(task.breaks, task.torque.kinks(task.scene.torque_limit, end))
+        kinks = task.torque.kinks(task.scene.torque_limit, end)
+        if len(task.breaks) or len(kinks):
+            kinks = np.union1d(task.breaks, kinks)
         inside = kinks[(kinks > begin) & (kinks < end)].tolist()
         for start, stop in pairwise([begin, *inside, end]):
             self._advance(start, stop - start, stop, task.torque.acting(start, stop))
@@ -189,20 +187,10 @@ class SteppedMotion:
         """Take the samples in a step, and note where the motion stands."""
         self._last, self._last_begin = step, self._segment[0] + step.t
         end = self._segment[1] if step.last else self._last_begin + step.h
-        inside = []
-        while self._wanted and self._wanted[-1] < end:
-            inside.append(self._wanted.pop())
-        is_function = callable(self._torque) and not isinstance(
-            self._torque, SineTorque
-        )
-        polynomial = (
-            self._interpolate(step) if is_function and len(inside) >= _MANY else None
-        )
-        for time in inside:
-            if polynomial is None:
-                self._take_inside(time)
-            else:
-                self._take(time, polynomial(time - self._last_begin).tolist())
+        times = self._times
+        if self._next < len(times) and times[self._next] < end:
+            first, self._next = self._next, bisect_left(times, end, self._next)
+            self._take_between(times[first : self._next])
         self.time, self.at = end, step.end
         self._take_if_wanted(end, step.end.y)
         begin, last = self._task.span
@@ -210,6 +198,18 @@ class SteppedMotion:
         self._bar.draw(share)
         if self._budget.spent > self._warn_after:
             self._warn_if_hopeless(share)
+
+    def _take_between(self, times: list[float]) -> None:
+        """Take samples at ascending times in the last step [s]."""
+        step, begin = self._last, self._last_begin
+        if times[0] <= begin:  # the time of its begin, but for rounding
+            self._take(times.pop(0), step.begin.y)
+        states = self._interpolate(step, [time - begin for time in times])
+        if states is not None:
+            for time, y in zip(times, states, strict=True):
+                self._take(time, y)
+        elif times:
+            self.samples.add_inside(times, self._torque, step, begin)
 
     def _warn_if_hopeless(self, share: float) -> None:
         """Warn once where the rest of the motion would take far more than the budget."""
@@ -221,40 +221,31 @@ class SteppedMotion:
             text = f"{self._task.scene.name}: {done}; {advice}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
 
-    def _interpolate(self, step: Step) -> Callable[[float], Array] | None:
-        """Return a polynomial of the time in a step, through states and slopes at its quarters.
+    def _interpolate(self, step: Step, x: list[float]) -> list[list[float]] | None:
+        """Return the states at times x after the begin of a step [s], by a polynomial.
 
-        None where it misses the state by more than the tolerance, where its error is
-        largest.
+        None where a step for each costs less, and where the polynomial misses the state
+        by more than the tolerance, where its error is largest.
         """
-        from scipy.interpolate import KroghInterpolator  # many runs have few samples
-
-        times = [0.25 * k * step.h for k in range(5)]
-        states = [step.begin.y, *(step.inside(x) for x in times[1:-1]), step.end.y]
-        slopes = [
-            step.steps.slope(step.t + x, y, step.drive)
-            for x, y in zip(times, states, strict=True)
-        ]
-        data = [row for pair in zip(states, slopes, strict=True) for row in pair]
-        self._budget.charge(4 * step.steps.cost + len(times))
-        if not np.isfinite(data).all():
+        steps = step.steps
+        if isinstance(steps, (MethodSteps, TimeSteps)):  # computed together, at the end
             return None
-        polynomial = KroghInterpolator(np.repeat(times, 2), data)
-        worst = _WORST * step.h
-        distance = state_distance(polynomial(worst).tolist(), step.inside(worst))
-        return polynomial if distance <= self._task.tolerance else None
+        cost = steps.interpolation_cost + steps.cost
+        if cost > len(x) * steps.cost:
+            return None
+        self._budget.charge(cost)
+        polynomial = steps.interpolate(step)
+        if polynomial is None:
+            return None
+        worst = steps.worst * step.h
+        *states, checked = polynomial(np.array([*x, worst])).tolist()
+        distance = state_distance(checked, step.inside(worst))
+        return states if distance <= self._task.tolerance else None
 
     def _take_if_wanted(self, time: float, y: Sequence[float]) -> None:
-        if self._wanted and self._wanted[-1] == time:
-            self._take(self._wanted.pop(), y)
-
-    def _take_inside(self, time: float) -> None:
-        """Take a sample in the last step."""
-        x = time - self._last_begin
-        if x > 0.0:
-            self.samples.add_inside(time, self._torque, self._last, x)
-        else:
-            self._take(time, self._last.begin.y)
+        if self._next < len(self._times) and self._times[self._next] == time:
+            self._next += 1
+            self._take(time, y)
 
     def _take(self, time: float, y: Sequence[float]) -> None:
         """Take a sample at a time and a state."""

@@ -23,7 +23,8 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import derivative
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque
-from sst_ros.integration.method_steps import FunctionSteps, MethodSteps
+from sst_ros.integration.function_steps import FunctionSteps
+from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE, METHODS, RK4, RODAS5P
 from sst_ros.integration.point import Drive, Point
 from sst_ros.programs.expression import compile_program, number_constants, trace

@@ -1,0 +1,528 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps under torques that are a function.
+
+1. A function of the time is evaluated at the times of all stages, and its torques go into
+   the compiled step: `TimeSteps`. Inside a step they are interpolated where a polynomial
+   through some of them meets all others, so samples need no further calls.
+2. A function of the state is called in each stage, between two compiled parts of the step:
+   `FeedbackSteps`.
+3. Rosenbrock methods, and derivatives in plain Python, take the steps as they are read in
+   `steps.py`: `FunctionSteps`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.polynomial.chebyshev import chebvander
+
+from sst_ros.dynamics.traced_dynamics import ODE
+from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.method_steps import (
+    JACOBIAN_COST,
+    JOINTS,
+    has_error,
+    lagged_torques,
+    read_outcome,
+    trace_steps,
+)
+from sst_ros.integration.methods import Method, Rosenbrock, Tableau
+from sst_ros.integration.point import Drive, Outcome, Point, Step
+from sst_ros.integration.steps import (
+    Linearisation,
+    NewState,
+    add_up,
+    compare,
+    end_step,
+    explicit_step,
+    move,
+    normalise,
+    rosenbrock_step,
+    step_pair,
+)
+from sst_ros.mechanism.geometry import Array
+from sst_ros.programs.compiled import (
+    RowsFunction,
+    compile_functions,
+    compile_rows,
+    without_errors,
+)
+from sst_ros.programs.expression import Program, Routine, trace
+from sst_ros.programs.llvm import Function
+
+Polynomial = Callable[[Array], Array]
+"""Times after the begin of a step [s], shape (n,) -> states, shape (n, size)."""
+
+_SHARE_FITTED = 0.4
+"""Of the torques of a step a polynomial goes through so many; the others check it."""
+_SAME_TORQUE = 1e-13
+"""Relative difference of interpolated torques from the function's, at most. In a step,
+which turns no joint by more than about a radian, it moves no joint by more in radians."""
+
+
+class FunctionSteps:
+    """Steps in plain Python, under a function or with a derivative in plain Python.
+
+    Args:
+        ode: what is integrated; the first three numbers of its drive are the torques.
+        method: how.
+        torque: evaluates the functions.
+        derivative: of the state in place of that of the ODE, with the same inputs.
+
+    Attributes:
+        method: as given.
+        cost: evaluations of a step; `pair` takes three.
+        interpolation_cost: evaluations of `interpolate`.
+        worst: share of a step at which the error of that polynomial is largest.
+
+    """
+
+    worst = 0.07
+
+    def __init__(
+        self,
+        ode: ODE,
+        method: Method,
+        torque: AppliedTorque,
+        derivative: Callable[..., Sequence[float]] | None = None,
+    ) -> None:
+        implicit = isinstance(method, Rosenbrock)
+        if derivative is not None and implicit:
+            raise ValueError(
+                "a derivative of its own has no Jacobian, which the method needs"
+            )
+        self.method, self._ode, self._torque = method, ode, torque
+        self._derivative = derivative
+        self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
+        self.interpolation_cost = 3 * self.cost + 5
+        self._size = len(ode.state)
+
+    @cached_property
+    def _slope(self) -> Function:
+        """The derivative under torques that are numbers."""
+        if self._derivative is not None:
+            return without_errors(self._derivative, self._size)
+        return self._ode.slope
+
+    def load(self) -> None:
+        """Have the code compiled that a run calls."""
+        _ = self._slope
+
+    def pair(
+        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+    ) -> Outcome:
+        """See `MethodSteps.pair`."""
+        drives = (drive, other or drive, other or drive)
+
+        def step(
+            part: int, t: float, h: float, y: Sequence[float], near: Any
+        ) -> NewState:
+            return self._step(t, h, y, near, drives[part])
+
+        pair = step_pair(step, t, h, at.y, at.z, lagged_torques(self._ode))
+        joints = self._ode.dynamics.joints(*pair.y[:7])
+        total = pair.total + add_up(joints)
+        numbers = [*pair.y, *pair.z, *joints, pair.size, total]
+        return read_outcome(numbers, at, self._size)
+
+    def single(
+        self, t: float, h: float, y: Sequence[float], drive: Drive
+    ) -> list[float]:
+        """See `MethodSteps.single`."""
+        return normalise(self._step(t, h, y, y, drive).state)
+
+    def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
+        """See `MethodSteps.slope`."""
+        torque = self._torque.of_drive(drive, t, y)
+        return self._slope(t, *y, *torque, *drive.numbers[3:])
+
+    def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
+        """See `MethodSteps.jacobian`."""
+        columns: Array = np.array(self._linearise(t, y, drive).columns)
+        if not np.isfinite(columns).all():
+            raise ArithmeticError("the Jacobian is not finite")
+        return columns.T
+
+    def interpolate(self, step: Step) -> Polynomial | None:
+        """Return the states inside a step, through states and slopes at its quarters.
+
+        None where one of these is not finite.
+        """
+        from scipy.interpolate import KroghInterpolator  # many runs have few samples
+
+        times = [0.25 * k * step.h for k in range(5)]
+        states = [step.begin.y, *(step.inside(x) for x in times[1:-1]), step.end.y]
+        data: list[Sequence[float]] = []
+        for x, y in zip(times, states, strict=True):
+            data += [y, self.slope(step.t + x, y, step.drive)]
+        if not np.isfinite(data).all():
+            return None
+        polynomial: Polynomial = KroghInterpolator(np.repeat(times, 2), data)
+        return polynomial
+
+    def _step(
+        self,
+        t: float,
+        h: float,
+        y: Sequence[float],
+        near: Sequence[float],
+        drive: Drive,
+    ) -> NewState:
+        method = self.method
+        if isinstance(method, Tableau):
+            drives = [drive] * len(method.a)
+            return explicit_step(self.slope, method, t, h, y, drives)
+        linearisation = self._linearise(t, near, drive)
+        return rosenbrock_step(self.slope, linearisation, method, t, h, y, drive)
+
+    def _linearise(self, t: float, y: Sequence[float], drive: Drive) -> Linearisation:
+        """Linearise: exact by the state, by differences of the torque."""
+        size, torque = self._size, self._torque.of_drive(drive, t, y)
+        moment = drive.numbers[3:]
+        numbers = self._ode.linearised_by_torque(t, *y, *torque, *moment)
+        rows = np.array(numbers).reshape(size + 5, size)
+        slope, by_time = rows[0], rows[1]
+        by_state, by_torque = rows[2 : size + 2], rows[size + 2 :]
+        rate = self._torque.rate(drive, t, y, torque)
+        feedback = self._torque.by_state(drive, t, y, torque)
+        columns = by_state + feedback.T @ by_torque
+        by_time = by_time + rate @ by_torque
+        return Linearisation(slope.tolist(), by_time.tolist(), columns.tolist())
+
+
+class TimeSteps(FunctionSteps):
+    """Steps of an explicit method under a function of the time."""
+
+    method: Tableau
+
+    @cached_property
+    def _functions(self) -> dict[str, Function]:
+        return compile_by_stage(self._ode, self.method)
+
+    def load(self) -> None:
+        """Have the code compiled that a run calls."""
+        _ = self._functions
+
+    def pair(
+        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+    ) -> Outcome:
+        """See `MethodSteps.pair`; `stages` are the torques in the stages of its steps."""
+        if other is not None:
+            raise ValueError("a function of the time is the same for both solutions")
+        half = 0.5 * h
+        times = [
+            *self._times(t, h),
+            *self._times(t, half),
+            *self._times(t + half, half),
+        ]
+        torques = self._torques_at(times, drive)
+        stages = self._join(torques, drive)
+        numbers = self._functions["pair"](t, h, *at.y, *at.z, *stages)
+        return read_outcome(numbers, at, self._size, torques)
+
+    def single(
+        self, t: float, h: float, y: Sequence[float], drive: Drive
+    ) -> list[float]:
+        """See `MethodSteps.single`."""
+        stages = self._join(self._torques_at(self._times(t, h), drive), drive)
+        return self._functions["single"](t, h, *y, *stages)
+
+    def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
+        """See `MethodSteps.jacobian`."""
+        torque = self._torque.of_drive(drive, t, y)
+        return self._ode.matrix(t, y, (*torque, *drive.numbers[3:]))
+
+    def states_inside(
+        self, steps: Sequence[Step], counts: Sequence[int], x: Array
+    ) -> Array:
+        """See `MethodSteps.states_inside`."""
+        rows = [(step.t, 0.0, *step.begin.y) for step in steps]
+        begins = np.array(rows).repeat(counts, axis=0)
+        begins[:, 1] = x
+        torques = self._torques_inside(steps, counts, x)
+        moments = np.array([step.drive.numbers[3:] for step in steps])
+        moments = moments.repeat(counts, axis=0)[:, None, :]
+        stages = (len(x), len(self.method.c))
+        moments = np.broadcast_to(moments, (*stages, moments.shape[2]))
+        drives = np.concatenate([torques, moments], axis=2).reshape(len(x), -1)
+        single = compile_rows_by_stage(self._ode, self.method)
+        return single(np.hstack([begins, drives]))
+
+    def _times(self, t: float, h: float) -> list[float]:
+        """Return the times of the stages of a step."""
+        return [t + node * h if node else t for node in self.method.c]
+
+    def _torques_at(self, times: Sequence[float], drive: Drive) -> list[Any]:
+        """Return the torques at times of the steps [s]; equal ones are asked for once."""
+        evaluate = self._torque.of_time(drive)
+        known = {time: evaluate(time) for time in dict.fromkeys(times)}
+        return [known[time] for time in times]
+
+    @staticmethod
+    def _join(torques: Sequence[Any], drive: Drive) -> list[float]:
+        """Return what acts in each stage, one stage after the other."""
+        moment = drive.numbers[3:]
+        numbers: list[float] = []
+        for torque in torques:
+            numbers += torque
+            numbers += moment
+        return numbers
+
+    def _torques_inside(
+        self, steps: Sequence[Step], counts: Sequence[int], x: Array
+    ) -> Array:
+        """Return the torques in the stages of steps to times inside, shape (n, s, 3)."""
+        fit = fit_of(self.method)
+        known = np.array([step.stages for step in steps])
+        coefficients = fit.solution @ known[:, fit.fitted]
+        off = np.abs(fit.values @ coefficients - known[:, fit.checked])
+        largest = np.abs(known).max(axis=(1, 2))
+        is_smooth = off.max(axis=(1, 2)) <= _SAME_TORQUE * largest
+        lengths = np.array([step.h for step in steps]).repeat(counts)
+        shares = np.multiply.outer(x / lengths, self.method.c)
+        basis = _basis(shares, fit.solution.shape[0])
+        torques = basis @ coefficients.repeat(counts, axis=0)
+        first = 0
+        for step, count, smooth in zip(steps, counts, is_smooth, strict=True):
+            if not smooth:
+                for k in range(first, first + count):
+                    times = self._times(step.t, float(x[k]))
+                    torques[k] = self._torques_at(times, step.drive)
+            first += count
+        return np.asarray(torques)
+
+
+@lru_cache(maxsize=64)
+def compile_by_stage(ode: ODE, method: Tableau) -> dict[str, Function]:
+    """Compile `pair` and `single` of steps that take the torques of each stage."""
+    return compile_functions(_trace_by_stage(ode, method), ("pair", "single"))
+
+
+@lru_cache(maxsize=64)
+def compile_rows_by_stage(ode: ODE, method: Tableau) -> RowsFunction:
+    """Compile `single` of `compile_by_stage` for rows of inputs."""
+    return compile_rows(_trace_by_stage(ode, method), "single")
+
+
+def _trace_by_stage(ode: ODE, method: Tableau) -> dict[str, Program]:
+    size, drive, lagged = len(ode.state), len(ode.drive), lagged_torques(ode)
+    return {
+        "slope": ode.program,
+        "joints": ode.dynamics.joints_program,
+        **trace_steps(method, size, drive, lagged, by_stage=True),
+    }
+
+
+class Fit(NamedTuple):
+    """A polynomial through some of the torques in the stages of `pair`.
+
+    Its terms are Chebyshev's polynomials on the step.
+    """
+
+    fitted: list[int]  # numbers of the stages that it goes through
+    checked: list[int]  # those of the others
+    solution: Array  # torques in the former -> coefficients
+    values: Array  # coefficients -> torques in the latter
+
+
+@lru_cache(maxsize=8)
+def fit_of(method: Tableau) -> Fit:
+    """Choose the stages nearest to the zeros of Chebyshev's polynomials."""
+    nodes = np.array(method.c)
+    shares = np.concatenate([nodes, 0.5 * nodes, 0.5 + 0.5 * nodes])
+    _, first = np.unique(shares, return_index=True)
+    left = first.tolist()
+    size = max(2, round(_SHARE_FITTED * len(left)))
+    fitted = []
+    for k in range(size):
+        target = 0.5 - 0.5 * np.cos(np.pi * (k + 0.5) / size)
+        nearest = min(left, key=lambda stage: abs(shares[stage] - target))
+        fitted.append(nearest)
+        left.remove(nearest)
+    solution = np.linalg.inv(_basis(shares[fitted], size))
+    return Fit(fitted, left, solution, _basis(shares[left], size))
+
+
+def _basis(shares: Array, size: int) -> Array:
+    """Return the terms of a polynomial at shares of a step, shape (..., size)."""
+    return np.asarray(chebvander(2.0 * shares - 1.0, size - 1))
+
+
+class FeedbackSteps(FunctionSteps):
+    """Steps of an explicit method under a function of the state.
+
+    The parts of a step between two calls of the function are compiled.
+    """
+
+    method: Tableau
+
+    def __init__(self, ode: ODE, method: Tableau, torque: AppliedTorque) -> None:
+        super().__init__(ode, method, torque)
+        if method.dense is not None:
+            self.interpolation_cost = 1 + len(method.dense.c)
+            self.worst = _WORST_OF_DENSE
+
+    @cached_property
+    def _functions(self) -> dict[str, Function]:
+        return compile_stages(self._ode, self.method)
+
+    def load(self) -> None:
+        """Have the code compiled that a run calls."""
+        _ = self._functions
+
+    def pair(
+        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+    ) -> Outcome:
+        """See `MethodSteps.pair`; `stages` are the slopes in the stages of the first."""
+        second = drive if other is None else other
+        joints, half, z = self._functions["joints"], 0.5 * h, at.z
+        slopes, y_end = self._go(t, h, at.y, at.joints, drive)
+        _, middle = self._go(t, half, z, joints(*z[:7]), second)
+        middle = middle[: self._size]
+        _, z_end = self._go(t + half, half, middle, joints(*middle[:7]), second)
+        numbers = self._functions["end"](h, *at.y, *z, *y_end, *z_end)
+        return read_outcome(numbers, at, self._size, slopes)
+
+    def _step(
+        self,
+        t: float,
+        h: float,
+        y: Sequence[float],
+        near: Sequence[float],
+        drive: Drive,
+    ) -> NewState:
+        joints = self._functions["joints"](*y[:7])
+        _, numbers = self._go(t, h, y, joints, drive)
+        return NewState(numbers[: self._size], None)
+
+    def _go(
+        self,
+        t: float,
+        h: float,
+        y: Sequence[float],
+        joints: Sequence[float],
+        drive: Drive,
+    ) -> tuple[list[float], list[float]]:
+        """Take a step; return the slopes in its stages, and the new state with its error.
+
+        `joints` are those of y.
+        """
+        functions, size, moment = self._functions, self._size, drive.numbers[3:]
+        evaluate, function, start = self._torque.of_state, drive.function, drive.start
+        slopes: list[float] = []
+        point = y
+        numbers: list[float] = []
+        for number, node in enumerate(self.method.c):
+            time = t + node * h if node else t
+            torque = evaluate(function, start + time, point, joints)
+            numbers = functions[f"stage{number}"](
+                time, h, *y, *slopes, *point, *torque, *moment
+            )
+            slopes += numbers[:size]
+            point = numbers[size : 2 * size]
+            joints = numbers[2 * size :]
+        return slopes, numbers[size:]
+
+    def interpolate(self, step: Step) -> Polynomial | None:
+        """Return the states inside a step by the method's dense output, if it has one."""
+        dense = self.method.dense
+        if dense is None:
+            return super().interpolate(step)
+        size, h, begin = self._size, step.h, np.array(step.begin.y)
+        slopes = np.array(step.stages).reshape(-1, size)
+        end = np.array(step.end.y)
+        slopes = np.vstack([slopes, self.slope(step.t + h, step.end.y, step.drive)])
+        for node, weights in zip(dense.c, dense.a, strict=True):
+            point = begin + h * (np.array(weights) @ slopes)
+            slope = self.slope(step.t + node * h, point.tolist(), step.drive)
+            slopes = np.vstack([slopes, slope])
+        chord = end - begin
+        bend = h * slopes[0] - chord
+        twist = chord - bend - h * slopes[len(self.method.c)]
+        terms = [chord, bend, twist, *(h * (np.array(dense.weights) @ slopes))]
+        if not np.isfinite(terms).all():
+            return None
+
+        def states(x: Array) -> Array:
+            share = np.reshape(x, (-1, 1)) / h
+            total = np.zeros((len(share), size))
+            for number in reversed(range(len(terms))):
+                factor = 1.0 - share if number % 2 else share
+                total = factor * (terms[number] + total)
+            return np.asarray(begin + total)
+
+        return states
+
+
+_WORST_OF_DENSE = 0.83
+"""Share of a step at which the error of DOP853's dense output is largest."""
+
+
+@lru_cache(maxsize=64)
+def compile_stages(ode: ODE, method: Tableau) -> dict[str, Function]:
+    """Compile the programs of `trace_stages`, and `joints`."""
+    size, drive, lagged = len(ode.state), len(ode.drive), lagged_torques(ode)
+    stages = trace_stages(method, size, drive, lagged)
+    programs = {
+        "slope": ode.program,
+        "joints": ode.dynamics.joints_program,
+        **stages,
+    }
+    return compile_functions(programs, (*stages, "joints"))
+
+
+@lru_cache(maxsize=16)
+def trace_stages(
+    method: Tableau, size: int, drive: int, lagged: int
+) -> dict[str, Program]:
+    """Trace the parts of an explicit step between calls of a function of the state.
+
+    Inputs of `stage0`, `stage1`, .. are t, h, the state y, the slopes in all stages
+    before, and the point and the drive of this stage; outputs its slope, and the point
+    of the next stage with its joints; in the last stage the new state and, of a method
+    with an estimate, its error. Inputs of `end` are h, both states before a step, and
+    for each the outputs of its last stage; its outputs are those of `pair` of
+    `trace_steps`.
+    """
+    slope = Routine("slope", 1 + size + drive, size)
+    joints = Routine("joints", 7, JOINTS)
+    stages = len(method.a)
+
+    def take_stage(number: int, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+        y, rest = inputs[:size], inputs[size:]
+        slopes = [rest[size * k : size * (k + 1)] for k in range(number)]
+        point = rest[size * number : size * (number + 1)]
+        slopes.append(slope(t, *point, *rest[size * (number + 1) :]))
+        if number == stages - 1:
+            new = end_step(method, h, y, slopes)
+            return (*slopes[-1], *new.state, *(new.error or ()))
+        following = move(y, h, method.a[number + 1], slopes)
+        return (*slopes[-1], *following, *joints(*following[:7]))
+
+    def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
+        y, z, rest = inputs[:size], inputs[size : 2 * size], inputs[2 * size :]
+        half = len(rest) // 2
+        ends = [
+            NewState([*end[:size]], [*end[size:]] or None)
+            for end in (rest[:half], rest[half:])
+        ]
+        pair = compare(h, y, z, *ends, lagged)
+        angles = joints(*pair.y[:7])
+        total = pair.total + add_up(angles)
+        return (*pair.y, *pair.z, *angles, pair.size, total)
+
+    programs = {}
+    for number in range(stages):
+        count = 2 + (2 + number) * size + drive
+        names = [f"i{k}" for k in range(count)]
+
+        def part(*inputs: Any, number: int = number) -> tuple[Any, ...]:
+            return take_stage(number, *inputs)
+
+        programs[f"stage{number}"] = trace(part, names)
+    count = 1 + (2 + 2 * (2 if has_error(method) else 1)) * size
+    programs["end"] = trace(end_pair, [f"i{k}" for k in range(count)])
+    return programs
