@@ -42,7 +42,12 @@ html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
-exclude_patterns = ["joss/*", "gallery/*.ipynb", "gallery/*.py", "**/GALLERY_HEADER.rst"]
+exclude_patterns = [
+    "joss/*",
+    "gallery/*.ipynb",
+    "gallery/*.py",
+    "**/GALLERY_HEADER.rst",
+]
 suppress_warnings = ["config.cache"]  # the scraper of figures is a function
 default_role = "code"
 autodoc_member_order = "bysource"
