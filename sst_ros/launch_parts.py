@@ -37,8 +37,8 @@ from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import explain_missing_ros, suggestion
-from sst_ros.host import processes
 from sst_ros.nodes import topics
+from sst_ros.runtime import child_process
 from sst_ros.runtime.settings import (
     LOG_LEVELS,
     USE_SIM_TIME,
@@ -229,7 +229,7 @@ def node(
         arguments=options,
         parameters=[source for source in sources if source],
         ros_arguments=["--log-level", values["log_level"]],
-        additional_env={processes.PARENT: str(os.getpid())},
+        additional_env={child_process.PARENT: str(os.getpid())},
     )
 
 
