@@ -140,7 +140,7 @@ setup(
         (f"share/{NAME}/config", files("config/*.*")),
         (f"share/{NAME}/config/scenes", files("config/scenes/*.yaml")),
         (f"share/{NAME}/config/sros2", files("config/sros2/*.xml")),
-        (f"share/{NAME}/launch", files("launch/*.launch.py")),
+        (f"share/{NAME}/launch", files("launch/*.launch.*")),
         # `ros2 run` looks here; pip would put the node executables into bin/.
         (f"lib/{NAME}", files("executables/*")),
     ],

@@ -9,62 +9,68 @@ from launch import LaunchDescription
 from launch.action import Action
 
 from sst_ros import launch_parts
-from sst_ros.launch_parts import Given
+from sst_ros.control.law import MODES
+from sst_ros.launch_parts import Argument, Values, flag
 
 CONTROL = {
-    "motion": ("", "scene, or topic: trajectories from ~/joint_trajectory"),
-    "mode": ("", "feedforward, feedforward_pd, computed_torque, pd or gravity_pd"),
-    "feedforward_at": ("middle", "start or middle of a control period, held over it"),
-    "bandwidth": ("", "natural frequency of the error [rad/s]"),
-    "hold": ("0.3", "time for which the end of the motion is held [s]"),
+    "motion": Argument(
+        "",
+        "scene, or topic: trajectories from ~/joint_trajectory",
+        ("", "scene", "topic"),
+    ),
+    "mode": Argument("", "control law", ("", *MODES)),
+    "feedforward_at": Argument(
+        "middle",
+        "instant of a control period whose torque is held over it",
+        ("start", "middle"),
+    ),
+    "bandwidth": Argument("", "natural frequency of the error [rad/s]"),
+    "hold": Argument("0.3", "time for which the end of the motion is held [s]"),
 }
 RUN = {
-    "scene": ("reach", "scene that is simulated, by name or by path of a .yaml file"),
-    "rate": ("", "steps per second of simulated time [Hz]"),
-    "duration": ("0.0", "length of the run [s]; 0 until the motion has ended"),
-    "real_time_factor": (
-        "",
-        "simulated time per time of the clock; 0 for as fast as possible",
+    "scene": Argument("reach", "simulated scene, by name or path of a .yaml file"),
+    "rate": Argument("", "steps per second of simulated time [Hz]"),
+    "duration": Argument("0.0", "length of the run [s]; 0 until the motion has ended"),
+    "real_time_factor": Argument(
+        "", "simulated time per time of the clock; 0 for as fast as possible"
     ),
-    "sync": ("lockstep", "free, or lockstep with the commands"),
+    "sync": Argument(
+        "lockstep", "free, or lockstep with the commands", ("free", "lockstep")
+    ),
 }
 ARGUMENTS = {
     **RUN,
-    "model": ("", "scene of the controller's model; by default the simulated one"),
-    "control_rate": (
-        "500",
-        "commands per second of simulated time [Hz], a divisor of rate",
+    "model": Argument(
+        "", "scene of the controller's model; default: the simulated one"
+    ),
+    "control_rate": Argument(
+        "500", "commands per second of simulated time [Hz], a divisor of rate"
     ),
     **CONTROL,
-    "record": ("true", "record the run, which starts when it is recorded"),
+    "record": flag("true", "record the run, which starts when it is recorded"),
     **launch_parts.recording_arguments("feedforward_bag"),
 }
 
 
-def actions(given: Given) -> list[Action]:
+def actions(values: Values) -> list[Action]:
     """Describe the nodes."""
-    recorded = given["record"] == "true"
-    run = {
-        **{name: given[name] for name in RUN},
-        "publish_rate": given["control_rate"],
-        "wait_for_command": "true",
-    }
-    control = {
-        **{name: given[name] for name in CONTROL},
-        "scene": given["model"] or given["scene"],
-        "rate": given["control_rate"],
-        "stamped": "true" if given["sync"] == "lockstep" else "",
-        # also until the simulator is up
-        "timeout": launch_parts.Default(launch_parts.WAIT_S),
-        "wait_for_recorder": given["record"],
-        # the recorder reads the commands, too
-        "min_subscribers": "2" if recorded else "",
-    }
-    return [
-        *([launch_parts.recorder(given)] if recorded else []),
-        launch_parts.simulator(given, run, recorded=recorded),
-        launch_parts.node(given, "inverse_dynamics", control),
-    ]
+    recorded = values.is_true("record")
+    run = {name: values[name] for name in RUN}
+    run["publish_rate"] = values["control_rate"]
+    run["wait_for_command"] = "true"
+    control = {name: values[name] for name in CONTROL}
+    control["scene"] = values["model"] or values["scene"]
+    control["rate"] = values["control_rate"]
+    control["stamped"] = "true" if values["sync"] == "lockstep" else ""
+    # The controller also waits until the simulator has started.
+    control["timeout"] = launch_parts.Default(launch_parts.WAIT_S)
+    control["wait_for_recorder"] = values["record"]
+    # The recorder reads the commands, too.
+    control["min_subscribers"] = "2" if recorded else ""
+    nodes = [launch_parts.recorder(values)] if recorded else []
+    nodes.append(launch_parts.simulator(values, run, recorded=recorded))
+    nodes.append(launch_parts.node(values, "inverse_dynamics", control))
+    return nodes
 
 
 def generate_launch_description() -> LaunchDescription:

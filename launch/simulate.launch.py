@@ -10,60 +10,65 @@ from launch import LaunchDescription
 from launch.action import Action
 
 from sst_ros import launch_parts
-from sst_ros.launch_parts import Given
+from sst_ros.launch_parts import Argument, Default, Values, flag
 
 RUN = {
-    "scene": ("example2", "scene, by name or by path of a .yaml file"),
-    "rate": ("", "steps per second of simulated time [Hz]"),
-    "publish_rate": ("", "published samples per second [Hz]"),
-    "duration": (
-        "",
-        "length of the run [s]; 0 for no end; in lockstep by default the scene's",
+    "scene": Argument("example2", "scene, by name or path of a .yaml file"),
+    "rate": Argument("", "steps per second of simulated time [Hz]"),
+    "publish_rate": Argument("", "published samples per second [Hz]"),
+    "duration": Argument(
+        "", "length of the run [s]; 0 for no end; in lockstep by default the scene's"
     ),
-    "real_time_factor": (
-        "",
-        "simulated time per time of the clock; 0 for as fast as possible",
+    "real_time_factor": Argument(
+        "", "simulated time per time of the clock; 0 for as fast as possible"
     ),
-    "publish_clock": ("", "true: publish the simulated time on /clock"),
-    "sync": (
+    "publish_clock": flag("", "publish the simulated time on /clock"),
+    "sync": Argument(
         "",
         "free, or lockstep with the commands; by default lockstep with play:=true",
+        ("", "free", "lockstep"),
     ),
 }
 ARGUMENTS = {
     **RUN,
-    "play": ("false", "also play the scene's torques, from the start of the run"),
-    "record": ("false", "also record the run, which starts when it is recorded"),
-    "rviz": ("false", "also start robot_state_publisher and RViz"),
+    "play": flag("false", "also play the scene's torques, from the start of the run"),
+    "record": flag("false", "also record the run, which starts when it is recorded"),
+    "rviz": flag("false", "also start robot_state_publisher and RViz"),
     **launch_parts.recording_arguments("sst_bag"),
 }
 
 
-def actions(given: Given) -> list[Action]:
+def actions(values: Values) -> list[Action]:
     """Describe the nodes."""
-    play, recorded = given["play"] == "true", given["record"] == "true"
-    run = {name: given[name] for name in RUN}
-    run["publish_description"] = "false" if given["rviz"] == "true" else ""
+    play = values.is_true("play")
+    recorded = values.is_true("record")
+    run = {name: values[name] for name in RUN}
+    nodes = []
+    if values.is_true("rviz"):
+        run["publish_description"] = "false"  # robot_state_publisher does
+        nodes += launch_parts.rviz(values, values["scene"])
     if play:
         run["wait_for_command"] = "true"
         # By default the same run on a busy machine.
-        run["sync"] = run["sync"] or launch_parts.Default("lockstep")
-    nodes = launch_parts.rviz(given, given["scene"]) if given["rviz"] == "true" else []
+        run["sync"] = run["sync"] or Default("lockstep")
     if recorded:
-        nodes.append(launch_parts.recorder(given))
-    nodes.append(launch_parts.simulator(given, run, recorded=recorded))
+        nodes.append(launch_parts.recorder(values))
+    nodes.append(launch_parts.simulator(values, run, recorded=recorded))
     if play:
-        played = {
-            "scene": given["scene"],
-            "rate": given["publish_rate"],
-            # also until the simulator is up
-            "timeout": launch_parts.Default(launch_parts.WAIT_S),
+        player = {
+            "scene": values["scene"],
+            "rate": values["publish_rate"],
+            # The player also waits until the simulator has started.
+            "timeout": Default(launch_parts.WAIT_S),
             "stamped": "" if run["sync"] == "lockstep" else "false",
-            "min_subscribers": "2" if recorded else "",  # the recorder reads them, too
+            # The recorder reads the commands, too.
+            "min_subscribers": "2" if recorded else "",
         }
-        endless = given["duration"] or ("0" if run["sync"] == "free" else "")
-        endless = bool(endless) and float(endless) == 0.0
-        nodes.append(launch_parts.node(given, "torque_player", played, ends=endless))
+        duration = values["duration"]
+        if not duration and run["sync"] == "free":
+            duration = "0"
+        endless = bool(duration) and float(duration) == 0.0
+        nodes.append(launch_parts.node(values, "torque_player", player, ends=endless))
     return nodes
 
 

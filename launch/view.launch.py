@@ -5,27 +5,33 @@ from launch import LaunchDescription
 from launch.action import Action
 
 from sst_ros import launch_parts
-from sst_ros.launch_parts import Given
+from sst_ros.launch_parts import Argument, Values, flag
 
+RUN = {
+    "scene": Argument("swing", "scene, by name or path of a .yaml file"),
+    "publish_rate": Argument("100", "published samples per second [Hz]"),
+    "duration": Argument("0.0", "length of the run [s]; 0 for no end"),
+}
 ARGUMENTS = {
-    "scene": ("swing", "scene, by name or by path of a .yaml file"),
-    "publish_rate": ("100", "published samples per second [Hz]"),
-    "duration": ("0.0", "length of the run [s]; 0 for no end"),
-    "browser": ("true", "serve the page"),
-    "port": ("", "port of the page on this machine; the next free one is taken"),
-    "rviz": ("false", "start robot_state_publisher and RViz"),
+    **RUN,
+    "browser": flag("true", "serve the page"),
+    "port": Argument(
+        "", "port of the page on this machine; the next free one is taken"
+    ),
+    "rviz": flag("false", "start robot_state_publisher and RViz"),
 }
 
 
-def actions(given: Given) -> list[Action]:
+def actions(values: Values) -> list[Action]:
     """Describe the nodes."""
-    shown = launch_parts.rviz(given, given["scene"]) if given["rviz"] == "true" else []
-    run = {name: given[name] for name in ("scene", "publish_rate", "duration")}
-    run["publish_description"] = "false" if given["rviz"] == "true" else ""
-    nodes = [launch_parts.simulator(given, run, recorded=False)]
-    if given["browser"] == "true":
-        nodes.append(launch_parts.node(given, "viewer", {"port": given["port"]}))
-    return [*nodes, *shown]
+    run = {name: values[name] for name in RUN}
+    views = []
+    if values.is_true("browser"):
+        views.append(launch_parts.node(values, "viewer", {"port": values["port"]}))
+    if values.is_true("rviz"):
+        run["publish_description"] = "false"  # robot_state_publisher does
+        views += launch_parts.rviz(values, values["scene"])
+    return [launch_parts.simulator(values, run, recorded=False), *views]
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share: arguments, nodes, recorders, RViz, and when a launch ends.
+"""Arguments, nodes, recorders and RViz for the launch files, and when a launch ends.
 
 Only launch files import this module: it needs `launch` and `launch_ros` of a ROS
-installation.
+installation. A launch file names its arguments, each an `Argument`, and a function that
+makes its actions from their values; `description` does the rest. The actions of one
+launch file end together: when one that `ends` has exited, or when any has failed.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 from ament_index_python.packages import get_packages_with_prefixes
@@ -37,328 +39,397 @@ from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import explain_missing_ros, suggestion
 from sst_ros.nodes import topics
 from sst_ros.runtime import child_process
-from sst_ros.runtime.settings import SimulatorParameters, default_topics, ros_arguments
+from sst_ros.runtime.settings import (
+    LOG_LEVELS,
+    USE_SIM_TIME,
+    SimulatorParameters,
+    default_topics,
+    ros_arguments,
+)
 from sst_ros.scene.scene import load, share_directory
 from sst_ros.scene.yaml_document import read_file, read_values
 from sst_ros.state import BASE_FRAME
 
 
-class Given(dict[str, str]):
-    """Values of the launch arguments of one launch file, and the actions that are made of them.
+class Argument(NamedTuple):
+    """A launch argument; an empty default leaves the value to params_file or the node."""
 
-    Those end together, and nothing else of a launch that includes this one does.
-    """
+    default: str
+    description: str
+    choices: Sequence[str] = ()
 
-    partners: Sequence[Action] = ()
-    ending = False
+
+def flag(default: str, description: str) -> Argument:
+    """Describe an argument that is true or false."""
+    choices = ["true", "false"]
+    return Argument(default, description, choices if default else ["", *choices])
+
+
+class Values(dict[str, str]):
+    """Values of the arguments of one launch file, and the actions made from them."""
+
+    actions: Sequence[Action] = ()
+    is_ending = False  # the actions of this launch file have been asked to end
+
+    def is_true(self, name: str) -> bool:
+        """Tell whether a flag is set."""
+        return self[name] == "true"
+
+    @property
+    def node_time(self) -> dict[str, bool]:
+        """Parameters of a node that reads the simulated time where that is asked for."""
+        return {USE_SIM_TIME: True} if self.is_true(USE_SIM_TIME) else {}
 
 
 class Default(str):
-    """A value that was not given, before which params_file goes."""
+    """A value that the user did not set: params_file takes precedence over it."""
 
     __slots__ = ()
 
 
-_CHOICES = {"sync": ["", "free", "lockstep"], "bag": ["ros2", "sst"]}
-_FLAG = ["true", "false"]
-_SHARED = {
-    "namespace": ("", "namespace of the nodes"),
-    "params_file": (
-        "",
-        "YAML file of parameters; arguments that are given here go before it",
-    ),
-    "log_level": ("info", "log level of the nodes: debug, info, warn, error or fatal"),
-}
 _SIGNAL_AGAIN_S = "10"
 """Wait for the end after SIGINT, before SIGTERM asks for the same: `ros2 bag record`
-can lose the first signal while it starts, when the handler of rclcpp is there and its
-own is not yet.
-"""
+can lose the first signal while it starts, when rclcpp has installed its handler and
+the recorder has not yet."""
 _CLOSING_S = "60"  # time that a recorder has to write its index before it is killed
 _ENDS: dict[str, Any] = {
     "sigterm_timeout": _SIGNAL_AGAIN_S,
     "sigkill_timeout": _CLOSING_S,
 }
-WAIT_S = "60.0"  # [s] of the nodes for each other; on a busy machine one starts in 20 s
+WAIT_S = "60.0"
+"""Time that nodes wait for each other [s]; on a busy machine one starts in 20 s."""
+
+_SHARED = {
+    "namespace": Argument("", "namespace of the nodes"),
+    "params_file": Argument(
+        "", "YAML file of parameters; arguments given here take precedence"
+    ),
+    "log_level": Argument("info", "log level of the nodes", LOG_LEVELS),
+    USE_SIM_TIME: flag(
+        "false",
+        "true: the nodes read the time from /clock, which the simulator publishes;"
+        " with publish_clock:=false the simulator follows another source of /clock",
+    ),
+}
 
 
-def recording_arguments(name: str) -> dict[str, tuple[str, str]]:
+def recording_arguments(name: str) -> dict[str, Argument]:
     """Return the launch arguments of `recorder`; the default of output is dated."""
     dated = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
     return {
-        "output": (dated, "folder of the recording, which must not exist yet"),
-        "bag": (
+        "output": Argument(dated, "folder of the recording, which must not exist yet"),
+        "bag": Argument(
             "ros2",
             "recorder: ros2 for `ros2 bag record`, sst for the node of this package",
+            ("ros2", "sst"),
         ),
     }
 
 
 def description(
     file: str,
-    arguments: Mapping[str, tuple[str, str]],
-    actions: Callable[[Given], list[Action]],
+    arguments: Mapping[str, Argument],
+    actions: Callable[[Values], list[Action]],
 ) -> LaunchDescription:
-    """Describe a launch: `actions` makes its nodes from the values of its launch arguments.
+    """Describe a launch: `actions` makes its nodes from the values of its arguments."""
+    declared = {**arguments, **_SHARED}
+    set_by_user = set[str]()
 
-    Arguments are default and description by name; empty defaults are left to the nodes.
-    """
-    every = {**arguments, **_SHARED}
+    def note_set_by_user(context: LaunchContext) -> None:
+        set_by_user.update(context.launch_configurations)
 
-    given = set[str]()
-
-    def perform(context: LaunchContext) -> list[Action]:
-        ours = any(
-            word.endswith(Path(file).name) for word in sys.argv
-        )  # not one that is included
-        for word in context.argv if ours else ():
-            name, assigned, _ = word.partition(":=")
-            if assigned and name not in every:
-                raise RuntimeError(f"{word}: no such argument{suggestion(name, every)}")
-        values = context.launch_configurations
-        if (path := values["params_file"]) and not Path(path).is_file():
+    def make_actions(context: LaunchContext) -> list[Action]:
+        _refuse_unknown_arguments(file, context, declared)
+        configurations = context.launch_configurations
+        values = Values()
+        for name in declared:
+            text = configurations[name]
+            values[name] = text if name in set_by_user else Default(text)
+        path = values["params_file"]
+        if path and not Path(path).is_file():
             raise RuntimeError(f"params_file:={path}: no such file")
-        chosen = Given(
-            {n: values[n] if n in given else Default(values[n]) for n in every}
+        namespace = prefix_namespace(
+            configurations.get("ros_namespace"), values["namespace"]
         )
-        pushed = prefix_namespace(values.get("ros_namespace"), values["namespace"])
-        chosen["namespace"] = make_namespace_absolute(pushed or "")
-        # not that of another robot's recording
-        if "output" in every and "output" not in given:
-            words = [*filter(None, chosen["namespace"].split("/")), chosen["output"]]
-            chosen["output"] = Default("_".join(words))
-        for name in every.keys() - given:
-            del values[name]  # the next file that is included has defaults of its own
-        chosen.partners = made = actions(chosen)
-        return made
+        values["namespace"] = make_namespace_absolute(namespace or "")
+        if isinstance(values.get("output"), Default):
+            # Each robot has a folder of its own.
+            words = [*values["namespace"].split("/"), values["output"]]
+            values["output"] = Default("_".join(filter(None, words)))
+        for name in declared.keys() - set_by_user:
+            del configurations[name]  # an included file has defaults of its own
+        values.actions = actions(values)
+        return list(values.actions)
 
-    def note(context: LaunchContext) -> None:
-        given.update(context.launch_configurations)
-
-    declared = [
+    declarations = [
         DeclareLaunchArgument(
             name,
-            default_value=default,
-            description=text,
-            choices=_FLAG if default in _FLAG else _CHOICES.get(name),
+            default_value=argument.default,
+            description=argument.description,
+            choices=list(argument.choices) or None,
         )
-        for name, (default, text) in every.items()
+        for name, argument in declared.items()
     ]
-    named = OpaqueFunction(function=note)  # before the defaults are filled in
-    return LaunchDescription([named, *declared, OpaqueFunction(function=perform)])
+    return LaunchDescription(
+        [
+            OpaqueFunction(function=note_set_by_user),  # before defaults are filled in
+            *declarations,
+            OpaqueFunction(function=make_actions),
+        ]
+    )
+
+
+def _refuse_unknown_arguments(
+    file: str, context: LaunchContext, declared: Mapping[str, Argument]
+) -> None:
+    """Raise for a misspelt NAME:=VALUE, which launch would ignore.
+
+    A file that is included takes no arguments of the command line.
+    """
+    if not any(word.endswith(Path(file).name) for word in sys.argv):
+        return
+    for word in context.argv:
+        name, assignment, _ = word.partition(":=")
+        if assignment and name not in declared:
+            raise RuntimeError(f"{word}: no such argument{suggestion(name, declared)}")
 
 
 def node(
-    given: Given, executable: str, values: Mapping[str, str], *, ends: bool = True
+    values: Values,
+    executable: str,
+    parameters: Mapping[str, str],
+    *,
+    ends: bool = True,
+    reads_clock: bool | None = None,
 ) -> Node:
     """Describe a node of this package, which ends with the launch, however that ends.
 
-    Values that are empty are left to params_file or the default; an InputError lists
-    what the node would refuse. Where it `ends`, its end is that of its partners; its
-    failure always is.
+    Empty parameters are left to params_file or the default; an InputError lists what
+    the node would refuse. Where it `ends`, so do the other actions of its launch file;
+    its failure always ends them. By default it reads /clock with use_sim_time.
     """
-    defaults = {k: str(v) for k, v in values.items() if v and isinstance(v, Default)}
-    set_here = {k: v for k, v in values.items() if v and k not in defaults}
-    words = [f"--{key.replace('_', '-')}={text}" for key, text in set_here.items()]
-    ros_arguments(executable, words)
+    defaults: dict[str, Any] = {}
+    options = []
+    for name, text in parameters.items():
+        if text and isinstance(text, Default):
+            defaults[name] = str(text)
+        elif text:
+            options.append(f"--{name.replace('_', '-')}={text}")
+    ros_arguments(executable, options)
+    if reads_clock is None:
+        reads_clock = values.is_true(USE_SIM_TIME)
+    if reads_clock:
+        defaults[USE_SIM_TIME] = True
+    sources = [defaults, values["params_file"]]  # the later takes precedence
     return _node(
-        given,
+        values,
         "sst_ros",
         executable,
         ends,
-        arguments=words,
-        parameters=[
-            one for one in (defaults, given["params_file"]) if one
-        ],  # the later goes first
-        ros_arguments=["--log-level", given["log_level"]],
+        arguments=options,
+        parameters=[source for source in sources if source],
+        ros_arguments=["--log-level", values["log_level"]],
         additional_env={child_process.PARENT: str(os.getpid())},
     )
 
 
 def _node(
-    given: Given, package: str, executable: str = "", ends: bool = True, **more: Any
+    values: Values, package: str, executable: str, ends: bool = True, **options: Any
 ) -> Node:
-    """Describe a node of a package, by default of the same name.
-
-    Its end may be its partners'.
-    """
+    """Describe a node of any package."""
     return Node(
         package=package,
-        executable=executable or package,
-        namespace=given["namespace"],
+        executable=executable,
+        namespace=values["namespace"],
         output="screen",
-        on_exit=_exit_handler(given, executable or package, ends),
+        on_exit=_exit_handler(values, executable, ends),
         **_ENDS,
-        **more,
+        **options,
     )
 
 
-def simulator(given: Given, parameters: Mapping[str, str], *, recorded: bool) -> Node:
+def simulator(values: Values, parameters: Mapping[str, str], *, recorded: bool) -> Node:
     """Describe a simulator, which does not start its run before it is recorded.
 
     In a namespace its frame has that as a prefix, as those of robot_state_publisher.
+    With use_sim_time it publishes /clock, or follows it with publish_clock:=false.
     """
-    parameters = {
-        **parameters,
-        "base_frame": Default(f"{_frame_prefix(given)}{BASE_FRAME}"),
-    }
-    waits = {
-        "wait_for_subscribers": ",".join(topics.SAMPLED),
-        "subscriber_timeout": WAIT_S,
-    }
-    return node(given, "simulator", {**parameters, **waits} if recorded else parameters)
+    base_frame = Default(f"{_frame_prefix(values)}{BASE_FRAME}")
+    parameters = {**parameters, "base_frame": base_frame}
+    reads_clock = False
+    if values.is_true(USE_SIM_TIME):
+        reads_clock = parameters.get("publish_clock") == "false"
+        if not parameters.get("publish_clock"):
+            parameters["publish_clock"] = Default("true")
+    if recorded:
+        parameters["wait_for_subscribers"] = ",".join(topics.SAMPLED)
+        parameters["subscriber_timeout"] = WAIT_S
+    return node(values, "simulator", parameters, reads_clock=reads_clock)
 
 
-def recorder(given: Given) -> Action:
+def recorder(values: Values) -> Action:
     """Describe what records the topics of config/topics.txt into `output`."""
-    shared, prefix = (
-        topics.SIMULATOR["diagnostics"].name,
-        given["namespace"].rstrip("/"),
-    )
-    names = {t: t if t == shared else prefix + t for t in default_topics()}
-    if given["bag"] == "sst":
-        recorded = {"output": given["output"], "topics": ",".join(names.values())}
-        return node(given, "recorder", recorded)
+    shared = topics.SIMULATOR["diagnostics"].name  # has no namespace
+    prefix = values["namespace"].rstrip("/")
+    names = {}
+    for topic in default_topics():
+        names[topic] = topic if topic == shared else prefix + topic
+    if values["bag"] == "sst":
+        parameters = {"output": values["output"], "topics": ",".join(names.values())}
+        return node(values, "recorder", parameters)
     require("ros2bag", "rosbag2_storage_mcap")
-    profiles = yaml.safe_load(
-        (share_directory() / "config" / "rosbag2_qos.yaml").read_text()
-    )
-    profiles = {names[topic]: profile for topic, profile in profiles.items()}
+    file = share_directory() / "config" / "rosbag2_qos.yaml"
+    profiles = yaml.safe_load(file.read_text(encoding="utf-8"))
+    renamed = {names[topic]: profile for topic, profile in profiles.items()}
+    command = ["ros2", "bag", "record"]
+    command += ["--storage", "mcap", "--output", values["output"]]
+    command += ["--disable-keyboard-controls"]
+    if values.is_true(USE_SIM_TIME):
+        command += ["--use-sim-time"]
+    command += [
+        "--qos-profile-overrides-path",
+        _temporary_file(yaml.safe_dump(renamed)),
+    ]
+    command += ["--topics", *names.values()]
     return ExecuteProcess(
-        cmd=[
-            *(
-                "ros2",
-                "bag",
-                "record",
-                "--storage",
-                "mcap",
-                "--output",
-                given["output"],
-            ),
-            *("--disable-keyboard-controls", "--qos-profile-overrides-path"),
-            _temporary_file(yaml.safe_dump(profiles)),
-            *("--topics", *names.values()),
-        ],
+        cmd=command,
         output="screen",
-        on_exit=_exit_handler(given, "ros2 bag record", True),
+        on_exit=_exit_handler(values, "ros2 bag record", True),
         **_ENDS,
     )
 
 
 def _temporary_file(text: str) -> str:
+    """Write a file that is removed when the launch ends; return its path."""
     with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
         file.write(text)
     atexit.register(Path(file.name).unlink, missing_ok=True)
     return file.name
 
 
-def rviz(given: Given, scene_name: str) -> list[Action]:
+def rviz(values: Values, scene_name: str) -> list[Action]:
     """Describe robot_state_publisher with the URDF of a scene, and RViz with our layout.
 
     In a namespace its frames have that as a prefix.
     """
     require("robot_state_publisher", "rviz2")
-    layout, prefix = share_directory() / "config" / "sst_ros.rviz", _frame_prefix(given)
-    path = str(layout)
+    path = str(share_directory() / "config" / "sst_ros.rviz")
+    prefix = _frame_prefix(values)
     if prefix:
-        text = layout.read_text(encoding="utf-8").replace(
-            "base_link", f"{prefix}base_link"
-        )
-        path = _temporary_file(
-            text.replace('TF Prefix: ""', f"TF Prefix: {prefix[:-1]}")
-        )
-    state_publisher = _state_publisher(given, urdf(load(scene_name)))
-    return [state_publisher, _node(given, "rviz2", arguments=["-d", path])]
+        layout = Path(path).read_text(encoding="utf-8")
+        layout = layout.replace(BASE_FRAME, f"{prefix}{BASE_FRAME}")
+        layout = layout.replace('TF Prefix: ""', f"TF Prefix: {prefix[:-1]}")
+        path = _temporary_file(layout)
+    return [
+        _state_publisher(values, urdf(load(scene_name)), values.node_time),
+        _node(
+            values,
+            "rviz2",
+            "rviz2",
+            arguments=["-d", path],
+            parameters=[values.node_time],
+        ),
+    ]
 
 
-def ros2_control(given: Given, controller: str, controllers: str) -> list[Action]:
-    """Describe a controller manager whose hardware is the simulator, and the controllers.
+def ros2_control(values: Values, controller: str, controllers: str) -> list[Action]:
+    """Describe a controller manager whose hardware is the simulator, and its controllers.
 
-    Beside joint_state_broadcaster it starts the controller of this name, by the file of
-    parameters `controllers`, config/controllers.yaml where empty.
+    Beside joint_state_broadcaster it starts the controller of this name, with the
+    parameters of the file `controllers`, by default config/controllers.yaml. In
+    lockstep they update once for each sample, so they read /clock.
     """
     path = controllers or str(share_directory() / "config" / "controllers.yaml")
     if not Path(path).is_file():
         raise RuntimeError(f"controllers:={path}: no such file")
-    lockstep = given["sync"] == "lockstep"
+    lockstep = values["sync"] == "lockstep"
+    spawned = ["joint_state_broadcaster", controller]
     hardware = (
         "sst_ros_hardware" if lockstep else "joint_state_topic_hardware_interface"
     )
-    names = ["controller_manager", hardware, "robot_state_publisher"]
-    spawned = ["joint_state_broadcaster", controller]
-    for listed in read_values(read_file(Path(path)), path).values():
-        given_there = listed.get("ros__parameters", {})
-        types = [
-            given_there[name].get("type", "") for name in spawned if name in given_there
-        ]
-        names += [plugin.partition("/")[0] for plugin in types if plugin]
-    require(*names)
-    topics_there = [given["namespace"].rstrip("/") + topic for topic in TOPICS]
-    # /clock may come late
-    words = [*spawned, "--param-file", path, "--switch-timeout", WAIT_S]
-    timed: dict[str, Any] = {"use_sim_time": lockstep}
-    if lockstep:  # an update for each sample
-        timed["update_rate"] = int(
-            given["publish_rate"] or SimulatorParameters().publish_rate
-        )
+    require(
+        "controller_manager",
+        hardware,
+        "robot_state_publisher",
+        *_plugin_packages(path, spawned),
+    )
+    namespace = values["namespace"].rstrip("/")
+    hardware_topics = [namespace + topic for topic in TOPICS]
+    document = urdf(load(values["scene"]), hardware_topics, lockstep=lockstep)
+    time = {USE_SIM_TIME: lockstep or values.is_true(USE_SIM_TIME)}
+    parameters: list[Any] = [path, time]
+    if lockstep:
+        rate = values["publish_rate"] or SimulatorParameters().publish_rate
+        parameters.append({"update_rate": int(rate)})
+    spawn = [*spawned, "--param-file", path]
+    spawn += ["--switch-timeout", WAIT_S]  # /clock may come late
     return [
-        _state_publisher(
-            given, urdf(load(given["scene"]), topics_there, lockstep=lockstep)
-        ),
-        _node(
-            given, "controller_manager", "ros2_control_node", parameters=[path, timed]
-        ),
-        _node(given, "controller_manager", "spawner", ends=False, arguments=words),
+        _state_publisher(values, document, time),
+        _node(values, "controller_manager", "ros2_control_node", parameters=parameters),
+        _node(values, "controller_manager", "spawner", ends=False, arguments=spawn),
     ]
 
 
-def _state_publisher(given: Given, document: str) -> Node:
-    description = ParameterValue(document, value_type=str)
+def _plugin_packages(path: str, controllers: Sequence[str]) -> list[str]:
+    """List the packages of the plug-ins that a parameter file names for controllers."""
+    packages = []
+    for listed in read_values(read_file(Path(path)), path).values():
+        parameters = listed.get("ros__parameters", {})
+        for name in controllers:
+            plugin = parameters.get(name, {}).get("type", "")
+            if plugin:
+                packages.append(plugin.partition("/")[0])
+    return packages
+
+
+def _state_publisher(values: Values, document: str, time: Mapping[str, bool]) -> Node:
+    """Describe robot_state_publisher with a URDF document."""
     parameters = {
-        "robot_description": description,
-        "frame_prefix": _frame_prefix(given),
+        "robot_description": ParameterValue(document, value_type=str),
+        "frame_prefix": _frame_prefix(values),
+        "ignore_timestamp": True,  # time stands still in a pause, and /tf goes on
+        **time,
     }
-    # time stands still in a pause, and /tf goes on
-    parameters["ignore_timestamp"] = True
-    return _node(given, "robot_state_publisher", parameters=[parameters])
+    package = "robot_state_publisher"
+    return _node(values, package, package, parameters=[parameters])
 
 
-def _frame_prefix(given: Given) -> str:
-    return f"{given['namespace']}/".lstrip("/")
+def _frame_prefix(values: Values) -> str:
+    """Return the namespace as robot_state_publisher puts it before frames."""
+    return f"{values['namespace']}/".lstrip("/")
 
 
 def require(*packages: str) -> None:
-    """Refuse a launch for which ROS packages are missing, all of them, before any start."""
+    """Refuse a launch without its ROS packages, naming all, before anything starts."""
     installed = get_packages_with_prefixes()
-    if missing := [package for package in packages if package not in installed]:
+    missing = [package for package in packages if package not in installed]
+    if missing:
         raise RuntimeError(explain_missing_ros(missing))
 
 
 def _exit_handler(
-    given: Given, name: str, ends: bool
+    values: Values, name: str, ends: bool
 ) -> Callable[[ProcessExited, LaunchContext], list[Action] | None]:
-    """Return what is done when a process exits: it ends its partners, also those that yet start.
+    """Return the handler of a process's exit.
 
-    If it has failed, the launch goes on with what else it includes, and its status will
-    be 1.
+    It ends the other actions of the launch file, also those that are yet to start. If
+    the process has failed, the launch goes on with what else it includes, and its exit
+    status will be 1.
     """
 
     def handle(event: ProcessExited, context: LaunchContext) -> list[Action] | None:
-        over = given.ending or context.is_shutdown
-        failed = event.returncode and not (over and event.returncode == -signal.SIGINT)
+        stopped = values.is_ending or context.is_shutdown
+        interrupted = stopped and event.returncode == -signal.SIGINT
+        failed = event.returncode != 0 and not interrupted
         if failed:
-            # launch takes its status from this handler, or from an exception, which
-            # ends all
-            text = f"{name} failed with exit status {event.returncode}"
-            context.asyncio_loop.call_exception_handler({"message": text})
-        if over or not (failed or ends):
+            # launch takes its exit status from this handler of asyncio, or from an
+            # exception, which would end everything.
+            message = f"{name} failed with exit status {event.returncode}"
+            context.asyncio_loop.call_exception_handler({"message": message})
+        if stopped or not (failed or ends):
             return None
-        given.ending = True
-        partners = [one for one in given.partners if one is not event.action]
-        return [
-            EmitEvent(
-                event=ShutdownProcess(process_matcher=lambda one: one in partners)
-            )
-        ]
+        values.is_ending = True
+        others = [action for action in values.actions if action is not event.action]
+        return [EmitEvent(event=ShutdownProcess(process_matcher=others.__contains__))]
 
     return handle

@@ -185,6 +185,10 @@ COMMANDS: dict[str, Subcommand | str] = {
             const="free",
             choices=("free", "lockstep"),
         ),
+        _flag(
+            "--xacro",
+            "a macro of xacro, which embeds the robot in a larger URDF",
+        ),
     ),
     "equations": Subcommand(
         "write the equations of a scene for another program: C, CasADi, JAX, FMI,"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from sst_ros.description.robot import TOPICS, urdf
+from sst_ros.description.robot import TOPICS, urdf, xacro
 from sst_ros.scene.scene import Scene, load, names
 from sst_ros.scene.yaml_document import json_schema
 
@@ -27,9 +27,8 @@ def print_schema(_: argparse.Namespace) -> None:
 
 
 def describe(options: argparse.Namespace) -> None:
-    """Print a scene as URDF."""
+    """Print a scene as URDF, or as a macro of xacro."""
     sync = options.ros2_control
-    print(
-        urdf(load(options.scene), TOPICS if sync else (), lockstep=sync == "lockstep"),
-        end="",
-    )
+    write = xacro if options.xacro else urdf
+    topics = TOPICS if sync else ()
+    print(write(load(options.scene), topics, lockstep=sync == "lockstep"), end="")

@@ -16,7 +16,6 @@ has beyond that is named at the head of the file.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,9 @@ from sst_ros.description.robot import (
     joints_of,
     load_description_templates,
     shapes,
-    solids,
+    short,
+    solids_of_links,
+    xml_name,
 )
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import limits_of, model_of, ranges_of
@@ -76,15 +77,12 @@ def mjcf(scene: Scene) -> str:
         load_description_templates()
         .get_template("model.mjcf.xml")
         .render(
-            name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
+            name=xml_name(scene),
             left_out=[*_left_out(scene)],
             least=LEAST,
             gravity=ZERO if scene.gravity is None else scene.gravity.acceleration,
             base=BASE,
-            visuals={
-                link: [*chain(*map(solids, some))]
-                for link, some in shapes(scene).items()
-            },
+            visuals=solids_of_links(shapes(scene)),
             solid=_geom,
             chains=[*_nest(joints)],
             bodies=bodies,
@@ -195,8 +193,5 @@ def _geom(kind: str, sizes: Any, at: Any, turn: Any, rgba: Any) -> str:
     else:
         size = sizes["radius"]
     parts = {"size": size, "pos": at, "euler": turn, "rgba": rgba}
-    words = (
-        f'{key}="{" ".join(f"{round(float(x), 6) + 0.0:g}" for x in values)}"'
-        for key, values in parts.items()
-    )
+    words = (f'{key}="{short(values)}"' for key, values in parts.items())
     return f'<geom type="{kind}" {" ".join(words)} />'

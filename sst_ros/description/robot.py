@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manipulator as links, joints and shapes, for the view, and as URDF, for ROS and engines.
+"""The manipulator as links, joints and shapes, for the view, and as URDF, for ROS.
 
     base_link -gamma_k- actuated_k -mu_k- intermediate_k -beta_1- star
                                                          -beta_2- star_from_2
@@ -9,9 +9,9 @@ All joints turn about axes through O, so every frame has its origin there and a 
 a rotation. The star is attached to leg 1. Legs 2 and 3 end in a frame without a body:
 {E} as that leg sees it. The loops are closed where the three are one. Links are drawn
 as arcs, rods, balls and boxes in their own frames; thicknesses are for the eye, arcs
-and radii are the scene's, no shape is meant for collisions. URDF has no loops, no
-springs, no elastic stops and no Stribeck friction: a simulation of the file must add
-them.
+and radii are the scene's. Fewer and simpler shapes enclose them for planners that check
+for collisions. URDF has no loops, no springs, no elastic stops and no Stribeck
+friction: a simulation of the file must add them.
 
 A scene gives inertias about O, and a mass only where something weighs; URDF wants a
 mass. Where the scene has none, it is the one that would have this tensor on the sphere
@@ -28,7 +28,7 @@ a tag of their own.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -36,7 +36,7 @@ import numpy as np
 from sst_ros.dynamics.model import limits_of, ranges_of
 from sst_ros.files import load_templates
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.loads import JOINTS, Friction
 from sst_ros.scene.scene import Scene
 from sst_ros.state import BASE_FRAME, Vector3
 
@@ -63,8 +63,12 @@ LEG_COLOURS: tuple[Colour, ...] = (
 LEAST = 1e-10
 """Mass [kg] and moments of inertia [kg m^2] that MuJoCo gives a link without them."""
 
-# arcs are drawn as chords of this length or less: 0.14 % of the radius off
 STEP = np.radians(6.0)
+"""Arcs are drawn as chords of this angle or less: 0.14 % of the radius off."""
+COLLISION_STEP = np.radians(15.0)
+"""The same of collision shapes: 0.9 % off, by which they are thicker."""
+CARRIAGE = 3.0 * np.array([1.0, 1.3, 1.3])
+"""Sides of a carriage on an arm of the star, in radii of a drawn bar."""
 
 SERVO_TORQUE, SERVO_RATE = 10.6, np.pi
 """Limits of an actuator whose scene has none [N m], [rad/s]: stall torque and speed
@@ -155,9 +159,9 @@ class Arc(NamedTuple):
     thickness: float
     colour: Colour
 
-    def points(self) -> Array:
-        """Points along the arc, STEP apart or less, shape (n, 3) [m]."""
-        count = max(2, int(np.ceil(self.angle / STEP)) + 1)
+    def points(self, step: float = STEP) -> Array:
+        """Return points along the arc, `step` [rad] apart or less, shape (n, 3) [m]."""
+        count = max(2, int(np.ceil(self.angle / step)) + 1)
         angles = np.linspace(0.0, self.angle, count)[:, None]
         across = np.cross(self.axis, self.begin)
         return np.asarray(
@@ -200,42 +204,77 @@ Shape: TypeAlias = "Arc | Rod | Ball | Box"
 def shapes(scene: Scene) -> dict[str, list[Shape]]:
     """Return the shapes of every link that has some, by the link's name."""
     geometry = Geometry.of(scene)
-    base, star = scene.base.radius, scene.star.radius
-    thick, (x, y, z) = 0.02 * base, np.eye(3)
+    base = scene.base.radius
+    star = scene.star.radius
+    bar = _bar_radius(scene)
+    x, y, z = np.eye(3)
     sides = zip(geometry.v, geometry.w, geometry.arc.tolist(), strict=True)
-    found: dict[str, list[Shape]] = {
+    drawn: dict[str, list[Shape]] = {
         BASE: [
-            Ball(np.zeros(3), base - thick, GLOBE, 0.92),
-            *(Arc(v, w, angle, base, 0.7 * thick, TRIANGLE) for v, w, angle in sides),
-            *(Ball(base * v, 1.6 * thick, TRIANGLE) for v in geometry.v),
+            Ball(np.zeros(3), base - bar, GLOBE, 0.92),
+            *(Arc(v, w, angle, base, 0.7 * bar, TRIANGLE) for v, w, angle in sides),
+            *(Ball(base * v, 1.6 * bar, TRIANGLE) for v in geometry.v),
         ],
         # In {E} the carriage k is at s turned about e by +beta.
         STAR: [
-            *(
-                Arc(z, e, geometry.beta_max, star, thick, STAR_COLOUR)
-                for e in geometry.e
-            ),
-            Ball(star * z, 2.2 * thick, STAR_COLOUR),
+            *(Arc(z, e, geometry.beta_max, star, bar, STAR_COLOUR) for e in geometry.e),
+            Ball(star * z, 2.2 * bar, STAR_COLOUR),
         ],
     }
     if scene.payload is not None:
         centre = np.array(scene.payload.centre)
-        rod = Rod(star * z, centre, 0.8 * thick, STEEL)
-        found[STAR] += [rod, Ball(centre, 2.8 * thick, STEEL)]
+        drawn[STAR].append(Rod(star * z, centre, 0.8 * bar, STEEL))
+        drawn[STAR].append(Ball(centre, 2.8 * bar, STEEL))
+    # A quarter arc goes from the motor at w to the carriage at r, just above the base.
+    quarter = base + 1.5 * bar
     for actuated, intermediate, colour in zip(
         ACTUATED, INTERMEDIATE, LEG_COLOURS, strict=True
     ):
-        # A quarter arc from the motor at w to the carriage at r, just above the base.
-        middle = base + 1.5 * thick
-        found[actuated] = [
-            Arc(x, -y, np.pi / 2, middle, thick, colour),
-            Rod(z * (base - thick), z * (middle + 2.0 * thick), 2.4 * thick, colour),
+        bearing = z * (base - bar), z * (quarter + 2.0 * bar)
+        drawn[actuated] = [
+            Arc(x, -y, np.pi / 2, quarter, bar, colour),
+            Rod(*bearing, 2.4 * bar, colour),
         ]
-        found[intermediate] = [
-            Rod(x * (base - thick), x * star, 0.9 * thick, STEEL),
-            Box(star * x, 3.0 * thick * np.array([1.0, 1.3, 1.3]), colour),
+        drawn[intermediate] = [
+            Rod(x * (base - bar), x * star, 0.9 * bar, STEEL),
+            Box(star * x, bar * CARRIAGE, colour),
         ]
-    return found
+    return drawn
+
+
+def collision_shapes(scene: Scene) -> dict[str, list[Shape]]:
+    """Return few convex shapes of every link, for planners that check for collisions.
+
+    Where the star lies outside of the base, they enclose what `shapes` draws: the
+    actuated links turn inside the ball of the base and need none of their own. Beside
+    the carriages on the arms of the star, which always touch these, links touch only
+    where the mechanism collides.
+    """
+    star = scene.star.radius
+    bar = _bar_radius(scene)
+    x = np.array([1.0, 0.0, 0.0])  # from O to the carriage
+    # Around the drawn bearings, but below the carriages and the arms of the star.
+    ball = max(bar, min(scene.base.radius + 4.0 * bar, star - 3.0 * bar))
+    parts: dict[str, list[Shape]] = {BASE: [Ball(np.zeros(3), ball, GLOBE)]}
+    parts[STAR] = []
+    for shape in shapes(scene)[STAR]:
+        if isinstance(shape, Arc):
+            # A chord lies below its arc, by less than this share of the radius.
+            sag = 1.0 - np.cos(COLLISION_STEP / 2.0)
+            parts[STAR].append(shape._replace(thickness=bar + sag * star))
+        else:
+            parts[STAR].append(shape)
+    for intermediate in INTERMEDIATE:
+        parts[intermediate] = [
+            Rod(x * (ball + 0.5 * bar), x * star, 0.9 * bar, STEEL),
+            Box(star * x, bar * CARRIAGE, STEEL),
+        ]
+    return parts
+
+
+def _bar_radius(scene: Scene) -> float:
+    """Return the radius of drawn bars [m], by which other sizes are given."""
+    return 0.02 * scene.base.radius
 
 
 def urdf(
@@ -256,72 +295,101 @@ def urdf(
     Mounts are frames of sensors that are fixed to the star, by name: where they are in
     {E} [m]; their axes are those of {E}.
     """
-    geometry, drawn = Geometry.of(scene), shapes(scene)
-    joints, own = joints_of(geometry), {body.name: body for body in bodies_of(scene)}
-    bodies = {body.name: body for body in _with_negligible_bodies(own, joints)}
-    ranges = {joint: ends for joint, *ends in ranges_of([*limits_of(scene, geometry)])}
-    limited = []
-    for joint in joints:
-        ends = ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf))
-        limits = (
-            dict(zip(("lower", "upper"), ends, strict=True))
-            if np.isfinite(ends).all()
-            else {}
-        )
-        kind = joint.name.split("_")[0]
-        motor = scene.actuators if kind == "gamma" else None
-        # The passive joints have no motor; their rates are of the order of the
-        # actuators'.
-        torque, rate = (
-            getattr(motor, f"{what}_limit", None) for what in ("torque", "velocity")
-        )
-        limits["effort"] = (torque or SERVO_TORQUE) if kind == "gamma" else 0.0
-        limits["velocity"] = rate or max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
-        limited.append((joint, limits, getattr(scene.friction, kind, None)))
-    document: str = (
-        load_description_templates()
-        .get_template("urdf.xml")
-        .render(
-            # An XML name has no spaces.
-            name="".join(letter if letter.isalnum() else "_" for letter in scene.name),
-            assumed=[body.name for body in bodies.values() if body.assumed],
-            links=list(
-                dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))
-            ),
-            bodies=bodies,
-            mounts=mounts or {},
-            visuals={
-                link: [*chain(*map(solids, some))] for link, some in drawn.items()
-            },
-            joints=limited,
-            starts=list(
-                zip(
-                    JOINTS[:3],
-                    scene.initial.gamma,
-                    scene.initial.gamma_dot,
-                    strict=True,
-                )
-            ),
-            topics=topics,
-            least=LEAST,
-            passive=JOINTS[3:],
-            plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
-            roll_pitch_yaw=roll_pitch_yaw,
-        )
+    return _render_urdf(scene, topics, lockstep=lockstep, macro="", prefix="")
+
+
+def xacro(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) -> str:
+    """Write a scene as a macro of xacro that embeds the robot in a larger URDF.
+
+    The macro sst_NAME fixes base_link to the link `parent` at the block `origin`, and
+    puts `prefix` before the names of links and joints.
+    """
+    macro = f"sst_{xml_name(scene)}"
+    return _render_urdf(
+        scene, topics, lockstep=lockstep, macro=macro, prefix="${prefix}"
+    )
+
+
+def _render_urdf(
+    scene: Scene, topics: Sequence[str], *, lockstep: bool, macro: str, prefix: str
+) -> str:
+    """Fill in the template of a URDF document, or of a macro with this name."""
+    joints = joints_of(Geometry.of(scene))
+    scene_bodies = {body.name: body for body in bodies_of(scene)}
+    bodies = {body.name: body for body in _with_negligible_bodies(scene_bodies, joints)}
+    links = dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))
+    initial = scene.initial
+    starts = zip(JOINTS[:3], initial.gamma, initial.gamma_dot, strict=True)
+    template = load_description_templates().get_template("urdf.xml")
+    document: str = template.render(
+        name=xml_name(scene),
+        macro=macro,
+        prefix=prefix,
+        base=BASE,
+        assumed=[body.name for body in bodies.values() if body.assumed],
+        links=list(links),
+        bodies=bodies,
+        visuals=solids_of_links(shapes(scene)),
+        collisions=solids_of_links(collision_shapes(scene), COLLISION_STEP),
+        joints=_limited_joints(scene, joints),
+        starts=list(starts),
+        topics=topics,
+        least=LEAST,
+        passive=JOINTS[3:],
+        plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
+        roll_pitch_yaw=roll_pitch_yaw,
     )
     return document
+
+
+def xml_name(scene: Scene) -> str:
+    """Return the name of a scene as XML allows it, without spaces."""
+    letters = (letter if letter.isalnum() else "_" for letter in scene.name)
+    return "".join(letters)
+
+
+def _limited_joints(
+    scene: Scene, joints: Iterable[Joint]
+) -> Iterator[tuple[Joint, dict[str, float], Friction | None]]:
+    """Yield each joint with the attributes of its limit, and its friction."""
+    ranges = {}
+    for joint_number, lower, upper in ranges_of(
+        [*limits_of(scene, Geometry.of(scene))]
+    ):
+        ranges[joint_number] = (lower, upper)
+    torque_limit = getattr(scene.actuators, "torque_limit", None) or SERVO_TORQUE
+    rate_limit = getattr(scene.actuators, "velocity_limit", None)
+    # The passive joints have no motor; their rates are of the order of the actuators'.
+    highest_rate = max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
+    for joint in joints:
+        kind = joint.name.split("_")[0]
+        driven = kind == "gamma"
+        limits = {}
+        lower, upper = ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf))
+        if np.isfinite([lower, upper]).all():
+            limits["lower"] = lower
+            limits["upper"] = upper
+        limits["effort"] = torque_limit if driven else 0.0
+        limits["velocity"] = (driven and rate_limit) or highest_rate
+        yield joint, limits, getattr(scene.friction, kind, None)
 
 
 def load_description_templates() -> Any:
     """Return the templates of this room, with the filters that write numbers."""
     templates = load_templates("description")
-    templates.filters |= {
-        "exact": lambda values: " ".join(repr(float(x) + 0.0) for x in values),
-        "short": lambda values: " ".join(
-            f"{round(float(x), 6) + 0.0:g}" for x in values
-        ),
-    }
+    templates.filters["exact"] = _exact
+    templates.filters["short"] = short
     return templates
+
+
+def _exact(values: Iterable[float]) -> str:
+    """Write numbers with all digits."""
+    return " ".join(repr(float(value) + 0.0) for value in values)
+
+
+def short(values: Iterable[float]) -> str:
+    """Write lengths [m] and angles [rad] of shapes to a millionth."""
+    return " ".join(f"{round(float(value), 6) + 0.0:g}" for value in values)
 
 
 class Body(NamedTuple):
@@ -343,50 +411,64 @@ class Body(NamedTuple):
 
 
 def bodies_of(scene: Scene) -> Iterator[Body]:
-    """All bodies that have mass or inertia."""
-    star, base, payload, motor = scene.star, scene.base, scene.payload, scene.actuators
-
-    def body(
-        name: str,
-        radius: float,
-        about_o: Array,
-        mass: float = 0.0,
-        at: Vector3 = (0.0, 0.0, 0.0),
-    ) -> Body:
-        c, assumed = np.array(at), float(np.trace(about_o)) / (2.0 * radius**2)
-        own = about_o - mass * (c @ c * np.eye(3) - np.outer(c, c))
-        return Body(name, name, mass or assumed, c, own, mass == 0.0)
-
-    yield body(STAR, star.radius, star.tensor, star.mass, star.centre)
+    """Yield all bodies that have mass or inertia."""
+    star = scene.star
+    yield _body(STAR, star.radius, star.tensor, star.mass, star.centre)
+    payload = scene.payload
     if payload is not None:
         tensor = np.zeros((3, 3)) if payload.inertia is None else payload.inertia.matrix
         yield Body(PAYLOAD, STAR, payload.mass, np.array(payload.centre), tensor)
+    motor = scene.actuators
     for k, leg in enumerate(LEGS):
         for name, link, radius in (
-            (ACTUATED[k], scene.actuated_links[k], base.radius),
+            (ACTUATED[k], scene.actuated_links[k], scene.base.radius),
             (INTERMEDIATE[k], scene.intermediate_links[k], star.radius),
         ):
             if link.mass or link.inertia is not None:
-                yield body(name, radius, link.tensor, link.mass, link.centre)
+                yield _body(name, radius, link.tensor, link.mass, link.centre)
         if motor is not None and motor.rotor_inertia:
             # A thin disc behind its gear: only its inertia about w matters.
-            behind = motor.gear_ratio**2 * motor.rotor_inertia
-            disc = np.diag([behind / 2.0, behind / 2.0, behind])
-            yield body(f"rotor_{leg}", base.radius, disc)._replace(link=ACTUATED[k])
+            reflected = motor.gear_ratio**2 * motor.rotor_inertia
+            disc = np.diag([reflected / 2.0, reflected / 2.0, reflected])
+            rotor = _body(f"rotor_{leg}", scene.base.radius, disc)
+            yield rotor._replace(link=ACTUATED[k])
+
+
+def _body(
+    name: str,
+    radius: float,
+    about_o: Array,
+    mass: float = 0.0,
+    centre: Vector3 = (0.0, 0.0, 0.0),
+) -> Body:
+    """Make a body from its tensor about O [kg m^2]; without a mass it is assumed.
+
+    The assumed mass has this tensor's trace on the sphere of this radius [m].
+    """
+    c = np.array(centre)
+    about_centre = about_o - mass * (c @ c * np.eye(3) - np.outer(c, c))
+    assumed = float(np.trace(about_o)) / (2.0 * radius**2)
+    return Body(name, name, mass or assumed, c, about_centre, mass == 0.0)
 
 
 def _with_negligible_bodies(
     bodies: Mapping[str, Body], joints: Iterable[Joint]
 ) -> list[Body]:
     """Give each moving link that has no body one that changes no motion."""
-    tensor, at_o = NEGLIGIBLE_INERTIA * np.eye(3), np.zeros(3)
-    bare = (joint.child for joint in joints if joint.child not in bodies)
-    negligible = [Body(link, link, NEGLIGIBLE_MASS, at_o, tensor) for link in bare]
-    return [*bodies.values(), *negligible]
+    tensor = NEGLIGIBLE_INERTIA * np.eye(3)
+    complete = list(bodies.values())
+    for joint in joints:
+        link = joint.child
+        if link not in bodies:
+            complete.append(Body(link, link, NEGLIGIBLE_MASS, np.zeros(3), tensor))
+    return complete
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
-    """Angles (r, p, y) [rad] of R = Rz(y) Ry(p) Rx(r), shape (3,), exact at p = pi/2 too."""
+    """Return the angles (r, p, y) [rad] of R = Rz(y) Ry(p) Rx(r), shape (3,).
+
+    They are exact at p = pi/2 too.
+    """
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     sine, cosine = np.sin(yaw), np.cos(yaw)
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
@@ -397,20 +479,43 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     return np.array([roll, pitch, yaw])
 
 
-def solids(shape: Shape) -> Iterator[tuple[Any, ...]]:
-    """Yield kind, sizes, centre, roll, pitch, yaw, and colour of what a shape is in URDF."""
+class Solid(NamedTuple):
+    """A primitive of URDF in the frame of its link."""
+
+    kind: str  # sphere, box or cylinder
+    sizes: Mapping[str, Any]  # [m], by the names of URDF's attributes
+    centre: Array  # [m], shape (3,)
+    roll_pitch_yaw: Array  # [rad], shape (3,)
+    colour: tuple[float, float, float, float]  # red, green, blue, opacity
+
+
+def solids_of_links(
+    links: Mapping[str, Iterable[Shape]], step: float = STEP
+) -> dict[str, list[Solid]]:
+    """Return the primitives of each link's shapes; arcs are chords of `step` [rad]."""
+    found = {}
+    for link, drawn in links.items():
+        found[link] = [solid for shape in drawn for solid in solids(shape, step)]
+    return found
+
+
+def solids(shape: Shape, step: float = STEP) -> Iterator[Solid]:
+    """Yield the primitives that a shape is in URDF; an arc is chords of `step` [rad]."""
     colour = (*shape.colour, getattr(shape, "opacity", 1.0))
+    upright = np.zeros(3)
     if isinstance(shape, Ball):
-        yield "sphere", {"radius": [shape.radius]}, shape.centre, np.zeros(3), colour
+        sizes = {"radius": [shape.radius]}
+        yield Solid("sphere", sizes, shape.centre, upright, colour)
     elif isinstance(shape, Box):
-        yield "box", {"size": shape.size}, shape.centre, np.zeros(3), colour
+        yield Solid("box", {"size": shape.size}, shape.centre, upright, colour)
     else:
-        ends = shape.points() if isinstance(shape, Arc) else (shape.begin, shape.end)
+        is_arc = isinstance(shape, Arc)
+        ends = shape.points(step) if is_arc else (shape.begin, shape.end)
         for begin, end in pairwise(ends):
             x, y, z = end - begin
-            # The cylinder's axis is z; it ends a little late, so that no gap shows at
-            # the bends.
+            # The cylinder's axis is z.
             turn = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
+            # It ends a little late, so that no gap shows at the bends.
             length = float(np.linalg.norm(end - begin)) + 0.1 * shape.thickness
-            size = {"radius": [shape.thickness], "length": [length]}
-            yield "cylinder", size, (begin + end) / 2.0, turn, colour
+            sizes = {"radius": [shape.thickness], "length": [length]}
+            yield Solid("cylinder", sizes, (begin + end) / 2.0, turn, colour)

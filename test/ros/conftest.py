@@ -17,7 +17,7 @@ rclpy = pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from programs import own_domain  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
@@ -278,6 +278,11 @@ class Observer:
             SetParameters, f"{NODE}/set_parameters", parameters=[parameter]
         )
         return reply.results[0]
+
+    def parameter(self, node, name):
+        """Value of a flag of a node."""
+        reply = self.call(GetParameters, f"{node}/get_parameters", names=[name])
+        return reply.values[0].bool_value
 
     def diagnostics(self, name=""):
         """All that was said in the statuses whose name ends so."""

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
+from rosgraph_msgs.msg import Clock
 
 from sst_ros.recording import recording
 
@@ -169,7 +170,9 @@ UNPLAYED = (
         ("simulate", "scen:=swing", 1, "scen:=swing: no such argument; did you mean 'scene'?"),
         ("simulate", "params_file:=nowhere.yaml", 1, "params_file:=nowhere.yaml: no such file"),
         ("simulate", "duration:=x play:=true", 1, "--duration = 'x': must be a finite number"),
-        ("feedforward", "mode:=nosuch bag:=sst", 1, "--mode = 'nosuch': must be one of feed"),
+        ("feedforward", "mode:=nosuch", 1, r"\"mode\".*\"nosuch\".*feedforward_pd.*pd"),
+        ("simulate", "use_sim_time:=yes", 1, r"\"yes\" is not valid.*'true', 'false'"),
+        ("record", "bag:=mcap", 1, r"\"mcap\" is not valid.*'ros2', 'sst'"),
     ],
 )  # fmt: skip
 def test_how_a_launch_ends(launch, name, words, status, said):
@@ -383,9 +386,38 @@ def test_ros2_control_begins_a_run_by_its_commands(
 def test_no_launch_file_is_left_out():
     text = Path(__file__).read_text(encoding="utf-8")
     found = {
-        path.name for path in (Path(__file__).parents[2] / "launch").glob("*.launch.py")
+        path.name for path in (Path(__file__).parents[2] / "launch").glob("*.launch.*")
     }
     assert found and all(f'"{name.partition(".")[0]}' in text for name in found)
+
+
+def test_the_example_in_xml_runs_two_robots(launch):
+    run = launch("two_robots.launch.xml", "left:=example1", "duration:=0.3")
+    run.ended()
+    for robot in ("left", "right"):
+        assert re.search(rf"\[{robot}.sst_simulator\]: finished", run.text), run.text
+
+
+def test_the_example_in_yaml_ends_with_the_motion(launch):
+    run = launch("two_nodes.launch.yaml").ended()
+    assert re.search(r"\[inverse_dynamics-2\]: process has finished cleanly", run.text)
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_use_sim_time_is_the_time_of_all_nodes(launch, observer, follows):
+    """The simulator is the source of /clock, or follows another one like the rest."""
+    words = ["use_sim_time:=true", "scene:=swing", "duration:=0.0"]
+    words += ["publish_clock:=false"] if follows else []
+    run = launch("view.launch.py" if not follows else "simulate.launch.py", *words)
+    run.until("sst_simulator")
+    if follows:
+        run.until("use_sim_time is set and there is no /clock")
+    else:
+        observer.until(lambda: observer.listen(Clock, "/clock"), "clock")
+        assert observer.parameter("/sst_viewer", "use_sim_time") is True
+    assert observer.parameter("/sst_simulator", "use_sim_time") is follows
+    run.interrupt()
+    run.ended()
 
 
 @needs_rosbag2
