@@ -295,7 +295,7 @@ def urdf(
     Mounts are frames of sensors that are fixed to the star, by name: where they are in
     {E} [m]; their axes are those of {E}.
     """
-    return _render_urdf(scene, topics, lockstep=lockstep, macro="", prefix="")
+    return _render_urdf(scene, topics, lockstep=lockstep, mounts=mounts)
 
 
 def xacro(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) -> str:
@@ -311,7 +311,13 @@ def xacro(scene: Scene, topics: Sequence[str] = (), *, lockstep: bool = False) -
 
 
 def _render_urdf(
-    scene: Scene, topics: Sequence[str], *, lockstep: bool, macro: str, prefix: str
+    scene: Scene,
+    topics: Sequence[str],
+    *,
+    lockstep: bool,
+    macro: str = "",
+    prefix: str = "",
+    mounts: Mapping[str, Vector3] | None = None,
 ) -> str:
     """Fill in the template of a URDF document, or of a macro with this name."""
     joints = joints_of(Geometry.of(scene))
@@ -329,6 +335,7 @@ def _render_urdf(
         assumed=[body.name for body in bodies.values() if body.assumed],
         links=list(links),
         bodies=bodies,
+        mounts=mounts or {},
         visuals=solids_of_links(shapes(scene)),
         collisions=solids_of_links(collision_shapes(scene), COLLISION_STEP),
         joints=_limited_joints(scene, joints),
