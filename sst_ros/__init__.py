@@ -41,8 +41,11 @@ if TYPE_CHECKING:
     )
     from sst_ros.mechanism.workspace import workspace as workspace
     from sst_ros.plot.workspace import plot_workspace as plot_workspace
+    from sst_ros.plot.workspace import plot_zone as plot_zone
     from sst_ros.proof.certify import ProvenMotion as ProvenMotion
     from sst_ros.proof.certify import certify as certify
+    from sst_ros.proof.zones import ProvenZone as ProvenZone
+    from sst_ros.proof.zones import certify_zone as certify_zone
     from sst_ros.recording import recording as _recording
     from sst_ros.recording.recording import Recording as Recording
     from sst_ros.scene import scene as _scene
@@ -78,8 +81,9 @@ _MODULES = {
     "mechanism.geometry": "Geometry",
     "mechanism.kinematics": "direct_kinematics:direct inverse_kinematics:inverse",
     "mechanism.workspace": "distance_to_singularity workspace",
-    "plot.workspace": "plot_workspace",
+    "plot.workspace": "plot_workspace plot_zone",
     "proof.certify": "ProvenMotion certify",
+    "proof.zones": "ProvenZone certify_zone",
     "recording.recording": "Recording read_bag:read",
     "scene.bodies": "arc_inertia",
     "scene.scene": "Scene load_scene:scene_of",

@@ -125,6 +125,8 @@ def test_a_copied_proof_has_the_same_bounds(make_copy):
     proof = sst_ros.certify("example2", duration=0.01)
     other = make_copy(proof)
     assert repr(other) == repr(proof) and other.largest == proof.largest
+    zone = sst_ros.certify_zone("general", tilt=0.4, max_boxes=1_000)
+    assert repr(make_copy(zone)) == repr(zone)
 
 
 def results(folder):

@@ -14,6 +14,7 @@ from sst_ros import (
     InverseDynamics,
     Simulation,
     certify,
+    certify_zone,
     equations,
     linearize,
     load_scene,
@@ -46,6 +47,7 @@ def made(bag):
         simulate(scene, duration=0.1),
         simulate(scene, duration=0.1).reactions,
         certify("example2", duration=0.01, t_eval=[0.01]),
+        certify_zone("general", tilt=0.4, max_boxes=1_000),
         linearize(scene, None, (0.0, 0.0, 0.0)),
         equations("example2", "numpy"),
     )

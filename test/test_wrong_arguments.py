@@ -134,6 +134,8 @@ PROOF = {
     name: TASK[name] for name in ("scene", "torque", "duration", "initial", "t_eval")
 }
 PROOF |= {"bound": 1e-9, "ranges": None, "progress": False}
+ZONE = {"scene": SCENE, "gamma_box": None, "tilt": 0.3, "torsion": 0.3}
+ZONE |= {"orientation": None, "ranges": None, "max_boxes": 500, "progress": False}
 STUDY = {
     "scene": SCENE,
     "vary": {"star.inertia.zz": [0.26, 0.27]},
@@ -189,6 +191,8 @@ def calls():
         (simulate, TASK),
         (simulate, TASK | {"torque": lambda t: REST, "control_period": 1e-3}),
         (sst_ros.certify, PROOF),
+        (sst_ros.certify_zone, ZONE),
+        (sst_ros.plot_zone, of(zone=None)),
         (load_scene, of(scene="example2")),
         (SCENE.with_values, of(values={"star.mass": 1.0})),
         (lambda k, x: SCENE.with_values({key(k): x}), of(k="star.mass", x=1.0)),
@@ -325,6 +329,7 @@ def test_each_public_name_is_thrown_at(calls):
         "Identification",
         "LinearModel",
         "ProvenMotion",
+        "ProvenZone",
         "State",
     }
     assert others - errors == {"__version__", *results}

@@ -148,6 +148,38 @@ COMMANDS: dict[str, Subcommand | str] = {
         SCENE,
         *_out("picture, .png, .pdf or .svg", "SCENE_workspace.png"),
     ),
+    "zone": Subcommand(
+        "prove a part of the workspace: regular and inside all limits, with tolerances",
+        "cli.runs:prove_zone",
+        SCENE,
+        _number(
+            "--tilt", "of E from the reference pose [deg]; default: to all corners"
+        ),
+        _number("--torsion", "about E [deg]; default: 180", default=180.0),
+        Arg(
+            "--gamma-box",
+            "in place of a cap: least and largest angle of each actuator [deg]",
+            nargs=6,
+            type=partial(_number_of, float),
+            metavar="DEG",
+        ),
+        Arg(
+            "--ranges",
+            "tolerances by key, half-widths or the word digits, as in: "
+            "star.alpha_deg=0.1 base.v=digits",
+            nargs="+",
+            default=[],
+            metavar="KEY=WIDTH",
+        ),
+        _count("--boxes", 20_000_000, "most boxes; default: 200000", default=200_000),
+        _path("--picture", "draw it, .png, .pdf or .svg", metavar="FILE"),
+        _path("--out", "table of the boxes, .csv", metavar="FILE"),
+        _flag("--force", "overwrite the files of --picture and --out"),
+        needs="flint",
+        more="Prove where the manipulator has no singularity and is inside all limits, "
+        "whatever its geometry within the tolerances. Exit status 1 if not all of the "
+        "zone is proven.",
+    ),
     "scene": "list, show and check scenes",
     "scene list": Subcommand("list the shipped scenes", "cli.scenes:list_all"),
     "scene show": Subcommand(

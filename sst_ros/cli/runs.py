@@ -9,12 +9,24 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import math
 import signal
 import threading
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from sst_ros.cli.commands import free_out, function, results_folder
-from sst_ros.errors import InputError, Problem, SstError, refuse_unless, require
+from sst_ros.errors import (
+    InputError,
+    Problem,
+    SstError,
+    refuse_errors,
+    refuse_unless,
+    require,
+)
 from sst_ros.files import require_free
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Geometry
@@ -158,6 +170,61 @@ def certify_scene(options: argparse.Namespace) -> int:
         proven.to_pandas().to_csv(options.out, index=False)
         print(options.out)
     return 0 if proven.success else 1
+
+
+def prove_zone(options: argparse.Namespace) -> int:
+    """Print what is proven of a zone of the workspace; draw and write it."""
+    out, picture = options.out, options.picture
+    if out is not None:
+        free_out(options, out)
+    if picture is not None:
+        is_picture = picture.suffix in PICTURES
+        allowed = f"must end in {' or '.join(PICTURES)}"
+        refuse_unless("zone", ("--picture", str(picture), is_picture, allowed))
+        require_free(picture, "zone", force=options.force, option="--picture")
+        require("matplotlib")
+    zone = function("proof.zones:certify_zone")(
+        options.scene,
+        ranges=_read_ranges(options.ranges),
+        max_boxes=options.boxes,
+        progress=True,
+        **_zone_limits(options),
+    )
+    print(zone)
+    if picture is not None:
+        figure = function("plot.workspace:plot_zone")(zone)
+        function("host.figures:save_figure")(figure, picture)
+        print(picture)
+    if out is not None:
+        zone.to_pandas().to_csv(out, index=False)
+        print(out)
+    return 0 if zone.success else 1
+
+
+def _zone_limits(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the cap or the box of a zone, in radians."""
+    half_turn = 180.0
+    if options.gamma_box is not None:
+        box = np.radians(options.gamma_box).reshape(3, 2)
+        is_alone = options.tilt is None and options.torsion == half_turn
+        given = (options.tilt, options.torsion)
+        allowed = "are those of a cap: leave them out with --gamma-box"
+        refuse_unless("zone", ("--tilt, --torsion", given, is_alone, allowed))
+        return {"gamma_box": box}
+    torsion = math.pi if options.torsion == half_turn else math.radians(options.torsion)
+    tilt = None if options.tilt is None else math.radians(options.tilt)
+    return {"tilt": tilt, "torsion": torsion}
+
+
+def _read_ranges(words: Sequence[str]) -> dict[str, float | str]:
+    """Read KEY=WIDTH."""
+    ranges: dict[str, float | str] = {}
+    for word in words:
+        key, _, width = word.partition("=")
+        allowed = "must be KEY=WIDTH, a half-width or the word digits"
+        with refuse_errors("zone", "--ranges", word, allowed, ValueError):
+            ranges[key] = width if width == "digits" else float(width)
+    return ranges
 
 
 def view(options: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,15 +21,28 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from sst_ros.errors import refuse_unless
-from sst_ros.figures import BLUE, INK, Looks, mark_ends, styled
+from sst_ros.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    VERMILION,
+    Looks,
+    mark_ends,
+    styled,
+)
 from sst_ros.mechanism import workspace
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.mechanism.workspace import OrientationMap
 from sst_ros.scene.scene import Scene
 
+if TYPE_CHECKING:  # the room needs python-flint
+    from sst_ros.proof.zones import ProvenZone
+
 # levels of cond J; above all are the same
 CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)
 _ALARM = "#d1182b"
+ZONE_DIVISIONS = 50  # of an edge of the triangle on which a zone is drawn
 
 
 @styled
@@ -81,6 +94,57 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
                 axes.plot([], [], "o", markersize=4, color=colour, label=label)
                 axes.legend(loc="upper right", fontsize=8, frameon=False)
     return figure
+
+
+@styled
+def plot_zone(zone: ProvenZone) -> Figure:
+    """Draw what is proven of a zone on the workspace triangle.
+
+    Of a cap the torsion at each direction of E: how much of it is proven, and how much is
+    neither proven nor refuted; of a box of actuator angles the directions of E.
+    """
+    is_zone = hasattr(zone, "turns_at")
+    refuse_unless("plot_zone", ("zone", zone, is_zone, "must be of `certify_zone`"))
+    geometry = Geometry.of(zone.scene)
+    if zone.names[0] == "gamma_1":
+        figure = Figure(figsize=(6.4, 5.6))
+        axes = figure.subplots()
+        _draw_statuses(axes, geometry, zone)
+        axes.legend(loc="upper right", fontsize=8, frameon=False)
+    else:
+        figure = Figure(figsize=(10.5, 4.9))
+        s, faces = workspace.triangle_directions(geometry, ZONE_DIVISIONS)
+        turns = np.degrees(zone.turns_at(s))
+        panels = figure.subplots(1, 2)
+        for axes, index, title in (
+            (panels[0], 2, "Proven torsion"),
+            (panels[1], 1, "Torsion neither proven nor refuted"),
+        ):
+            x, y = project(geometry, s)
+            mesh = Triangulation(x, y, faces)
+            most = max(float(turns[:, index].max()), 1e-9)
+            levels = MaxNLocator(10).tick_values(0.0, most)
+            filled = axes.tricontourf(mesh, turns[:, index], levels=levels)
+            bar = figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02)
+            bar.set_label("deg", fontsize=9)
+            axes.set_title(title, fontsize=10.5, color=INK, loc="center")
+            draw_triangle(axes, geometry)
+    figure.suptitle(f"{zone.scene.name}: {zone.shares}", fontsize=12, color=INK)
+    return figure
+
+
+def _draw_statuses(axes: Axes, geometry: Geometry, zone: ProvenZone) -> None:
+    """Draw the direction of E in the middle of each box, by its status."""
+    s = zone.middles()[:, :, 2]
+    for status, colour, label in (
+        (-1, VERMILION, "refuted"),
+        (0, GREY, "open"),
+        (1, GREEN, "proven"),
+    ):
+        rows = zone.columns["status"] == status
+        x, y = project(geometry, s[rows])
+        axes.plot(x, y, ".", markersize=2.5, color=colour, label=label)
+    draw_triangle(axes, geometry)
 
 
 def triangles(chart: OrientationMap) -> NDArray[np.intp]:

@@ -79,6 +79,7 @@ _UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 AT_START = "the posture at the start is not proven to be the only one near"
 MOST_PARTS = 10_000  # of the box of ranges
 ORDER = -1.6
+INFLATIONS = 6  # of the box in which the start is looked for
 ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
 # proofs by which the width of ranges is looked for that would do, each by half
 NARROWER = 8
@@ -337,13 +338,17 @@ def krawczyk(
     values = at(middle, middles)[0] + at(middle, given)[2] * off
     step = inverse * values
     least = arb(2) ** (8 - PRECISION)
-    radii = [(2 * x + least).upper() for x in entries(magnitude(step))]
-    box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
-    _, slopes, by_given = at(box, given)
-    image = entries(middle - step - (inverse * slopes - 1) * (box - middle))
-    if not all(
-        b.contains_interior(x) for b, x in zip(entries(box), image, strict=True)
-    ):
+    reach = entries(magnitude(step))
+    for _ in range(INFLATIONS):
+        radii = [(2 * x + least).upper() for x in reach]
+        box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
+        _, slopes, by_given = at(box, given)
+        image = middle - step - (inverse * slopes - 1) * (box - middle)
+        pairs = zip(entries(box), entries(image), strict=True)
+        if all(wide.contains_interior(narrow) for wide, narrow in pairs):
+            break
+        reach = entries(magnitude(image - middle))
+    else:
         raise Refused(reason)
     back = slopes.inv()
     linear = -1 * (back * by_given)

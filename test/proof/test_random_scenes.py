@@ -8,6 +8,7 @@ from mpmath import mp, mpf
 from sst_ros import SineTorque, certify, load_scene
 from studies.sixty_digits import Motion, angle
 
+REST = (0.0, 0.0, 0.0)
 END, COUNT = 0.05, 200  # s; the truth of a scene takes about as long as its proof
 SCENES = ("example2_heavy", "general", "gravity_payload")
 
@@ -81,3 +82,10 @@ def test_all_random_motions_lie_inside():
     found = np.array([compare(number) for number in range(COUNT)])
     assert np.all(found >= 1.0)
     print(np.quantile(found[:, :2], (0.0, 0.05, 0.5, 0.95, 1.0), axis=0))
+
+
+def test_a_start_of_equal_rates_is_enclosed():
+    # The first order of what moves the body rate there is zero, the second is not.
+    rates = {"initial.gamma_dot": (1.0, 1.0, 1.0)}
+    proven = certify(load_scene("example2").with_values(rates), REST, 0.01)
+    assert not proven.reason and proven.largest < 1e-14
