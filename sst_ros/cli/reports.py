@@ -20,7 +20,7 @@ def report_run(options: argparse.Namespace) -> None:
     """Evaluate a recorded run."""
     out = free_out(options, results_folder(options.bag, "report"))
     given = {"damaged": options.damaged, "namespace": options.namespace}
-    summary = function("report.run:write_run_report")(options.bag, out, **given)
+    summary = function("report.run_page:write_run_report")(options.bag, out, **given)
     if options.verbose:
         print(function("report.run:summary_table")(summary))
     print(function("report.run:summary_text")(summary, str(out)), end="")
@@ -122,7 +122,7 @@ def run_demo(options: argparse.Namespace) -> None:
         folder = out if name == "example2" else out / name  # the main job
         print(f"{name}: {load(name).description}", flush=True)
         bag = demo.record(name, folder)
-        summary = function("report.run:write_run_report")(bag, folder)
+        summary = function("report.run_page:write_run_report")(bag, folder)
         print(function("report.run:summary_text")(summary, str(folder)), flush=True)
         proven = function("report.accuracy:proven_error")(name)
         print(f"Error of simulate on {name}, proven to be below: {proven}", flush=True)

@@ -10,10 +10,11 @@ import os
 import platform
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from enum import Enum
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,31 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 WHOLE_RUN_S = 1.0  # length of a run [s] where the scene names no duration
+
+
+class Severity(Enum):
+    """Weight of a finding."""
+
+    WARNING = "warning"  # the run is not what was asked for
+    NOTE = "note"  # how the numbers of the report are to be read
+
+
+class Finding(NamedTuple):
+    """A statement about a recorded run."""
+
+    severity: Severity
+    text: str
+
+
+def judge(findings: Sequence[Finding]) -> str:
+    """Return WARNING if one of the findings is a warning, else OK."""
+    warned = any(finding.severity is Severity.WARNING for finding in findings)
+    return "WARNING" if warned else "OK"
+
+
+def texts_of(findings: Sequence[Finding], severity: Severity) -> list[str]:
+    """Return the texts of the findings of one severity, in their order."""
+    return [finding.text for finding in findings if finding.severity is severity]
 
 
 def data_frame(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of one recorded run, from its bag alone: numbers, page and pictures.
+"""The evaluation of one recorded run, from its bag alone: numbers and findings.
 
 The numbers are one flat mapping, units in the names, nothing that is not finite; what a
 recording does not contain is None, never a guess.
@@ -20,34 +20,28 @@ the first tick that applies its values. Two delays are measured:
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
-from sst_ros import figures
-from sst_ros.figures import BLUE, GREY, LINES, Looks, hide_zeros
-from sst_ros.files import write_into
-from sst_ros.plot import pictures
-from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.report import findings, reference, tracking
-from sst_ros.report.findings import Severity
+from sst_ros.report import reference, tracking
 from sst_ros.report.reference import QUANTITIES, Comparison
-from sst_ros.report.results import largest, made_on, provenance, publish, render
+from sst_ros.report.results import (
+    Finding,
+    Severity,
+    judge,
+    largest,
+    made_on,
+    render,
+    texts_of,
+)
 from sst_ros.state import NANOSECONDS, Array
-
-DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
-"""Pictures of `plot` that the report has, too."""
-
-PAGE, HTML = "page.png", "page.html"
 
 # of the integration, where the tolerance of the run was not recorded
 ERROR_LIMIT_RAD = 1e-9
@@ -66,6 +60,10 @@ STATISTICS = {
     "max": "max",
 }
 """What is shown of periods and delays, as pandas and as the summary name it."""
+
+LEAST_ANSWERED_PERCENT = 90.0
+"""A controller at the rate of the samples answers nearly all of them; one that is late
+or whose commands are lost answers fewer."""
 
 
 class Timing(NamedTuple):
@@ -110,45 +108,14 @@ def evaluate_run(run: Recording) -> RunEvaluation:
     numbers = (
         _count(run, measured) | summarise(run, integration, ideal) | measured.numbers
     )
-    found = findings.find_all(run, integration, ideal, numbers)
+    findings = find_findings(run, integration, ideal, numbers)
     summary = {
-        "verdict": findings.verdict(found),
-        "reasons": findings.texts(found, Severity.WARNING),
-        "notes": findings.texts(found, Severity.NOTE),
+        "verdict": judge(findings),
+        "reasons": texts_of(findings, Severity.WARNING),
+        "notes": texts_of(findings, Severity.NOTE),
         **numbers,
     }
     return RunEvaluation(measured, integration, ideal, summary)
-
-
-def write_run_report(
-    bag: Path, out: Path, *, damaged: bool = False, namespace: str | None = None
-) -> dict[str, Any]:
-    """Evaluate a recorded run.
-
-    Write summary.json, the page and the pictures into `out`.
-
-    Of a `damaged` recording what is intact is evaluated; the `namespace` is that of
-    `read_bag`. The summary is returned; `summary_text` makes a short text of it,
-    `summary_table` the whole. Raises InputError where the bag is no whole recording of
-    a run, or `out` cannot be written.
-    """
-    run = recording.read(bag, damaged=damaged, namespace=namespace)
-    with write_into(out, "report"):
-        found = evaluate_run(run)
-        drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
-        title = f"Error against run time, {run.scene.name}"
-        drawn += pictures.save(
-            draw_errors(run.seconds, found), title, out, "error", ["png"]
-        )
-        figures.save_figure(draw_overview(run, found), out / PAGE)
-        result = found.summary | {
-            "pictures": [path.name for path in drawn],
-            "page": [PAGE, HTML],
-        }
-        given = {"s": result, "table": summary_table(result), "overview": out / PAGE}
-        page = render("run.html", pictures=drawn, **given)
-        publish(out, "report", {HTML: page, "summary.json": result})
-    return result
 
 
 def summary_text(summary: dict[str, Any], folder: str) -> str:
@@ -391,119 +358,132 @@ def _measure_answers(
     return {"samples_answered_percent": share, "command_age_mean_s": age}
 
 
-@figures.styled
-def draw_errors(seconds: Array, found: RunEvaluation) -> Figure:
-    """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
-    panels = {"(a) integration error, against the same torques": found.integration}
-    if found.ideal is not None:
-        panels["(b) sample-and-hold error, against continuous torques"] = found.ideal
-    figure, grid = figures.stack(["largest difference"] * len(panels), 3.1)
-    for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
-        _draw_comparison(axes, seconds, comparison)
-        axes.set_title(title)
-    return figure
+def find_findings(
+    run: Recording,
+    integration: Comparison,
+    ideal: Comparison | None,
+    numbers: Mapping[str, Any],
+) -> list[Finding]:
+    """Return warnings, the weightiest first, then notes.
+
+    Args:
+        run: the recording.
+        integration: its comparison with the same torques.
+        ideal: its comparison with continuous torques, if there is one.
+        numbers: the numbers of its summary.
+
+    """
+    warnings = [Finding(Severity.WARNING, text) for text in _find_warnings(numbers)]
+    notes = [
+        *_note_recording(run),
+        *_note_comparisons(run, integration, ideal),
+        *_note_measurement(run, numbers),
+    ]
+    return warnings + [Finding(Severity.NOTE, text) for text in notes]
 
 
-def _draw_comparison(axes: Axes, seconds: Array, comparison: Comparison) -> None:
-    """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
-    least = figures.SMALLEST_SHOWN
-    floor = np.fmax(comparison.own.max(axis=1), least)
-    axes.fill_between(
-        seconds,
-        least,
-        floor,
-        color=GREY,
-        alpha=0.3,
-        linewidth=0.0,
-        label="error of the reference",
-    )
-    names = ("γ [rad]", "γ̇ [rad/s]", "orientation [rad]")
-    for values, name, looks in zip(
-        comparison.error.to_numpy().T, names, LINES, strict=False
-    ):
-        axes.plot(seconds, hide_zeros(values), label=name, **looks)
-    axes.set_yscale("log")
-    axes.set_ylim(bottom=least)
-    axes.legend(fontsize=8, ncol=2, loc="lower right")
-
-
-@figures.styled
-def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
-    """Draw a run on one page; a panel without data says that it has none."""
-    seconds, measured, reported = run.seconds, found.timing, found.timing.reported
-    figure = Figure(figsize=(12.0, 10.4))
-    grid = iter(figure.subplots(3, 2).ravel())
-
-    def panel(title: str, values: Any, ylabel: str, xlabel: str = "time t [s]") -> Axes:
-        axes: Axes = next(grid)
-        axes.set(title=title, ylabel=ylabel, xlabel=xlabel)
-        if xlabel == "time t [s]":
-            axes.set_xlim(0.0, seconds[-1])
-        if not np.isfinite(np.asarray(values)).any():
-            axes.text(0.5, 0.5, "not recorded", transform=axes.transAxes, ha="center")
-        return axes
-
-    errors = found.integration.error
-    axes = panel(
-        "Integration error, against the same torques", errors, "largest difference"
-    )
-    _draw_comparison(axes, seconds, found.integration)
-    axes = panel("Energy residual", found.integration.energy, "energy residual [J]")
-    axes.plot(seconds, found.integration.energy, color=BLUE, linewidth=1.4)
-    axes.yaxis.set_major_formatter("{x:.1e}")
-    title = "Real-time factor (recorder clock), and losses"
-    axes = panel(title, measured.pace, "real-time factor")
-    axes.plot(measured.pace.index, measured.pace, color=BLUE, marker=".")
-    axes.axhline(1.0, color=GREY, linewidth=0.9, linestyle="--")
-    figures.widen(axes, np.append(measured.pace, 1.0), 0.04)
-    missed = reported.dropna(subset="ticks_missed").set_index("time_s").ticks_missed
-    total = f"{missed.iloc[-1]:g}" if len(missed) else "unknown"
-    losses = {
-        f"{len(measured.lost_s)} samples lost": measured.lost_s,
-        f"{len(measured.gaps_s)} gaps of torques": measured.gaps_s,
-        f"{total} ticks missed": missed.index[missed.diff().fillna(missed) > 0.0],
+def _find_warnings(numbers: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with a run, the weightiest first."""
+    phase = numbers["phase"]
+    if numbers["fault"]:
+        yield f"fault: {numbers['fault']}"
+    elif phase not in (None, "finished"):
+        yield f"the run was cut short, or its recording was: last phase {phase}"
+    yield from numbers["damage"]
+    if numbers["samples_lost"]:
+        recorded = numbers["samples_recorded_percent"]
+        yield f"{numbers['samples_lost']} samples lost ({recorded:.2f} % recorded)"
+    if numbers["tick_gaps"]:
+        yield f"{numbers['tick_gaps']} gaps between applied torques"
+    if numbers["ticks_missed"]:
+        yield f"{numbers['ticks_missed']} ticks missed by the simulator"
+    answered = numbers["samples_answered_percent"]
+    if answered is not None and answered < LEAST_ANSWERED_PERCENT:
+        age_ms = 1e3 * numbers["command_age_mean_s"]
+        yield f"commands answered {answered:.3g} % of samples, mean age {age_ms:.3g} ms"
+    limit = numbers["error_limit_rad"]
+    errors = {
+        "integration error": numbers["integration_error_gamma_rad"],
+        "error estimate": numbers["simulator_error_estimate"],
     }
-    foot: Looks = {"transform": axes.get_xaxis_transform(), "linestyle": "none"}
-    marks = zip(losses.items(), ("r|", "gx", "kv"), (0.03, 0.07, 0.11), strict=True)
-    for (name, times), mark, height in marks:
-        axes.plot(times, np.full(len(times), height), mark, label=name, **foot)
-    axes.legend(fontsize=8, loc="best", ncol=3)
-    label = "deviation from the nominal period [µs]"
-    axes = panel(
-        "Period between received samples", measured.period_us, "samples", label
-    )
-    axes.hist(measured.period_us - run.period_ns / 1e3, bins=80, color=BLUE, log=True)
-    axes.set_ylim(bottom=0.5)
-    axes.xaxis.set_major_locator(MaxNLocator(5))
-    commands = measured.commands
-    title = "Latency: reception of a command to the step that applies it"
-    axes = panel(title, commands.received_us, "latency [µs]")
-    axes.plot(commands.time_s, commands.received_us, ".", color=BLUE, markersize=3)
-    axes.axhline(0.0, color=GREY, linewidth=0.9, linestyle="--")
-    used = (1e-6 * reported.ticks * reported.step_mean_us).to_numpy()
-    # Reports come once a second: between them, and from the start, the steps cost the
-    # same.
-    at = np.interp(seconds, [0.0, *reported.time_s], [0.0, *used])
-    so_far = np.fmax.accumulate(errors.orientation.to_numpy())
-    curves = {
-        "integration error": (at if len(used) else np.full(len(at), np.nan), so_far)
-    }
-    for name, column in (
-        ("its estimate by the simulator", "error_estimate"),
-        ("hold error if torques are those of the start", "hold_error_start"),
-        ("the same, of the middle", "hold_error_middle"),
-    ):
-        curves[name] = used, reported[column].to_numpy()
-    title = "Error against computing time used, over the run"
-    label = "computing time of all steps [ms]"
-    axes = panel(title, used, "error of the orientation [rad]", label)
-    axes.set_yscale("log")
-    for (name, (times, values)), looks in zip(curves.items(), LINES, strict=False):
-        marker = "" if name == "integration error" else "o"
-        axes.plot(1e3 * times, hide_zeros(values), label=name, marker=marker, **looks)
-    axes.legend(fontsize=8, loc="best")
-    figure.suptitle(
-        f"Run of {run.scene.name}: {seconds[-1]:g} s, {len(seconds)} samples"
-    )
-    figures.note(figure, provenance(found.summary["report"]), 200)
-    return figure
+    for name, error in errors.items():
+        if error is not None and error > limit:
+            yield f"{name} {error:.1e} rad above {limit:.0e} rad"
+    difference = numbers["effort_difference_max_N_m"]
+    if difference and not numbers["actuators_lag"]:
+        yield f"efforts differ from applied torques by {difference:.1e} N m"
+
+
+def _note_recording(run: Recording) -> Iterator[str]:
+    """Yield what the recording says of the course of the run."""
+    phase, fault = run.diagnostics.get("phase"), run.diagnostics.get("fault")
+    if not run.diagnostics:
+        yield (
+            "no diagnostics are recorded: missed ticks and error estimates are unknown"
+        )
+    elif phase not in ("finished", "fault"):
+        yield f"the run or its recording was cut short: the last phase is {phase}"
+    if phase == "fault" or fault:
+        end = float(run.seconds[-1])
+        yield (
+            "the run ended by a fault; it is compared up to its last sample, at "
+            f"{end:.6f} s"
+        )
+    if not reference.begins(run):
+        yield "the start of the run is not recorded; times count from the first sample"
+
+
+def _note_comparisons(
+    run: Recording, integration: Comparison, ideal: Comparison | None
+) -> Iterator[str]:
+    """Yield what could not be compared."""
+    moment = run.scene.moment
+    pushed = bool(moment and moment.topic)
+    if pushed and run.ticks.moment is None:
+        yield (
+            "the moment on the star came from a topic and is not recorded: nothing is "
+            "compared"
+        )
+    left_out = len(run.time_ns) - integration.compared
+    restarts = len(integration.restarts_ns)
+    if restarts:
+        yield (
+            f"torques are missing: the reference began again {restarts} times from a "
+            f"recorded sample; {left_out} samples are not compared"
+        )
+    elif left_out:
+        yield f"{left_out} samples could not be compared"
+    if ideal is None and pushed:
+        yield "the moment comes from a topic: no ideal to compare with"
+    if ideal is None and run.scene.torque is None:
+        yield "the scene has no torques: no ideal to compare with"
+
+
+def _note_measurement(run: Recording, numbers: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the recorded signals are, and are not."""
+    if numbers["motion_of"] != "joint_states":
+        rms = numbers["measurement_error_rms_rad"]
+        largest = numbers["measurement_error_max_rad"]
+        off = f"{rms:.1e} rad RMS, {largest:.1e} rad at most"
+        if numbers["motion_of"] == "true_joint_states":
+            yield (
+                "integration error and energy are those of the true motion "
+                "(true_joint_states), tracking is that of the measured one "
+                f"(joint_states), which is off by {off}"
+            )
+        else:
+            yield (
+                f"joint_states are measured, off the orientation by {off}, and "
+                "true_joint_states are not recorded: the integration error is that of "
+                "the orientation; rates and energy are not compared"
+            )
+    if numbers["foreign_states"]:
+        count = numbers["foreign_states"]
+        yield f"{count} joint states of other robots are left out"
+    if run.scene.lags:
+        yield "the actuators lag: efforts differ from the torques that are asked for"
+    if run.signals.bag.unverified:
+        count = run.signals.bag.unverified
+        yield f"{count} chunks have no checksum: damage would not be noticed"
+    if "euler_zyz" in run.missing:
+        yield ("euler_zyz is not recorded: its pictures show the orientation's angles")

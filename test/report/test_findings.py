@@ -5,8 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from sst_ros.report import findings, reference
-from sst_ros.report.findings import Severity
+from sst_ros.report import reference
+from sst_ros.report.results import Severity, judge, texts_of
+from sst_ros.report.run import find_findings
 
 GOOD = {
     "phase": "finished",
@@ -45,36 +46,36 @@ def find(monkeypatch):
     monkeypatch.setattr(reference, "begins", lambda _: True)
 
     def find_of(**changed):
-        return findings.find_all(RUN, WHOLE, object(), GOOD | changed)
+        return find_findings(RUN, WHOLE, object(), GOOD | changed)
 
     return find_of
 
 
 def test_a_good_run_has_no_finding_and_the_verdict_ok(find):
-    assert find() == [] and findings.verdict([]) == "OK"
+    assert find() == [] and judge([]) == "OK"
 
 
 @pytest.mark.parametrize(("share", "warned"), [(89.9, True), (90.0, False)])
 def test_answers_to_nine_samples_of_ten_are_enough(find, share, warned):
     found = find(samples_answered_percent=share)
-    assert findings.verdict(found) == ("WARNING" if warned else "OK")
+    assert judge(found) == ("WARNING" if warned else "OK")
 
 
 def test_warnings_come_in_order_of_weight_and_notes_make_no_verdict(find):
     found = find(tick_gaps=2, samples_lost=3, fault="singular", foreign_states=5)
-    assert findings.texts(found, Severity.WARNING) == [
+    assert texts_of(found, Severity.WARNING) == [
         "fault: singular",
         "3 samples lost (100.00 % recorded)",
         "2 gaps between applied torques",
     ]
     notes = ["5 joint states of other robots are left out"]
-    assert findings.texts(found, Severity.NOTE) == notes
-    assert findings.verdict(find(foreign_states=5)) == "OK"
+    assert texts_of(found, Severity.NOTE) == notes
+    assert judge(find(foreign_states=5)) == "OK"
 
 
 def test_errors_are_held_against_the_limit_of_the_run(find):
     found = find(integration_error_gamma_rad=2e-9, simulator_error_estimate=3e-9)
-    assert findings.texts(found, Severity.WARNING) == [
+    assert texts_of(found, Severity.WARNING) == [
         "integration error 2.0e-09 rad above 1e-09 rad",
         "error estimate 3.0e-09 rad above 1e-09 rad",
     ]

@@ -21,14 +21,8 @@ from sst_ros.recording import recording
 from sst_ros.report import reference
 from sst_ros.report.reference import TickStepper
 from sst_ros.report.results import render
-from sst_ros.report.run import (
-    draw_overview,
-    evaluate_run,
-    measure_timing,
-    summary_table,
-    summary_text,
-    write_run_report,
-)
+from sst_ros.report.run import evaluate_run, measure_timing, summary_table, summary_text
+from sst_ros.report.run_page import draw_overview, write_run_report
 from sst_ros.report.tracking import read_tracking, write_tracking_report
 from sst_ros.scene import scene
 from sst_ros.scene.loads import Initial
