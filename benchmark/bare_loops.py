@@ -29,8 +29,8 @@ import rclpy
 from benchmark.measure import read_options
 from benchmark.nodes import Account, Client, Process, start_simulator, wait_for
 from sst_ros.nodes import process, topics
-from sst_ros.nodes.publications import LOG_NS
-from sst_ros.nodes.state_messages import Numbers, TorqueLog, state_messages, time_of
+from sst_ros.nodes.publications import LOG_NS, TorqueLog, state_messages, time_of
+from sst_ros.nodes.sensors import Numbers
 from sst_ros.nodes.topics import Reader
 from sst_ros.report.results import data_frame, markdown
 from sst_ros.runtime import scheduling

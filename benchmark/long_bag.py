@@ -30,7 +30,8 @@ from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.nodes.state_messages import Numbers, TorqueLog, state_messages, time_of
+from sst_ros.nodes.publications import TorqueLog, state_messages, time_of
+from sst_ros.nodes.sensors import Numbers
 from sst_ros.progress import slices
 from sst_ros.recording.bag_reader import message_types
 from sst_ros.recording.bag_writer import BagWriter

@@ -65,18 +65,23 @@ class ReferenceMotion(Explained):
     It is made of a function that gives the reference at a time from 0 to `duration`, in
     which an ArithmeticError is a serial singularity, and of `pieces`, rising times from
     0 to `duration`: from one to the next the motion is so smooth that some ten samples
-    resolve it.
+    resolve it. An `effort` is a function that gives torques at such a time, which a
+    controller adds to its own [N m].
     """
 
     @check_kinds
     def __init__(
-        self, inside: Callable[[float], Reference], pieces: tuple[float, ...]
+        self,
+        inside: Callable[[float], Reference],
+        pieces: tuple[float, ...],
+        effort: Callable[[float], Vector3] | None = None,
     ) -> None:
         some = isinstance(pieces, tuple) and len(pieces) > 0
         refuse_unless(
             "motion", ("pieces", pieces, some, "must be rising times [s], a tuple")
         )
         self._inside, self.pieces, self.duration = inside, pieces, pieces[-1]
+        self.effort = effort
 
     @check_kinds_late
     def at(self, time: float) -> Reference:
@@ -96,6 +101,12 @@ class ReferenceMotion(Explained):
         if time == inside:
             return found
         return Reference(found.quaternion, ZERO, ZERO, found.gamma, ZERO, ZERO)
+
+    def effort_at(self, time: float) -> Vector3 | None:
+        """Return the torques to add at a time [s], those of the ends beyond them [N m]."""
+        if self.effort is None:
+            return None
+        return self.effort(min(max(time, 0.0), self.duration))
 
     def _facts(self) -> dict[str, object]:
         pieces = len(self.pieces) - 1
@@ -124,7 +135,24 @@ def slow_down(
     is inside all limits of position, for half of `duration` more at most.
     """
     inside = partial(_slowed_down, motion, begin, duration)
-    return ReferenceMotion(inside, equal_pieces(duration, 4))
+    effort = None
+    if motion.effort is not None:
+        effort = partial(_slowed_effort, motion, begin, duration)
+    return ReferenceMotion(inside, equal_pieces(duration, 4), effort)
+
+
+def _slowed_effort(
+    motion: ReferenceMotion, begin: float, duration: float, time: float
+) -> Vector3:
+    """Return the effort of `slow_down` at a time [s]: that of the place on the path."""
+    effort = motion.effort_at(_slowed_time(begin, duration, time))
+    assert effort is not None
+    return effort
+
+
+def _slowed_time(begin: float, duration: float, time: float) -> float:
+    u = time / duration
+    return begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u))
 
 
 def _slowed_down(
@@ -135,7 +163,7 @@ def _slowed_down(
     A function that pickle takes.
     """
     u = time / duration
-    at = motion.at(begin + duration * u * (1.0 - u * u * (1.0 - 0.5 * u)))
+    at = motion.at(_slowed_time(begin, duration, time))
     speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
     return replace(
         at,

@@ -7,6 +7,7 @@ The control laws are in `law`: by the model, by feedback, or by both.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -303,6 +304,12 @@ class Controller:
         mechanism = virtual_work.Mechanism.of(model)
         t1, _ = virtual_work.equation_of_motion(mechanism, posture, (0.0, 0.0, 0.0))
         self.inertia: Vector3 = triple((-np.diag(t1)).tolist())
+        limit = float(law.command_limit(settings.torque_limit, model))
+        self._limit = limit if math.isfinite(limit) else None
+        self._law = self._make_law(settings)
+        self.reset()
+
+    def _make_law(self, settings: ControllerSettings) -> law.ControlLaw:
         column, rate = np.array(self.inertia)[:, None], settings.integral_rate
         gains = law.feedback_gains(
             column, lambda name: getattr(settings, name), settings.direct
@@ -316,17 +323,16 @@ class Controller:
         refuse_unless(
             "control", ("integral_rate", rate, not rate or rate < min(kd), allowed)
         )
-        limit = float(law.command_limit(settings.torque_limit, model))
-        known = limit if math.isfinite(limit) else None
-        self._numbers = kp, kd, self.inertia, rate, known, period_s
-        self._law = self._make_law()
-        self.reset()
-
-    def _make_law(self) -> law.ControlLaw:
-        functions = self._inverse.torque, self._space.star_motion
-        kp, kd, inertia, rate, limit, period = self._numbers
         return law.ControlLaw(
-            self._settings, *functions, kp, kd, inertia, rate, limit, period
+            settings,
+            self._inverse.torque,
+            self._space.star_motion,
+            kp,
+            kd,
+            self.inertia,
+            rate,
+            self._limit,
+            self._period_s,
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -336,7 +342,21 @@ class Controller:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on where the controller was when it was copied."""
         vars(self).update(state)
-        self._law = self._make_law()
+        self._law = self._make_law(self._settings)
+
+    @check_kinds
+    def tune(self, settings: ControllerSettings) -> None:
+        """Take other gains from the next command on; mode and limit stay.
+
+        The sum of errors stays, too. Raises InputError, and changes nothing, where the
+        integral action would be unstable.
+        """
+        kept = {
+            name: getattr(self._settings, name)
+            for name in ("mode", "space", "torque_limit", "feedforward_at")
+        }
+        settings = dataclasses.replace(settings, **kept)
+        self._law, self._settings = self._make_law(settings), settings
 
     def reset(self) -> None:
         """Clear the integral, the orientation that was observed last, and a failure."""
@@ -362,9 +382,14 @@ class Controller:
         now = held = self._inverse.reference_torque(desired)
         if self._settings.feedforward_at == "middle":
             held = self._inverse.reference_torque(
-                self._motion.at(time + 0.5 * self._period_s)
+                self._motion.at(self._hold_time(time))
             )
         return desired, now, held
+
+    def _hold_time(self, time: float) -> float:
+        """Return the time whose feedforward is held over the period from `time` on [s]."""
+        is_middle = self._settings.feedforward_at == "middle"
+        return time + 0.5 * self._period_s if is_middle else time
 
     @check_kinds_late
     def command(self, time: float, measured: Measurement) -> Command:
@@ -388,7 +413,12 @@ class Controller:
                 self._space.follow(*self._known, measured.gamma) if observes else ()
             )
             command = self._law.answer(
-                desired, torques, *measured, observed, self._integral
+                desired,
+                torques,
+                *measured,
+                observed,
+                self._integral,
+                self._motion.effort_at(self._hold_time(time)),
             )
             total = command.total
             refuse_unless(

@@ -221,13 +221,14 @@ class ControlLaw(NamedTuple):
         gamma_dot: Triple,
         observed: Any,
         integral: Any,
+        effort: Triple | None = None,
     ) -> Command:
         """Return the torques at a sample, of angles [rad] and rates [rad/s] as measured.
 
         `torques` are those of the desired motion [N m], now and at the instant whose
         torque is held; `observed` is the orientation at the measured angles, where the
         law needs it, and `integral` the sum of errors [rad s], none without integral
-        action.
+        action. An `effort` is added to the feedforward [N m].
         """
         mode, feedback, summed = self.settings.mode, ZERO, ZERO
         feedforward = torques[1] if self.settings.feeds else ZERO
@@ -249,6 +250,8 @@ class ControlLaw(NamedTuple):
         elif mode != "feedforward":
             summed = error
             feedback = _by_joint(self.inertia, self._correct(integral, error, rates))
+        if effort is not None:
+            feedforward = add(feedforward, effort)
         torque = total = add(feedforward, feedback)
         weight: Scalar = 1.0
         if self.limit is not None:

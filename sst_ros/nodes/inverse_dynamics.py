@@ -110,6 +110,11 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._report()
         _print(self.follower.tracking())
 
+    def change(self, changed: ControllerNodeParameters) -> None:
+        """Take over gains, from the next sample on: callbacks come one after the other."""
+        self.follower.tune(changed)
+        super().change(changed)
+
     def hear(self, phase: String) -> None:
         """End with the simulator; begin anew when it does.
 

@@ -6,40 +6,46 @@ next deadline; a topic without subscribers is left out. rclpy holds the interpre
 lock while it publishes (measured: 200 publications beside a busy thread are never
 interrupted), so a thread of its own could not work beside the next step; it would only
 add switches between threads.
+
+`publish` serialises a message before it returns, so one object of each kind serves a
+whole run: to make new ones would take longer than to publish them.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from array import array
+from collections.abc import Sequence
 from typing import Any
 
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.description.robot import ACTUATED, INTERMEDIATE, urdf
 from sst_ros.dynamics.reactions import reaction_at
 from sst_ros.errors import refuse_unless
 from sst_ros.nodes import topics
-from sst_ros.nodes.state_messages import (
+from sst_ros.nodes.sensors import (
     ImuMessage,
-    JointStateMessage,
     MeasuredJointStateMessage,
     Numbers,
     ReactionMessage,
     StateMessages,
-    TorqueLog,
-    state_messages,
-    time_of,
 )
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.scene.loads import JOINTS
+from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, ZERO, State, Vector3
+from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, ZERO, State, Vector3
 
 LOG_NS = 50_000_000
 """Torques are published once for about this time, not with each sample."""
@@ -47,8 +53,138 @@ _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
 _AT_REST = (0.0,) * len(JOINTS)
+_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATORS))
 _SENSORS = ("imu", "reaction")
 """Topics of samples only, for which the acceleration of the star is computed."""
+
+
+class _Stateless:
+    """A message that depends on the present numbers only."""
+
+    def restart(self) -> None:
+        """Begin anew at the first sample of a run: there is nothing to forget."""
+
+
+def time_of(nanoseconds: int) -> Time:
+    """Return a stamp."""
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+class JointStateMessage(_Stateless):
+    """joint_states: all nine joints; the effort is the torque over the step that ended."""
+
+    def __init__(self, frame_id: str = "") -> None:
+        self._message = JointState(name=list(JOINTS))
+        self._message.header.frame_id = frame_id
+
+    def fill(self, stamp: Time, numbers: Numbers) -> JointState:
+        """Return the message."""
+        message = self._message
+        message.header.stamp = stamp
+        message.position = array("d", numbers.angles)
+        message.velocity = array("d", numbers.rates)
+        message.effort = array("d", (*numbers.torque, *_PASSIVE))
+        return message
+
+
+class OrientationMessage(_Stateless):
+    """~/orientation: the quaternion of {E} in {B}."""
+
+    def __init__(self, base_frame: str = BASE_FRAME) -> None:
+        self._message = QuaternionStamped()
+        self._message.header.frame_id = base_frame
+
+    def fill(self, stamp: Time, numbers: Numbers) -> QuaternionStamped:
+        """Return the message."""
+        self._message.header.stamp = stamp
+        part = self._message.quaternion
+        part.x, part.y, part.z, part.w = numbers.quaternion
+        return self._message
+
+
+class EulerMessage(_Stateless):
+    """~/euler_zyz: theta, phi and psi as x, y and z of a vector."""
+
+    def __init__(self, base_frame: str = BASE_FRAME) -> None:
+        self._message = Vector3Stamped()
+        self._message.header.frame_id = base_frame
+
+    def fill(self, stamp: Time, numbers: Numbers) -> Vector3Stamped:
+        """Return the message."""
+        self._message.header.stamp = stamp
+        part = self._message.vector
+        part.x, part.y, part.z = zyz_angles(numbers.quaternion)
+        return self._message
+
+
+def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
+    """ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w), as `geometry.zyz_angles`.
+
+    z / w is tan((theta + psi) / 2), -x / y is tan((theta - psi) / 2).
+    """
+    x, y, z, w = quaternion
+    sine, cosine = math.hypot(x, y), math.hypot(z, w)
+    total = math.atan2(z, w) if cosine else 0.0
+    difference = math.atan2(-x, y) if sine else 0.0
+    if sine and cosine:
+        theta, psi = total + difference, total - difference
+    else:
+        theta, psi = 0.0, 2.0 * (total - difference)
+    theta, psi = (math.remainder(angle, 2.0 * math.pi) for angle in (theta, psi))
+    return theta, 2.0 * math.atan2(sine, cosine), psi
+
+
+class TorqueLog:
+    """applied_torques: torque and moment of every tick since the last publication.
+
+    Point i holds over tick i; its time is the end of that tick, relative to the
+    header's stamp.
+    """
+
+    def __init__(
+        self, period_ns: int, *, moments: bool = False, base_frame: str = BASE_FRAME
+    ) -> None:
+        self._period_ns, self._moments = period_ns, moments
+        names = (*ACTUATORS, *MOMENTS) if moments else ACTUATORS
+        self._message = JointTrajectory(joint_names=list(names))
+        self._message.header.frame_id = base_frame
+        self._points: list[JointTrajectoryPoint] = []  # those of the longest log so far
+        self.clear()
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def clear(self) -> None:
+        """Forget the rows."""
+        self._rows: list[tuple[float, ...]] = []
+
+    def append(self, torque: Vector3, moment: Sequence[float], ticks: int = 1) -> None:
+        """Log the torque [N m] and the moment [N m] of some ticks."""
+        self._rows += [(*torque, *moment) if self._moments else torque] * ticks
+
+    def take(self, stamp_ns: int) -> JointTrajectory:
+        """Return the message of the ticks logged since stamp_ns and clear the log."""
+        for tick in range(len(self._points) + 1, len(self) + 1):
+            seconds, rest = divmod(tick * self._period_ns, NANOSECONDS)
+            end = Duration(sec=seconds, nanosec=rest)
+            self._points.append(JointTrajectoryPoint(time_from_start=end))
+        points = self._points[: len(self)]
+        for point, row in zip(points, self._rows, strict=True):
+            point.effort = array("d", row)
+        self._message.points = points
+        self._message.header.stamp = time_of(stamp_ns)
+        self.clear()
+        return self._message
+
+
+def state_messages(frame_id: str = "", base_frame: str = BASE_FRAME) -> StateMessages:
+    """Return the messages that each state has; the frame_id is that of joint_states."""
+    return {
+        "joint_states": JointStateMessage(frame_id),
+        "orientation": OrientationMessage(base_frame),
+        "euler_zyz": EulerMessage(base_frame),
+    }
 
 
 def follows_clock(node: Node) -> bool:
@@ -86,7 +222,9 @@ class SimulatorTopics:
         self._samples = state_messages("", settings.base_frame)
         self._idles = state_messages(IDLE_FRAME_ID, settings.base_frame)
         if settings.channel is not None:
-            self._samples["joint_states"] = MeasuredJointStateMessage(settings)
+            self._samples["joint_states"] = MeasuredJointStateMessage(
+                settings, self._samples["joint_states"]
+            )
             self._samples["true_joint_states"] = JointStateMessage()
             self._idles["true_joint_states"] = JointStateMessage(IDLE_FRAME_ID)
         self._samples |= sensor_messages(scene, settings)

@@ -324,7 +324,15 @@ class PlayerParameters(AnsweringParameters):
 
 
 class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
-    """Parameters of sst_inverse_dynamics: those of the control law and those of the node."""
+    """Parameters of sst_inverse_dynamics: those of the control law and of the node."""
+
+    CHANGEABLE: ClassVar = (
+        "bandwidth",
+        "damping_ratio",
+        "stiffness",
+        "damping",
+        "integral_rate",
+    )
 
     scene: str = entry(
         "scene of the controller's model, by name or by path", default="reach"
@@ -333,6 +341,10 @@ class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
         "scene: the scene's motion, once; topic: trajectories from ~/joint_trajectory"
         " and goals of ~/follow_joint_trajectory, until it is stopped",
         ("scene", "topic"),
+    )
+    allow_partial_joints_goal: bool = entry(
+        "take trajectories of some of the actuators; the others hold their position",
+        default=False,
     )
     hold: float = _number(
         "time for which the end of the scene's motion is held", "s", 0.0

@@ -32,7 +32,7 @@ from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.trajectory_messages import Points, plan, read_points
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, ZERO
+from sst_ros.state import NANOSECONDS, ZERO, Vector3
 
 _FIRST_PERIODS_AHEAD = 25
 """Control periods that the first check may take where the reference moves.
@@ -151,12 +151,24 @@ class TrajectoryFollower:
         refuse_unless(
             "joint_trajectory", ("motion", motion, motion == "topic", allowed)
         )
-        order = Order(read_points(message), seen, seen_ns)
+        is_partial_allowed = self._settings.allow_partial_joints_goal
+        points = read_points(message, is_partial_allowed=is_partial_allowed)
+        order = Order(points, seen, seen_ns)
         if self._waiting is not None:
             self._waiting.outcome.cancel()
         self._waiting = order
         self.proceed()
         return order
+
+    def tune(self, settings: ControllerNodeParameters) -> None:
+        """Take other gains from the next sample on.
+
+        Raises InputError, and changes nothing, where the controller refuses them; before
+        the first motion they are checked when it is taken.
+        """
+        if self.stage is not Stage.WAITING:
+            self._controller.tune(settings)
+        self._settings = settings
 
     def proceed(self) -> None:
         """Have the newest trajectory checked, and follow it once it has been."""
@@ -180,26 +192,36 @@ class TrajectoryFollower:
             order, self._checked = self._checked, None
             self._settle(order, result)
 
-    def _place(self, order: Order) -> tuple[Reference, float]:
-        """Find the reference from which to plan, and the time of the trajectory then [s]."""
-        stamp_ns, order.begin_ns, order.asked_ns = (
-            order.points.stamp_ns,
-            None,
-            self._last_ns,
-        )
+    def _place(self, order: Order) -> tuple[Reference, float, Vector3]:
+        """Find where a trajectory begins.
+
+        Returns the reference, the time of the trajectory then [s], and the torques that
+        are added then [N m].
+        """
+        stamp_ns = order.points.stamp_ns
+        order.asked_ns = self._last_ns
+        order.begin_ns = None
         now_ns = self._last_ns + self._settings.period_ns
+        effort: Vector3 | None = None
         if self._last is None:
-            order.begin, now_ns = self._reference_at_rest(order.seen), order.seen_ns
+            order.begin = self._reference_at_rest(order.seen)
+            now_ns = order.seen_ns
         elif stamp_ns == 0 and self._rests():
             order.begin = self._motion.at(math.inf)
+            effort = self._motion.effort_at(math.inf)
         else:
             now_ns = order.begin_ns = max(self._last_ns + self._ahead_ns, stamp_ns)
-            order.begin = self._reference_at(now_ns)
+            motion, time = self._motion_at(now_ns)
+            order.begin = motion.at(time)
+            effort = motion.effort_at(time)
         order.passed = max(0, now_ns - stamp_ns) / NANOSECONDS if stamp_ns else 0.0
-        return order.begin, order.passed
+        return order.begin, order.passed, effort or ZERO
 
     def _settle(self, order: Order, result: Any) -> None:
-        """Follow what was checked if it still goes on from the reference, else have it repeated."""
+        """Follow what was checked, or have the check repeated.
+
+        That is where the reference has gone on meanwhile, in another way.
+        """
         order.asked += 1
         if order.outcome.done():  # by a reset
             return
@@ -210,7 +232,10 @@ class TrajectoryFollower:
             )
             self._ahead_ns = max(2 * (took_ns + period_ns), self._ahead_ns - period_ns)
         if isinstance(result, ReferenceMotion) and self._is_timely(order):
-            self._follow(order, result)
+            try:
+                self._follow(order, result)
+            except SstError as error:  # of the gains, with the first motion
+                order.outcome.set_exception(error)
         elif isinstance(result, SstError):
             order.outcome.set_exception(result)
         elif self._waiting is not None:
@@ -226,9 +251,8 @@ class TrajectoryFollower:
             return True
         if order.begin_ns is None:
             return self._rests() and order.begin == self._motion.at(math.inf)
-        return order.begin_ns >= self._last_ns and order.begin == self._reference_at(
-            order.begin_ns
-        )
+        motion, time = self._motion_at(order.begin_ns)
+        return order.begin_ns >= self._last_ns and order.begin == motion.at(time)
 
     def has(self, order: Order) -> bool:
         """Whether the trajectory is followed, or will be at its stamp."""
@@ -238,13 +262,13 @@ class TrajectoryFollower:
         """Whether the reference stands still from now on."""
         return not self._upcoming and self.time >= self._motion.duration
 
-    def _reference_at(self, stamp_ns: int) -> Reference:
-        """Return the reference at a stamp that has not come yet."""
+    def _motion_at(self, stamp_ns: int) -> tuple[ReferenceMotion, float]:
+        """Return what is followed at a stamp that has not come yet, and its time then [s]."""
         motion, start_ns = self._motion, self._start_ns or self._last_ns
         for begin_ns, upcoming, _ in self._upcoming:
             if begin_ns <= stamp_ns:
                 motion, start_ns = upcoming, begin_ns
-        return motion.at((stamp_ns - start_ns) / NANOSECONDS)
+        return motion, (stamp_ns - start_ns) / NANOSECONDS
 
     def _follow(self, order: Order, motion: ReferenceMotion) -> None:
         """Follow a motion from its stamp on, and until then what is followed now."""

@@ -11,101 +11,167 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from enum import IntEnum
+from functools import partial
 from operator import attrgetter
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from sst_ros.control.actuator_space import Reference, ReferenceMotion
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference_motions import through_points
 from sst_ros.errors import Check, refuse_unless
-from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.generic_math import triple
+from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.runtime.settings import ControllerNodeParameters
 from sst_ros.runtime.torque_input import ACTUATORS
 from sst_ros.scene.scene import Scene
-from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
+from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
 NO_TOLERANCE = -1.0  # in a message: the default does not hold either
 
 
 class Points(NamedTuple):
-    """Points of a trajectory_msgs/JointTrajectory: rows in the order of the legs."""
+    """Points of a trajectory_msgs/JointTrajectory: rows by leg, empty where open."""
 
     stamp_ns: int  # when it begins; 0 for at once
     times: list[float]  # from then on [s]
-    # positions, velocities, accelerations; empty where open
-    rows: tuple[list[list[float]], ...]
+    legs: list[int]  # of the actuators that it moves; the others hold their position
+    positions: list[list[float]]
+    velocities: list[list[float]]
+    accelerations: list[list[float]]
+    efforts: list[list[float]]  # no rows where no torques are added
 
 
-def read_points(message: Any) -> Points:
+def read_points(message: Any, *, is_partial_allowed: bool = False) -> Points:
     """Read a trajectory_msgs/JointTrajectory; its joints may come in any order.
 
-    Positions are needed, velocities and accelerations may be left out. An InputError
-    lists faults; `plan` finds those of the numbers.
+    Positions are needed; velocities and accelerations may be left out, efforts in all
+    points or in none. Some joints suffice where that is allowed. An InputError lists
+    faults; `plan` finds those of the numbers.
     """
-    names, stamp_ns = list(message.joint_names), nanoseconds(message.header.stamp)
-    one_each = f"must be {', '.join(ACTUATORS)}, each once"
-    refuse_unless(
-        "joint_trajectory",
-        ("joint_names", names, sorted(names) == list(ACTUATORS), one_each),
-        *(
-            (
-                f"points[{i}].effort",
-                [*at.effort],
-                not at.effort,
-                "must be left out: it is computed",
-            )
-            for i, at in enumerate(message.points)
-        ),
-    )
-    places = [names.index(name) for name in ACTUATORS]
+    names = list(message.joint_names)
+    is_known = sorted(names) == list(ACTUATORS)
+    allowed = f"must be {', '.join(ACTUATORS)}, each once"
+    if is_partial_allowed:
+        is_known = 0 < len(names) == len({*names} & {*ACTUATORS})
+        allowed = f"must be some of {', '.join(ACTUATORS)}, each once"
+    elif set(names) < set(ACTUATORS):
+        allowed += ", or allow_partial_joints_goal true"
+    refuse_unless("joint_trajectory", ("joint_names", names, is_known, allowed))
+    legs = [leg for leg, name in enumerate(ACTUATORS) if name in names]
+    places = [names.index(ACTUATORS[leg]) for leg in legs]
+    whole = f"must be {len(names)} finite numbers, one for each of joint_names"
+    checks: list[Check] = []
 
-    def by_leg(quantity: str) -> list[list[float]]:
-        """Sort by leg what is whole; what is not is refused as it is."""
-        rows = [list(map(float, getattr(point, quantity))) for point in message.points]
-        return [
-            [row[k] for k in places] if len(row) == len(places) else row for row in rows
-        ]
+    def rows_of(quantity: str) -> list[list[float]]:
+        """Return the rows of a quantity by leg; those of another length are refused."""
+        rows = []
+        for index, point in enumerate(message.points):
+            row = [float(number) for number in getattr(point, quantity)]
+            fits = len(row) in (0, len(names))
+            checks.append((f"points[{index}].{quantity}", row, fits, whole))
+            rows.append([row[place] for place in places] if row and fits else row)
+        return rows
 
+    positions = rows_of("positions")
+    velocities = rows_of("velocities")
+    accelerations = rows_of("accelerations")
+    efforts = rows_of("effort")
+    if any(efforts):
+        for index, row in enumerate(efforts):
+            fits = len(row) > 0 and all(map(math.isfinite, row))
+            said = f"{whole}, or none in any point"
+            checks.append((f"points[{index}].effort", row, fits, said))
+    else:
+        efforts = []
+    refuse_unless("joint_trajectory", *checks)
     times = [
         nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points
     ]
-    return Points(
-        stamp_ns,
-        times,
-        tuple(map(by_leg, ("positions", "velocities", "accelerations"))),
-    )
+    stamp_ns = nanoseconds(message.header.stamp)
+    return Points(stamp_ns, times, legs, positions, velocities, accelerations, efforts)
 
 
 def plan(
-    model: Scene, points: Points, begin: Reference, passed: float
+    model: Scene,
+    points: Points,
+    begin: Reference,
+    passed: float,
+    effort: Vector3 = ZERO,
 ) -> ReferenceMotion:
     """Return the motion from a reference, which may be moving, through points.
 
-    It is checked.
+    Points that lie before, and one at time 0 where the reference moves, are passed
+    already. The motion is checked. Efforts are interpolated linearly; they are no part
+    of the check, as commands are limited.
 
-    `passed` is the time of the trajectory at which it begins [s]. Points that lie
-    before, and one at time 0 where the reference moves, are passed already. An
-    InputError lists every fault; MotionRefused and SingularConfiguration say why the
-    motion cannot be followed.
+    Args:
+        model: the scene of the controller.
+        points: those of the message.
+        begin: the reference from which the motion goes on.
+        passed: time of the trajectory at which it begins [s].
+        effort: torques that are added then [N m].
+
+    Raises:
+        InputError: lists every fault of the points.
+        MotionRefused, SingularConfiguration: the motion cannot be followed.
+
     """
-    times, rows = points.times, list(points.rows)
     if passed > 0.0 or any((*begin.gamma_dot, *begin.gamma_ddot)):
-        ahead = [index for index, time in enumerate(times) if time > passed]
-        late = (
-            f"must lie less than {max(times, default=0.0):g} s back: all points have"
-            " passed"
-        )
-        refuse_unless(
-            "joint_trajectory", ("header.stamp", points.stamp_ns, bool(ahead), late)
-        )
-        times = [times[index] - passed for index in ahead]
-        rows = [[row[index] for index in ahead] for row in rows]
-    geometry, going = Geometry.of(model), (begin.gamma_dot, begin.gamma_ddot)
+        points = _points_ahead(points, passed)
+    geometry = Geometry.of(model)
     motion = through_points(
-        geometry, begin.quaternion, times, rows[0], rows[1], rows[2], going
+        geometry,
+        begin.quaternion,
+        points.times,
+        [_fill_in(row, points.legs, begin.gamma) for row in points.positions],
+        [_fill_in(row, points.legs, ZERO) for row in points.velocities],
+        [_fill_in(row, points.legs, ZERO) for row in points.accelerations],
+        (begin.gamma_dot, begin.gamma_ddot),
     )
     check_motion(motion, model)
+    if not points.efforts:
+        return motion
+    times = points.times
+    efforts = [_fill_in(row, points.legs, ZERO) for row in points.efforts]
+    if times[0] > 0.0:
+        times = [0.0, *times]
+        efforts = [list(effort), *efforts]
+    motion.effort = partial(_interpolate, np.array(times), np.array(efforts))
     return motion
+
+
+def _points_ahead(points: Points, passed: float) -> Points:
+    """Return the points behind a time of the trajectory [s], with times from there on."""
+    ahead = [index for index, time in enumerate(points.times) if time > passed]
+    latest = max(points.times, default=0.0)
+    late = f"must lie less than {latest:g} s back: all points have passed"
+    refuse_unless(
+        "joint_trajectory", ("header.stamp", points.stamp_ns, bool(ahead), late)
+    )
+    return points._replace(
+        times=[points.times[index] - passed for index in ahead],
+        positions=[points.positions[index] for index in ahead],
+        velocities=[points.velocities[index] for index in ahead],
+        accelerations=[points.accelerations[index] for index in ahead],
+        efforts=[points.efforts[index] for index in ahead] if points.efforts else [],
+    )
+
+
+def _fill_in(row: list[float], legs: list[int], others: Vector3) -> list[float]:
+    """Return a row of all legs, with the numbers of those that are not in it; open if empty."""
+    if not row:
+        return row
+    whole = list(others)
+    for leg, number in zip(legs, row, strict=True):
+        whole[leg] = number
+    return whole
+
+
+def _interpolate(times: Array, rows: Array, time: float) -> Vector3:
+    """Return the row at a time on straight lines; a function that pickle takes."""
+    return triple(float(np.interp(time, times, column)) for column in rows.T)
 
 
 class ErrorCode(IntEnum):

@@ -272,10 +272,10 @@ class Observer:
     def pause(self, paused, node=NODE):
         return self.call(SetBool, f"{node}/pause", data=paused)
 
-    def set_parameter(self, name, value):
+    def set_parameter(self, name, value, node=NODE):
         parameter = Parameter(name, value=value).to_parameter_msg()
         reply = self.call(
-            SetParameters, f"{NODE}/set_parameters", parameters=[parameter]
+            SetParameters, f"{node}/set_parameters", parameters=[parameter]
         )
         return reply.results[0]
 

@@ -111,7 +111,7 @@ BAD = {
         trajectory((1.0, AWAY), names=[NAMES[0], *NAMES[:2]]),
         "joint_names",
     ),
-    "two numbers": (trajectory((1.0, AWAY[:2])), "positions[0]"),
+    "two numbers": (trajectory((1.0, AWAY[:2])), "points[0].positions"),
     "a start elsewhere": (
         trajectory((0.0, np.add(HOME, 0.5)), (1.0, HOME)),
         "positions[0]",
@@ -119,7 +119,14 @@ BAD = {
     "out of the stroke": (trajectory((1.0, np.add(HOME, (0.9, 0.0, 0.0)))), "gamma_1"),
     "out of the workspace": (trajectory((1.0, (0.35, 0.3, 1.35))), "beta_"),
     "too fast": (trajectory((0.02, AWAY)), "exceeds the limit 8 N m"),
-    "torques given": (trajectory((1.0, AWAY), effort=[0.0] * 3), "points[0].effort"),
+    "torques of one point": (
+        trajectory((1.0, AWAY), (2.0, HOME), effort=[0.0] * 3),
+        "points[1].effort",
+    ),
+    "a joint alone": (
+        trajectory((1.0, AWAY[:1]), names=NAMES[:1]),
+        "allow_partial_joints_goal true",
+    ),
 }
 
 
@@ -203,6 +210,48 @@ def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(
         if line.startswith("error, largest")
     ]
     assert errors and np.array(errors, dtype=float).max() < 1e-4
+
+
+def test_gains_are_set_while_it_runs_or_refused_with_the_reason(
+    nodes, observer, tmp_path
+):
+    path = written(tmp_path, motion=None)
+    reference = observer.listen(JointState, f"{NODE}/reference")
+    errors = observer.listen(JointState, f"{NODE}/tracking_error")
+    nodes.run("simulator", scene=path, sync="lockstep", lockstep_timeout=0.0)
+    controller = nodes.run(
+        "inverse_dynamics", scene=path, stamped=True, motion="topic", mode="pd",
+        bandwidth=20.0, allow_partial_joints_goal=True,
+    )  # fmt: skip
+    publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
+    one_joint = trajectory((0.5, AWAY[:1]), names=NAMES[:1])
+    observer.publish_until(publisher, one_joint, lambda: reference, "the motion")
+
+    def put(name, value):
+        reply = observer.set_parameter(name, value, node=NODE)
+        return reply.successful, reply.reason
+
+    def gains():
+        """Stiffness and damping of gamma_1: the feedback is linear in the errors."""
+        begin = len(errors) + 50
+        observer.until(lambda: len(errors) >= begin + 50, "samples")
+        rows = [(e.position[0], e.velocity[0], e.effort[0]) for e in errors[begin:]]
+        *columns, torques = np.transpose(rows)
+        return np.linalg.lstsq(np.transpose(columns), torques, rcond=None)[0]
+
+    before = gains()
+    assert put("bandwidth", 40.0) == (True, "")
+    np.testing.assert_allclose(gains(), before * (4.0, 2.0), rtol=1e-6)
+    successful, reason = put("integral_rate", 500.0)
+    assert not successful and "integral_rate = 500.0: must be < 80 1/s" in reason
+    for name, value in (("bandwidth", -1.0), ("stiffness", [1.0]), ("mode", "pd")):
+        successful, reason = put(name, value)
+        assert not successful and reason, name
+    assert put("stiffness", [5.0, 6.0, 7.0])[0] and put("damping", [0.5] * 3)[0]
+    np.testing.assert_allclose(gains(), (5.0, 0.5), rtol=1e-6)
+    assert controller.poll() is None
+    # The joints that it does not name have stayed where they were.
+    assert np.abs(np.subtract(reference[-1].position[1:], HOME[1:])).max() < 1e-12
 
 
 def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(

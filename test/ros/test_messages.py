@@ -11,9 +11,16 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from sst_ros import load_scene
 from sst_ros.mechanism.geometry import rotation_matrix, zyz_angles
-from sst_ros.nodes import state_messages
-from sst_ros.nodes.publications import SimulatorTopics
-from sst_ros.nodes.state_messages import Numbers, TorqueLog, time_of
+from sst_ros.nodes.publications import (
+    SimulatorTopics,
+    TorqueLog,
+    state_messages,
+    time_of,
+)
+from sst_ros.nodes.publications import (
+    zyz_angles as fast_zyz_angles,
+)
+from sst_ros.nodes.sensors import Numbers
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.scene.loads import JOINTS
 from sst_ros.simulation.simulation import Simulation
@@ -44,7 +51,7 @@ def filled(messages, stamp_ns, state):
 
 
 def test_a_state_is_read_as_it_is(state):
-    messages = state_messages.state_messages()
+    messages = state_messages()
     read, orientation, euler = filled(messages, STAMP_NS, state)
     at = state.joints
     assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
@@ -62,10 +69,10 @@ def test_a_state_is_read_as_it_is(state):
 
 
 def test_a_message_that_is_filled_anew_keeps_nothing_of_the_last_state(state):
-    messages = state_messages.state_messages("idle", "left/base_link")
+    messages = state_messages("idle", "left/base_link")
     filled(messages, STAMP_NS, state)
     start = Simulation(load_scene("example2")).state
-    fresh = state_messages.state_messages("idle", "left/base_link")
+    fresh = state_messages("idle", "left/base_link")
     assert filled(messages, 7, start) == filled(fresh, 7, start)
 
 
@@ -114,9 +121,7 @@ def test_zyz_angles_are_those_of_the_rotation(theta, phi, psi, length):
     half = phi / 2.0, (theta + psi) / 2.0, (theta - psi) / 2.0
     x, y = -np.sin(half[0]) * np.sin(half[2]), np.sin(half[0]) * np.cos(half[2])
     z, w = np.cos(half[0]) * np.sin(half[1]), np.cos(half[0]) * np.cos(half[1])
-    found = np.array(
-        state_messages.zyz_angles([float(length * part) for part in (x, y, z, w)])
-    )
+    found = np.array(fast_zyz_angles([float(length * part) for part in (x, y, z, w)]))
     assert np.all(np.abs(found) <= np.pi)
     apart = found - (theta, phi, psi)
     np.testing.assert_allclose(np.exp(1j * apart), 1.0, atol=1e-9)
@@ -127,7 +132,7 @@ def test_zyz_angles_are_those_of_the_rotation(theta, phi, psi, length):
 )
 def test_at_a_pole_psi_carries_it_all(q):
     np.testing.assert_allclose(
-        state_messages.zyz_angles(q), zyz_angles(rotation_matrix(q)), atol=1e-15
+        fast_zyz_angles(q), zyz_angles(rotation_matrix(q)), atol=1e-15
     )
 
 

@@ -15,8 +15,8 @@ from std_msgs.msg import String
 from sst_ros import Simulation, load_scene
 from sst_ros.dynamics.reactions import LINK_JOINTS, reactions_of
 from sst_ros.mechanism.geometry import rotation_matrix
-from sst_ros.nodes.publications import sensor_messages
-from sst_ros.nodes.state_messages import Numbers, time_of
+from sst_ros.nodes.publications import sensor_messages, time_of
+from sst_ros.nodes.sensors import Numbers
 from sst_ros.runtime.settings import REACTION_JOINTS, SimulatorParameters
 from sst_ros.scene.scene import replace
 from sst_ros.state import nanoseconds

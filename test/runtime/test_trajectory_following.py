@@ -38,6 +38,7 @@ MOVE = DesiredMotion(spiral=Spiral(phi=0.02, theta=0.5, psi=0.03, duration=0.05)
 MODEL = dataclasses.replace(scene.load("example2_heavy"), motion=MOVE, torque=None)
 
 HERE = Measurement(MODEL.initial.gamma, REST)
+NAMES = ("gamma_1", "gamma_2", "gamma_3")
 
 
 def seen(state):
@@ -214,25 +215,34 @@ class Stream:
             ControllerNodeParameters(motion="topic", **settings),
         )
         self.measured, self.references, self.stamp_ns = HERE, [], START_NS
+        self.commands = []
         self.assistant = self.follower._assistant
         if self.assistant is not None:
             self.assistant.takes = takes
 
     def send(self, time, off, stamp_ns=0):
         """A point at a time [s], so far [rad] from where the run begins."""
-        point = Message(
-            positions=list(np.add(HERE.gamma, off)), velocities=[], accelerations=[], effort=[],
-            time_from_start=duration(time * 1e9),
-        )  # fmt: skip
+        return self.send_points((time, off), stamp_ns=stamp_ns)
+
+    def send_points(self, *points, names=NAMES, stamp_ns=0):
+        """Points of time, distances by joint, efforts if any."""
+        start = dict(zip(NAMES, HERE.gamma, strict=True))
+        rows = [
+            Message(
+                positions=[start[name] + x for name, x in zip(names, off, strict=True)],
+                velocities=[], accelerations=[], effort=list(*effort),
+                time_from_start=duration(time * 1e9),
+            )
+            for time, off, *effort in points
+        ]  # fmt: skip
         header = Message(stamp=duration(stamp_ns))
-        given = Message(
-            header=header, joint_names=["gamma_1", "gamma_2", "gamma_3"], points=[point]
-        )
+        given = Message(header=header, joint_names=list(names), points=rows)
         return self.follower.take(given, self.measured, self.stamp_ns - PERIOD_NS)
 
     def samples(self, count):
         for _ in range(count):
             if command := self.follower.answer(self.stamp_ns, self.measured):
+                self.commands.append(command)
                 desired = command.desired
                 self.measured = Measurement(desired.gamma, desired.gamma_dot)
                 self.references.append(desired)
@@ -280,6 +290,117 @@ def test_a_stream_is_followed_without_a_jump_however_long_its_checks_take(
     ]  # by a newer one
     assert not any(order.outcome.exception() for order in taken)
     assert len(taken) >= (len(orders) if takes < every else len(orders) // 9)
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_joints_that_a_trajectory_leaves_out_hold_their_position(monkeypatch, stamped):
+    given = {"stamped": stamped, "mode": "pd"}
+    stream = Stream(monkeypatch, 0, allow_partial_joints_goal=True, **given)
+    stream.send_points((0.2, (0.1, -0.05)), names=("gamma_3", "gamma_1"))
+    stream.samples(150)
+    at = np.subtract([one.gamma for one in stream.references], HERE.gamma)
+    np.testing.assert_allclose(at[-1], (-0.05, 0.0, 0.1), atol=1e-12)
+    assert np.abs(at[:, 1]).max() < 1e-12
+    stream.send_points((0.2, (0.04,)), names=("gamma_2",))  # from where they are now
+    stream.samples(150)
+    end = np.subtract(stream.references[-1].gamma, HERE.gamma)
+    np.testing.assert_allclose(end, (-0.05, 0.04, 0.1), atol=1e-12)
+    header = Message(stamp=duration(0))
+    for names in ([], ["gamma_1", "gamma_1"], ["gamma_1", "wrist"]):
+        message = Message(header=header, joint_names=names, points=[])
+        with pytest.raises(InputError, match="must be some of gamma_1, gamma_2, gamma"):
+            stream.follower.take(message, HERE)
+    assert stream.follower.stage is Stage.HOLDING
+
+
+def test_some_joints_are_refused_where_that_is_not_allowed(monkeypatch):
+    stream = Stream(monkeypatch, 0)
+    with pytest.raises(InputError, match="allow_partial_joints_goal true"):
+        stream.send_points((0.2, (0.1,)), names=("gamma_3",))
+
+
+@pytest.mark.parametrize("mode", ["feedforward", "pd", "gravity_pd", "computed_torque"])
+def test_efforts_are_added_to_the_torque_linearly_in_time(monkeypatch, mode):
+    """The same motion without them gives the torque that they are added to."""
+    added = [(1.0, -0.5, 0.2), (0.6, 0.0, 0.2)]
+    torques = []
+    for efforts in (added, [[], []]):
+        stream = Stream(monkeypatch, 0, stamped=True, mode=mode, bandwidth=20.0)
+        offs = (0.02, 0.01, 0.0), (0.04, 0.0, 0.01)
+        stream.send_points(*zip((0.1, 0.3), offs, efforts, strict=True))
+        stream.samples(201)
+        torques.append(np.array([one.torque for one in stream.commands]))
+        assert stream.commands[0].torque == tuple(
+            np.add(stream.commands[0].feedforward, stream.commands[0].feedback)
+        )
+    times = 1e-9 * PERIOD_NS * np.arange(201)
+    rows = np.array([(0.0, 0.0, 0.0), *added])  # from zero, and held at the end
+    expected = [np.interp(times, (0.0, 0.1, 0.3), column) for column in rows.T]
+    np.testing.assert_allclose(
+        torques[0] - torques[1], np.transpose(expected), atol=1e-9
+    )
+
+
+def test_efforts_go_on_from_those_of_the_trajectory_before(monkeypatch):
+    stream = Stream(monkeypatch, 0, stamped=True, mode="pd")
+    stream.send_points((0.1, (0.0,) * 3, (1.0, 0.0, 0.0)))
+    stream.samples(26)  # half of it is there
+    stream.send_points((0.2, (0.0,) * 3, (0.0, 0.0, 0.0)))
+    stream.samples(100)
+    first = np.array([one.torque[0] for one in stream.commands])
+    assert np.abs(np.diff(first)).max() < 0.021 and 0.48 < first.max() < 0.54
+    assert first[-1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("efforts", [((1.0,) * 3, ()), ((1.0,) * 2, (1.0,) * 2),
+                                     ((math.nan,) * 3, (0.0,) * 3)])  # fmt: skip
+def test_efforts_of_some_points_or_joints_are_refused(monkeypatch, efforts):
+    stream = Stream(monkeypatch, 0)
+    with pytest.raises(InputError, match=r"points\[[01]\]\.effort .* 3 finite numbers"):
+        stream.send_points(
+            *((0.1 + k, (0.0,) * 3, effort) for k, effort in enumerate(efforts))
+        )
+
+
+def test_gains_change_between_two_samples_and_the_sum_of_errors_stays():
+    given = {"mode": "pd", "integral_rate": 2.0}
+    off = Measurement(tuple(np.subtract(HERE.gamma, 1e-3)), REST)
+    tuned, plain = follow(bandwidth=30.0, **given), follow(bandwidth=30.0, **given)
+    (before,) = answers(tuned, [0], off)
+    answers(plain, [0], off)
+    stronger = ControllerNodeParameters(bandwidth=60.0, **given)
+    tuned.tune(stronger)
+    for follower, factor in ((tuned, 4.0), (plain, 1.0)):
+        (after,) = answers(follower, [1], off)
+        inertia = follower._controller.inertia
+        spring = np.multiply(inertia, 900.0 * factor)
+        damping = np.multiply(inertia, 60.0 * math.sqrt(factor))
+        summed = np.multiply(before.error, 2.0 * 1e-9 * PERIOD_NS)
+        expected = spring * (after.error + summed) + damping * after.error_rate
+        np.testing.assert_allclose(after.feedback, expected, rtol=1e-9)
+
+
+def test_gains_that_would_be_unstable_are_refused_and_change_nothing():
+    follower = follow(mode="pd", bandwidth=30.0, integral_rate=2.0)
+    answers(follower, [0], HERE)
+    for worse in ({"integral_rate": 200.0}, {"bandwidth": 0.5, "integral_rate": 2.0}):
+        with pytest.raises(InputError, match=r"integral_rate .* the loop is unstable"):
+            follower.tune(ControllerNodeParameters(mode="pd", **worse))
+    same = follow(mode="pd", bandwidth=30.0, integral_rate=2.0)
+    answers(same, [0], HERE)
+    off = Measurement(tuple(np.subtract(HERE.gamma, 1e-3)), REST)
+    assert answers(follower, [1], off)[0].torque == answers(same, [1], off)[0].torque
+
+
+def test_gains_of_the_node_that_no_motion_can_have_refuse_the_trajectory(monkeypatch):
+    stream = Stream(monkeypatch, 0, mode="pd")
+    unstable = {"mode": "pd", "motion": "topic", "integral_rate": 200.0}
+    stream.follower.tune(ControllerNodeParameters(**unstable))  # checked with a motion
+    order = stream.send(0.2, (0.1, 0.0, 0.0))
+    stream.follower.proceed()
+    assert "the loop is unstable" in str(order.outcome.exception())
+    stream.follower.tune(ControllerNodeParameters(mode="pd", motion="topic"))
+    assert stream.send(0.2, (0.1, 0.0, 0.0)).outcome.result(0) is None
 
 
 def test_control_goes_on_beside_the_check_of_a_trajectory():

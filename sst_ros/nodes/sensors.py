@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of one state: numbers in message objects that are filled anew each time.
+"""Sensors of the simulated robot: encoders behind a channel, an IMU, a force sensor.
 
-`Publisher.publish` serialises a message before it returns, so one object of each kind
-serves a whole run: to make new ones would take longer than to publish them.
+Each fills its message from the numbers of a state.
 """
 
 from __future__ import annotations
 
 import math
-from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
-from builtin_interfaces.msg import Duration, Time
-from geometry_msgs.msg import QuaternionStamped, Vector3Stamped, WrenchStamped
-from sensor_msgs.msg import Imu, JointState
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import WrenchStamped
+from sensor_msgs.msg import Imu
 
 from sst_ros.control.controller import ChannelState
 from sst_ros.control.law import ControlChannel
@@ -32,8 +29,8 @@ from sst_ros.mechanism.generic_math import (
 )
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.torque_input import ACTUATORS
-from sst_ros.scene.loads import JOINTS, MOMENTS
-from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Quaternion, Vector3
+from sst_ros.scene.loads import JOINTS
+from sst_ros.state import ZERO, Quaternion, Vector3
 
 _PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATORS))
 _KINDS = len(JOINTS) // 3  # gamma, mu, beta
@@ -63,90 +60,20 @@ class StateMessage(Protocol):
         """Begin anew at the first sample of a run."""
 
 
-class _Stateless:
-    """A message that depends on the present numbers only."""
-
-    def restart(self) -> None:
-        """Begin anew at the first sample of a run: there is nothing to forget."""
-
-
-def time_of(nanoseconds: int) -> Time:
-    """Return a stamp."""
-    seconds, rest = divmod(nanoseconds, NANOSECONDS)
-    return Time(sec=seconds, nanosec=rest)
-
-
-class JointStateMessage(_Stateless):
-    """joint_states: all nine joints; the effort is the torque over the step that ended."""
-
-    def __init__(self, frame_id: str = "") -> None:
-        self._message = JointState(name=list(JOINTS))
-        self._message.header.frame_id = frame_id
-
-    def fill(self, stamp: Time, numbers: Numbers) -> JointState:
-        """Return the message."""
-        message = self._message
-        message.header.stamp = stamp
-        message.position = array("d", numbers.angles)
-        message.velocity = array("d", numbers.rates)
-        message.effort = array("d", (*numbers.torque, *_PASSIVE))
-        return message
-
-
-class OrientationMessage(_Stateless):
-    """~/orientation: the quaternion of {E} in {B}."""
-
-    def __init__(self, base_frame: str = BASE_FRAME) -> None:
-        self._message = QuaternionStamped()
-        self._message.header.frame_id = base_frame
-
-    def fill(self, stamp: Time, numbers: Numbers) -> QuaternionStamped:
-        """Return the message."""
-        self._message.header.stamp = stamp
-        part = self._message.quaternion
-        part.x, part.y, part.z, part.w = numbers.quaternion
-        return self._message
-
-
-class EulerMessage(_Stateless):
-    """~/euler_zyz: theta, phi and psi as x, y and z of a vector."""
-
-    def __init__(self, base_frame: str = BASE_FRAME) -> None:
-        self._message = Vector3Stamped()
-        self._message.header.frame_id = base_frame
-
-    def fill(self, stamp: Time, numbers: Numbers) -> Vector3Stamped:
-        """Return the message."""
-        self._message.header.stamp = stamp
-        _set_vector(self._message.vector, zyz_angles(numbers.quaternion))
-        return self._message
-
-
-def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
-    """ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w), as `geometry.zyz_angles`.
-
-    z / w is tan((theta + psi) / 2), -x / y is tan((theta - psi) / 2).
-    """
-    x, y, z, w = quaternion
-    sine, cosine = math.hypot(x, y), math.hypot(z, w)
-    total = math.atan2(z, w) if cosine else 0.0
-    difference = math.atan2(-x, y) if sine else 0.0
-    if sine and cosine:
-        theta, psi = total + difference, total - difference
-    else:
-        theta, psi = 0.0, 2.0 * (total - difference)
-    theta, psi = (math.remainder(angle, 2.0 * math.pi) for angle in (theta, psi))
-    return theta, 2.0 * math.atan2(sine, cosine), psi
-
-
 class MeasuredJointStateMessage:
-    """joint_states as a robot gives them: all nine joints behind a measurement channel."""
+    """joint_states as a robot gives them: all nine joints behind a measurement channel.
 
-    def __init__(self, settings: SimulatorParameters) -> None:
+    Args:
+        settings: those of the channel.
+        exact: the message without the channel.
+
+    """
+
+    def __init__(self, settings: SimulatorParameters, exact: StateMessage) -> None:
         self._channel = settings.channel or ControlChannel()
         self._seed = settings.measurement_seed
         self._dropped_share = settings.dropped_samples
-        self._exact = JointStateMessage()
+        self._exact = exact
         self.restart()
 
     def restart(self) -> None:
@@ -159,7 +86,7 @@ class MeasuredJointStateMessage:
         # Rates are only late, as the angles are: those have their noise, too.
         self._rates = [ChannelState(self._channel, 0) for kind in kinds]
 
-    def fill(self, stamp: Time, numbers: Numbers) -> JointState | None:
+    def fill(self, stamp: Time, numbers: Numbers) -> Any:
         """Return the message; None for a sample that is dropped."""
         angles: list[float] = []
         rates: list[float] = []
@@ -262,7 +189,7 @@ class ImuMessage:
         return self._late[0]
 
 
-class ReactionMessage(_Stateless):
+class ReactionMessage:
     """~/reaction: what one joint exerts on the link that is nearer the star.
 
     Args:
@@ -276,6 +203,9 @@ class ReactionMessage(_Stateless):
         self._wrench = wrench
         self._message = WrenchStamped()
         self._message.header.frame_id = frame_id
+
+    def restart(self) -> None:
+        """Begin anew: there is nothing to forget."""
 
     def fill(self, stamp: Time, numbers: Numbers) -> WrenchStamped:
         """Return the message."""
@@ -291,60 +221,8 @@ class ReactionMessage(_Stateless):
         return self._message
 
 
-class TorqueLog:
-    """applied_torques: torque and moment of every tick since the last publication.
-
-    Point i holds over tick i; its time is the end of that tick, relative to the
-    header's stamp.
-    """
-
-    def __init__(
-        self, period_ns: int, *, moments: bool = False, base_frame: str = BASE_FRAME
-    ) -> None:
-        self._period_ns, self._moments = period_ns, moments
-        names = (*ACTUATORS, *MOMENTS) if moments else ACTUATORS
-        self._message = JointTrajectory(joint_names=list(names))
-        self._message.header.frame_id = base_frame
-        self._points: list[JointTrajectoryPoint] = []  # those of the longest log so far
-        self.clear()
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def clear(self) -> None:
-        """Forget the rows."""
-        self._rows: list[tuple[float, ...]] = []
-
-    def append(self, torque: Vector3, moment: Sequence[float], ticks: int = 1) -> None:
-        """Log the torque [N m] and the moment [N m] of some ticks."""
-        self._rows += [(*torque, *moment) if self._moments else torque] * ticks
-
-    def take(self, stamp_ns: int) -> JointTrajectory:
-        """Return the message of the ticks logged since stamp_ns and clear the log."""
-        for tick in range(len(self._points) + 1, len(self) + 1):
-            seconds, rest = divmod(tick * self._period_ns, NANOSECONDS)
-            end = Duration(sec=seconds, nanosec=rest)
-            self._points.append(JointTrajectoryPoint(time_from_start=end))
-        points = self._points[: len(self)]
-        for point, row in zip(points, self._rows, strict=True):
-            point.effort = array("d", row)
-        self._message.points = points
-        self._message.header.stamp = time_of(stamp_ns)
-        self.clear()
-        return self._message
-
-
 StateMessages: TypeAlias = dict[str, StateMessage]
 """Messages by the keys of their topics in `topics.SIMULATOR`."""
-
-
-def state_messages(frame_id: str = "", base_frame: str = BASE_FRAME) -> StateMessages:
-    """Return the messages that each state has; the frame_id is that of joint_states."""
-    return {
-        "joint_states": JointStateMessage(frame_id),
-        "orientation": OrientationMessage(base_frame),
-        "euler_zyz": EulerMessage(base_frame),
-    }
 
 
 def _covariance(deviation: float) -> list[float]:
