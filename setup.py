@@ -55,6 +55,7 @@ EXTRAS |= {
     "casadi": ["casadi>=3.6.5"],
     "jax": ["jax>=0.4.35"],
     "mpmath": ["mpmath"],
+    "sympy": ["sympy"],
     # For developers.
     "docs": [
         "casadi>=3.6.5",
@@ -88,6 +89,7 @@ EXTRAS |= {
         "python-flint>=0.8",
         "ruff",
         "selenium",
+        "sympy",
         "twine",
         "types-PyYAML",
         "xarray",

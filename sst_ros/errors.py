@@ -399,7 +399,7 @@ EXTRAS |= {
     "llvmlite": "fast",
 }
 EXTRAS |= {**dict.fromkeys(("trimesh", "viser", "websockets"), "view"), "xarray": "all"}
-EXTRAS |= {"casadi": "casadi", "jax": "jax", "mpmath": "mpmath"}
+EXTRAS |= {"casadi": "casadi", "jax": "jax", "mpmath": "mpmath", "sympy": "sympy"}
 """Extra of this package that installs a module."""
 
 _APT = ("argcomplete", "llvmlite", "lz4", "matplotlib", "pandas", "xarray", "zstandard")

@@ -95,7 +95,7 @@ def _count(name: str, most: int, what: str, least: int = 1, **options: Any) -> A
 
 _INTEGRATORS = ("auto", "rk4", "dopri5", "dop853", "rodas5p")
 _MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
-_TARGETS = ("c", "numpy", "jax", "casadi", "mpmath", "fmu", "mjcf")
+_TARGETS = ("c", "numpy", "jax", "casadi", "mpmath", "sympy", "fmu", "mjcf")
 _OF_SCENE = "name of a scene, or path of a .yaml file"
 SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")

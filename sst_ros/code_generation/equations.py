@@ -116,7 +116,7 @@ def equations(
 
     Args:
         scene: name or path of a scene, its document as a dict, or a `Scene`.
-        target: "c" (C99 with its header), "numpy", "jax", "casadi" or "mpmath" (a
+        target: "c" (C99 with its header), "numpy", "jax", "casadi", "mpmath" or "sympy" (a
             module of Python, whose functions the result has too), "fmu" (FMI 3.0, Model
             Exchange and Co-Simulation) or "mjcf" (the mechanism for MuJoCo).
         parameters: keys of numbers of the scene that stay open, as "star.inertia.zz",

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 from sst_ros.code_generation.named_programs import NamedProgram, SceneEquations
 
-FUNCTIONS = ("sqrt", "tanh", "exp", "sin", "cos")
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 STACK = """
@@ -22,7 +21,12 @@ def _collect(values, *shape):
 """
 ARRAYS = """\
 An argument is an array whose first axis has the numbers below, in their order; further
-axes, of many runs, follow, also in the results. {more}"""
+axes, of many runs, follow, also in the results. {numbers}"""
+DOUBLES = "Numbers are doubles."
+ANY_PRECISION = """\
+Functions are pure: jit, grad, vmap and scan take them.
+Numbers have the precision of the arguments: for doubles call
+`jax.config.update("jax_enable_x64", True)` before arrays are made."""
 
 CASADI_TAIL = """
 def _collect(values, *shape):
@@ -36,11 +40,22 @@ def _function(equations, results, **sizes):
     return casadi.Function(results, given, [equations(*given)], [*symbols], [results])
 
 """
+MPMATH = """\
+Arguments are sequences of numbers; the precision is that of mpmath.mp.
+The constants are the doubles of the package: more digits than theirs are
+those of the equations with exactly these constants."""
 MPMATH_TAIL = """
 def _collect(values, rows, columns=None):
     if columns is None:
         return [*map(mpmath.mpf, values)]
     return mpmath.matrix([values[columns * i : columns * (i + 1)] for i in range(rows)])
+"""
+SYMPY = """\
+Arguments are sequences of symbols or numbers. Of symbols the results share their
+parts, which are many: derive and print one of them with `sympy.cse`."""
+SYMPY_TAIL = """
+def _collect(values, rows, columns=1):
+    return sympy.Matrix(rows, columns, values)
 """
 
 
@@ -70,36 +85,23 @@ class Library:
         return f"{self.words.get(operation, operation)}({', '.join(operands)})"
 
 
+def library_of_arrays(name: str, module: str, numbers: str) -> Library:
+    """Return a library whose arrays and functions are NumPy's by name, in a module."""
+    functions = "arctan2, cos, exp, maximum, sin, sqrt, tanh, where"
+    return Library(
+        name=name,
+        imports=f"import {module}\nfrom {module} import {functions}",
+        about=ARRAYS.format(numbers=numbers),
+        collect=STACK.format(library=module),
+        words={"atan2": "arctan2"},
+    )
+
+
 LIBRARIES = {
     library.name: library
     for library in (
-        Library(
-            name="numpy",
-            imports=(
-                "import numpy\n"
-                "from numpy import arctan2, cos, exp, maximum, sin, sqrt, tanh, where"
-            ),
-            about=ARRAYS.format(more="Numbers are doubles."),
-            collect=STACK.format(library="numpy"),
-            words={"atan2": "arctan2"},
-        ),
-        Library(
-            name="jax",
-            imports=(
-                "import jax.numpy as jnp\nfrom jax.numpy import arctan2, cos, exp,"
-                " maximum, sin, sqrt, tanh, where"
-            ),
-            about=ARRAYS.format(
-                more=(
-                    "Functions are pure: jit, grad, vmap and scan take them.\nNumbers"
-                    " have the precision of the arguments: for doubles"
-                    ' call\n`jax.config.update("jax_enable_x64", True)` before arrays'
-                    " are made."
-                )
-            ),
-            collect=STACK.format(library="jnp"),
-            words={"atan2": "arctan2"},
-        ),
+        library_of_arrays("numpy", "numpy", DOUBLES),
+        library_of_arrays("jax", "jax.numpy", ANY_PRECISION),
         Library(
             name="casadi",
             imports=(
@@ -115,18 +117,21 @@ LIBRARIES = {
         ),
         Library(
             name="mpmath",
-            imports=(
-                "import mpmath\nfrom mpmath import atan2, cos, exp, sin, sqrt, tanh"
-            ),
-            about=(
-                "Arguments are sequences of numbers; the precision is that of"
-                " mpmath.mp.\nThe constants are the doubles of the package: more digits"
-                " than theirs are\nthose of the equations with exactly these constants."
-            ),
+            imports="import mpmath\nfrom mpmath import atan2, cos, exp, sin, sqrt, tanh",
+            about=MPMATH,
             collect=MPMATH_TAIL,
             unpack="map(mpmath.mpf, {})",
             positive="max({}, 0)",
             step="(1 if {} > 0 else 0)",
+        ),
+        Library(
+            name="sympy",
+            imports="import sympy\nfrom sympy import atan2, cos, exp, sin, sqrt, tanh",
+            about=SYMPY,
+            collect=SYMPY_TAIL,
+            unpack="map(sympy.sympify, {})",
+            positive="sympy.Max({}, 0)",
+            step="sympy.Heaviside({}, 0)",
         ),
     )
 }

@@ -135,7 +135,7 @@ def tanh_steps(x: Scalar) -> Scalar:
 
 def power_of_two(k: Scalar) -> Scalar:
     """Return 2^k for a whole number k between -1000 and 1000."""
-    if type(k) is float:
+    if isinstance(k, float):  # NumPy's own, too
         return math.ldexp(1.0, int(k)) if math.isfinite(k) else math.nan
     return k.apply("power_of_two")
 

@@ -20,12 +20,19 @@ from sst_ros.code_generation.equations import TARGETS
 from sst_ros.code_generation.python_module import LIBRARIES
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
 from sst_ros.errors import EXTRAS, MissingDependency
+from sst_ros.scene.own_loads import FormulaLoad
 from sst_ros.scene.scene import names
+from sst_ros.scene.yaml_document import plain
 
 jax = pytest.importorskip("jax", reason="needs jax: pip install .[test]")
 jax.config.update("jax_enable_x64", True)  # no other test has JAX
 
-SCENES = [*names(), "loaded"]
+SCENES = [*names(), "loaded", "own loads"]
+OWN = (
+    "tanh(beta_2) + positive(mu_1 - 0.1)**2 + max(R11, -2) * abs(R22) / (2 + min(R33, 5))"
+    " + abs(gamma_1 - 0.7) * atan2(beta_1, 2) + tan(0.2 * gamma_2) - max(R11, R22)"
+)
+"""A potential with every function that formulas have."""
 CLOSE = 1e-12  # relative to the largest number of a result
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O1")
 FAST = ("-std=gnu11", "-O3", "-march=native")
@@ -33,6 +40,9 @@ FAST = ("-std=gnu11", "-O3", "-march=native")
 
 
 def scene_of(name):
+    if name == "own loads":
+        load = FormulaLoad(name="own", potential=OWN)
+        return load_scene("general").with_values({"own_loads": [plain(load)]})
     return loaded() if name == "loaded" else load_scene(name)
 
 
@@ -244,6 +254,22 @@ def test_mpmath_has_more_digits():
         assert mpmath.mp.dps == 50 and fine[4] != float(fine[4])
 
 
+def test_sympy_takes_symbols():
+    """Of symbols the results are expressions: their values, and Euler's theorem."""
+    sympy = pytest.importorskip("sympy", reason="needs sympy: pip install .[test]")
+    functions = equations("example2", "sympy")
+    ((state, (torque,)),) = states(load_scene("example2"), 1)
+    numbers = [*state, *torque]
+    y, t = sympy.symbols("y:7"), sympy.symbols("t:3")
+    kinetic = functions.energies(y)[0]
+    twice = sum(rate * kinetic.diff(rate) for rate in y[4:])
+    found = sympy.lambdify((*y, *t), [kinetic, twice, *functions.derivative(y, t)])
+    kinetic, twice, *derivative = found(*numbers)
+    assert twice == pytest.approx(2.0 * kinetic, rel=1e-13)
+    exact = Dynamics.of(load_scene("example2")).derivative(*numbers)
+    assert derivative == pytest.approx(exact, rel=1e-11, abs=1e-12)
+
+
 def test_a_casadi_function_names_what_it_takes():
     casadi = pytest.importorskip("casadi", reason="needs casadi: pip install .[test]")
     functions = equations("example2", "casadi", parameters=["star.inertia.zz"])
@@ -338,7 +364,7 @@ def test_a_written_module_needs_its_library_alone(tmp_path):
     assert imported == "False"
 
 
-@pytest.mark.parametrize("library", ["casadi", "jax", "mpmath"])
+@pytest.mark.parametrize("library", ["casadi", "jax", "mpmath", "sympy"])
 def test_a_library_that_is_missing_names_its_extra(library, monkeypatch):
     written = equations("swing", library)  # needs none
     monkeypatch.setitem(sys.modules, library, None)

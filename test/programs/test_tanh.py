@@ -39,6 +39,11 @@ def test_error_is_a_few_units_in_the_last_place():
             assert tanh(-x) == -tanh(x)
 
 
+def test_numpy_numbers_are_floats():
+    assert tanh_of_float(np.float64(0.3)) == tanh_of_float(0.3) == tanh(0.3)
+    assert tanh_of_float(1) == tanh_of_float(1.0)
+
+
 def test_no_number_stays_none():
     assert math.isnan(tanh(math.nan)) and math.isnan(tanh_of_float(math.nan))
 
