@@ -5,8 +5,8 @@ A leg holds t_k at a right angle to r_k; that is all there is to the position pr
 r_k(gamma_k) . R e_k = 0 for k = 1, 2, 3. Its roots R are those of one quartic, for many
 r at once:
 
-t_1 = cos(x) n + sin(x) m spans the plane across r_1 and s = cos(y) r_1 + sin(y) t_1 x
-r_1. Legs 2 and 3 then read a cos(y) + b sin(y) + c = 0, so (cos y, sin y, 1) is the
+t_1 = cos(x) n + sin(x) m spans the plane across r_1, and
+s = cos(y) r_1 + sin(y) t_1 x r_1. Legs 2 and 3 then read a cos(y) + b sin(y) + c = 0, so (cos y, sin y, 1) is the
 cross product of the two rows (a, b, c), and cos^2 + sin^2 = 1 is a form of degree four
 in (cos x, sin x). Its roots come from a companion matrix; each is polished on the
 rotation itself. t_1 and -t_1 give two assemblies, R and R Rot(z, pi), that share s: up
@@ -15,8 +15,8 @@ to eight.
 Resolution: two roots are distinguished when the residual r_k . t_k midway between them
 is more than rounding, so that they are some 1e-6 rad apart or gamma is some 1e-12 rad
 off the fold where they meet. Closer ones, real or a complex pair, are a double root in
-this arithmetic, for r_k and e_k
-are rounded too: they come out as one, with det J2 near 0.
+this arithmetic, for r_k and e_k are rounded too: they come out as one, with det J2
+near 0.
 """
 
 from __future__ import annotations
@@ -49,8 +49,17 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 NEAR = 0.1  # how near an assembly must be to the rotation that names it [rad]
 ROUNDING = 1e-15  # largest abs(r_k . t_k) that is rounding and not a residual
-_NOT_ISOLATED, _NEAR_REAL, _SAME, _MISFIT = 1e-13, 1e-3, 1e-3, 1e-2
-_STEPS, _LONGEST_TURN, _LAST_STEP, _REGULAR = 40, 0.3, 1e-9, 1e-5
+NOT_ISOLATED = 1e-13  # quartic forms with smaller coefficients vanish identically
+NEAR_REAL = 1e-3  # imaginary part, over 1 + abs(z)^2, of a root that may be real
+SAME_ROOT = 1e-3  # entries of two rotations that may be one root differ by less
+MISFIT = 1e-2  # residual of leg 2 or 3 at an angle y that is worth polishing
+NEWTON_STEPS = 40
+LONGEST_TURN = 0.3  # of a Newton step [rad]
+LAST_STEP = 1e-9  # a Newton step [rad] after which rounding is reached
+REGULAR = 1e-5  # abs(det J2) above which a Newton step is solved by the adjugate
+SMALLEST = 1e-300  # divisor in place of zero
+SORTED_DIGITS = 6  # decimals by which assemblies are sorted: rounding decides nothing
+HALF_TURN = np.array([-1.0, -1.0, 1.0])  # R Rot(z, pi) is R times it
 
 
 @dataclass(frozen=True)
@@ -60,31 +69,38 @@ class Assemblies:
     Read-only arrays.
     """
 
-    # : row of gamma that each assembly belongs to, ascending, shape (m,)
+    #: row of gamma that each assembly belongs to, ascending, shape (m,)
     configuration: Index
     rotation: Array  #: this and what follows as in `Assembly`, with m first
     mu: Array
     beta: Array
     det_j2: Array
     admissible: Mask
-    # : shape (n,); False where gamma has a continuum of assemblies, of which none is
-    # listed
+    #: shape (n,); False where gamma has a continuum of assemblies: none is listed
     isolated: Mask
 
 
 def carriage_directions(geometry: Geometry, gamma: ArrayLike) -> Array:
-    """Directions r_k of the intermediate joints in {B}, Eq. 1, shape (..., 3, 3), rows by leg."""
+    """Directions r_k of the intermediate joints in {B}, Eq. 1.
+
+    Shape (..., 3, 3), rows by leg.
+    """
     angles = np.asarray(gamma, dtype=float)[..., None]
     across = cross(geometry.w, geometry.v)
     return np.asarray(np.cos(angles) * geometry.v + np.sin(angles) * across)
 
 
-def closure(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Array:
-    """Products r_k .
+def star_axes(geometry: Geometry, rotation: Array) -> Array:
+    """Axes t_k = R e_k of the star's arcs in {B}, shape (..., 3, 3), rows by leg."""
+    return np.asarray(geometry.e @ np.swapaxes(rotation, -1, -2))
 
-    R e_k of gamma (..., 3) [rad] and R (..., 3, 3), zero in closed loops.
+
+def closure(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Array:
+    """Residuals r_k . R e_k of the loops, zero where they are closed, shape (..., 3).
+
+    They are those of gamma [rad], shape (..., 3), and R, shape (..., 3, 3).
     """
-    t = geometry.e @ np.swapaxes(np.asarray(rotation, dtype=float), -1, -2)
+    t = star_axes(geometry, np.asarray(rotation, dtype=float))
     return dot(carriage_directions(geometry, gamma), t)
 
 
@@ -92,7 +108,9 @@ def closure(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Array:
 def inverse(
     geometry: Geometry, rotation: ArrayLike, signs: ArrayLike = (1, 1, 1)
 ) -> tuple[Array, Array, Array]:
-    """Joint angles (gamma, mu, beta) [rad], each shape (..., 3), of orientations R (..., 3, 3).
+    """Joint angles (gamma, mu, beta) of orientations R, shape (..., 3, 3).
+
+    Each of the three is in radians and has the shape (..., 3).
 
     The planes across w_k and t_k meet in one line, so every leg has two solutions, r_k
     and -r_k, and an orientation has eight:
@@ -115,12 +133,14 @@ def inverse(
         ),
         ("signs", signs, np.shape(signs) == (3,), "must be three of 1 and -1"),
     )
-    t, s = geometry.e @ np.swapaxes(matrices, -1, -2), matrices[..., None, :, 2]
+    t = star_axes(geometry, matrices)
+    s = matrices[..., None, :, 2]
     p = cross(t, geometry.w)
     sine = np.sqrt(dot(p, p))
     sign = np.asarray(signs, dtype=float)
     p = sign[:, None] * p
-    gamma = np.arctan2(dot(p, cross(geometry.w, geometry.v)), dot(p, geometry.v))
+    across = cross(geometry.w, geometry.v)
+    gamma = np.arctan2(dot(p, across), dot(p, geometry.v))
     mu = np.arctan2(sign * sine, dot(t, geometry.w))
     beta = np.arctan2(dot(p, cross(t, s)), dot(p, s))
     return gamma, mu, beta
@@ -135,24 +155,23 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
     the assemblies are not isolated, AssemblyError is raised.
     """
     angles = np.array(gamma, dtype=float)
-    found = direct_many(geometry, angles[None])
-    if not found.isolated[0]:
+    assemblies = direct_many(geometry, angles[None])
+    if not assemblies.isolated[0]:
         raise AssemblyError("the assemblies are not isolated", angles)
-    rows = zip(
-        found.rotation,
-        found.mu,
-        found.beta,
-        found.det_j2,
-        found.admissible,
-        strict=True,
-    )
-    return [Assembly(*row[:3], float(row[3]), bool(row[4])) for row in rows]
+    return [
+        Assembly(
+            assemblies.rotation[row],
+            assemblies.mu[row],
+            assemblies.beta[row],
+            float(assemblies.det_j2[row]),
+            bool(assemblies.admissible[row]),
+        )
+        for row in range(len(assemblies.rotation))
+    ]
 
 
 def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
-    """All real assemblies of many gamma [rad], shape (n, 3), at once.
-
-    The order is `direct`'s.
+    """All real assemblies of many gamma [rad], shape (n, 3), in the order of `direct`.
 
     The geometry may be one for each. AssemblyError refuses what is not (n, 3) finite
     numbers.
@@ -163,9 +182,8 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
             "gamma must be three finite numbers, or rows of them", angles
         )
     r = carriage_directions(geometry, angles)
-    configuration, rotation, isolated = _solve_closure(
-        r, np.broadcast_to(geometry.e, r.shape)
-    )
+    e = np.broadcast_to(geometry.e, r.shape)
+    configuration, rotation, isolated = _solve_closure(r, e)
     mu, beta, det_j2, admissible = describe_assemblies(
         geometry.of_rows(configuration), r[configuration], rotation
     )
@@ -177,9 +195,9 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
 def admissible(
     geometry: Geometry, gamma: ArrayLike, near: ArrayLike | None = None
 ) -> Assembly:
-    """Return the one assembly in which the manipulator can be built at gamma [rad], section 4.1.
+    """Return the one assembly in which the manipulator can be built, section 4.1.
 
-    Where several are admissible, the rotation `near` selects the only one within NEAR
+    The actuator angles gamma [rad] have the shape (3,). Where several are admissible, the rotation `near` selects the only one within NEAR
     of it.
 
     Raises:
@@ -197,13 +215,13 @@ def admissible(
     if not candidates:
         raise NoAdmissibleAssembly("no admissible assembly", angles)
     if len(candidates) > 1:
-        orientations = quaternion_of(np.stack([one.rotation for one in candidates]))
+        rotations = np.stack([candidate.rotation for candidate in candidates])
+        orientations = quaternion_of(rotations)
         if near is not None:
-            (meant,) = np.nonzero(
-                angle_between(orientations, quaternion_of(near)) < NEAR
-            )
-            if len(meant) == 1:
-                return candidates[int(meant[0])]
+            apart = angle_between(orientations, quaternion_of(near))
+            selected = np.flatnonzero(apart < NEAR)
+            if len(selected) == 1:
+                return candidates[int(selected[0])]
         raise AmbiguousAssembly(angles, candidates, orientations)
     return candidates[0]
 
@@ -211,20 +229,21 @@ def admissible(
 def describe_assemblies(
     geometry: Geometry, r: Array, rotation: Array
 ) -> tuple[Array, Array, Array, Mask]:
-    """Passive angles mu, beta (..., 3) [rad], det J2 and admissibility (...) of assemblies.
+    """Passive angles mu and beta [rad], det J2 and admissibility of closed assemblies.
 
-    They have the carriage directions r in rows and R, (..., 3, 3) each, with r_k . R
-    e_k = 0.
+    The carriage directions r, in rows, and R have the shape (..., 3, 3); mu and beta
+    then have (..., 3), the others (...).
     """
-    t, s = geometry.e @ np.swapaxes(rotation, -1, -2), rotation[..., None, :, 2]
+    t = star_axes(geometry, rotation)
+    s = rotation[..., None, :, 2]
     mu = np.arctan2(dot(cross(t, geometry.w), r), dot(geometry.w, t))
     beta = np.arctan2(dot(r, cross(t, s)), dot(r, s))
-    normal = cross(r, t)
-    volume = dot(normal[..., 0, :], cross(normal[..., 1, :], normal[..., 2, :]))
-    edge = dot(np.broadcast_to(s, t.shape), geometry.w) > 0.0
-    most = np.asarray(geometry.beta_max)[..., None]
-    valid = np.all(edge & (beta > 0.0) & (beta <= most), axis=-1)
-    return mu, beta, -volume, valid
+    first, second, third = np.moveaxis(cross(r, t), -2, 0)
+    det_j2 = -dot(first, cross(second, third))
+    is_on_triangle = dot(np.broadcast_to(s, t.shape), geometry.w) > 0.0
+    beta_max = np.asarray(geometry.beta_max)[..., None]
+    in_reach = (beta > 0.0) & (beta <= beta_max)
+    return mu, beta, det_j2, np.all(is_on_triangle & in_reach, axis=-1)
 
 
 def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
@@ -234,46 +253,59 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     ascending, (m,); the rotations, (m, 3, 3), in the order of `direct`; and whether the
     roots of a configuration are isolated, (n,): where they are not, none is given.
     """
-    r0, rest = r[:, 0], r[:, 1:]
-    n = cross(r0, np.eye(3)[np.argmin(np.abs(r0), axis=1)])
+    r_1 = r[:, 0]
+    others = r[:, 1:]  # r_2 and r_3
+    n = cross(r_1, np.eye(3)[np.argmin(np.abs(r_1), axis=1)])
     n /= np.linalg.norm(n, axis=1)[:, None]
-    m = cross(r0, n)
-    rn, rm = (rest @ n[:, :, None])[..., 0], (rest @ m[:, :, None])[..., 0]
-    ex, ey = e[..., 1:, 0], e[..., 1:, 1]
-    # Coefficients of (cos x, sin x) in a and c, and the number b; shapes (n, 2, 2) and
-    # (n, 2).
-    a = ex[..., None] * np.stack([-rm, rn], axis=-1)
-    b = -ex * (rest @ r0[:, :, None])[..., 0]
-    c = ey[..., None] * np.stack([rn, rm], axis=-1)
+    m = cross(r_1, n)
+    along_n = (others @ n[:, :, None])[..., 0]
+    along_m = (others @ m[:, :, None])[..., 0]
+    along_r = (others @ r_1[:, :, None])[..., 0]
+    e_x, e_y = e[..., 1:, 0], e[..., 1:, 1]
+    # Of legs 2 and 3: coefficients of (cos x, sin x) in a and c, shape (n, 2, 2), and
+    # the number b, (n, 2).
+    a = e_x[..., None] * np.stack([-along_m, along_n], axis=-1)
+    b = -e_x * along_r
+    c = e_y[..., None] * np.stack([along_n, along_m], axis=-1)
     form = _quartic(a, b, c)
-    isolated = np.abs(form).max(axis=1) > _NOT_ISOLATED
-    x, keep = _roots(form, isolated)
+    isolated = np.abs(form).max(axis=1) > NOT_ISOLATED
+    x, may_be_real = _roots(form, isolated)
     y, fits = _second_angles(x, a, b, c)
-    owner, root, which = np.nonzero(keep[:, :, None] & fits)
-    x, y = x[owner, root][:, None], y[owner, root, which][:, None]
-    t1 = np.cos(x) * n[owner] + np.sin(x) * m[owner]
-    s = np.cos(y) * r0[owner] + np.sin(y) * cross(t1, r0[owner])
-    rotation, residual = _polish(r[owner], e[owner], columns(cross(t1, s), t1, s))
-    good = residual <= ROUNDING
-    owner, rotation = _distinct(r, e, owner[good], rotation[good])
-    return (*_arrange(owner, rotation), isolated)
+    owner, root, branch = np.nonzero(may_be_real[:, :, None] & fits)
+    x = x[owner, root][:, None]
+    y = y[owner, root, branch][:, None]
+    t_1 = np.cos(x) * n[owner] + np.sin(x) * m[owner]
+    s = np.cos(y) * r_1[owner] + np.sin(y) * cross(t_1, r_1[owner])
+    start = columns(cross(t_1, s), t_1, s)
+    rotation, residual = _polish(r[owner], e[owner], start)
+    closed = residual <= ROUNDING
+    owner, rotation = _distinct(r, e, owner[closed], rotation[closed])
+    owner, rotation = _arrange(owner, rotation)
+    return owner, rotation, isolated
 
 
 def _largest(rows: Array) -> Array:
-    """Largest size of an entry in rows of three."""
-    size = np.abs(rows)
-    return np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])
+    """Largest size of an entry in rows of three, shape (n, 3) -> (n,)."""
+    first, second, third = np.abs(rows).T
+    return np.maximum(np.maximum(first, second), third)
 
 
 def _quartic(a: Array, b: Array, c: Array) -> Array:
-    """Coefficients of cos^4, cos^3 sin, ..., sin^4 in cos(y)^2 + sin(y)^2 - 1, shape (n, 5)."""
-    cosine = b[:, :1] * c[:, 1] - b[:, 1:] * c[:, 0]
-    one = a[:, 0] * b[:, 1:] - a[:, 1] * b[:, :1]
-    sine = _product(c[:, 0], a[:, 1]) - _product(a[:, 0], c[:, 1])
+    """Coefficients of cos^4 x, cos^3 x sin x, ..., sin^4 x, shape (n, 5).
+
+    The form is that of cos(y)^2 + sin(y)^2 - 1, where (cos y, sin y, 1) is the cross
+    product of the rows (a, b, c) of legs 2 and 3.
+    """
+    a_2, a_3 = a[:, 0], a[:, 1]
+    b_2, b_3 = b[:, :1], b[:, 1:]
+    c_2, c_3 = c[:, 0], c[:, 1]
+    cosine = b_2 * c_3 - b_3 * c_2
+    scale = a_2 * b_3 - a_3 * b_2
+    sine = _product(c_2, a_3) - _product(a_2, c_3)
     form = _product(sine, sine)
-    bare = _product(cosine, cosine) - _product(one, one)
-    form[:, :3] += bare
-    form[:, 2:] += bare
+    quadratic = _product(cosine, cosine) - _product(scale, scale)
+    form[:, :3] += quadratic  # times cos^2 x
+    form[:, 2:] += quadratic  # times sin^2 x
     return form
 
 
@@ -286,120 +318,130 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _turn_forms(count: int) -> tuple[Array, Array]:
-    """Angles x0 and matrices that turn a quartic form's coefficients from x to x - x0."""
+    """Angles x_0, and matrices that turn the coefficients of a quartic form to x - x_0."""
     angles = np.arange(count) * np.pi / count
     matrices = np.zeros((count, 5, 5))
-    for turn, (cosine, sine) in enumerate(
-        zip(np.cos(angles), np.sin(angles), strict=True)
-    ):
+    for turn, angle in enumerate(angles):
+        cosine, sine = np.cos(angle), np.sin(angle)
         for power in range(5):
+            factors = [[cosine, -sine]] * (4 - power) + [[sine, cosine]] * power
             term = np.ones(1)
-            for factor in [[cosine, -sine]] * (4 - power) + [[sine, cosine]] * power:
+            for factor in factors:
                 term = np.convolve(term, factor)
             matrices[turn, :, power] = term
     return angles, matrices
 
 
-_TURN, _TURNED = _turn_forms(5)
+TURN_ANGLES, TURN_MATRICES = _turn_forms(5)
 
 
 def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
     """Angles x of the roots, shape (n, 4), modulo pi, and which of them may be real."""
     # Count x from where the form is largest: then its leading coefficient is no small
     # number.
-    best = np.argmax(np.abs(form @ _TURNED[:, 0].T), axis=1)
-    turned = (_TURNED[best] @ form[:, :, None])[..., 0]
-    lead = np.where(isolated, turned[:, 0], 1.0)
+    leading = form @ TURN_MATRICES[:, 0].T
+    best = np.argmax(np.abs(leading), axis=1)
+    turned = (TURN_MATRICES[best] @ form[:, :, None])[..., 0]
+    divisor = np.where(isolated, turned[:, 0], 1.0)
     companion = np.zeros((len(form), 4, 4))
-    companion[:, 0] = -turned[:, 1:] / lead[:, None]
+    companion[:, 0] = -turned[:, 1:] / divisor[:, None]
     companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
     z = np.linalg.eigvals(companion)
-    size = z.real**2 + z.imag**2
-    x = _TURN[best][:, None] + 0.5 * np.arctan2(2.0 * z.real, size - 1.0)
-    return x, isolated[:, None] & (np.abs(z.imag) < _NEAR_REAL * (1.0 + size))
+    square = z.real**2 + z.imag**2
+    # z = cot(x - x_0)
+    x = TURN_ANGLES[best][:, None] + 0.5 * np.arctan2(2.0 * z.real, square - 1.0)
+    is_near_real = np.abs(z.imag) < NEAR_REAL * (1.0 + square)
+    return x, isolated[:, None] & is_near_real
 
 
 def _second_angles(x: Array, a: Array, b: Array, c: Array) -> tuple[Array, Mask]:
-    """Angles y at x, shape (n, 4, 2), and which fit both legs: two where the legs agree."""
+    """Angles y at x, shape (n, 4, 2), and which fit both legs: two where the legs agree.
+
+    They are those of the leg that depends more on y.
+    """
     direction = np.stack([np.cos(x), np.sin(x)], axis=1)
-    a, c = a @ direction, c @ direction
+    a = a @ direction  # (n, leg, root)
+    c = c @ direction
     b = np.broadcast_to(b[:, :, None], a.shape)
     reach = np.hypot(a, b)
-    steep = reach[:, 1] > reach[:, 0]
-    chosen = np.where(steep, reach[:, 1], reach[:, 0])
+    by_third = reach[:, 1] > reach[:, 0]
+
+    def select(of_legs: Array) -> Array:
+        return np.where(by_third, of_legs[:, 1], of_legs[:, 0])
+
+    radius = select(reach)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = np.clip(-np.where(steep, c[:, 1], c[:, 0]) / chosen, -1.0, 1.0)
-    swing = np.arccos(np.where(chosen > 0.0, cosine, 0.0))
-    middle = np.arctan2(
-        np.where(steep, b[:, 1], b[:, 0]), np.where(steep, a[:, 1], a[:, 0])
-    )
+        cosine = np.clip(-select(c) / radius, -1.0, 1.0)
+    swing = np.arccos(np.where(radius > 0.0, cosine, 0.0))
+    middle = np.arctan2(select(b), select(a))
     y = np.stack([middle + swing, middle - swing], axis=-1)
-    misfit = (
-        a[..., None] * np.cos(y)[:, None]
-        + b[..., None] * np.sin(y)[:, None]
-        + c[..., None]
-    )
-    return y, np.abs(misfit).max(axis=1) < _MISFIT
+    of_cosine = a[..., None] * np.cos(y)[:, None]
+    of_sine = b[..., None] * np.sin(y)[:, None]
+    misfit = of_cosine + of_sine + c[..., None]
+    return y, np.abs(misfit).max(axis=1) < MISFIT
 
 
 def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
     """Newton's method on SO(3); the best iterate of each start and its residual."""
-    best, least = rotation.copy(), np.full(len(rotation), np.inf)
-    active, last = np.arange(len(rotation)), np.full(len(rotation), np.inf)
-    for _ in range(_STEPS):
+    best = rotation.copy()
+    least = np.full(len(rotation), np.inf)  # residual of `best`
+    active = np.arange(len(rotation))  # which start each row of `rotation` is of
+    length = np.full(len(rotation), np.inf)  # of the last step
+    for _ in range(NEWTON_STEPS):
         t = e @ rotation.transpose(0, 2, 1)
         residual = dot(r, t)
         largest = _largest(residual)
         better = largest < least[active]
-        least[active[better]], best[active[better]] = largest[better], rotation[better]
-        open_ = last > _LAST_STEP
-        if not open_.any():
+        least[active[better]] = largest[better]
+        best[active[better]] = rotation[better]
+        moves = length > LAST_STEP
+        if not moves.any():
             break
-        if not open_.all():
-            active, r, t, rotation = active[open_], r[open_], t[open_], rotation[open_]
-            residual, e = residual[open_], e[open_]
+        if not moves.all():
+            active, rotation = active[moves], rotation[moves]
+            r, e, t = r[moves], e[moves], t[moves]
+            residual = residual[moves]
         step = _newton_step(cross(t, r), residual)
-        last = np.sqrt(dot(step, step))
-        if last.max() > _LONGEST_TURN:
-            step = (
-                step
-                * np.minimum(1.0, _LONGEST_TURN / np.maximum(last, 1e-300))[:, None]
-            )
+        length = np.sqrt(dot(step, step))
+        if length.max() > LONGEST_TURN:
+            share = LONGEST_TURN / np.maximum(length, SMALLEST)
+            step = step * np.minimum(1.0, share)[:, None]
         rotation = rotate(rotation, step)
     return best, least
 
 
 def _newton_step(slope: Array, residual: Array) -> Array:
-    """Solve slope step = -residual.
-
-    The shortest such step where slope is nearly singular.
-    """
+    """Solve slope step = -residual, by the shortest step where slope is nearly singular."""
     first, second, third = slope[:, 0], slope[:, 1], slope[:, 2]
     # A^-1 is the adjugate over the determinant; its columns are these vector products.
     adjugate = columns(cross(second, third), cross(third, first), cross(first, second))
     determinant = dot(first, adjugate[:, :, 0])
-    regular = np.abs(determinant) > _REGULAR
+    regular = np.abs(determinant) > REGULAR
     scale = -1.0 / np.where(regular, determinant, 1.0)
     step = (adjugate @ residual[:, :, None])[..., 0] * scale[:, None]
     if not regular.all():
-        odd = ~regular
-        inverse = np.linalg.pinv(slope[odd], rcond=1e-9)
-        step[odd] = -(inverse @ residual[odd][:, :, None])[..., 0]
+        singular = ~regular
+        pseudo_inverse = np.linalg.pinv(slope[singular], rcond=1e-9)
+        step[singular] = -(pseudo_inverse @ residual[singular][:, :, None])[..., 0]
     return np.asarray(step)
 
 
 def rotate(rotation: Array, step: Array) -> Array:
-    """Turn R, shape (..., 3, 3), by small rotation vectors `step` in {B} and keep it orthonormal.
+    """Turn R, shape (..., 3, 3), by small rotation vectors in {B}; keep it orthonormal.
 
     The turn is exact to second order, which is all that Newton's method asks for.
     """
-    t, s = rotation[..., 1], rotation[..., 2]
-    ts, ss = cross(step, t), cross(step, s)
-    t, s = t + ts + 0.5 * cross(step, ts), s + ss + 0.5 * cross(step, ss)
+    t = _turn_vector(rotation[..., 1], step)
+    s = _turn_vector(rotation[..., 2], step)
     s = s / np.sqrt(dot(s, s))[..., None]
     t = t - s * dot(s, t)[..., None]
     t = t / np.sqrt(dot(t, t))[..., None]
     return columns(cross(t, s), t, s)
+
+
+def _turn_vector(vector: Array, step: Array) -> Array:
+    moved = cross(step, vector)
+    return vector + moved + 0.5 * cross(step, moved)
 
 
 def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index, Array]:
@@ -412,27 +454,33 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
         later = later[(owner[later] == owner[later - back]) & fresh[later]]
         if not len(later):
             continue
-        new, old = rotation[later], rotation[later - back]
+        new = rotation[later]
+        old = rotation[later - back]
         sign = np.where(dot(new[:, :, 1], old[:, :, 1]) < 0.0, -1.0, 1.0)
-        old = old * np.stack([sign, sign, np.ones_like(sign)], axis=1)[:, None, :]
-        close = np.abs(new - old).max(axis=(1, 2)) < _SAME
+        partner = np.stack([sign, sign, np.ones_like(sign)], axis=1)
+        old = old * partner[:, None, :]
+        close = np.abs(new - old).max(axis=(1, 2)) < SAME_ROOT
         if close.any():
-            at = later[close]
-            middle = rotate(0.5 * (new[close] + old[close]), np.zeros((len(at), 3)))
-            t = e[owner[at]] @ middle.transpose(0, 2, 1)
-            fresh[at] = _largest(dot(r[owner[at]], t)) > ROUNDING
+            rows = later[close]
+            mean = 0.5 * (new[close] + old[close])
+            middle = rotate(mean, np.zeros((len(rows), 3)))
+            t = e[owner[rows]] @ middle.transpose(0, 2, 1)
+            fresh[rows] = _largest(dot(r[owner[rows]], t)) > ROUNDING
     return owner[fresh], rotation[fresh]
 
 
 def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
     """Sort, and set the partner R Rot(z, pi) beside each root."""
-    s = np.round(rotation[:, :, 2], 6)
-    order = np.lexsort((s[:, 0], s[:, 1], s[:, 2], owner))
-    owner, rotation = owner[order], rotation[order]
+    s_x, s_y, s_z = np.round(rotation[:, :, 2], SORTED_DIGITS).T
+    order = np.lexsort((s_x, s_y, s_z, owner))
+    owner = owner[order]
+    rotation = rotation[order]
+    partner = rotation * HALF_TURN
     # t_1 first, then -t_1: first the one further along the first base vector where they
     # differ.
-    t = np.round(rotation[:, :, 1], 6)
-    lead = t[np.arange(len(t)), np.argmax(t != 0.0, axis=1)] < 0.0
-    rotation = np.where(lead[:, None, None], rotation * [-1.0, -1.0, 1.0], rotation)
-    both = np.stack([rotation, rotation * [-1.0, -1.0, 1.0]], axis=1)
+    t_1 = np.round(rotation[:, :, 1], SORTED_DIGITS)
+    first_entry = t_1[np.arange(len(t_1)), np.argmax(t_1 != 0.0, axis=1)]
+    is_behind = (first_entry < 0.0)[:, None, None]
+    leading = np.where(is_behind, partner, rotation)
+    both = np.stack([leading, leading * HALF_TURN], axis=1)
     return np.repeat(owner, 2), both.reshape(-1, 3, 3)
