@@ -7,7 +7,6 @@ components.
 
 from __future__ import annotations
 
-import copy
 import os
 from collections import deque
 from collections.abc import Mapping
@@ -147,7 +146,8 @@ class Batch(Explained):
 
         Numbers that do not differ in this batch must not differ in that.
         """
-        other = copy.copy(self)
+        other = Batch.__new__(Batch)  # a copy would trace its programs again
+        vars(other).update(vars(self))
         other._scenarios, other.columns = scenarios, self.model.columns(scenarios)
         return other
 

@@ -551,10 +551,17 @@ def _checksum(about: Mapping[str, Any], table: pa.Table) -> str:
     texts = {"about": json.dumps(said, sort_keys=True)}
     for name in table.column_names:
         if name == "reason":
-            texts[name] = "\0".join(table[name].to_pylist())
+            texts[name] = "\0".join(_read_texts(table[name]))
         else:
             columns[name] = table[name].to_numpy()
     return compute_checksum(texts, columns)
+
+
+def _read_texts(column: pa.ChunkedArray) -> list[str]:
+    """Return a column of texts, each distinct one of which is made once."""
+    whole = column.dictionary_encode().combine_chunks()
+    texts: list[str] = whole.dictionary.to_pylist()
+    return [texts[code] for code in whole.indices.to_numpy().tolist()]
 
 
 def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
