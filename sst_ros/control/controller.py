@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -30,7 +30,7 @@ from sst_ros.errors import (
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import axpy, symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.scene.scene import SceneInput, scene_of, terms
+from sst_ros.scene.scene import Scene, SceneInput, scene_of, terms
 from sst_ros.state import (
     ZERO,
     Explained,
@@ -322,12 +322,35 @@ class Controller:
         self._law = self._make_law()
         self.reset()
 
-    def _make_law(self) -> law.ControlLaw:
-        functions = self._inverse.torque, self._space.star_motion
+    @property
+    def model(self) -> Scene:
+        """The manipulator as the controller knows it."""
+        return self._inverse.scene
+
+    @property
+    def settings(self) -> ControllerSettings:
+        """Mode and gains."""
+        return self._settings
+
+    @property
+    def space(self) -> ActuatorSpaceMap:
+        """The kinematics of the model."""
+        return self._space
+
+    def law_with(
+        self, torque: Callable[..., Any], accelerate: Callable[..., Any]
+    ) -> law.ControlLaw:
+        """Return the law with functions of the model that take numbers of another kind.
+
+        See `law.ControlLaw`.
+        """
         kp, kd, inertia, rate, limit, period = self._numbers
         return law.ControlLaw(
-            self._settings, *functions, kp, kd, inertia, rate, limit, period
+            self._settings, torque, accelerate, kp, kd, inertia, rate, limit, period
         )
+
+    def _make_law(self) -> law.ControlLaw:
+        return self.law_with(self._inverse.torque, self._space.star_motion)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle gets: all but compiled functions."""
