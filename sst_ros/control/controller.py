@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -31,7 +31,7 @@ from sst_ros.errors import (
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import axpy, symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.scene.scene import SceneInput, scene_of, terms
+from sst_ros.scene.scene import Scene, SceneInput, scene_of, terms
 from sst_ros.state import (
     ZERO,
     Explained,
@@ -309,7 +309,39 @@ class Controller:
         self._law = self._make_law(settings)
         self.reset()
 
+    @property
+    def model(self) -> Scene:
+        """The manipulator as the controller knows it."""
+        return self._inverse.scene
+
+    @property
+    def settings(self) -> ControllerSettings:
+        """Mode and gains."""
+        return self._settings
+
+    @property
+    def space(self) -> ActuatorSpaceMap:
+        """The kinematics of the model."""
+        return self._space
+
     def _make_law(self, settings: ControllerSettings) -> law.ControlLaw:
+        return self.law_with(
+            self._inverse.torque, self._space.star_motion, settings=settings
+        )
+
+    def law_with(
+        self,
+        torque: Callable[..., Any],
+        accelerate: Callable[..., Any],
+        *,
+        settings: ControllerSettings | None = None,
+    ) -> law.ControlLaw:
+        """Return the law with functions of the model that take numbers of another kind.
+
+        See `law.ControlLaw`. Its settings are by default those of the controller. Raises
+        InputError where the integral action would be unstable.
+        """
+        settings = settings or self._settings
         column, rate = np.array(self.inertia)[:, None], settings.integral_rate
         gains = law.feedback_gains(
             column, lambda name: getattr(settings, name), settings.direct
@@ -325,8 +357,8 @@ class Controller:
         )
         return law.ControlLaw(
             settings,
-            self._inverse.torque,
-            self._space.star_motion,
+            torque,
+            accelerate,
             kp,
             kd,
             self.inertia,

@@ -198,6 +198,20 @@ class Command:
         return self.torque != self.total
 
 
+def is_above(value: Scalar) -> Scalar:
+    """Return 1 where a number is positive, else 0."""
+    return value.apply("step") if hasattr(value, "apply") else float(value > 0.0)
+
+
+def rotation_vector(quaternion: Quadruple) -> Triple:
+    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
+    sign = 2.0 * is_above(quaternion[3]) - 1.0
+    x, y, z, w = (sign * part for part in quaternion)
+    sine = gm.sqrt(x * x + y * y + z * z + 1e-300)
+    factor = 2.0 * gm.atan2(sine, w) / sine
+    return factor * x, factor * y, factor * z
+
+
 class ControlLaw(NamedTuple):
     """The law of some settings, and its numbers; by joint where there are three."""
 
@@ -212,6 +226,8 @@ class ControlLaw(NamedTuple):
     integral_rate: Scalar  # [1/s]
     limit: Scalar | None  # of commands [N m]
     period: float  # from one sample to the next [s]
+    # axis times angle [rad] of a quaternion
+    turn: Callable[[Quadruple], Triple] = rotation_vector
 
     def answer(
         self,
@@ -256,7 +272,7 @@ class ControlLaw(NamedTuple):
         weight: Scalar = 1.0
         if self.limit is not None:
             torque = bound(total, self.limit)
-            weight = 1.0 - is_above(gm.dot3(axpy(1.0, total, -1.0, torque), error))
+            weight = 1.0 - is_above(gm.dot3(excess(total, self.limit), error))
         integral = integral and axpy(1.0, integral, weight * self.period, summed)
         return Command(
             torque, feedforward, feedback, desired, error, rates, integral, total
@@ -272,7 +288,7 @@ class ControlLaw(NamedTuple):
         rate = triple(gm.dot3(row, desired.body_rate) for row in turn)
         forward = triple(gm.dot3(row, desired.body_acceleration) for row in turn)
         moving = axpy(1.0, forward, -1.0, gm.cross3(body_rate, rate))
-        error, rates = rotation_vector(between), axpy(1.0, rate, -1.0, body_rate)
+        error, rates = self.turn(between), axpy(1.0, rate, -1.0, body_rate)
         return error, add(moving, self._correct(integral, error, rates))
 
     def _correct(self, integral: Any, error: Triple, rates: Triple) -> Triple:
@@ -310,15 +326,6 @@ def command_limit(limit: Any, model: Scene) -> Array:
     return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own)
 
 
-def rotation_vector(quaternion: Quadruple) -> Triple:
-    """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
-    sign = 2.0 * is_above(quaternion[3]) - 1.0
-    x, y, z, w = (sign * part for part in quaternion)
-    sine = gm.sqrt(x * x + y * y + z * z + 1e-300)
-    factor = 2.0 * gm.atan2(sine, w) / sine
-    return factor * x, factor * y, factor * z
-
-
 def bound(values: Triple, limit: Scalar) -> Triple:
     """Clamp three numbers to the interval from -limit to limit."""
     if isinstance(limit, float):
@@ -326,6 +333,6 @@ def bound(values: Triple, limit: Scalar) -> Triple:
     return triple(x - gm.positive(x - limit) + gm.positive(-limit - x) for x in values)
 
 
-def is_above(value: Scalar) -> Scalar:
-    """Return 1 where a number is positive, else 0."""
-    return value.apply("step") if hasattr(value, "apply") else float(value > 0.0)
+def excess(values: Triple, limit: Scalar) -> Triple:
+    """Return what `bound` takes from three numbers: zeros inside of the limit."""
+    return triple(gm.positive(x - limit) - gm.positive(-limit - x) for x in values)

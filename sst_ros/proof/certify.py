@@ -10,6 +10,7 @@ this file makes a motion of steps.
 
 from __future__ import annotations
 
+import copy
 import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,33 +23,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sst_ros.control.controller import Controller
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.motion_table import JOINTS
 from sst_ros.dynamics.traced_dynamics import MOTION, RATE, TORQUE, Dynamics
-from sst_ros.errors import check_kinds, refuse_unless, require
+from sst_ros.errors import SstError, check_kinds, refuse_unless, require
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import Bar
 from sst_ros.proof import enclosure
 from sst_ros.proof.balls import (
-    PRECISION,
     arb,
     arb_mat,
     arb_poly,
     between,
-    column,
-    entries,
-    magnitude,
     norm,
     precision,
     upper,
     write_down,
     write_up,
 )
+from sst_ros.proof.closed_loop import SampledControl, SampledLoop, TrackingRow
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
+from sst_ros.proof.root import krawczyk
 from sst_ros.proof.scene_balls import (
     Parts,
     Reading,
@@ -76,10 +76,10 @@ SPLITS = 200  # of a step, most of them near a limit
 TURN = ("turn_x", "turn_y", "turn_z")
 ANGLES, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
 _UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+KNOWN_TORQUES = "must be numbers, sines, a table, polynomials or a Controller"
 AT_START = "the posture at the start is not proven to be the only one near"
 MOST_PARTS = 10_000  # of the box of ranges
 ORDER = -1.6
-INFLATIONS = 6  # of the box in which the start is looked for
 ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
 # proofs by which the width of ranges is looked for that would do, each by half
 NARROWER = 8
@@ -93,12 +93,21 @@ class BallEquations:
     """
 
     def __init__(
-        self, scene: Scene, profile: TorqueProfile | None, ranges: Mapping[Place, Any]
+        self,
+        scene: Scene,
+        profile: TorqueProfile | None,
+        ranges: Mapping[Place, Any],
+        control: SampledControl | None = None,
     ) -> None:
         self.scene, self._profile = scene, profile
         self.state = Dynamics.of(scene).state
         self.balls = SceneBalls(scene, profile, ranges)
-        self.inputs = (*self.state, *self.balls.inputs)
+        self.loop: SampledLoop | None = None
+        self._held: tuple[str, ...] = ()  # numbers that a controller changes at ticks
+        if control is not None:
+            self.loop = SampledLoop(control, self.balls, self.state)
+            self._held = (*TORQUE, *self.loop.memory)
+        self.inputs = (*self.state, *self._held, *self.balls.inputs)
 
     def start(self) -> Region:
         """Enclose the start by Krawczyk's test.
@@ -135,7 +144,8 @@ class BallEquations:
         given = [x.ball if isinstance(x, Reading) else x for x in initial_numbers]
         given += self.balls.varied_balls
         root = krawczyk(run, [0.0, 0.0, 0.0, *rate], given, AT_START)
-        size, n = len(self.state), len(self.inputs)
+        size = len(self.state)
+        n = size + len(self.balls.inputs)
         # Columns of the set: a range of an initial number has one, in place of a number of the
         # state; how numbers are read, and all other ranges, have that of their own input.
         by_column = [[arb(0)] * n for _ in unknown]
@@ -174,7 +184,8 @@ class BallEquations:
         lagged = [arb(0)] * (size - len(MOTION))
         varied = [arb(x.mid()) for x in given[len(initial) :]]
         centre = [*turned, *root.middle[3:], *lagged, *varied]
-        return Region.linear(0.0, centre, arb_mat(slopes), radii, errors, n - size)
+        region = Region.linear(0.0, centre, arb_mat(slopes), radii, errors, n - size)
+        return region if self.loop is None else self.loop.begin(region)
 
     def _unlimited(self, parts: Parts, time: Any, command: Sequence[Any]) -> list[Any]:
         """Return the torques that are commanded: those given, or sines of the time."""
@@ -203,11 +214,11 @@ class BallEquations:
         size = len(self.state)
 
         def derivative(parts: Parts, time: Any, *given: Any) -> Any:
-            torque = self._acting(parts, time, given[size:])
+            torque = self._acting(parts, time, given[size : size + 3])
             slope = kernel.derivative(parts.model, given[:size], triple(torque))
-            return (*slope, *[0.0] * len(self.balls.inputs))
+            return (*slope, *[0.0] * (len(self.inputs) - size))
 
-        inputs = ("t", *self.state, *TORQUE)
+        inputs = ("t", *self.state, *(self._held or TORQUE))
         value = self.balls.compile(derivative, inputs)
         return value, self.balls.compile(derivative, inputs, self.inputs)
 
@@ -222,6 +233,8 @@ class BallEquations:
 
     def _commanded(self, function: Function, begin: float, end: float) -> Function:
         """Return a function of time and state, of one that has commands after the state."""
+        if self.loop is not None:
+            return function
         size = len(self.state)
         acting: Any = (0.0, 0.0, 0.0)
         if self._profile is not None and not isinstance(self._profile, SineTorque):
@@ -294,69 +307,12 @@ class BallEquations:
                 values += [angles[k], parts.axes.arc[k] - angles[k]]
             most = getattr(parts.scene.actuators, "torque_limit", None)
             if most is not None:
-                unlimited = self._unlimited(parts, time, given[size:])
+                unlimited = self._unlimited(parts, time, given[size : size + 3])
                 values += [(most - x) * (most + x) for x in unlimited]
             return values
 
-        return self.balls.compile(distances, ("t", *self.state, *TORQUE))
-
-
-class Root(NamedTuple):
-    """Where the unknowns of equations are: middle + slopes (given - its middle) +- rest."""
-
-    middle: list[Any]
-    slopes: Any
-    rest: list[Any]
-
-
-def krawczyk(
-    run: Function, near: Sequence[float], given: Sequence[Any], reason: str
-) -> Root:
-    """Enclose the root of equations near some numbers, for all that is given as balls.
-
-    `run` returns the values of the equations at unknowns and givens, then their
-    derivatives by each. Raises Refused, with the reason, where the root is not proven
-    to exist and to be the only one in a box.
-    """
-    n, middles = len(near), [x.mid() for x in given]
-    off = column([x - middle for x, middle in zip(given, middles, strict=True)])
-
-    def at(unknown: Any, parameters: Sequence[Any]) -> tuple[Any, Any, Any]:
-        flat = [arb(x) for x in run(*entries(unknown), *parameters)]
-        rows = [
-            [flat[n * (j + 1) + i] for j in range(n + len(given))] for i in range(n)
-        ]
-        by_unknown = arb_mat([row[:n] for row in rows])
-        return column(flat[:n]), by_unknown, arb_mat([row[n:] for row in rows])
-
-    middle = column([arb(x) for x in near])
-    for _ in range(6):  # Newton
-        values, slopes, _ = at(middle, middles)
-        inverse = slopes.mid().inv().mid()
-        middle = (middle - inverse * values).mid()
-    # for all that is given
-    values = at(middle, middles)[0] + at(middle, given)[2] * off
-    step = inverse * values
-    least = arb(2) ** (8 - PRECISION)
-    reach = entries(magnitude(step))
-    for _ in range(INFLATIONS):
-        radii = [(2 * x + least).upper() for x in reach]
-        box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
-        _, slopes, by_given = at(box, given)
-        image = middle - step - (inverse * slopes - 1) * (box - middle)
-        pairs = zip(entries(box), entries(image), strict=True)
-        if all(wide.contains_interior(narrow) for wide, narrow in pairs):
-            break
-        reach = entries(magnitude(image - middle))
-    else:
-        raise Refused(reason)
-    back = slopes.inv()
-    linear = -1 * (back * by_given)
-    kept = linear.mid()
-    rest = magnitude(back * at(middle, middles)[0]) + magnitude(
-        linear - kept
-    ) * magnitude(off)
-    return Root(entries(middle), kept, entries(rest))
+        inputs = ("t", *self.state, *(self._held or TORQUE))
+        return self.balls.compile(distances, inputs)
 
 
 class Row(NamedTuple):
@@ -377,6 +333,7 @@ class Follower:
         self._equations, self._trajectory = equations, trajectory
         self._left = trajectory.t.tolist()
         self.rows: list[Row] = []
+        self.tracking: list[TrackingRow] = []
         self.signs: dict[str, list[Span]] = {name: [] for name in equations.limit_names}
         self.until, self.reason, self.steps = 0.0, "", 0
 
@@ -396,8 +353,11 @@ class Follower:
         """Prove step by step from one break in time to the next, as far as that goes."""
         order = max(14, math.ceil(ORDER * math.log10(tolerance)))
         try:
+            loop = self._equations.loop
             here = self._equations.start()
             for begin, end in pairwise(breaks):
+                if loop is not None:
+                    here = self._sample(loop, here)
                 f, jacobian = self._equations.between(begin, end)
                 limits = self._equations.limits_between(begin, end)
                 for step in ProvenSteps(f, jacobian, here, end, tolerance, order):
@@ -408,10 +368,18 @@ class Follower:
                     if self.steps >= max_steps and step.end < breaks[-1]:
                         raise Refused(f"{max_steps} steps are not enough")
                 here = enclosure.region_at_end(step)
-        except Refused as refused:
+            if loop is not None:
+                self._sample(loop, here)
+        except (Refused, SstError) as refused:
             self.reason = str(refused)
         except (ArithmeticError, ValueError):
             self.reason = enclosure.UNBOUNDED
+
+    def _sample(self, loop: SampledLoop, here: Region) -> Region:
+        """Return the region behind a tick of the controller; keep the tracking error."""
+        here, row = loop.sample(here)
+        self.tracking.append(row)
+        return here
 
     def _take(self, step: Advance, limits: Function) -> None:
         """Take what a step proves, up to where the motion meets an end of the scene."""
@@ -428,9 +396,9 @@ class Follower:
 
     def _row(self, step: Advance, time: float) -> Row:
         p, e = step.at(time)
-        size = len(self._equations.state)
-        # of the state, without a lag
-        known = [*range(len(MOTION)), *range(size, len(p))]
+        varied = len(self._equations.balls.inputs)
+        # of the state, without a lag, and what is a range
+        known = [*range(len(MOTION)), *range(len(p) - varied, len(p))]
         centre = [p[i] for i in known]
         values = [*zip(p[4:7], e[4:7], strict=True)]
         try:
@@ -488,6 +456,31 @@ def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
     return rows, spans
 
 
+def track_columns(parts: Sequence[Follower], until: float) -> dict[str, Array]:
+    """Return what holds for all parts at the ticks: middles and bounds by name."""
+    table: dict[str, list[float]] = {}
+    for rows_at in zip(*(part.tracking for part in parts), strict=False):
+        if rows_at[0].time > until:
+            break
+        table.setdefault("t", []).append(rows_at[0].time)
+        for name in ("error", "torque"):
+            by_leg = zip(*(getattr(row, name) for row in rows_at), strict=True)
+            for leg, pairs in enumerate(by_leg, 1):
+                middle, bound = _hull(pairs)
+                table.setdefault(f"{name}_{leg}", []).append(middle)
+                table.setdefault(f"{name}_{leg}_bound", []).append(bound)
+    return {name: np.array(numbers) for name, numbers in table.items()}
+
+
+def _hull(pairs: Sequence[tuple[Any, Any]]) -> tuple[float, float]:
+    """Return a number and how far any of some numbers with bounds can be from it."""
+    hull = arb(pairs[0][0]) + arb(0, pairs[0][1])
+    for middle, bound in pairs[1:]:
+        hull = hull.union(arb(middle) + arb(0, bound))
+    centre = float(hull)
+    return centre, upper(abs(hull - centre))
+
+
 class ProvenMotion(Explained):
     """What is proven of a motion at the instants of a table.
 
@@ -505,6 +498,9 @@ class ProvenMotion(Explained):
             motion may be on it; at all other times until `until` it is proven not to
             be. Contacts with elastic stops and torques at their limit are among them:
             they begin and end in these spans.
+        tracking: under a controller, by name, shape (m,): t [s], its ticks and the end;
+            error_1 to _3 [rad], desired - true gamma, and torque_1 to _3 [N m], what it
+            commands, each with NAME_bound, how far the true one can be from it.
         trajectory: what `simulate` gives.
         bound: what the angle was to be at most [rad].
         steps: number of steps of the proof.
@@ -533,11 +529,24 @@ class ProvenMotion(Explained):
         for k, name in enumerate(names):
             self.columns[name] = values[:, k, 0]
             self.columns[f"{name}_bound"] = values[:, k, 1]
-        for numbers in self.columns.values():
+        self.tracking = track_columns(parts, self.until)
+        for numbers in (*self.columns.values(), *self.tracking.values()):
             numbers.flags.writeable = False
         self.limits: dict[str, list[tuple[float, float]]] = {}
         for name, known in spans.items():
             self.limits[name] = _unknown_spans(known, self.until)
+
+    @property
+    def tracking_error(self) -> float:
+        """Largest tracking error of a joint at a tick that is possible [rad]."""
+        most = 0.0 if self.tracking else math.inf
+        for leg in (1, 2, 3):
+            middle, bound = (
+                self.tracking.get(f"error_{leg}{x}", ()) for x in ("", "_bound")
+            )
+            for x, r in zip(middle, bound, strict=True):
+                most = max(most, upper(abs(arb(float(x))) + arb(float(r))))
+        return most
 
     @property
     def largest(self) -> float:
@@ -589,6 +598,9 @@ class ProvenMotion(Explained):
                 f"not above {write_up(self.error)} rad; its estimate is"
                 f" {estimate:.2g} rad"
             )
+            if self.tracking:
+                most = write_up(self.tracking_error)
+                facts["tracking error"] = f"not above {most} rad at any tick"
             facts["limits"] = met or "no limit is reached and no singularity is passed"
         return facts | {"steps": self.steps}
 
@@ -656,22 +668,27 @@ class ProofTask(NamedTuple):
     """What is to be proven, and how hard to try."""
 
     trajectory: Trajectory
-    profile: TorqueProfile
+    profile: TorqueProfile | None
     breaks: list[float]
     bound: float
     max_steps: int
     progress: bool
+    control: SampledControl | None = None
 
     def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
         """Prove the motion for all numbers of ranges."""
-        equations = BallEquations(self.trajectory.scene, self.profile, ranges)
+        scene, profile = self.trajectory.scene, self.profile
         tolerance = 1e-6 * self.bound
         for _ in range(ATTEMPTS):
+            equations = BallEquations(scene, profile, ranges, self.control)
             follower = Follower(equations, self.trajectory)
             follower.follow(
                 self.breaks, tolerance, self.max_steps, Bar(label, self.progress)
             )
-            if follower.largest <= self.bound or ranges or follower.largest == math.inf:
+            is_wide = bool(ranges) or self.control is not None
+            if is_wide or follower.largest <= self.bound:
+                break
+            if follower.largest == math.inf:
                 break
             tolerance *= 0.1 * self.bound / follower.largest
         return follower
@@ -713,6 +730,7 @@ def certify(
     ranges: Mapping[str, Any] | None = None,
     split: int = 1,
     max_steps: int = 100_000,
+    noise: tuple[float, float] = (0.0, 0.0),
     progress: bool = False,
     **options: Any,
 ) -> ProvenMotion:
@@ -723,12 +741,16 @@ def certify(
     their limit. It ends where the motion meets an end of the scene, or where no step is
     proven: `until` and `reason` say so. One proof runs at a time, whatever the threads.
 
+    Under a `Controller` the motion is that of the sampled loop: torques are held over
+    `control_period`, and its law acts at the ticks as it does in `simulate`, but without
+    rounding. `tracking` is then the proven tube of the tracking error.
+
     Args:
         scene: as `simulate` takes it.
-        torque: as `simulate` takes it, but for functions.
+        torque: as `simulate` takes it; of functions a `Controller` alone.
         duration: as `simulate` takes it.
-        bound: angle [rad] within which the orientation is to be proven; steps are
-            chosen for it.
+        bound: angle [rad] within which the orientation is to be proven; steps are chosen
+            for it.
         ranges: how far numbers of the document may be from those given, by key, as in
             {"star.inertia.zz": 5e-4, "star.alpha_deg": (119.0, 121.0), "star.mass":
             "digits"}: a half-width, an interval, or half a unit of the last digit that
@@ -736,11 +758,12 @@ def certify(
             its geometry, limits and torques included; others are refused.
         split: number of parts that the box of ranges is split into; what holds for all
             of them is returned.
-        max_steps: number of steps after which the proof of a part ends, some 20 ms
-            each.
+        max_steps: number of steps after which the proof of a part ends, some 20 ms each.
+        noise: most that a controller may measure angles [rad] and rates [rad/s] wrong,
+            by any amount at any tick.
         progress: draw a bar on a terminal.
-        options: of `simulate`, as initial, method, tolerance, and t_eval, the times of
-            the table.
+        options: of `simulate`, as initial, method, tolerance, control_period, and
+            t_eval, the times of the table.
 
     Raises:
         InputError: an argument is not allowed; names it and the allowed values.
@@ -748,18 +771,26 @@ def certify(
         MissingDependency: python-flint is not installed.
 
     """
+    control = None
+    if isinstance(torque, Controller):
+        control = _read_control(torque, noise, options.get("control_period"))
+        torque = copy.deepcopy(control.controller)
     trajectory = simulate(scene, torque, duration, **options)
-    given, profile, end = (
-        trajectory.scene,
-        trajectory.law,
-        duration or trajectory.scene.duration,
-    )
+    given = trajectory.scene
+    profile = trajectory.law
+    end = given.duration if duration is None else duration
     is_known = profile is not None and not isinstance(
         profile, (FunctionTorque, LostTorque)
     )
     refuse_unless(
         "certify",
-        ("torque", torque, is_known, "must be numbers, sines, a table or polynomials"),
+        ("torque", torque, is_known, KNOWN_TORQUES),
+        (
+            "noise",
+            noise,
+            control is not None or not any(noise),
+            "is that of what a Controller measures",
+        ),
         ("bound", bound, 0.0 < bound < math.inf, "must be a number > 0 [rad]"),
         ("max_steps", max_steps, max_steps > 0, "must be > 0"),
         (
@@ -771,17 +802,51 @@ def certify(
         ("split", split, split == 1 or bool(ranges), "splits ranges: give some"),
     )
     assert profile is not None and end is not None
-    end, kinks = round(end * NANOSECONDS) / NANOSECONDS, profile.kinks()
+    own_torque = profile == given.torque
+    end = round(end * NANOSECONDS) / NANOSECONDS
+    kinks = profile.kinks()
+    if control is not None:
+        profile = None
+        kinks = _ticks(control.period, end)
     breaks = [0.0, *np.unique(kinks[(kinks > 0.0) & (kinks < end)]).tolist(), end]
     with precision():
         balls = range_balls(
             WrittenDocument.of(given),
             ranges or {},
-            own_torque=profile == given.torque,
+            own_torque=own_torque,
             origin="certify",
         )
-        task = ProofTask(trajectory, profile, breaks, bound, max_steps, progress)
+        task = ProofTask(
+            trajectory, profile, breaks, bound, max_steps, progress, control
+        )
         wide = {place: x for place, x in balls.items() if x.rad() > 0}
         boxes = split_ranges(wide, split) if wide else [{}]
         parts = [task.prove_part({**balls, **box}) for box in boxes]
         return ProvenMotion(parts, bound, trajectory)
+
+
+def _read_control(
+    controller: Controller, noise: tuple[float, float], period: float | None
+) -> SampledControl:
+    """Return a copy of a controller as it begins, and how it is sampled."""
+    allowed = "must be two half-widths >= 0, of angles [rad] and of rates [rad/s]"
+    refuse_unless(
+        "certify",
+        (
+            "control_period",
+            period,
+            period is not None,
+            "must be given with a Controller [s]",
+        ),
+        ("noise", noise, all(0.0 <= x < math.inf for x in noise), allowed),
+    )
+    assert period is not None
+    begun = copy.deepcopy(controller)
+    begun.reset()
+    return SampledControl(begun, period, noise)
+
+
+def _ticks(period: float, end: float) -> Array:
+    """Return the times of ticks before an end [s], as `simulate` has them."""
+    step = round(period * NANOSECONDS)
+    return np.arange(0, round(end * NANOSECONDS), step) / NANOSECONDS

@@ -203,15 +203,53 @@ def _is_constant(x: Any) -> bool:
     return x.prec > 1 and all(coefficient == 0 for coefficient in x.coeffs()[1:])
 
 
-def _step(x: Any) -> Any:
-    """Return the slope of max(x, 0).
+class SideRecord:
+    """On which side of zero the numbers of a program were, for another evaluation of it.
 
-    On both sides of the kink it is any number from 0 to 1.
+    A value that jumps there has no slope: where a set lies on both sides of the jump,
+    its values in the middle of the set must have all of the jump, too.
     """
+
+    def __init__(self) -> None:
+        self._sides: list[Any] = []
+        self._next: int | None = None
+
+    @contextlib.contextmanager
+    def within(self, *, replay: bool) -> Iterator[None]:
+        """Note the sides, or take those that were noted."""
+        global _record
+        before, _record = _record, self
+        self._next = 0 if replay else None
+        try:
+            yield
+        finally:
+            _record = before
+
+    def side(self, x: Any) -> Any:
+        """Return 1, 0 or what is between."""
+        if self._next is None:
+            self._sides.append(_step_of(x))
+            return self._sides[-1]
+        self._next += 1
+        return self._sides[self._next - 1]
+
+
+_record: SideRecord | None = None
+
+
+def _step(x: Any) -> Any:
+    """Return the slope of max(x, 0), or 1 where x > 0 and 0 elsewhere."""
+    return _step_of(x) if _record is None else _record.side(x)
+
+
+def _step_of(x: Any) -> Any:
+    """Return a slope; on both sides of the kink it is any number from 0 to 1."""
     side = _side(x)
-    if side is None:
-        return between(0, 1) if _is_constant(x) else _Kink()
-    return side
+    if side is not None:
+        return side
+    if isinstance(x, arb) and x.is_zero():
+        return 0  # max(x, 0) is zero in all of the set
+    return between(0, 1) if _is_constant(x) else _Kink()
 
 
 def cut(x: Any, _zero: float = 0.0) -> Any:
@@ -364,9 +402,13 @@ class Advance(NamedTuple):
         self, function: Function, where: Any, size: int, tube: Sequence[Any]
     ) -> list[Any]:
         """Coefficients below `size` of a function of t and y = p + e at s = where, e in `tube`."""
-        rows = (p(arb_poly([where, 1])) + e for p, e in zip(self.p, tube, strict=True))
+        count = self.begin.moving
+        pairs = zip(self.p[:count], tube[:count], strict=True)
+        rows = (p(arb_poly([where, 1])) + e for p, e in pairs)
+        fixed = (x + e for x, e in zip(self.begin.centre, tube, strict=True))
         time = arb_series([arb(self.begin.time) + where, 1], size)
-        found = function(time, *(_series(row, size) for row in rows))
+        series = (_series(row, size) for row in rows)
+        found = function(time, *series, *islice(fixed, count, None))
         return [_coefficients(x, size) for x in found]
 
     def values(self, function: Function, where: Any, tube: Sequence[Any]) -> list[Any]:
@@ -431,8 +473,9 @@ def approximate(
     n, p, j = len(at.centre), [[x] for x in at.centre], list[Any]()
 
     def run(function: Function, size: int) -> list[list[Any]]:
+        series = (arb_series(row, size) for row in p[: at.moving])
         found = function(
-            arb_series([at.time, 1], size), *(arb_series(row, size) for row in p)
+            arb_series([at.time, 1], size), *series, *at.centre[at.moving :]
         )
         return [_coefficients(x, size) for x in found]
 

@@ -1,0 +1,438 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ticks of a sampled controller, on balls.
+
+Between ticks the torques are held, so that a motion is one of a smooth equation with
+three more numbers that never change. At a tick the law of `control.law`, traced as the
+controllers of a batch have it, is a function of state, memory and noise. A region goes
+through it by the mean value theorem: its axes by the Jacobian at the middle, what the
+Jacobian varies by over the region as new errors. Noise is new at every tick: its
+columns are kept among those of what the motion began with, so that later ticks may take
+them back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from itertools import islice
+from typing import Any, NamedTuple
+
+from sst_ros.control.actuator_space import Reference
+from sst_ros.control.controller import Controller
+from sst_ros.dynamics import kernel
+from sst_ros.mechanism.generic_math import (
+    Quadruple,
+    Triple,
+    add,
+    axpy,
+    multiply,
+    quaternion_product,
+    triple,
+)
+from sst_ros.programs.expression import trace
+from sst_ros.proof.balls import (
+    arb,
+    arb_mat,
+    between,
+    column,
+    entries,
+    magnitude,
+)
+from sst_ros.proof.enclosure import (
+    Refused,
+    Region,
+    SideRecord,
+    compile_on_balls,
+    fit_axes,
+)
+from sst_ros.proof.root import krawczyk
+from sst_ros.proof.scene_balls import Parts, SceneBalls
+
+NOISE_COLUMNS = 180  # of a region, the oldest beyond it become part of its box
+TERMS = 40  # of the series of atan(t) / t
+SMALL = 0.25  # largest square of the tangent of half an error on SO(3)
+LOST = "the orientation at the measured angles is not proven to be the only one near"
+FAR = "the error on SO(3) may exceed what the series of its logarithm is proven for"
+
+_DESIRED = {
+    part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)
+}
+_GIVEN = {"guess": 4, **_DESIRED, "feedforward": 3, "held": 3, "limit": 1, "rest": 1}
+"""Sizes of what a tick is given as exact numbers: reference, its torques, limit."""
+
+
+def name_parts(sizes: Mapping[str, int]) -> list[str]:
+    """Return names of the numbers of some parts."""
+    return [f"{name}_{k}" for name, size in sizes.items() for k in range(size)]
+
+
+def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
+    """Divide numbers into tuples by name."""
+    rest = iter(numbers)
+    return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
+
+
+def turn_near_zero(quaternion: Quadruple, rest: Any) -> Triple:
+    """Return the rotation vector of a small turn, where `law.rotation_vector` divides by 0.
+
+    With t = |(x, y, z)| / w it is 2 atan(t) / t (x, y, z) / w. What the alternating
+    series of atan(t) / t leaves out is less than its next term, and so is its
+    derivative: both are in those of `rest` t^(2 TERMS), for a ball from -1 to 1.
+    """
+    x, y, z, w = quaternion
+    tangent: Triple = (x / w, y / w, z / w)
+    square = sum(part * part for part in tangent)
+    total = rest
+    for k in reversed(range(TERMS)):
+        total = total * square + (-1.0) ** k / (2 * k + 1)
+    return multiply(2.0 * total, tangent)
+
+
+class TrackingRow(NamedTuple):
+    """What is proven at a tick: middles and bounds, by joint."""
+
+    time: float
+    error: list[tuple[Any, Any]]  # desired - true gamma [rad]
+    torque: list[tuple[Any, Any]]  # that the controller commands [N m]
+
+
+class _Response(NamedTuple):
+    """The law at a tick: values at the middle, and slopes in all of the region."""
+
+    values: list[Any]
+    by_region: list[list[Any]]  # a row for each value
+    by_noise: list[list[Any]]
+    rest: list[Any]  # by what the observer leaves open, bounds
+
+
+class SampledControl(NamedTuple):
+    """A controller, and what lies between it and the plant."""
+
+    controller: Controller
+    period: float  # from one sample to the next [s]
+    noise: tuple[float, float]  # most that an angle [rad] and a rate [rad/s] are off
+
+
+class SampledLoop:
+    """A controller at its ticks, for all numbers of a scene in balls.
+
+    Args:
+        control: what is sampled; it computes with the doubles of its own model.
+        balls: the plant.
+        state: names of the numbers of the state.
+
+    """
+
+    def __init__(
+        self, control: SampledControl, balls: SceneBalls, state: Sequence[str]
+    ) -> None:
+        controller, noise = control.controller, control.noise
+        self._controller, self._settings = controller, controller.settings
+        self._size, self._varied = len(state), len(balls.inputs)
+        self._noise = [arb(noise[k // 3]) for k in range(6)]
+        self._integrates = bool(self._settings.integral_rate)
+        self.memory = name_parts({"integral": 3 if self._integrates else 0})
+        self._sizes = {
+            "state": self._size,
+            "integral": len(self.memory),
+            "noise": 6,
+            "turn": 3,
+            **_GIVEN,
+        }
+        moving = [*state, *self.memory, *name_parts({"noise": 6, "turn": 3})]
+        inputs = [*moving, *name_parts(_GIVEN)]
+        self._respond = balls.compile(self._law, inputs, (*moving, *balls.inputs))
+        self._measure = balls.compile(_angles, state, (*state, *balls.inputs))
+        start = controller.desire(0.0)[0]
+        self._known = start.quaternion, start.gamma
+        self._loops = self._compile_loops() if self._settings.observes else None
+        self._limit = controller.law_with(_none, _none).limit
+
+    def _law(self, parts: Parts, *inputs: Any) -> list[Any]:
+        """Torques, new memory, and the true error, in symbols."""
+        of = divide(self._sizes, inputs)
+        legs = list(kernel.leg_motions(parts.model, of["state"]))
+        gamma = triple(kernel.joint_angle(leg, 0) for leg in legs)
+        gamma_dot = triple(leg.gamma_dot for leg in legs)
+        measured = add(gamma, of["noise"][:3]), add(gamma_dot, of["noise"][3:])
+        observed = quaternion_product(of["guess"], (*of["turn"], 1.0))
+        model = kernel.model_of(self._controller.model)
+
+        def torque(*at: Any) -> Any:
+            return kernel.actuator_torque(model, *at)[0]
+
+        def turn(quaternion: Quadruple) -> Triple:
+            return turn_near_zero(quaternion, of["rest"][0])
+
+        accelerate = self._controller.space.star_accelerations
+        scheme = self._controller.law_with(torque, accelerate)
+        limit = None if scheme.limit is None else of["limit"][0]
+        scheme = scheme._replace(limit=limit, turn=turn)
+        desired = Reference(**{name: of[name] for name in _DESIRED})
+        torques = of["feedforward"], of["held"]
+        command = scheme.answer(desired, torques, *measured, observed, of["integral"])
+        error = axpy(1.0, desired.gamma, -1.0, gamma)
+        return [*command.torque, *command.integral, *error]
+
+    def _compile_loops(self) -> Any:
+        """Compile the loop closures of the model: by a turn, gamma and a quaternion."""
+        space = self._controller.space
+        by = name_parts({"turn": 3, "gamma": 3})
+
+        def closures(*inputs: Any) -> Any:
+            turned = quaternion_product(inputs[6:], (*inputs[:3], 1.0))
+            return space.newton_step(*turned, *space.carriages(inputs[3:6]))[4:]
+
+        program = trace(closures, [*by, *name_parts({"guess": 4})], by)
+        return compile_on_balls(program, [])
+
+    def begin(self, start: Region) -> Region:
+        """Return a region with torques and memory, which are zero, behind the state."""
+        count, size = 3 + len(self.memory), self._size
+        places = [*range(size), *range(size + count, len(start.centre) + count)]
+        self._first = start.c.ncols()
+        n = len(start.centre) + count
+        centre = [arb(0)] * n
+        for place, number in zip(places, start.centre, strict=True):
+            centre[place] = number
+        one = [[arb(int(i == j)) for j in range(n)] for i in range(n)]
+        axes, b = [row[:] for row in one], [arb(0)] * n
+        columns = [[arb(0)] * start.c.ncols() for _ in range(n)]
+        rows = zip(places, start.c.tolist(), start.axes.tolist(), strict=True)
+        for place, c_row, axes_row in rows:
+            columns[place] = c_row
+            for other, x in zip(places, axes_row, strict=True):
+                axes[place][other] = x
+        for place, x in zip(places, entries(start.b), strict=True):
+            b[place] = x
+        return Region(
+            start.time,
+            centre,
+            arb_mat(columns),
+            start.a,
+            arb_mat(axes),
+            column(b),
+            start.fixed + count,
+        )
+
+    def sample(self, here: Region) -> tuple[Region, TrackingRow]:
+        """Return the region behind a tick, and what is proven of it."""
+        desired, now, held = self._controller.desire(here.time)
+        spread = entries(here.spread())
+        response = self._answer(here, spread, desired, now, held)
+        torques, count = range(3), 3 + len(self.memory)
+        bounds = self._bounds(here, response)
+        pairs = list(zip(response.values, bounds, strict=True))
+        row = TrackingRow(here.time, pairs[count:], [pairs[k] for k in torques])
+        return self._move(here, spread, response, count), row
+
+    def _answer(
+        self,
+        here: Region,
+        spread: Sequence[Any],
+        desired: Reference,
+        now: Sequence[float],
+        held: Sequence[float],
+    ) -> _Response:
+        """Enclose the law in a region."""
+        size, memory, varied = self._size, len(self.memory), self._varied
+        box = [arb(0, x.upper()) + c for c, x in zip(here.centre, spread, strict=True)]
+        noise = [arb(0, x) for x in self._noise]
+        guess, turn, turn_box, by_gamma, turn_rest, gamma_slopes = self._observe(
+            here, spread, box, noise
+        )
+        numbers: dict[str, Sequence[float]] = {"guess": guess}
+        numbers |= {name: getattr(desired, name) for name in _DESIRED}
+        if self._settings.space == "so3" and self._settings.mode == "computed_torque":
+            numbers["quaternion"] = self._alike(guess, turn_box, desired.quaternion)
+        numbers |= {"feedforward": now, "held": held, "limit": (self._limit or 0.0,)}
+        given = [arb(x) for name in list(_GIVEN)[:-1] for x in numbers[name]]
+        given.append(between(-1, 1))
+        record = SideRecord()
+        memories = slice(size + 3, size + 3 + memory)
+        tail = slice(len(box) - varied, len(box))
+
+        def run(at: Sequence[Any], off: Sequence[Any], turned: Sequence[Any]) -> Any:
+            state = (*at[:size], *at[memories], *off, *turned)
+            return [arb(x) for x in self._respond(*state, *given, *at[tail])]
+
+        count = 6 + memory
+        with record.within(replay=False):
+            flat = run(box, noise, turn_box)
+        with record.within(replay=True):
+            values = run(here.centre, [arb(0)] * 6, turn)[:count]
+        blocks = [flat[k : k + count] for k in range(count, len(flat), count)]
+        by_state, by_memory = blocks[:size], blocks[size : size + memory]
+        by_noise = blocks[size + memory : size + memory + 6]
+        by_turn = blocks[size + memory + 6 : size + memory + 9]
+        by_varied = blocks[size + memory + 9 :]
+        by_measured = [
+            [
+                sum((by_turn[j][i] * by_gamma[j, k] for j in range(3)), arb(0))
+                for k in range(3)
+            ]
+            for i in range(count)
+        ]
+        rows, noise_rows, rest = [], [], []
+        for i in range(count):
+            row = [arb(0)] * len(box)
+            for j, block in enumerate(by_state):
+                row[j] = block[i]
+            for j, block in enumerate(by_memory):
+                row[size + 3 + j] = block[i]
+            for j, block in enumerate(by_varied):
+                row[len(box) - varied + j] = block[i]
+            for k in range(3):
+                for j, slope in gamma_slopes[k].items():
+                    row[j] = row[j] + by_measured[i][k] * slope
+            rows.append(row)
+            off = [block[i] for block in by_noise]
+            for k in range(3):
+                off[k] = off[k] + by_measured[i][k]
+            noise_rows.append(off)
+            left = (abs(by_turn[j][i]) * turn_rest[j] for j in range(3))
+            rest.append(sum(left, arb(0)).abs_upper())
+        return _Response(values, rows, noise_rows, rest)
+
+    def _observe(
+        self,
+        here: Region,
+        spread: Sequence[Any],
+        box: Sequence[Any],
+        noise: Sequence[Any],
+    ) -> Any:
+        """Enclose the orientation at the measured angles, as a turn from a quaternion.
+
+        It is the turn at the middle, its slopes by the measured angles, and a rest.
+        """
+        if self._loops is None:
+            zero = [arb(0)] * 3
+            none: list[dict[int, Any]] = [{}, {}, {}]
+            return (0.0, 0.0, 0.0, 1.0), zero, zero, arb_mat(3, 3, [0] * 9), zero, none
+        size, varied = self._size, self._varied
+        first = len(box) - varied
+        places = [*range(size), *range(first, len(box))]
+        middle = [arb(x) for x in self._measure(*(here.centre[j] for j in places))[:3]]
+        flat = [arb(x) for x in self._measure(*(box[j] for j in places))]
+        slopes = [
+            {j: flat[3 * (k + 1) + i] for k, j in enumerate(places)} for i in range(3)
+        ]
+        measured = []
+        for x, row, off in zip(middle, slopes, noise[:3], strict=True):
+            moved = sum((s * arb(0, spread[j].upper()) for j, s in row.items()), arb(0))
+            measured.append(x + moved + off)
+        gamma = triple(float(x.mid()) for x in measured)
+        guess = self._controller.space.follow(*self._known, gamma)
+        self._known = guess, gamma
+        exact_guess = [arb(x) for x in guess]
+        loops = self._loops
+
+        def run(*numbers: Any) -> Any:
+            return loops(*numbers, *exact_guess)
+
+        root = krawczyk(run, [0.0, 0.0, 0.0], measured, LOST)
+        off = column([x - y.mid() for x, y in zip(middle, measured, strict=True)])
+        turn = [
+            x + moved
+            for x, moved in zip(root.middle, entries(root.slopes * off), strict=True)
+        ]
+        rest = [
+            arb(x).abs_upper() + t.rad() for x, t in zip(root.rest, turn, strict=True)
+        ]
+        exact = [x.mid() for x in turn]
+        widths = column(
+            [
+                arb(x.rad()) + abs(x.mid() - m)
+                for x, m in zip(measured, middle, strict=True)
+            ]
+        )
+        reach = entries(magnitude(root.slopes) * widths)
+        turn_box = [
+            arb(0, (x + r).upper()) + t
+            for t, x, r in zip(exact, reach, rest, strict=True)
+        ]
+        return guess, exact, turn_box, root.slopes, rest, slopes
+
+    def _alike(
+        self, guess: Sequence[float], turn: Sequence[Any], desired: Sequence[float]
+    ) -> Sequence[float]:
+        """Return a desired quaternion with the sign of the observed one; Refused: far."""
+        x, y, z, w = quaternion_product(tuple(map(arb, guess)), (*turn, arb(1)))
+        signed = desired
+        if sum(a * float(b) for a, b in zip(desired, (x, y, z, w), strict=True)) < 0.0:
+            signed = [-part for part in desired]
+        d: Any = tuple(map(arb, signed))
+        first, second, third, real = quaternion_product((-x, -y, -z, w), d)
+        if not real > 0 or not (first**2 + second**2 + third**2) / real**2 < SMALL:
+            raise Refused(FAR)
+        return signed
+
+    def _bounds(self, here: Region, response: _Response) -> list[Any]:
+        """Bound how far the values are from those at the middle; exact errors first."""
+        reach = entries(here.spread(arb_mat(response.by_region)))
+        noise = entries(magnitude(arb_mat(response.by_noise)) * column(self._noise))
+        parts = zip(reach, noise, response.rest, response.values, strict=True)
+        return [(x + y + z + v.rad()).upper() for x, y, z, v in parts]
+
+    def _move(
+        self, here: Region, spread: Sequence[Any], response: _Response, count: int
+    ) -> Region:
+        """Return the region with new torques and memory."""
+        n, size = len(here.centre), self._size
+        rows = [[arb(int(i == j)) for j in range(n)] for i in range(n)]
+        noise_rows = [[arb(0)] * 6 for _ in range(n)]
+        centre, rest = list(here.centre), [arb(0)] * n
+        for k in range(count):
+            place = size + k
+            rows[place], noise_rows[place] = response.by_region[k], response.by_noise[k]
+            centre[place] = response.values[k].mid()
+            rest[place] = response.rest[k] + response.values[k].rad()
+        slopes, noise = arb_mat(rows), arb_mat(noise_rows)
+        middle, noise_middle = slopes.mid(), noise.mid()
+        widths = column(self._noise)
+        error = magnitude(slopes - middle) * column(spread)
+        error += magnitude(noise - noise_middle) * widths + column(rest)
+        moved = middle * here.c
+        c = moved.mid()
+        error += magnitude(moved - c) * here.a
+        c, a, folded = self._keep(c, here.a, noise_middle)
+        error = magnitude(error + folded)
+        turned = middle * here.axes
+        sizes = magnitude(c) * a + magnitude(turned) * here.b + error
+        scale = [float(x.upper()) or 1.0 for x in entries(sizes)]
+        axes = fit_axes(turned, here.b, scale)
+        back = axes.inv()
+        b = magnitude(magnitude(back * turned) * here.b + magnitude(back) * error)
+        return here._replace(centre=centre, c=c, a=a, axes=axes, b=b)
+
+    def _keep(self, c: Any, a: Any, noise: Any) -> tuple[Any, Any, Any]:
+        """Add the columns of noise; those that are too many become part of the box."""
+        n, first = c.nrows(), self._first
+        columns = [*zip(*c.tolist(), strict=True)]
+        widths = entries(a)
+        for k, width in enumerate(self._noise):
+            if width > 0:
+                columns.append(tuple(noise[i, k] for i in range(n)))
+                widths.append(width)
+        folded = column([0] * n)
+        most = first + NOISE_COLUMNS
+        if len(columns) > most:
+            old = range(first, first + len(columns) - most)
+            for k in old:
+                folded += magnitude(column(list(columns[k]))) * widths[k]
+            columns = columns[:first] + columns[old.stop :]
+            widths = widths[:first] + widths[old.stop :]
+        return arb_mat([*zip(*columns, strict=True)]), column(widths), folded
+
+
+def _angles(parts: Parts, *state: Any) -> list[Any]:
+    """Angles of the actuators of a plant, in symbols."""
+    return [
+        kernel.joint_angle(leg, 0) for leg in kernel.leg_motions(parts.model, state)
+    ]
+
+
+def _none(*_: Any) -> Any:
+    """Stand for a function that is not called."""
+    raise AssertionError(math.nan)
