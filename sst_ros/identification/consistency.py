@@ -46,6 +46,8 @@ BARRIERS = tuple(
 # squared decrement over the barrier below which Newton converges quadratically
 CENTRED = 1e-2
 _NEWTON_STEPS = 100
+SMALLEST_STEP = 1e-12  # share of a step below which it is rounding
+LARGEST = float(np.finfo(float).max)
 _CLOSE = 0.95  # share of the distance to the boundary that a step may cover
 
 _PSEUDO = np.zeros((10, 4, 4))  # J of each of the ten parameters alone
@@ -137,6 +139,16 @@ def find_consistent_values(
         logs = np.log(np.diagonal(factors, axis1=1, axis2=2))
         return float(0.5 * off @ off - 2.0 * barrier * logs.sum())
 
+    def shorten(
+        values: Array, step: Array, size: float, barrier: float, most: float
+    ) -> float:
+        """Halve a step until the cost is no more than `most`; 0 where it stays more."""
+        while size > SMALLEST_STEP:
+            if cost(values + size * step, barrier) <= most:
+                return size
+            size *= 0.5
+        return 0.0
+
     # Into the interior: flat bodies and what is zero lie on the boundary.
     lifted = [
         ".moment." not in name and name[-2:] not in ("xy", "xz", "yz") for name in names
@@ -163,14 +175,12 @@ def find_consistent_values(
                 np.linalg.eigvalsh(np.tensordot(step, slopes, 1)).min(initial=0.0)
             )
             size = 1.0 if least > -_CLOSE else -_CLOSE / least
-            if part @ part < CENTRED * barrier:
-                values = values + size * step
-                break
-            before = cost(values, barrier)
-            # Below the last size is rounding: the step cannot get better.
-            while cost(values + size * step, barrier) > before and size > 1e-12:
-                size *= 0.5
+            centred = part @ part < CENTRED * barrier
+            most = LARGEST if centred else cost(values, barrier)
+            size = shorten(values, step, size, barrier, most)
             values = values + size * step
+            if centred or size == 0.0:
+                break
     off = root @ (transform @ values - estimate)
     return values, float(off @ off)
 

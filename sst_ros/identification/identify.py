@@ -34,6 +34,7 @@ uncertainty, too.
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ from sst_ros.errors import (
     refuse_errors,
     refuse_unless,
 )
-from sst_ros.identification import parameters
+from sst_ros.identification import contradictions, parameters
 from sst_ros.identification.consistency import (
     find_consistent_values,
     fit_weighted,
@@ -95,6 +96,9 @@ POSITIVE = re.compile(
     r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$"
 )
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
+INEXPLICABLE = 250.0  # chi^2 from which other signs and orders of torques are tried
+# Share of a period from which angles that are taken as in time are called late.
+LATE = 0.25
 # [s] that is looked for: at 5 Hz this is a whole period of the motion
 LONGEST_DELAY = 0.2
 FIRST_DELAY = 10.0  # periods, up to which a delay is looked for first
@@ -105,6 +109,12 @@ APART = 0.05
 NEAR = 0.1
 # of the delay, and of its column, which depends on the estimates
 _DELAY_STEPS, _SLOPES = 20, 4
+MOST_POSES = 100  # of the kinetic energy
+LIKE_NOISE = 1.1  # ratio of residuals that are alike
+DELAY_AT_BOUND = (
+    f"the delay is at the longest that is looked for, {LONGEST_DELAY:g} s: torques and "
+    "angles may be of different times"
+)
 # samples at both ends at which an interpolating quintic spline has not its full order
 _EDGE = 8
 
@@ -261,20 +271,17 @@ def fit_torques(
             f"must be from -{LONGEST_DELAY:g} to {LONGEST_DELAY:g} s",
         ),
     )
+    notes = contradictions.check_angles(segments.motion)
     equations = RegressionEquations(segments.parts, Regressor(scene, names), cutoff)
     fitted = equations.fit(weights, delay)
-    base, estimate, root, spread = (
-        fitted.base,
-        fitted.estimate,
-        fitted.root,
-        fitted.noise,
-    )
+    found, deviation, expected = equations.compare_energies(fitted)
+    other_units = contradictions.check_energy(found, deviation, expected)
+    base, estimate, root = fitted.base, fitted.estimate, fitted.root
     given = parameters.values(scene, names)
     inverse = solve_triangular(root, np.eye(len(root)))
-    reach = max(scene.base.radius, scene.star.radius)
-    values, excess = find_consistent_values(
-        names, given, base.transform, estimate, root, reach
-    )
+    values, excess = equations.find_bodies(fitted)
+    if excess > INEXPLICABLE and not other_units:
+        equations.refuse_relabelled(fitted, weights, delay)
     whole = parameters.find_base_parameters(equations.regressor)
     lost = [chosen not in base.chosen for chosen in whole.chosen]
     vague = np.linalg.norm(inverse, axis=1) > scales(names, given)[base.chosen]
@@ -288,9 +295,15 @@ def fit_torques(
         estimate=estimate,
         covariance=inverse @ inverse.T,
         undetermined=tuple(compress(whole.labels, lost)),
-        warnings=(*segments.notes, *equations.notes, *fitted.notes),
+        warnings=(
+            *segments.notes,
+            *equations.notes,
+            *fitted.notes,
+            *other_units,
+            *notes,
+        ),
         base=base,
-        noise=spread,
+        noise=fitted.noise,
         condition=float(np.linalg.cond(root / np.linalg.norm(root, axis=0))),
         excess=excess,
         vague=tuple(compress(base.labels, vague)),
@@ -353,14 +366,34 @@ class RegressionEquations:
         """
         if delay is not None or self.band is None:
             given = delay or 0.0
-            return self._fit_at(given, None, noise, abs(given))
-        longest = FIRST_DELAY * self._period
+            fitted = self._fit_at(given, None, noise, abs(given))
+            if delay is None:
+                fitted = fitted._replace(notes=(*fitted.notes, *self._find_late(noise)))
+            return fitted
+        longest = min(FIRST_DELAY * self._period, LONGEST_DELAY)
         while True:
             found = self._find_delay(noise, longest)
             inside = abs(found.delay) <= 0.8 * longest
-            if inside or longest >= LONGEST_DELAY:
+            if inside:
                 return found
+            if longest >= LONGEST_DELAY:
+                return found._replace(notes=(*found.notes, DELAY_AT_BOUND))
             longest = min(2.0 * longest, LONGEST_DELAY)
+
+    def _find_late(self, noise: Sequence[float] | None) -> list[str]:
+        """Return a note where angles that are taken as in time are late, or early."""
+        late = self._fit_at(0.0, 0.25 * self._period, noise, self._period)
+        deviation = late.delay_deviation or 0.0
+        if abs(late.delay) < max(
+            contradictions.CERTAIN * deviation, LATE * self._period
+        ):
+            return []
+        word = "late" if late.delay > 0.0 else "early"
+        return [
+            f"angles seem to be {word} against the torques, by some "
+            f"{1e3 * abs(late.delay):.2g} ms: give the delay, or leave out gamma_dot, "
+            "so that it is estimated"
+        ]
 
     def _find_delay(self, noise: Sequence[float] | None, longest: float) -> WeightedFit:
         """Fit the delay up to a longest one [s] by Gauss-Newton."""
@@ -372,7 +405,7 @@ class RegressionEquations:
             if abs(change) <= SETTLED * self._period or limited == delay:
                 break
             delay = limited
-        return found._replace(delay=delay)
+        return found._replace(delay=limited)
 
     def _fit_at(
         self,
@@ -386,7 +419,8 @@ class RegressionEquations:
         Segments are cut so that no delay up to the longest leaves them.
         """
         names = self.regressor.names
-        torque, columns, samples, notes = self._form(delay, longest)
+        formed = self._form(delay, longest)
+        torque, columns = formed.torque - formed.known, formed.columns
         base = parameters.find_independent(columns, names)
         allowed = "must determine something: no torque depends on these parameters here"
         refuse_unless(
@@ -396,13 +430,17 @@ class RegressionEquations:
         terms = float(np.sqrt(np.mean((np.abs(columns) @ np.abs(given)) ** 2)))
         chosen = columns[..., base.chosen]
         estimate, root, spread = fit_weighted(chosen, torque, noise, terms=terms)
-        found = WeightedFit(base, estimate, root, spread, samples, delay, None, notes)
+        found = WeightedFit(
+            base, estimate, root, spread, formed.samples, delay, None, formed.notes
+        )
         if step is None:
             return found
-        later, moved, *_ = self._form(delay + step, longest)
+        later = self._form(delay + step, longest)
+        moved = later.columns[..., base.chosen]
+        moved_torque = later.torque - later.known
         for _ in range(_SLOPES):
             before = torque - chosen @ estimate
-            slope = (later - moved[..., base.chosen] @ estimate - before) / step
+            slope = (moved_torque - moved @ estimate - before) / step
             # The delay comes first: what is below its row of the root is what it leaves
             # to the others.
             both = np.concatenate([-slope[..., None], chosen], axis=2)
@@ -417,31 +455,97 @@ class RegressionEquations:
             delay_deviation=float(np.linalg.norm(inverse[0])),
         )
 
-    def _form(
-        self, delay: float, longest: float
-    ) -> tuple[Array, Array, int, tuple[str, ...]]:
-        """Return torques less known ones, (m, 3), columns, (m, 3, p), number of samples, notes."""
+    def find_bodies(self, fitted: WeightedFit) -> tuple[Array, float]:
+        """Return values of bodies that can exist, and chi^2 of them; see `consistency`."""
+        scene, names = self.regressor.scene, self.regressor.names
+        return find_consistent_values(
+            names,
+            parameters.values(scene, names),
+            fitted.base.transform,
+            fitted.estimate,
+            fitted.root,
+            max(scene.base.radius, scene.star.radius),
+        )
+
+    def compare_energies(self, fitted: WeightedFit) -> tuple[float, float, float]:
+        """Compare the kinetic energy of the estimates with that of the given scene.
+
+        Returns the mean energy [J] of the measured motion by the estimates, its
+        standard deviation, and that of the given scene.
+
+        Parameters that the motion does not determine are those nearest to the given.
+        """
+        scene, names = self.regressor.scene, self.regressor.names
+        parts = [
+            path.sum_energies(self.regressor, fitted.delay) for path in self._paths
+        ]
+        count = sum(part.samples for part in parts)
+        known = sum(part.known for part in parts) / count
+        slopes = np.sum([part.slopes for part in parts], axis=0) / count
+        given = parameters.values(scene, names)
+        transform = fitted.base.transform
+        weighted = transform * scales(names, given) ** 2  # T S of the lift S T^T
+        by_estimate = np.linalg.solve(weighted @ transform.T, weighted @ slopes)
+        expected = known + float(slopes @ given)
+        change = by_estimate @ (fitted.estimate - transform @ given)
+        deviation = np.linalg.norm(
+            solve_triangular(fitted.root, by_estimate, trans="T")
+        )
+        return expected + float(change), float(deviation), expected
+
+    def refuse_relabelled(
+        self, fitted: WeightedFit, noise: Sequence[float] | None, delay: float | None
+    ) -> None:
+        """Raise InputError where bodies fit the torques with another sign or order."""
+        for other in contradictions.RELABELLINGS:
+            trial = copy.copy(self)
+            trial._paths = [
+                path._replace(measured=path.measured.with_torque(other.apply))
+                for path in self._paths
+            ]
+            fit = trial.fit(noise, delay)
+            if trial.find_bodies(fit)[1] > SIGNIFICANT:
+                continue
+            if np.linalg.norm(fit.noise) < LIKE_NOISE * np.linalg.norm(fitted.noise):
+                allowed = (
+                    f"fit no bodies, but {other.columns} do: must be those of gamma"
+                )
+                raise refusal("identify", "columns of torque", [1, 2, 3], allowed)
+
+    def correlate(self) -> Array:
+        """Return the correlations of the torques with those of the scene, shape (3,).
+
+        They are 0 where either is.
+        """
+        formed = self._form(0.0, 0.0)
+        known = formed.known
+        size = np.linalg.norm(formed.torque, axis=0) * np.linalg.norm(known, axis=0)
+        products = np.sum(formed.torque * known, axis=0)
+        return np.asarray(products / np.maximum(size, 1e-300))
+
+    def _form(self, delay: float, longest: float) -> FormedEquations:
+        """Form the equations at a delay [s], which is no longer than the longest."""
         scene, names = self.regressor.scene, self.regressor.names
         limit = (
             np.inf if scene.torque_limit is None else scene.torque_limit * (1.0 - 1e-9)
         )
-        torques, columns = list[Array](), list[Array]()
+        rows = list[tuple[Array, Array, Array]]()
         samples = cut = total = 0
         for path in self._paths:
             known, part, torque = path.evaluate(self.regressor, delay, longest)
             sound = np.abs(torque).max(axis=1) < limit
-            total, cut = total + len(sound), cut + int((~sound).sum())
-            left, part = (torque - known)[sound], part[sound]
-            samples += len(left)
+            total += len(sound)
+            cut += int((~sound).sum())
+            torque, known, part = torque[sound], known[sound], part[sound]
+            samples += len(torque)
             if path.band is not None:
-                count = int(np.ceil(2.0 * path.band * path.period * len(left)))
+                count = int(np.ceil(2.0 * path.band * path.period * len(torque)))
                 count = max(count, len(names) if len(self._paths) == 1 else 0)
-                left, part = (
+                torque, known, part = (
                     np.asarray(dst(one, type=1, norm="ortho", axis=0)[:count])
-                    for one in (left, part)
+                    for one in (torque, known, part)
                 )
-            torques.append(left)
-            columns.append(part)
+            rows.append((torque, known, part))
         allowed = (
             f"must leave more than {len(names)} samples for {len(names)} parameters"
         )
@@ -450,8 +554,30 @@ class RegressionEquations:
             f"{cut} of {total} samples left out: a torque was at the limit of "
             "the actuators, and what was recorded may not be what acted"
         )
-        notes = (warning,) if cut else ()
-        return np.concatenate(torques), np.concatenate(columns), samples, notes
+        torque, known, columns = (
+            np.concatenate(each) for each in zip(*rows, strict=True)
+        )
+        return FormedEquations(
+            torque, known, columns, samples, notes=(warning,) if cut else ()
+        )
+
+
+class FormedEquations(NamedTuple):
+    """torque = known + columns parameters, of samples, or of their components."""
+
+    torque: Array  # measured [N m], shape (m, 3)
+    known: Array  # of the scene without the parameters [N m], shape (m, 3)
+    columns: Array  # shape (m, 3, p)
+    samples: int  # that were taken
+    notes: tuple[str, ...]
+
+
+class EnergySums(NamedTuple):
+    """Sums over samples of the kinetic energy, linear in the parameters."""
+
+    known: float  # without the parameters [J]
+    slopes: Array  # shape (p,)
+    samples: int
 
 
 class _Path(NamedTuple):
@@ -538,10 +664,34 @@ class _Path(NamedTuple):
         star = np.stack(self.space.star_accelerations(*moving), axis=1)
         found = regressor(quaternion, star[:, :3], star[:, 3:])
         known, columns = (
-            one.reshape(-1, times.shape[1], *one.shape[1:]).mean(axis=1)
-            for one in found
+            one.reshape(*times.shape, *one.shape[1:]).mean(axis=1) for one in found
         )
         return known, columns, self.measured.torque[rows]
+
+    def sum_energies(self, regressor: Regressor, delay: float) -> EnergySums:
+        """Sum the kinetic energy at some of the samples.
+
+        It is half the rates times the torques that, from rest and without gravity, give
+        accelerations of the size of the rates.
+        """
+        step = max(len(self.times) // MOST_POSES, 1)
+        chosen = self.times[:, 0] + delay
+        inside = (chosen >= self.times[0, 0]) & (chosen <= self.times[-1, -1])
+        times = chosen[inside][::step]
+        angles, rates, _ = (curve(times) for curve in self.curves)
+        quaternion = _follow_orientations(self.space, angles, self.measured)
+        rest = np.zeros((len(times), 3))
+        star = np.stack(
+            self.space.star_accelerations(*quaternion.T, *rest.T, *rates.T), axis=1
+        )
+        moved = regressor(quaternion, rest, star[:, 3:])
+        held = regressor(quaternion, rest, rest)
+        known, columns = (one - other for one, other in zip(moved, held, strict=True))
+        return EnergySums(
+            known=0.5 * float(np.sum(rates * known)),
+            slopes=0.5 * np.einsum("nk,nkp->p", rates, columns),
+            samples=len(times),
+        )
 
 
 def _check_passive(
@@ -675,6 +825,7 @@ def fit_simulation(
     names = (given,) if isinstance(given, str) else tuple(given)
     allowed = "must be keys of numbers of the scene, with method simulation"
     refuse_unless("identify", ("parameters", requested, bool(names), allowed))
+    notes = _check_simulated(data, scene)
     torque, t, gamma = take_angles(data, scene)
     motion, model = (
         VariationalEquations(scene, names, torque, caller="identify"),
@@ -721,7 +872,7 @@ def fit_simulation(
     relative[: len(singular)][some] = 1.0 / singular[some]
     spread = (rows.T * np.minimum(relative, 1e9) ** 2) @ rows * np.outer(scale, scale)
     vague = rows[relative >= NOT_DETERMINED]
-    note, kept, warnings = "identified by simulation", names, tuple[str, ...]()
+    note, kept, warnings = "identified by simulation", names, tuple(notes)
     try:
         adjusted = parameters.with_parameters(scene, names, fitted, note)
     except InputError:
@@ -730,7 +881,7 @@ def fit_simulation(
             raise
         chosen = [name in kept for name in names]
         adjusted = parameters.with_parameters(scene, kept, fitted[chosen], note)
-        warnings = (
+        warnings += (
             "no bodies have the inertias that fit best: the scene keeps the given ones",
         )
     return SimulationFit(
@@ -747,6 +898,29 @@ def fit_simulation(
         directions=rows,
         error=float(np.sqrt(np.mean(off**2))),
     )
+
+
+def _check_simulated(data: Measured, scene: Scene) -> list[str]:
+    """Return notes on a motion that is to be simulated.
+
+    Raises InputError where a torque opposes that of the scene along the motion; motions
+    that are too short to be filtered are not judged.
+    """
+    segments = read_segments(data)
+    notes = contradictions.check_angles(segments.motion)
+    try:
+        equations = RegressionEquations(segments.parts, Regressor(scene, ()), None)
+        correlation = equations.correlate()
+    except InputError:
+        return notes
+    leg = int(np.argmin(correlation))
+    allowed = "must be > 0: the signs of torque and gamma contradict each other"
+    key = f"correlation of torque_{leg + 1} with that of the scene"
+    opposed = correlation[leg] < contradictions.OPPOSED
+    refuse_unless(
+        "identify", (key, round(float(correlation[leg]), 2), not opposed, allowed)
+    )
+    return notes
 
 
 def describe_combination(row: Array, names: tuple[str, ...]) -> str:

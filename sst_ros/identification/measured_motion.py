@@ -9,7 +9,7 @@ it is cut into segments.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
@@ -93,10 +93,15 @@ class MeasuredMotion(Section):
             wrong = array is not None and len(array) != count
             yield wrong, name, np.shape(array), f"must have the shape {count, 3}"
 
+    def with_torque(self, change: Callable[[Array], Array]) -> MeasuredMotion:
+        """Return the motion with changed torques [N m], shape (n, 3)."""
+        return replace(self, torque=change(self.torque))
+
 
 class Segments(NamedTuple):
     """A measured motion in parts, over each of which angles and torques are known."""
 
+    motion: MeasuredMotion  # the whole
     parts: tuple[MeasuredMotion, ...]
     notes: tuple[str, ...]  # what was done to the data
 
@@ -128,7 +133,7 @@ def read_segments(data: Measured) -> Segments:
         allowed = f"must have {FEWEST} samples or more without a gap"
         raise refusal("identify", "t", len(motion.t), allowed)
     return Segments(
-        tuple(_cut(motion, first, end) for first, end in spans), tuple(notes)
+        motion, tuple(_cut(motion, first, end) for first, end in spans), tuple(notes)
     )
 
 

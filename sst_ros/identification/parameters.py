@@ -245,8 +245,10 @@ class Regressor:
         symbols = tuple(f"p{i}" for i in range(len(traced)))
         inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
         self._torques = compile_for_arrays(trace(torques, inputs, symbols))
-        self._traced = [self.names.index(name) for name in traced]
-        self._springs = np.array([name.startswith("springs") for name in self.names])
+        places = [self.names.index(name) for name in traced]
+        self._traced = np.array(places, dtype=int)
+        is_spring = [name.startswith("springs") for name in self.names]
+        self._springs = np.array(is_spring, dtype=bool)
 
     def __call__(
         self, quaternion: Array, rate: Array, acceleration: Array
