@@ -12,7 +12,7 @@ import io
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
@@ -53,6 +53,8 @@ DEGREES = float(np.degrees(1.0))
 
 SMALLEST_SHOWN = 1e-17
 """Lower end of logarithmic axes of errors; zero lies below it and is not drawn."""
+
+NO_GAPS: Array = np.empty((0, 2))  # begin and end of each [s]
 
 _FILE = Path(__file__).with_suffix(".mplstyle")
 STYLE: Any = mpl.rc_params_from_file(_FILE, use_default_template=False)
@@ -95,6 +97,16 @@ def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes
     return figure, list(grid)
 
 
+def break_lines(seconds: Array, values: Array, gaps: Array) -> tuple[Array, Array]:
+    """Return times [s] and values with a row of nan in each gap, where no line is drawn.
+
+    Values have the shape (n,) or (n, k), gaps begin and end [s], (g, 2).
+    """
+    places = np.searchsorted(seconds, gaps[:, 0], side="right")
+    broken = np.insert(values, places, np.nan, axis=0)
+    return np.insert(seconds, places, gaps[:, 0]), broken
+
+
 def widen(axes: Axes, values: Array, least_span: float) -> None:
     """Show no less than `least_span` of the values, so that rounding is a flat line."""
     known = values[np.isfinite(values)]
@@ -109,9 +121,14 @@ def lines(
     values: Array,
     names: Sequence[str],
     *,
+    gaps: Array = NO_GAPS,
     least_span: float = 0.0,
 ) -> None:
-    """Draw columns over time, the legend above the panel; as `widen` does."""
+    """Draw columns over time, broken at gaps, the legend above the panel.
+
+    The panel is as `widen` makes it.
+    """
+    seconds, values = break_lines(seconds, values, gaps)
     for column, name, style in zip(values.T, names, LINES, strict=False):
         axes.plot(seconds, column, label=name, **style)
     widen(axes, values, least_span)
@@ -119,20 +136,29 @@ def lines(
         legend(axes)
 
 
+class Panel(NamedTuple):
+    """Curves over time."""
+
+    label: str  # of the axis
+    names: Sequence[str]  # of the curves
+    values: Array  # shape (n, k)
+    seconds: Array | None = None  # shape (n,); None for those of the figure
+
+
 @styled
 def draw_panels(
     seconds: Array,
-    panels: Sequence[tuple[str, Sequence[str], Array]],
+    panels: Sequence[Panel],
     height: float = 2.2,
     least_span: float = 0.0,
+    gaps: Array = NO_GAPS,
 ) -> Figure:
-    """Draw panels over time: label of the axis, names of curves, values (n, k).
-
-    See `lines`.
-    """
-    figure, grid = stack([label for label, _, _ in panels], height)
-    for axes, (_, names, values) in zip(grid, panels, strict=True):
-        lines(axes, seconds, values, names, least_span=least_span)
+    """Draw panels over time [s], whose lines are broken at gaps; see `lines`."""
+    figure, grid = stack([panel.label for panel in panels], height)
+    for axes, panel in zip(grid, panels, strict=True):
+        times = seconds if panel.seconds is None else panel.seconds
+        looks: Looks = {"gaps": gaps, "least_span": least_span}
+        lines(axes, times, panel.values, panel.names, **looks)
     return figure
 
 

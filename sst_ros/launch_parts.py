@@ -47,7 +47,7 @@ from sst_ros.runtime.settings import (
     ros_arguments,
 )
 from sst_ros.scene.scene import load, share_directory
-from sst_ros.scene.yaml_document import read_file, read_values
+from sst_ros.scene.yaml_document import read_file, read_values, resolve_numbers
 from sst_ros.state import BASE_FRAME
 
 
@@ -278,8 +278,8 @@ def recorder(values: Values) -> Action:
         parameters = {"output": values["output"], "topics": ",".join(names.values())}
         return node(values, "recorder", parameters)
     require("ros2bag", "rosbag2_storage_mcap")
-    file = share_directory() / "config" / "rosbag2_qos.yaml"
-    profiles = yaml.safe_load(file.read_text(encoding="utf-8"))
+    path = share_directory() / "config" / "rosbag2_qos.yaml"
+    profiles = resolve_numbers(read_values(read_file(path), str(path)))
     renamed = {names[topic]: profile for topic, profile in profiles.items()}
     command = ["ros2", "bag", "record"]
     command += ["--storage", "mcap", "--output", values["output"]]

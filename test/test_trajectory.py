@@ -305,3 +305,28 @@ def test_reactions_are_columns_of_tables_and_files_that_ask_for_them(tmp_path):
         motion.save(tmp_path / name)
         again = Trajectory.load(tmp_path / name)
         assert np.all(again.reactions.revolute.moment[:, 1, 2] == column)
+
+
+def test_held_torques_are_drawn_as_steps_and_gaps_are_left_open():
+    times = np.array([0.0, 0.013, 0.02])
+    rows = np.array([[0.1, 0.0, 0.0], [-0.2, 0.1, 0.0], [0.0, 0.0, 0.3]])
+    table = TorqueTable(times, rows)
+    motion = simulate("example2", table, 0.03, samples=4)
+    line = motion.plot().axes[2].get_lines()[0]
+    seconds, torque = line.get_data()
+    for k, time in enumerate(times[1:], start=1):
+        at = np.flatnonzero(seconds == time)
+        assert torque[at[0]] == rows[k - 1, 0] and torque[at[-1]] == rows[k, 0]
+    parts = Trajectory(
+        motion.scene,
+        motion.t,
+        motion.quaternion,
+        motion.body_rate,
+        motion.torque,
+        gaps=[[motion.t[1], motion.t[2]]],
+    )
+    angles = parts.plot().axes[0].get_lines()[0].get_ydata()
+    assert np.flatnonzero(np.isnan(angles)).tolist() == [2]
+    torque = parts.plot().axes[2].get_lines()[0].get_ydata()  # held up to its sample
+    assert torque[0] == motion.torque[1, 0] and np.isnan(torque).any()
+    assert np.isnan(parts.reactions.plot().axes[0].get_lines()[0].get_ydata()).any()

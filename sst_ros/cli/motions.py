@@ -44,7 +44,7 @@ def check_plan(options: argparse.Namespace) -> int:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
     # needs rosbags
     scene, of_bag = load(options.scene), "recording.recording:read_run_motion"
-    motion = reference_motion(scene, lambda bag: function(of_bag)(bag))
+    motion = reference_motion(scene, lambda bag, name: function(of_bag)(bag, name))
     plan = examine_motion(motion, scene)
     speeds = time_scaling(plan)
     if options.json:

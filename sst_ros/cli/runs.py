@@ -193,7 +193,7 @@ def prove_zone(options: argparse.Namespace) -> int:
     print(zone)
     if picture is not None:
         figure = function("plot.workspace:plot_zone")(zone)
-        function("host.figures:save_figure")(figure, picture)
+        function("figures:save_figure")(figure, picture)
         print(picture)
     if out is not None:
         zone.to_pandas().to_csv(out, index=False)

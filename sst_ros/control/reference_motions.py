@@ -67,7 +67,8 @@ OpenPoints: TypeAlias = Sequence[Sequence[float] | None]
 
 @check_kinds
 def reference_motion(
-    scene: SceneInput, read_motion: Callable[[str], Any] | None = None
+    scene: SceneInput,
+    read_motion: Callable[[str, str | None], Any] | None = None,
 ) -> ReferenceMotion:
     """Return the reference motion of a scene.
 
@@ -86,7 +87,7 @@ def reference_motion(
         if read_motion is None:
             allowed = "a recorded motion cannot be read here"
             raise refusal(scene.name, "motion.recorded", bag, allowed)
-        found = read_motion(bag)
+        found = read_motion(bag, motion.recorded.namespace)
         x, y, z, w = found.quaternion[0].tolist()
         return through_samples(
             geometry, (x, y, z, w), found.t, found.gamma, found.gamma_dot

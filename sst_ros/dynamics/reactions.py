@@ -25,8 +25,8 @@ theorem of least work). The sums over the three legs do not depend on this choic
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -146,6 +146,7 @@ class Reactions(Explained):
         prismatic: intermediate links on the star.
         actuated_frames: rotations of {1k} in {B}, shape (..., 3, 3, 3).
         intermediate_frames: rotations of {2k} in {B}.
+        gaps: times of which nothing is known, begin and end [s], shape (g, 2).
 
     """
 
@@ -155,6 +156,7 @@ class Reactions(Explained):
     prismatic: JointLoads
     actuated_frames: Array
     intermediate_frames: Array
+    gaps: Array = field(default_factory=partial(np.empty, (0, 2)))
 
     def joints(self) -> Iterator[tuple[str, JointLoads]]:
         """Yield the name and the loads of each kind of joint."""
@@ -181,18 +183,17 @@ class Reactions(Explained):
     def plot(self) -> Figure:
         """Draw bearing forces and moments and torques over time; needs matplotlib."""
         require("matplotlib")
-        from sst_ros.figures import draw_panels, leg_names
+        from sst_ros.figures import Panel, draw_panels, leg_names
 
         panels = []
         for name, loads in self.joints():
             force = _length(loads.force)
-            panels.append((f"{name}\nforce [N]", leg_names("F"), force))
+            panels.append(Panel(f"{name}\nforce [N]", leg_names("F"), force))
             bending = loads.bending_moment
-            panels.append((f"{name}\nbending [N m]", leg_names("M"), bending))
-        panels.append(
-            ("motor and loads\nat γ [N m]", leg_names("τ"), self.actuated.axis_torque)
-        )
-        return draw_panels(self.t, panels, height=1.5)
+            panels.append(Panel(f"{name}\nbending [N m]", leg_names("M"), bending))
+        torque = self.actuated.axis_torque
+        panels.append(Panel("motor and loads\nat γ [N m]", leg_names("τ"), torque))
+        return draw_panels(self.t, panels, height=1.5, gaps=self.gaps)
 
     def _facts(self) -> dict[str, object]:
         facts: dict[str, object] = {"samples": len(self.t)}
@@ -332,7 +333,7 @@ def _flatten(parts: Any) -> list[Scalar]:
 def _collect(t: Array, numbers: Sequence[Scalar], rows: Rows) -> Reactions:
     """Make reactions of the 36 numbers of each leg, which `_flatten` lists."""
     flat = _stack(t, numbers).reshape(*t.shape, 3, 12, 3)
-    joints = {}
+    joints: dict[str, Any] = {}
     for index, name in enumerate(LINK_JOINTS):
         force, moment = flat[..., 2 * index, :], flat[..., 2 * index + 1, :]
         joints[name] = JointLoads(force, moment, AXES[name])

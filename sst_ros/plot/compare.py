@@ -20,13 +20,14 @@ from sst_ros.figures import (
     DEGREES,
     LINES,
     SMALLEST_SHOWN,
+    break_lines,
     hide_zeros,
     legend,
     styled,
 )
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.plot import pictures, workspace
-from sst_ros.plot.pictures import KINDS, Picture, draw_legs, tick_torques
+from sst_ros.plot.pictures import KINDS, LegCurves, Picture, draw_legs, tick_torques
 from sst_ros.recording.recording import Signals
 from sst_ros.recording.topic_tables import SCENE
 
@@ -44,7 +45,7 @@ def _overlay(
 
     def draw(runs: Drawn) -> Figure:
         legs = [
-            (name, run.seconds(), scale * run.legs(quantity), look)
+            LegCurves.of(name, run, scale * run.legs(quantity), look)
             for run, name, look in runs
         ]
         below = f"largest difference\nfrom the first {label.partition(' ')[2]}"
@@ -60,14 +61,12 @@ def _overlay(
             if differs := bool(np.isfinite(largest).any()):
                 axes.set_yscale("log")
             same = len(there) and bool((apart <= SMALLEST_SHOWN).all())
-            said = (
-                ""
-                if differs
-                else ": no difference"
-                if same
-                else ": no samples in common"
-            )
-            axes.plot(run.seconds()[there], largest, label=name + said, **look)
+            result = ""
+            if not differs:
+                result = ": no difference" if same else ": no samples in common"
+            times = run.seconds()[there]
+            times, largest = break_lines(times, largest, run.gaps())
+            axes.plot(times, largest, label=name + result, **look)
         legend(axes)
         return figure
 
@@ -75,9 +74,8 @@ def _overlay(
 
 
 def _torques(runs: Drawn) -> Figure:
-    return draw_legs(
-        "τ [N m]", [(name, *tick_torques(run), look) for run, name, look in runs]
-    )
+    curves = [LegCurves(name, *tick_torques(run), look) for run, name, look in runs]
+    return draw_legs("τ [N m]", curves)
 
 
 def _sphere(runs: Drawn) -> Figure:

@@ -19,7 +19,16 @@ from scipy.interpolate import CubicHermiteSpline
 from sst_ros import figures
 from sst_ros.dynamics.kernel import kinetic_energy, model_of, potential_energy
 from sst_ros.errors import refuse_unless
-from sst_ros.figures import BLUE, DEGREES, GREY, LINES, VERMILION, leg_names, stack
+from sst_ros.figures import (
+    BLUE,
+    DEGREES,
+    GREY,
+    LINES,
+    VERMILION,
+    Panel,
+    leg_names,
+    stack,
+)
 from sst_ros.files import write_into
 from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
 from sst_ros.mechanism.rates import body_rates
@@ -66,11 +75,12 @@ Curves: TypeAlias = "tuple[str, Sequence[str], Callable[[Signals], Array]]"
 
 def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], Figure]:
     """Return what draws panels one above the other."""
-    return lambda run, _: figures.draw_panels(
-        run.seconds(),
-        [(label, names, values(run)) for label, names, values in panels],
-        height,
-    )
+
+    def draw(run: Signals, _: Scene) -> Figure:
+        drawn = [Panel(label, names, values(run)) for label, names, values in panels]
+        return figures.draw_panels(run.seconds(), drawn, height, gaps=run.gaps())
+
+    return draw
 
 
 def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
@@ -100,26 +110,40 @@ def joints(
                         seconds, column, ".", color=GREY, markersize=2, label=label
                     )
                     label = None
-            figures.lines(axes, seconds, scale * run.true_legs(name), leg_names(letter))
+            values = scale * run.true_legs(name)
+            figures.lines(axes, seconds, values, leg_names(letter), gaps=run.gaps())
         return figure
 
     return draw
 
 
-def draw_legs(
-    label: str,
-    series: Sequence[tuple[str, Array, Array, Mapping[str, Any]]],
-    *below: str,
-) -> Figure:
-    """Draw series of a name, times [s] (n,), values (n, 3) and a style: a panel for each leg.
+class LegCurves(NamedTuple):
+    """A quantity of the three legs over time."""
+
+    name: str
+    seconds: Array  # shape (n,)
+    values: Array  # shape (n, 3); no line is drawn at nan
+    looks: Mapping[str, Any]
+
+    @classmethod
+    def of(
+        cls, name: str, run: Signals, values: Array, looks: Mapping[str, Any]
+    ) -> LegCurves:
+        """Return values at the samples of a run, broken at its gaps."""
+        seconds, broken = figures.break_lines(run.seconds(), values, run.gaps())
+        return cls(name, seconds, broken, looks)
+
+
+def draw_legs(label: str, curves: Sequence[LegCurves], *below: str) -> Figure:
+    """Draw curves, a panel for each leg.
 
     Panels of the labels `below` follow, in which nothing is drawn yet.
     """
     letter, _, unit = label.partition(" ")
     figure, panels = stack([*(f"{name} {unit}" for name in leg_names(letter)), *below])
-    for name, seconds, values, looks in series:
-        for axes, column in zip(panels, values.T, strict=False):
-            axes.plot(seconds, column, label=name, **looks)
+    for curve in curves:
+        for axes, column in zip(panels, curve.values.T, strict=False):
+            axes.plot(curve.seconds, column, label=curve.name, **curve.looks)
     figures.legend(panels[0])
     return figure
 
@@ -155,15 +179,17 @@ def zyz_degrees(quaternion: Array, which: int) -> Array:
 def _position(run: Signals, scene: Scene) -> Figure:
     """Draw the coordinates of E over time."""
     values = position_of_e(scene, run.take(*QUATERNION))
-    return figures.draw_panels(
-        run.seconds(), [(POSITION, "xyz", values)], 3.2, LEAST_POSITION_M
-    )
+    panel = Panel(POSITION, "xyz", values)
+    looks: figures.Looks = {"least_span": LEAST_POSITION_M, "gaps": run.gaps()}
+    return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
 
 
 def _angle(run: Signals, _: Scene | None, which: int) -> Figure:
     """Draw one of the ZYZ angles over time."""
-    panel = f"{ZYZ[which]} [deg]", ZYZ[which], zyz_degrees(run.take(*QUATERNION), which)
-    return figures.draw_panels(run.seconds(), [panel], 3.2, LEAST_ANGLE_DEG)
+    degrees = zyz_degrees(run.take(*QUATERNION), which)
+    panel = Panel(f"{ZYZ[which]} [deg]", ZYZ[which], degrees)
+    looks: figures.Looks = {"least_span": LEAST_ANGLE_DEG, "gaps": run.gaps()}
+    return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
 
 
 def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
@@ -215,23 +241,24 @@ def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
 
 def _path(run: Signals, scene: Scene) -> Figure:
     """Draw the recorded path of E."""
-    return draw_path(scene, {"path of E": run.take(*QUATERNION)})
+    return draw_path(scene, {"path of E": broken_quaternions(run)})
 
 
 def _tracking(run: Signals, _: Scene) -> Figure:
     """Draw the desired angle of each actuator, and the measured one over it."""
-    seconds, below = run.seconds(), {"color": GREY, "linewidth": 3.2}
+    below = {"color": GREY, "linewidth": 3.2}
     above = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
     desired, measured = (
         DEGREES * run.legs(name) for name in ("gamma_desired", "gamma")
     )
     series = [
-        ("desired", seconds, desired, below),
-        ("measured", seconds, measured, above),
+        LegCurves.of("desired", run, desired, below),
+        LegCurves.of("measured", run, measured, above),
     ]
     if TRUE_JOINT_STATES.key not in run.missing:
         looks = {"color": VERMILION, "linewidth": 0.9, "linestyle": ":"}
-        series.append(("true", seconds, DEGREES * run.true_legs("gamma"), looks))
+        true = DEGREES * run.true_legs("gamma")
+        series.append(LegCurves.of("true", run, true, looks))
     return draw_legs("γ [deg]", series)
 
 
@@ -241,7 +268,8 @@ def _torques(run: Signals, _: Scene) -> Figure:
     Commands without a stamp are drawn where the recorder received them, by its clock.
     """
     seconds, torque = tick_torques(run)
-    series = [("applied", seconds, torque, {"color": BLUE, "linewidth": 3.0})]
+    line = {"color": BLUE, "linewidth": 3.0}
+    series = [LegCurves("applied", seconds, torque, line)]
     table = next(
         (name for name in ("commands_stamped", "commands") if name in run.tables), None
     )
@@ -255,7 +283,7 @@ def _torques(run: Signals, _: Scene) -> Figure:
             "markersize": 1.5,
         }
         if inside.any():
-            series.append(("commanded", at[inside], values[inside], dots))
+            series.append(LegCurves("commanded", at[inside], values[inside], dots))
     return draw_legs("τ [N m]", series)
 
 
@@ -337,10 +365,10 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     if not np.nanmax(np.abs(raised), initial=0.0):
         del shown["potential, gained"]  # no gravity, no springs
     panels = (
-        ("energy [J]", list(shown), np.stack([*shown.values()], axis=1)),
-        ("energy gained − work [J]", ["residual"], (gained - done)[:, None]),
+        Panel("energy [J]", list(shown), np.stack([*shown.values()], axis=1)),
+        Panel("energy gained − work [J]", ["residual"], (gained - done)[:, None]),
     )
-    figure = figures.draw_panels(run.seconds(), panels, 2.8)
+    figure = figures.draw_panels(run.seconds(), panels, 2.8, gaps=run.gaps())
     figure.axes[1].axhline(0.0, color=GREY, linewidth=0.8)
     return figure
 
@@ -355,16 +383,21 @@ def _margins(run: Signals, scene: Scene) -> Figure:
     for axes, (name, limit) in zip(panels, most.items(), strict=True):
         angles = run.true_legs(name)
         left = np.minimum(angles, limit - angles)
-        figures.lines(
-            axes, run.seconds(), DEGREES * left, [f"leg {k}" for k in (1, 2, 3)]
-        )
+        names = [f"leg {k}" for k in (1, 2, 3)]
+        figures.lines(axes, run.seconds(), DEGREES * left, names, gaps=run.gaps())
         axes.axhline(0.0, color="black", linewidth=0.8)
     return figure
 
 
+def broken_quaternions(run: Signals) -> Array:
+    """Return the orientations of the samples, with a row of nan in each gap, (n, 4)."""
+    quaternions = run.take(*QUATERNION)
+    return figures.break_lines(run.seconds(), quaternions, run.gaps())[1]
+
+
 def directions(run: Signals) -> Array:
-    """Direction of E in {B} at each sample, shape (n, 3)."""
-    return rotation_matrix(run.take(*QUATERNION))[:, :, 2]
+    """Direction of E in {B} at each sample, and nan in gaps, shape (n, 3)."""
+    return rotation_matrix(broken_quaternions(run))[:, :, 2]
 
 
 def _sphere(run: Signals, scene: Scene) -> Figure:

@@ -51,6 +51,7 @@ MEASURED_APART = 1e-9
 """Angle [rad] by which joint_states are off the orientation where they are not the
 motion itself: those of a simulator agree to rounding.
 """
+LEAST_GAP = 10.0  # usual periods without a row over which no picture draws a line
 MEASURED_SHARE = 0.1  # of the samples that must be, as single ones are faults
 
 
@@ -131,6 +132,18 @@ class Signals:
     def seconds(self, table: str = "samples") -> Array:
         """Time of each row since the start of the run [s]."""
         return np.asarray(self.time_ns(table) / NANOSECONDS)
+
+    def gaps(self, table: str = "samples") -> Array:
+        """Return begin and end of the times [s] without a row, shape (g, 2).
+
+        A time is one from LEAST_GAP usual periods of the rows on.
+        """
+        times_ns = self.time_ns(table)
+        spacing = np.diff(times_ns)
+        if not len(spacing):
+            return np.empty((0, 2))
+        at = np.flatnonzero(spacing > LEAST_GAP * max(_usual(spacing), 1))
+        return np.stack([times_ns[at], times_ns[at + 1]], axis=1) / NANOSECONDS
 
     def take(self, *names: str, table: str = "samples") -> Array:
         """Columns of quantities, shape (n, number of names)."""
@@ -689,9 +702,9 @@ def read(
     return Recording(read_signals(path, damaged=damaged, namespace=namespace))
 
 
-def read_run_motion(bag: str | Path) -> Trajectory:
+def read_run_motion(bag: str | Path, namespace: str | None = None) -> Trajectory:
     """Read the motion of a run, to be done again: two or more samples that have an orientation."""
-    motion = read(bag).trajectory
+    motion = read(bag, namespace=namespace).trajectory
     if len(motion) < 2:
         raise refusal(
             Path(bag), "orientation", len(motion), "two samples or more must have one"

@@ -20,7 +20,6 @@ from sst_ros.recording.recording import Recording
 from sst_ros.report.reference import Comparison
 from sst_ros.report.results import provenance, publish, render
 from sst_ros.report.run import RunEvaluation, evaluate_run, summary_table
-from sst_ros.state import Array
 
 DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 """Pictures of `plot` that the report has, too."""
@@ -45,9 +44,7 @@ def write_run_report(
         found = evaluate_run(run)
         drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
         title = f"Error against run time, {run.scene.name}"
-        drawn += pictures.save(
-            draw_errors(run.seconds, found), title, out, "error", ["png"]
-        )
+        drawn += pictures.save(draw_errors(run, found), title, out, "error", ["png"])
         figures.save_figure(draw_overview(run, found), out / PAGE)
         result = found.summary | {
             "pictures": [path.name for path in drawn],
@@ -60,22 +57,24 @@ def write_run_report(
 
 
 @figures.styled
-def draw_errors(seconds: Array, found: RunEvaluation) -> Figure:
+def draw_errors(run: Recording, found: RunEvaluation) -> Figure:
     """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
     panels = {"(a) integration error, against the same torques": found.integration}
     if found.ideal is not None:
         panels["(b) sample-and-hold error, against continuous torques"] = found.ideal
     figure, grid = figures.stack(["largest difference"] * len(panels), 3.1)
     for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
-        _draw_comparison(axes, seconds, comparison)
+        _draw_comparison(axes, run, comparison)
         axes.set_title(title)
     return figure
 
 
-def _draw_comparison(axes: Axes, seconds: Array, comparison: Comparison) -> None:
+def _draw_comparison(axes: Axes, run: Recording, comparison: Comparison) -> None:
     """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
+    gaps = run.signals.gaps()
     least = figures.SMALLEST_SHOWN
     floor = np.fmax(comparison.own.max(axis=1), least)
+    seconds, floor = figures.break_lines(run.seconds, floor, gaps)
     axes.fill_between(
         seconds,
         least,
@@ -89,7 +88,8 @@ def _draw_comparison(axes: Axes, seconds: Array, comparison: Comparison) -> None
     for values, name, looks in zip(
         comparison.error.to_numpy().T, names, LINES, strict=False
     ):
-        axes.plot(seconds, hide_zeros(values), label=name, **looks)
+        _, broken = figures.break_lines(run.seconds, hide_zeros(values), gaps)
+        axes.plot(seconds, broken, label=name, **looks)
     axes.set_yscale("log")
     axes.set_ylim(bottom=least)
     axes.legend(fontsize=8, ncol=2, loc="lower right")
@@ -115,9 +115,11 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     axes = panel(
         "Integration error, against the same torques", errors, "largest difference"
     )
-    _draw_comparison(axes, seconds, found.integration)
+    _draw_comparison(axes, run, found.integration)
     axes = panel("Energy residual", found.integration.energy, "energy residual [J]")
-    axes.plot(seconds, found.integration.energy, color=BLUE, linewidth=1.4)
+    energy = found.integration.energy
+    broken = figures.break_lines(seconds, energy, run.signals.gaps())
+    axes.plot(*broken, color=BLUE, linewidth=1.4)
     axes.yaxis.set_major_formatter("{x:.1e}")
     title = "Real-time factor (recorder clock), and losses"
     axes = panel(title, measured.pace, "real-time factor")

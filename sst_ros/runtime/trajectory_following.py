@@ -420,8 +420,8 @@ class TrajectoryFollower:
         refuse_unless("joint_states", ("position", measured.gamma, near, allowed))
 
 
-def _read_motion(bag: str) -> Trajectory:
+def _read_motion(bag: str, namespace: str | None) -> Trajectory:
     # needs rosbags, which others do not
     from sst_ros.recording.recording import read_run_motion
 
-    return read_run_motion(bag)
+    return read_run_motion(bag, namespace)

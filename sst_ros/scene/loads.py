@@ -207,6 +207,9 @@ class Recorded(Section):
     """What the actuators did in a recorded run."""
 
     bag: str = entry("folder of the bag, as seen from where the program runs")
+    namespace: str | None = entry(
+        "namespace of the simulator, where the bag has several runs"
+    )
 
 
 class DesiredMotion(Section):

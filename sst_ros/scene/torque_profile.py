@@ -9,7 +9,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TextIO, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from sst_ros.errors import (
     InputError,
     Problem,
     check_kinds,
+    check_regular,
     read_numbers,
     refusal,
     refuse_errors,
@@ -293,6 +294,13 @@ def _read_numbers(row: Sequence[str], places: Sequence[int]) -> list[float] | No
     return numbers if all(map(math.isfinite, numbers)) else None
 
 
+def open_table(path: Path) -> TextIO:
+    """Open a CSV file; raises OSError for a pipe or a device, which may never end."""
+    check_regular(path)
+    # Spreadsheets begin a file with a byte order mark.
+    return path.open(newline="", encoding="utf-8-sig")
+
+
 class TorqueTable(TorqueProfile):
     """Held torques [N m], shape (n, 3): each row acts from its time until the next.
 
@@ -326,8 +334,7 @@ class TorqueTable(TorqueProfile):
         unread = OSError, UnicodeDecodeError, csv.Error
         with (
             refuse_errors(origin, "csv", origin, "must be readable", *unread),
-            # Spreadsheets begin a file with a byte order mark.
-            Path(path).open(newline="", encoding="utf-8-sig") as file,
+            open_table(Path(path)) as file,
         ):
             reader = csv.reader(file)
             names = [name.strip() for name in next(reader, [])]

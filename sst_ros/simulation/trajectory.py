@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,7 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import (
     LostTorque,
     TorqueProfile,
+    TorqueTable,
     ascend,
     profile_from,
     profile_of,
@@ -289,9 +291,10 @@ class Trajectory(MotionTable):
 
         A moment from a topic is no part of them.
         """
-        return reactions_of(
+        found = reactions_of(
             self.scene, self.t, self.quaternion, self.body_rate, self.torque
         )
+        return replace(found, gaps=self.gaps)
 
     @cached_property
     def euler_zyz(self) -> Array:
@@ -521,21 +524,44 @@ class Trajectory(MotionTable):
     def _of_run(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in _FIGURES}
 
+    def _torque_lines(self) -> tuple[Array, Array]:
+        """Return torques [N m], shape (m, 3), and times [s] whose lines show them.
+
+        Torques that are held are steps, as they acted between the samples.
+        """
+        law = self.law
+        if self.scene.lags or not len(self):
+            return self.torque, self.t
+        if law is None:  # each over the interval that ends at its sample
+            times = np.repeat(self.t, 2)
+            return np.repeat(self.torque, 2, axis=0)[1:], times[:-1]
+        if not isinstance(law, TorqueTable):
+            return self.torque, self.t
+        kinks = law.kinks()
+        inside = kinks[(kinks > self.t[0]) & (kinks < self.t[-1])]
+        times = np.sort(np.concatenate([self.t, inside, inside]))
+        # Of the two points at a step the first is of before it.
+        first = np.append(times[1:] == times[:-1], False)
+        acting = np.where(first, np.nextafter(times, -np.inf), times)
+        limit = self.scene.torque_limit or np.inf
+        return np.clip(law.values(acting), -limit, limit), times
+
     def plot(self) -> Figure:
         """Draw actuator angles, rates, torques and the energy of the samples.
 
         Needs matplotlib.
         """
         require("matplotlib")
-        from sst_ros.figures import DEGREES, draw_panels, leg_names
+        from sst_ros.figures import DEGREES, Panel, draw_panels, leg_names
 
+        torque = Panel("τ [N m]", leg_names("τ"), *self._torque_lines())
         panels = (
-            ("γ [deg]", leg_names("γ"), DEGREES * self.gamma),
-            ("γ̇ [rad/s]", leg_names("γ̇"), self.gamma_dot),
-            ("τ [N m]", leg_names("τ"), self.torque),
-            ("energy [J]", ["energy"], self.energy[:, None]),
+            Panel("γ [deg]", leg_names("γ"), DEGREES * self.gamma),
+            Panel("γ̇ [rad/s]", leg_names("γ̇"), self.gamma_dot),
+            torque,
+            Panel("energy [J]", ["energy"], self.energy[:, None]),
         )
-        figure = draw_panels(self.t, panels)
+        figure = draw_panels(self.t, panels, gaps=self.gaps)
         figure.suptitle(f"{self.scene.name}: {self.message}")
         return figure
 

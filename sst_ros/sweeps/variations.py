@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.errors import refuse_errors, require
+from sst_ros.errors import check_regular, refuse_errors, require
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Place, Section, Spec, key_of
@@ -242,6 +242,7 @@ def read_table(given: Any) -> dict[str, Array]:
     )
     with refuse_errors("sweep", *refused, OSError, ValueError, TypeError, LookupError):
         if isinstance(given, Path):
+            check_regular(given)
             kind = "parquet" if given.suffix == ".parquet" else "csv"
             given = getattr(require("pandas"), f"read_{kind}")(given)
         columns = {str(name): freeze(real_numbers(given[name])) for name in given}

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 
 import pytest
 from hypothesis import given
@@ -13,6 +14,7 @@ from models import FAST
 from sst_ros.errors import InputError
 from sst_ros.scene.scene import load
 from sst_ros.scene.torque_profile import TorqueTable
+from sst_ros.sweeps.variations import read_table
 
 HEADER = "time,tau_1,tau_2,tau_3\n"
 
@@ -155,3 +157,17 @@ def test_arbitrary_rows_are_a_profile_or_refused(tmp_path_factory, text):
         return
     last = profile.times[-1]
     assert all(map(math.isfinite, (*profile(last), last)))
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("kind", ["fifo", "/dev/zero"])
+def test_a_pipe_or_a_device_is_refused_at_once(tmp_path, kind):
+    path = tmp_path / "torques.csv"
+    if kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(kind)
+    with pytest.raises(InputError, match=r"torques\.csv.* no regular file"):
+        TorqueTable.read(path)
+    with pytest.raises(InputError, match=r"table.* no regular file"):
+        read_table(path)

@@ -372,3 +372,49 @@ def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(
 def test_runs_that_cannot_be_told_apart_are_refused(pair, tmp_path):
     with pytest.raises(InputError, match="must be 2 to 6 bags"):
         draw_comparison([pair[0]] * 7, tmp_path)
+
+
+GAP_NS = 400_000_000
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory, bags):
+    """A run of 0.1 s, and the same again after a gap of which nothing is recorded."""
+    once = bags.simulated(scene.load("example2"), 0.1)
+    again = [one for one in once if one.sample >= 0]
+    later = [
+        dataclasses.replace(one, received_ns=one.received_ns + GAP_NS)
+        for one in shifted(bags, again, GAP_NS)
+    ]
+    sent = [*once, *later]
+    path = bags.write(tmp_path_factory.mktemp("twice") / "bag", sent)
+    return recording.read_signals(path)
+
+
+def crosses(line):
+    """Whether a line is drawn from before 0.2 s to after it."""
+    seconds, values = (np.asarray(one, dtype=float) for one in line.get_data())
+    ends = np.stack([seconds[:-1], seconds[1:]])
+    drawn = np.isfinite(values[:-1]) & np.isfinite(values[1:])
+    return bool(np.any(drawn & (ends.min(axis=0) < 0.2) & (ends.max(axis=0) > 0.2)))
+
+
+@pytest.mark.parametrize(
+    "name", ["joint_angles", "position_of_E", "psi", "torques", "energy", "margins"]
+)
+def test_no_line_is_drawn_across_a_gap(twice, name):
+    figure = pictures.PICTURES[name].make(twice, twice.scene)
+    lines = [
+        line
+        for axes in figure.axes
+        for line in axes.get_lines()
+        if len(line.get_xdata()) > 2
+    ]
+    assert lines and not any(map(crosses, lines))
+    last = max(np.nanmax(line.get_xdata()) for line in lines)
+    assert last == pytest.approx(0.5, abs=0.01)  # what is after it is drawn
+
+
+def test_the_path_of_a_run_is_broken_at_a_gap(twice):
+    broken = np.isnan(pictures.directions(twice)).any(axis=1)
+    assert np.flatnonzero(broken).tolist() == [51]

@@ -13,7 +13,7 @@ from sst_ros import read_bag
 from sst_ros.errors import InputError
 from sst_ros.recording import recording
 from sst_ros.recording.recording import read_signals
-from sst_ros.scene import scene
+from sst_ros.scene import scene, yaml_document
 
 GRIPPER = ["finger", "thumb"]
 
@@ -156,6 +156,17 @@ def test_commands_read_the_run_of_a_namespace(two_robots, tmp_path, capsys):
         assert "must be one of /left, /right" in capsys.readouterr().err
         assert cli.main([*line, "--namespace", "/right"]) == 0, capsys.readouterr().err
     assert "example1" in (tmp_path / "report" / "summary.json").read_text()
+
+
+def test_a_run_of_a_namespace_is_followed(two_robots, tmp_path, capsys):
+    path = tmp_path / "again.yaml"
+    for namespace, status in ({}, 1), ({"namespace": "/right"}, 0):
+        recorded = {"bag": str(two_robots), **namespace}
+        following = {"torque": None, "motion": {"recorded": recorded}}
+        changed = scene.load("example1").with_values(following)
+        path.write_text(yaml_document.dump(changed), encoding="utf-8")
+        assert cli.main(["plan", "check", str(path)]) == status
+    assert "must be one of /left, /right" in capsys.readouterr().err
 
 
 def test_two_robots_in_one_bag_are_compared(two_robots, tmp_path, capsys):
