@@ -31,7 +31,7 @@ MOST_TRAVEL = np.pi  # range of an angle [rad] that no leg of a manipulator has
 # Share of the change of an angle by which the integral of its rate may be off. Noise
 # and offsets of rates stay far below, other units and legs do not.
 RATE_SHARE = 0.25
-LEAST_TRAVEL = 1e-3  # range of an angle [rad] below which its rate is not judged
+LEAST_TRAVEL = 1e-3  # range of an angle [rad] below which its rate is not checked
 CERTAIN = 5.0  # standard deviations
 LEAST_ENERGY = 0.1  # share of the scene's kinetic energy that is more than none
 STRANGE = 100.0  # ratio of energies from which the units are worth a look

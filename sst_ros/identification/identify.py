@@ -904,7 +904,7 @@ def _check_simulated(data: Measured, scene: Scene) -> list[str]:
     """Return notes on a motion that is to be simulated.
 
     Raises InputError where a torque opposes that of the scene along the motion; motions
-    that are too short to be filtered are not judged.
+    that are too short to be filtered are not checked.
     """
     segments = read_segments(data)
     notes = contradictions.check_angles(segments.motion)
