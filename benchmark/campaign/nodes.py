@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import random
 import signal
 import subprocess
 import time
@@ -24,6 +25,8 @@ from benchmark.nodes import Client, Process, own_domain
 from sst_ros.errors import SstError
 from sst_ros.recording import bag_writer
 from sst_ros.recording.recording import read
+from sst_ros.scene.scene import load
+from sst_ros.state import IDLE_FRAME_ID
 
 SAMPLE_NS = 2_000_000
 FAULT_S, REPLY_S, CLOSE_S = 1.0, 0.5, 2.0
@@ -314,3 +317,100 @@ def _shared_memory() -> set[str]:
     return (
         {path.name for path in folder.glob("*fastrtps*")} if folder.is_dir() else set()
     )
+
+
+def message_orders(ledger: Ledger) -> None:
+    """Give workers states and phases in random orders: a fault or the end is heard.
+
+    A worker that has commanded and sees a fault ends with it, whichever topic is first.
+    """
+    import rclpy
+    from std_msgs.msg import String
+
+    from sst_ros.nodes.inverse_dynamics import InverseDynamicsController
+    from sst_ros.nodes.torque_player import TorquePlayer
+
+    rng = ledger.rng
+    with own_domain():
+        rclpy.init(args=["--ros-args", "--log-level", "fatal"])
+        try:
+            for number in ledger.cases(600, least=20):
+                kind = (TorquePlayer, InverseDynamicsController)[number % 2]
+                last = rng.choice((FAULT, "finished"))
+                phases = [String(data=name) for name in ("waiting", "running", last)]
+                states = _states(rng, count=4 if last == FAULT else 3)
+                merged = _merge(rng, phases[rng.randrange(3) :], states)
+                worker = kind()
+                worker._commands = Commands()
+                _hear(ledger, worker, merged, last)
+                if isinstance(worker, InverseDynamicsController):
+                    worker.follower.close()
+                worker.node.destroy_node()
+        finally:
+            rclpy.try_shutdown()
+
+
+FAULT = "fault: stopped at t = 0.1 s"
+
+
+class Commands:
+    """Stands for a publisher of commands with one subscriber."""
+
+    topic_name = "commands"
+
+    def publish(self, _: object) -> None:
+        """Send nothing."""
+
+    def get_subscription_count(self) -> int:
+        """Return one."""
+        return 1
+
+
+def _states(rng: random.Random, count: int) -> list[Any]:
+    """Return joint states of a run, with foreign ones between them."""
+    from sensor_msgs.msg import JointState
+
+    states = []
+    for number, stamp_ms in enumerate((1, 2, 4, 5)[:count]):
+        state = JointState(name=[f"gamma_{leg}" for leg in (1, 2, 3)])
+        state.position, state.velocity = list(load("reach").initial.gamma), [0.0] * 3
+        state.header.stamp.nanosec = stamp_ms * 1_000_000
+        if number in (0, 3):
+            state.header.frame_id = IDLE_FRAME_ID
+        states.append(state)
+        if rng.random() < 0.3:
+            finger = JointState(name=["finger"], position=[0.0], velocity=[0.0])
+            finger.header.stamp.sec = 7
+            states.append(finger)
+    return states[rng.randrange(2) :]
+
+
+def _merge(rng: random.Random, first: list[Any], second: list[Any]) -> list[Any]:
+    """Return the messages of two topics in a random order that keeps each one's."""
+    places = set(rng.sample(range(len(first) + len(second)), len(first)))
+    one, other = iter(first), iter(second)
+    count = len(first) + len(second)
+    return [next(one) if place in places else next(other) for place in range(count)]
+
+
+def _hear(ledger: Ledger, worker: Any, messages: list[Any], last: str) -> None:
+    """Call a worker as its executor does; count a fault or an end that it ignores."""
+    from std_msgs.msg import String
+
+    name = type(worker).__name__
+    order = ["phase" if isinstance(one, String) else "state" for one in messages]
+    heard = False
+    try:
+        for message in messages:
+            (worker.hear if isinstance(message, String) else worker.receive)(message)
+        worker.watch()
+        heard = worker.done.is_set()
+    except SstError as error:
+        heard = last == FAULT
+        if not heard:
+            ledger.found("tracebacks", f"{name} after {order}: {error}")
+    except Exception as error:
+        text = f"{name} after {order}: {type(error).__name__}: {error}"
+        ledger.found("tracebacks", text)
+    if not heard and worker.commanded:
+        ledger.found("lost", f"{name} does not hear {last!r} after {order}")

@@ -10,7 +10,7 @@ from benchmark.campaign.ledger import PARTS, Ledger, run_part
 from sst_ros.errors import SstError
 
 ROS = {part for part, (room, _) in PARTS.items() if room == "nodes"}
-LONG = {"bits", "estimates", "workers", "interrupts"}
+LONG = {"bits", "estimates", "workers", "interrupts", "cold_threads"}
 QUICK = {"messages", *(PARTS.keys() - ROS - LONG)}
 
 
