@@ -340,7 +340,7 @@ def message_orders(ledger: Ledger) -> None:
                 phases = [String(data=name) for name in ("waiting", "running", last)]
                 states = _states(rng, count=4 if last == FAULT else 3)
                 merged = _merge(rng, phases[rng.randrange(3) :], states)
-                worker = kind()
+                worker: Any = kind()
                 worker._commands = Commands()
                 _hear(ledger, worker, merged, last)
                 if isinstance(worker, InverseDynamicsController):

@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmark.campaign.ledger import Ledger
 from sst_ros import Simulation, TorqueTable, Trajectory, identify, load_scene, simulate
+from sst_ros.identification.identify import TorqueFit
 from sst_ros.scene.scene import load, text_of
 from sst_ros.state import Array
 from sst_ros.sweeps.sweep import read_sweep, run_study
@@ -316,6 +317,7 @@ def measurements(ledger: Ledger) -> None:
         name = f"measurement {number}: {how}"
         with ledger.case(name, bound=120.0):
             found = identify(data, scene)
+            assert isinstance(found, TorqueFit)
             told = bool(found.warnings) or not found.consistent
             value = float(found.values[found.names.index("star.inertia.xx")])
             if not told and abs(value / true.xx - 1.0) > FAR:
