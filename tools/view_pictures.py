@@ -92,6 +92,15 @@ def _build(server: PageServer, scene: Scene) -> None:
     camera.position = size * (3.4 * middle + np.array([0.25, -1.1, 1.1]))
 
 
+LABELS = {
+    BASE: (-0.3, -0.3, -0.3),
+    STAR: (0.45, 0.0, 0.8),
+    ACTUATED[0]: (0.65, 0.7, 0.0),
+    ACTUATED[1]: (-0.3, -0.7, 0.3),
+}
+"""Places of names that would lie on an axis of their frame, in lengths of its axes."""
+
+
 def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
     thick, base, star = 0.02 * scene.base.radius, scene.base.radius, scene.star.radius
     end = np.array([0.0, 0.0, star])
@@ -110,9 +119,9 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
             node, axes_length=length * size, axes_radius=0.010 * size, position=position,
             origin_radius=0.018 * size,
         )  # fmt: skip
-        along = {BASE: -0.3, STAR: 0.25}.get(link, 0.5)
+        beside = np.array(LABELS.get(link, (0.5, 0.5, 0.5)))
         server.scene.add_label(
-            f"{node}/name", name, position=along * length * size * np.ones(3),
+            f"{node}/name", name, position=length * size * beside,
             anchor="center-center", font_screen_scale=1.7,
         )  # fmt: skip
 

@@ -318,14 +318,12 @@ def _value_of(number: Any) -> Any:
 class LoadState:
     """What the function of an own load is given: arrays of symbols.
 
-    Attributes:
-        rotation: R of {E} in {B}, shape (3, 3); column 2 is the direction of E.
-        gamma, mu, beta: angles of the joints [rad], shape (3,).
-        omega: angular velocity of the star in {B} [rad/s], shape (3,). For a moment only,
-            as are the following.
-        body_rate: the same in {E}.
-        gamma_dot, mu_dot, beta_dot: rates of the joints [rad/s], shape (3,).
-
+    - rotation: R of {E} in {B}, shape (3, 3); column 2 is the direction of E.
+    - gamma, mu, beta: angles of the joints [rad], shape (3,).
+    - omega: angular velocity of the star in {B} [rad/s], shape (3,). For a moment only,
+      as are the following.
+    - body_rate: the same in {E}.
+    - gamma_dot, mu_dot, beta_dot: rates of the joints [rad/s], shape (3,).
     """
 
     rotation: Any

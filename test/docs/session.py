@@ -94,9 +94,14 @@ class Session:
             for line in commands(block.text):
                 self._line(line, block)
         else:
-            assert block.language in ("", "text", "yaml") or block.language.startswith(
-                "{"
-            ), f"{block}: nobody knows what to do with {block.language}"
+            assert block.language in (
+                "",
+                "text",
+                "yaml",
+                "diff",
+            ) or block.language.startswith("{"), (
+                f"{block}: nobody knows what to do with {block.language}"
+            )
 
     def settle(self):
         """Wait for what ends by itself, for recorders to have something, and press
