@@ -189,7 +189,7 @@ def _kind_of(hint: Any) -> Kind | None:
     wanted = parts[0]
     plain = isinstance(wanted, type) and get_origin(wanted) is None
     if len(parts) > 1 or wanted is Any or not plain:
-        return None  # several kinds, which the function tells apart
+        return None  # several kinds, which the function itself distinguishes
     return Kind(lambda x: isinstance(x, wanted), f"must be a {wanted.__name__}")
 
 

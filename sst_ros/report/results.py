@@ -44,7 +44,7 @@ class Finding(NamedTuple):
     text: str
 
 
-def judge(findings: Sequence[Finding]) -> str:
+def verdict_of(findings: Sequence[Finding]) -> str:
     """Return WARNING if one of the findings is a warning, else OK."""
     warned = any(finding.severity is Severity.WARNING for finding in findings)
     return "WARNING" if warned else "OK"

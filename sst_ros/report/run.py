@@ -35,11 +35,11 @@ from sst_ros.report.reference import QUANTITIES, Comparison
 from sst_ros.report.results import (
     Finding,
     Severity,
-    judge,
     largest,
     made_on,
     render,
     texts_of,
+    verdict_of,
 )
 from sst_ros.state import NANOSECONDS, Array
 
@@ -110,7 +110,7 @@ def evaluate_run(run: Recording) -> RunEvaluation:
     )
     findings = find_findings(run, integration, ideal, numbers)
     summary = {
-        "verdict": judge(findings),
+        "verdict": verdict_of(findings),
         "reasons": texts_of(findings, Severity.WARNING),
         "notes": texts_of(findings, Severity.NOTE),
         **numbers,

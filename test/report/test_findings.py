@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from sst_ros.report import reference
-from sst_ros.report.results import Severity, judge, texts_of
+from sst_ros.report.results import Severity, texts_of, verdict_of
 from sst_ros.report.run import find_findings
 
 GOOD = {
@@ -52,13 +52,13 @@ def find(monkeypatch):
 
 
 def test_a_good_run_has_no_finding_and_the_verdict_ok(find):
-    assert find() == [] and judge([]) == "OK"
+    assert find() == [] and verdict_of([]) == "OK"
 
 
 @pytest.mark.parametrize(("share", "warned"), [(89.9, True), (90.0, False)])
 def test_answers_to_nine_samples_of_ten_are_enough(find, share, warned):
     found = find(samples_answered_percent=share)
-    assert judge(found) == ("WARNING" if warned else "OK")
+    assert verdict_of(found) == ("WARNING" if warned else "OK")
 
 
 def test_warnings_come_in_order_of_weight_and_notes_make_no_verdict(find):
@@ -70,7 +70,7 @@ def test_warnings_come_in_order_of_weight_and_notes_make_no_verdict(find):
     ]
     notes = ["5 joint states of other robots are left out"]
     assert texts_of(found, Severity.NOTE) == notes
-    assert judge(find(foreign_states=5)) == "OK"
+    assert verdict_of(find(foreign_states=5)) == "OK"
 
 
 def test_errors_are_held_against_the_limit_of_the_run(find):
