@@ -43,7 +43,7 @@ view: $(VENV)/.view  ## show a simulation in the browser
 	@$(RUN) -m sst_ros view --scene swing --open
 
 test: $(VENV)/.test lint  ## run the tests, without the slow ones
-	$(PYTEST) $(PARALLEL) -m "not slow" --ignore test/ros
+	$(PYTEST) $(PARALLEL) $(COVERAGE) -m "not slow" --ignore test/ros
 	$(PYTEST) $(PARALLEL_NODES) -m "not slow" test/ros
 
 test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment of their own
@@ -56,7 +56,9 @@ test-slow: $(VENV)/.test $(VENV)/.docs  ## run the slow tests: sweeps, long page
 	$(PYTEST) $(PARALLEL) -m slow --ignore test/ros --timeout 600
 	$(PYTEST) $(PARALLEL) -m slow test/ros --timeout 600
 
-test-all: test test-slow test-jazzy  ## run all tests
+# Lines and branches that the tests without nodes pass, those of child processes not counted.
+test-all: COVERAGE = --cov sst_ros --cov-branch --cov-report term
+test-all: test test-slow test-jazzy  ## run all tests, and print which share of lines and branches they pass
 
 lint: $(VENV)/.test  ## check style and types
 	@$(MAKE) --no-print-directory --jobs --keep-going --output-sync lint-style lint-types lint-words

@@ -84,6 +84,7 @@ EXTRAS |= {
         "mpmath",
         "mypy",
         "pytest",
+        "pytest-cov",
         "pytest-timeout",
         "pytest-xdist",
         "python-flint>=0.8",
