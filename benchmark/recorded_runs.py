@@ -3,12 +3,13 @@
 
 python -m benchmark.recorded_runs [--runs 20] [--crowds 3] [--busy 2]
 
-Runs of `reach` under the controller, with the sensors and all topics, in turn by the
-clock and in lockstep; then crowds: a recorder, two lockstep simulators and two
-controllers in namespaces, all started at once. Beside them so many processes keep the
-processors busy. A run is whole if no node fails, and its bag has every sample and every
-tick, once, with all its topics. In lockstep all runs have the same bits. Else the
-status is 1.
+Runs with the sensors and all topics, in turn by the clock and in lockstep, then crowds:
+a recorder, two lockstep simulators and two controllers in namespaces, all started at
+once. In lockstep it is `reach` under the controller, by the clock `swing` without one:
+where a controller gets no processor for tenths of a second, the run may end in a fault.
+Beside them so many processes keep the processors busy. A run is whole if no node fails,
+and its bag has every sample and every tick, once, with all its topics. In lockstep all
+runs have the same bits. Else the status is 1.
 """
 
 from __future__ import annotations
@@ -22,21 +23,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.rosbag2 import Reader
 
 from benchmark.measure import describe_machine, join_line, read_options
 from benchmark.nodes import Process, own_domain, start_simulator
 from sst_ros.recording import recording
 from sst_ros.runtime.settings import default_topics
 
-SCENE, SECONDS, RATE, TICKS_A_SAMPLE = "reach", 1.5, 500, 2
+SCENES = {"lockstep": "reach", "free": "swing"}
+SECONDS, RATE, TICKS_A_SAMPLE = 1.5, 500, 2
 SAMPLES = round(SECONDS * RATE) + 1
 BUSY = "while True: pass"
 TIMEOUT_S = 300.0
 """Longest wait for a process: five of them start on a machine with others."""
 NAMESPACES = ("/left", "/right")
-SENSORS: dict[str, Any] = {"imu": True, "reaction": "prismatic_1"}
-NOT_OF_A_RUN = ("true_joint_states", "external_moment", "commands")
-"""Last words of topics without messages here: commands have a stamp."""
+AWAITED = (
+    "joint_states",
+    *(f"~/{name}" for name in ("orientation", "euler_zyz", "applied_torques")),
+    *("~/imu", "~/reaction"),
+)
+SENSORS = ("imu", "reaction")
+"""Their messages are counted one by one: reading a run does not need them."""
 
 
 @contextmanager
@@ -50,22 +57,28 @@ def busy(number: int) -> Iterator[None]:
         yield
 
 
-def _simulator(namespace: str, sync: str, topics: list[str]) -> Process:
-    given: dict[str, Any] = {"scene": SCENE, "duration": SECONDS, "sync": sync}
-    given |= {"publish_rate": RATE, "lockstep_timeout": TIMEOUT_S, **SENSORS}
-    if sync == "free":
-        given |= {"wait_for_command": True, "command_timeout": 0.0}
-    waits = [one.removeprefix("/sst_simulator") for one in topics]
-    given["wait_for_subscribers"] = f"[{','.join(waits)}]"
-    given["subscriber_timeout"] = TIMEOUT_S
-    return start_simulator(namespace, **given)
+def _simulator(namespace: str, sync: str, stderr: int) -> Process:
+    return start_simulator(
+        namespace,
+        stderr=stderr,
+        scene=SCENES[sync],
+        duration=SECONDS,
+        sync=sync,
+        publish_rate=RATE,
+        lockstep_timeout=TIMEOUT_S,
+        wait_for_subscribers=f"[{','.join(AWAITED)}]",
+        subscriber_timeout=TIMEOUT_S,
+        imu=True,
+        reaction="prismatic_1",
+    )
 
 
-def _controller(namespace: str) -> Process:
+def _controller(namespace: str, stderr: int) -> Process:
     return Process(
         "inverse_dynamics",
         namespace,
-        scene=SCENE,
+        stderr=stderr,
+        scene=SCENES["lockstep"],
         stamped=True,
         mode="feedforward_pd",
         feedforward_at="middle",
@@ -87,33 +100,40 @@ def record(folder: Path, namespaces: tuple[str, ...], sync: str) -> list[str]:
         for topic in default_topics()
     ]
     listed = f"[{','.join(dict.fromkeys(topics))}]"
-    nodes = {
-        "recorder": Process("recorder", output=folder, topics=listed, timeout=TIMEOUT_S)
-    }
-    awaited = ["joint_states", "~/orientation", "~/euler_zyz", "~/applied_torques"]
-    awaited += ["~/imu", "~/reaction"]
-    for namespace in namespaces:
-        nodes[f"{namespace} simulator"] = _simulator(namespace, sync, awaited)
-        nodes[f"{namespace} controller"] = _controller(namespace)
     faults = []
-    deadline = time.monotonic() + TIMEOUT_S
-    for name, process in nodes.items():
-        if name != "recorder":
-            left = max(1.0, deadline - time.monotonic())
-            status, _ = _wait(process, left)
+    with (folder.parent / f"{folder.name}.err").open("w+") as errors:
+        stderr = errors.fileno()
+        recorder = Process(
+            "recorder", stderr=stderr, output=folder, topics=listed, timeout=TIMEOUT_S
+        )
+        nodes = {}
+        for namespace in namespaces:
+            nodes[f"{namespace} simulator"] = _simulator(namespace, sync, stderr)
+            if sync == "lockstep":
+                nodes[f"{namespace} controller"] = _controller(namespace, stderr)
+        deadline = time.monotonic() + TIMEOUT_S
+        for name, process in nodes.items():
+            status = _wait(process, max(1.0, deadline - time.monotonic()))
             if status != 0:
                 faults.append(f"{name.strip()} ended with status {status}")
-    status, said = nodes["recorder"].end()
-    if status != 0:
-        faults.append(f"recorder ended with status {status}: {said.strip()}")
+        status, _ = recorder.end()
+        if status != 0:
+            faults.append(f"recorder ended with status {status}")
+        if faults:
+            errors.seek(0)
+            faults += [line.strip() for line in errors if "[INFO]" not in line][-4:]
     return faults
 
 
-def _wait(process: Process, seconds: float) -> tuple[int, str]:
+def _wait(process: Process, seconds: float) -> int:
+    """Wait for the end of a process, end it after the time; return its status."""
     deadline = time.monotonic() + seconds
     while process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.1)
-    return process.end(timeout=10.0) if process.poll() is None else (process.wait(), "")
+    if process.poll() is None:
+        process.end(timeout=10.0)
+        return 255
+    return process.wait()
 
 
 def examine(run: recording.Recording, sync: str) -> Iterator[str]:
@@ -132,9 +152,17 @@ def examine(run: recording.Recording, sync: str) -> Iterator[str]:
         yield "samples without orientation"
     if sync == "lockstep" and len(run.commands.received_ns) < SAMPLES - 1:
         yield f"{len(run.commands.received_ns)} of {SAMPLES - 1} commands"
-    lost = [key for key in run.missing if key not in NOT_OF_A_RUN]
-    if lost:
-        yield f"no {', '.join(lost)}"
+
+
+def count_readings(folder: Path, namespace: str) -> Iterator[str]:
+    """Yield the sensors that do not have a message for each sample."""
+    with Reader(folder) as reader:
+        counts = {each.topic: each.msgcount for each in reader.connections}
+    for sensor in SENSORS:
+        topic = f"{namespace}/sst_simulator/{sensor}"
+        count = counts.get(topic, 0)
+        if count != SAMPLES:
+            yield f"{count} of {SAMPLES} messages of {topic}"
 
 
 def check(
@@ -153,6 +181,7 @@ def check(
             faults.append(f"{namespace} {error}".strip())
             continue
         faults += [f"{namespace} {lack}".strip() for lack in examine(run, sync)]
+        faults += count_readings(folder, namespace)
         gammas.append(run.gamma.tobytes())
     if len(set(gammas)) > 1:
         faults.append("the runs of the namespaces differ")

@@ -35,7 +35,7 @@ from sst_ros.nodes.topics import (
 )
 from sst_ros.recording.topic_tables import TABLES, TIMES, Column
 from sst_ros.report.results import markdown
-from sst_ros.runtime import run_loop, settings
+from sst_ros.runtime import diagnostics, settings
 from sst_ros.runtime.settings import (
     NodeParameters,
     SimulatorParameters,
@@ -155,7 +155,7 @@ def _default(value: Any) -> str:
 def nodes_tables() -> Iterator[tuple[str, str]]:
     """Yield the parts of docs/nodes.md: name and text."""
     for name, keys in (
-        ("diagnostics", run_loop.KEYS),
+        ("diagnostics", diagnostics.KEYS),
         ("inverse_dynamics diagnostics", inverse_dynamics.KEYS),
     ):
         yield (

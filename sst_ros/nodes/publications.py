@@ -149,7 +149,7 @@ class TorqueLog:
         names = (*ACTUATORS, *MOMENTS) if moments else ACTUATORS
         self._message = JointTrajectory(joint_names=list(names))
         self._message.header.frame_id = base_frame
-        self._points: list[JointTrajectoryPoint] = []  # those of the longest log so far
+        self._points: list[JointTrajectoryPoint] = []  # those of the longest log
         self.clear()
 
     def __len__(self) -> int:

@@ -20,7 +20,8 @@ from sst_ros.errors import InputError, SstError, refuse_unless
 from sst_ros.nodes import simulation_interfaces, topics
 from sst_ros.nodes.process import Worker, every
 from sst_ros.nodes.publications import SimulatorTopics, follows_clock
-from sst_ros.runtime.run_loop import Phase, Reply, RunDiagnostics, RunLoop, read_gauges
+from sst_ros.runtime.diagnostics import RunDiagnostics, read_gauges
+from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.runtime.scheduling import CpuDmaLatency, quiet, schedule
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime

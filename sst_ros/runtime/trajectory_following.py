@@ -220,7 +220,7 @@ class TrajectoryFollower:
     def _settle(self, order: Order, result: Any) -> None:
         """Follow what was checked, or have the check repeated.
 
-        That is where the reference has gone on meanwhile, in another way.
+        It is repeated where the reference is another one by now.
         """
         order.asked += 1
         if order.outcome.done():  # by a reset

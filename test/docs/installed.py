@@ -98,6 +98,9 @@ def _value(spec, text):
     kinds = {"flag": bool, "integer": int, "number": float, "texts": list, "text": str}
     kind = kinds.get(spec.kind)
     value = yaml.safe_load(text)
+    if spec.shape:
+        assert [type(number) for number in value] == [float] * spec.shape[0], text
+        return
     assert kind is None or type(value) is kind, f"{text} is no {kind.__name__}"
 
 

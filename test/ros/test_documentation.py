@@ -13,7 +13,7 @@ import yaml
 from sensor_msgs.msg import JointState
 
 from sst_ros.nodes import topics
-from sst_ros.runtime import run_loop
+from sst_ros.runtime import diagnostics
 from sst_ros.scene.loads import JOINTS
 from sst_ros.state import BASE_FRAME
 from tools.reference_pages import NODES, SIMULATION_INTERFACES, policy
@@ -133,7 +133,7 @@ def test_the_diagnostics_are_those_of_the_docs_and_the_description_can_be_left_o
     observer.told("phase", "running")
     said = observer.told("error_estimate", lambda value: True)
     # Without a torque that is held there is no error of the hold.
-    known = [key for key in run_loop.KEYS if not key.startswith("hold_error")]
+    known = [key for key in diagnostics.KEYS if not key.startswith("hold_error")]
     assert list(said)[:-2] == known
     assert "/robot_description" not in dict(observer.node.get_topic_names_and_types())
 

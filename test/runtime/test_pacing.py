@@ -17,7 +17,11 @@ from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer
 
 MS = 1_000_000
-CHANGEABLE = SimulatorParameters.CHANGEABLE
+CHANGEABLE = [
+    name
+    for name in SimulatorParameters.CHANGEABLE
+    if not SimulatorParameters.SPECS[name].shape  # three numbers, as those of a scene
+]
 
 
 class Hand(HandClock):

@@ -13,7 +13,8 @@ from runtime.bench import Bench, HandClock, plain, run_here, stamped
 from sst_ros.errors import RunStopped
 from sst_ros.integration import method_steps
 from sst_ros.runtime import tick_loop
-from sst_ros.runtime.run_loop import OK, WARN, Phase, Reply, RunDiagnostics
+from sst_ros.runtime.diagnostics import OK, WARN, RunDiagnostics
+from sst_ros.runtime.run_loop import Phase, Reply
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import ZERO
 
