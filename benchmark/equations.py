@@ -40,7 +40,16 @@ from sst_ros.report.results import data_frame, markdown
 from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import names
 
-LIBRARIES = ("jax", "casadi", "numpy", "mpmath", "sympy")
+LIBRARIES = {
+    "jax": "JAX",
+    "casadi": "CasADi",
+    "numpy": "NumPy",
+    "mpmath": "mpmath",
+    "sympy": "SymPy",
+}
+QUICK = ("jax", "casadi")
+"""Those whose derivative is integrated."""
+
 TIMED = ("example2", "friction", "general", "gravity_payload")
 """Scenes whose times and sizes are shown: no loads, friction, all inertias, weight."""
 
@@ -218,7 +227,9 @@ def compare_mujoco(scene: Scene) -> float:
     found = [data.qacc[model.joint(name).dofadr[0]] for name in JOINTS[:3]]
     drive = [*TORQUE, *(0.0 for _ in dynamics.drive[3:])]
     slope = dynamics.derivative(*state, *drive)
-    expected = kernel.actuator_acceleration(dynamics.model, state.tolist(), slope[4:7])
+    expected = kernel.actuator_acceleration(
+        dynamics.model, state.tolist(), (slope[4], slope[5], slope[6])
+    )
     return float(np.abs(np.subtract(found, expected)).max() / np.abs(expected).max())
 
 
@@ -234,51 +245,45 @@ def compare(name: str) -> dict[str, str]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         compiled = Compiled(equations(scene, "c"), folder)
-        size = (len(package.state),)
-        note(
-            "C",
-            find_difference(
-                package,
-                lambda output, state, drive: compiled(
-                    output, package.values(state)[output].shape, state, *drive
-                ),
-                STATES,
-            ),
-            find_motion_error(
-                scene,
-                package,
-                lambda y: compiled("derivative", size, y, *package.drive),
-            ),
-        )
-        for library in LIBRARIES:
-            written = equations(scene, library)
-            states = 1 if library == "sympy" else STATES
-            slope = written.derivative
-            if library == "jax":
-                import jax
 
-                slope = jax.jit(slope)
-            difference = find_difference(
-                package,
-                lambda output, state, drive, of=written: getattr(of, output)(
-                    state, *drive
-                ),
-                states,
-            )
-            motion = None
-            if library in ("jax", "casadi"):
-                motion = find_motion_error(
-                    scene, package, lambda y, of=slope: of(y, *package.drive)
-                )
-            note(
-                {"jax": "JAX", "casadi": "CasADi"}.get(library, library),
-                difference,
-                motion,
-            )
+        def call(output: str, state: np.ndarray, drive: list[np.ndarray]) -> np.ndarray:
+            return compiled(output, package.values(state)[output].shape, state, *drive)
+
+        def slope(state: np.ndarray) -> np.ndarray:
+            return compiled("derivative", state.shape, state, *package.drive)
+
+        difference = find_difference(package, call, STATES)
+        note("C", difference, find_motion_error(scene, package, slope))
+        for library, title in LIBRARIES.items():
+            note(title, *compare_library(scene, package, library))
         problems, motion = compare_unit(scene, folder / "unit")
         row["FMU"] = f"{motion:.0e} rad" + (f", {problems} faults" if problems else "")
     row["MJCF"] = f"{compare_mujoco(scene):.0e}"
     return row
+
+
+def compare_library(
+    scene: Scene, package: Package, library: str
+) -> tuple[float, float | None]:
+    """Return the difference of values, and the error of the motion where it is quick."""
+    written = equations(scene, library)
+
+    def call(output: str, state: np.ndarray, drive: list[np.ndarray]) -> Any:
+        return getattr(written, output)(state, *drive)
+
+    difference = find_difference(package, call, 1 if library == "sympy" else STATES)
+    if library not in QUICK:
+        return difference, None
+    derivative = written.derivative
+    if library == "jax":
+        import jax
+
+        derivative = jax.jit(derivative)
+
+    def slope(state: np.ndarray) -> Any:
+        return derivative(state, *package.drive)
+
+    return difference, find_motion_error(scene, package, slope)
 
 
 def measure_times(name: str) -> dict[str, str]:
@@ -308,8 +313,7 @@ def measure_times(name: str) -> dict[str, str]:
         begin = time.perf_counter()
         function(state, torque).block_until_ready()
         tracing = time.perf_counter() - begin
-        many = np.tile(state[:, None], LANES), np.tile(torque[:, None], LANES)
-        many = tuple(jax.numpy.array(array) for array in many)
+        many = [jax.numpy.tile(x[:, None], LANES) for x in (state, torque)]
         one = jax.numpy.array(state), jax.numpy.array(torque)
         casadi, columns = written["casadi"].derivative, written["numpy"].derivative
         calls["jax"] = lambda: function(*one).block_until_ready()
@@ -369,20 +373,11 @@ def measure_sizes(name: str) -> dict[str, str]:
             with tempfile.TemporaryDirectory() as place:
                 paths = equations(load_scene(name), "c", outputs=outputs).write(place)
                 source = next(path for path in paths if path.suffix == ".c")
-                target = source.with_suffix(".o")
-                words = [
-                    compiler,
-                    "-std=c99",
-                    "-Os",
-                    *flags,
-                    "-c",
-                    "-o",
-                    target,
-                    source,
-                ]
-                subprocess.run(words, check=True)
+                made = str(source.with_suffix(".o"))
+                words = [compiler, "-std=c99", "-Os", *flags, "-c", "-o", made]
+                subprocess.run([*words, str(source)], check=True)
                 done = subprocess.run(
-                    [size, target], check=True, capture_output=True, text=True
+                    [size, made], check=True, capture_output=True, text=True
                 )
             text, data = map(int, done.stdout.splitlines()[1].split()[:2])
             row[f"{said}, {machine}"] = f"{(text + data) / 1000:.1f} kB"
@@ -394,7 +389,7 @@ def main(arguments: list[str] | None = None) -> int:
     import jax
 
     options = read_options("equations", __doc__, arguments, no_page=False)
-    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]
     values = [compare(name) for name in names()]
     times = [measure_times(name) for name in TIMED]
     sizes = [measure_sizes(name) for name in TIMED]
