@@ -111,8 +111,18 @@ def test_fixed_steps_converge_with_order_eight(tmp_path):
     assert 6.5 < np.log2(errors[0] / errors[1]) < 9.5, errors
 
 
-def test_model_exchange_gives_the_derivative(tmp_path):
-    scene = load_scene("general")
+@pytest.mark.parametrize("name", names())
+def test_short_fixed_steps_are_the_motion_of_simulate(name, tmp_path):
+    scene, torques = load_scene(name), held_torques(5)[:3]
+    path = write(scene, tmp_path)
+    with instance(path, tmp_path / "unit", values={"step": 1e-4}) as (unit, known):
+        found = follow(unit, known, torques)
+    assert np.abs(found - expected(scene, torques)).max() < EXACT
+
+
+@pytest.mark.parametrize("name", names())
+def test_model_exchange_gives_the_derivative(name, tmp_path):
+    scene, duration = load_scene(name), 0.05
     path, torque = write(scene, tmp_path), [0.4, -0.2, 0.3]
     with instance(path, tmp_path / "unit", "model") as (unit, references):
         unit.setFloat64([references[f"torque_{leg}"] for leg in (1, 2, 3)], torque)
@@ -128,11 +138,11 @@ def test_model_exchange_gives_the_derivative(tmp_path):
 
         unit.getContinuousStates(pointer(start), 7)
         run = solve_ivp(
-            derivative, (0, 0.1), start.copy(), "DOP853", rtol=1e-13, atol=1e-14
+            derivative, (0, duration), start.copy(), "DOP853", rtol=1e-13, atol=1e-14
         )
         unit.setContinuousStates(pointer(run.y[:, -1].copy()), 7)
         found = unit.getFloat64([references[name] for name in GAMMA])
-    motion = simulate(scene, torque, 0.1, tolerance=1e-13)
+    motion = simulate(scene, torque, duration, tolerance=1e-13)
     assert np.abs(found - motion.gamma[-1]).max() < EXACT
 
 
@@ -181,7 +191,7 @@ def test_what_is_not_finite_is_refused(tmp_path):
         unit.doStep(currentCommunicationPoint=0.0, communicationStepSize=PERIOD)
 
 
-@pytest.mark.parametrize("scene", ["example2", "friction", "loaded"])
+@pytest.mark.parametrize("scene", [*names(), "loaded"])
 def test_fmpy_finds_the_unit_valid(scene, tmp_path):
     from fmpy.validation import validate_fmu
 

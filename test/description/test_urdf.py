@@ -245,6 +245,24 @@ def test_motion_under_gravity_with_payload_and_rotors():
 
 
 @pytest.mark.parametrize("name", names())
+def test_motion_of_every_scene(name):
+    """Inertias and weight; what URDF has not is left out of the scene."""
+    scene = replace(load(name), friction=None, springs=(), own_loads=(), moment=None)
+    scene = replace(scene, actuators=None)
+    geometry = Geometry.of(scene)
+    at = virtual_work.posture(
+        geometry, np.add(scene.initial.gamma, [0.02, -0.01, 0.01])
+    )
+    torque = np.array([0.3, -1.0, 2.0])
+    motion = rates.of_actuators(at, np.array([0.8, -1.1, 0.5]))
+    angles = angles_of(geometry, at.gamma, at.rotation)
+    state = (*quaternion_of(at.rotation), *(at.rotation.T @ motion.omega))
+    expected = np.array(Dynamics.of(scene).derivative(*state, *torque)[4:7])
+    found = acceleration(scene, angles, motion, torque)
+    assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("name", names())
 def test_mujoco_loads_every_scene(name):
     mujoco = pytest.importorskip(
         "mujoco", reason="MuJoCo is missing: pip install mujoco"
