@@ -240,7 +240,7 @@ class ActuatorSpaceMap:
         with contextlib.suppress(ArithmeticError):
             if sigma is None:
                 sigma = 2.0 / 3.0 * abs(self.posture(*known)[-1])
-            if step <= continuation.SAFE * sigma * sigma:
+            if step <= continuation.SAFE_STEP * sigma * sigma:
                 found = self._find_orientation(known, gamma)
                 # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle /
                 # 2).

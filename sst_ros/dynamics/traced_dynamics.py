@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions of scenes, traced: those that a run calls, the ODE that is integrated, many scenarios.
+"""Functions of scenes, traced: what a run calls, the ODE, and many scenarios at once.
 
 The programs of many scenarios have the numbers that differ as inputs. What is the same
 in all of them stays a constant that `trace` folds, so a batch computes only what
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import Limit, limits_of
-from sst_ros.errors import refuse_unless
-from sst_ros.mechanism.generic_math import Scalar, positive, sin
+from sst_ros.errors import Check, refuse_unless
+from sst_ros.mechanism.generic_math import Scalar, positive, sin, triple
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.programs.compiled import compile_functions, compile_rows
 from sst_ros.programs.expression import (
@@ -46,6 +46,9 @@ TORQUE = ("t1", "t2", "t3")
 MOMENT = ("n1", "n2", "n3")
 BODY_ACCELERATION = ("ax", "ay", "az")
 
+STATE_SIZE = len(MOTION)  # of a state without lagged torques
+LEGS = 3
+
 OUTPUTS = (*Joints._fields, "energy")
 """Quantities of a state that depend on the numbers of its scenario."""
 
@@ -59,13 +62,18 @@ class Dynamics:
     """
 
     def __init__(self, model: kernel.Model, *, has_moment_topic: bool = False) -> None:
-        self.model, self.has_moment_topic = model, has_moment_topic
-        self.state = (*MOTION, *(LAG if model.time_constant is not None else ()))
-        self.drive = (*TORQUE, *(MOMENT if has_moment_topic else ()))
+        self.model = model
+        self.has_moment_topic = has_moment_topic
+        self.state: tuple[str, ...] = MOTION
+        if model.time_constant is not None:
+            self.state = (*MOTION, *LAG)
+        self.drive: tuple[str, ...] = TORQUE
+        if has_moment_topic:
+            self.drive = (*TORQUE, *MOMENT)
 
     @staticmethod
     def of(scene: Scene) -> Dynamics:
-        """Give those of a scene: traced once for all scenes that have the same constants."""
+        """Return those of a scene: traced once for all scenes of the same constants."""
         has_moment_topic = scene.moment is not None and scene.moment.topic
         return recent(kernel.model_of(scene), has_moment_topic=has_moment_topic)
 
@@ -76,9 +84,10 @@ class Dynamics:
 
     @cached_property
     def joints(self) -> Function:
-        """Angles gamma, mu, beta and rates in the same order, 18 numbers of the first seven.
+        """Angles gamma, mu and beta, and rates in the same order, 18 numbers.
 
-        They are nan where an angle has no value.
+        They depend on the first seven of the state, and are nan where an angle has no
+        value.
         """
         return compile_functions({"joints": self.joints_program}, ("joints",))["joints"]
 
@@ -90,58 +99,59 @@ class Dynamics:
     @cached_property
     def joints_program(self) -> Program:
         """The program of `joints`."""
-        return trace(
-            lambda *state: [*chain(*kernel.joints(self.numbers, state))], MOTION
-        )
+
+        def angles_and_rates(*state: Any) -> list[Any]:
+            return [*chain(*kernel.joints(self.numbers, state))]
+
+        return trace(angles_and_rates, MOTION)
 
     @cached_property
     def inverse(self) -> Function:
-        """Torques that give a W_dot, det g and sin^2(mu_k), 7 numbers: `kernel.actuator_torque`.
+        """Torques that give a W_dot, det g and sin^2(mu_k), seven numbers.
 
-        Of the first seven numbers of the state, W_dot, and a moment if it comes from a
-        topic.
+        See `kernel.actuator_torque`. The inputs are the first seven numbers of the
+        state, W_dot, and a moment if it comes from a topic.
         """
 
         def torques(*inputs: Any) -> tuple[Any, ...]:
-            q, rate, acceleration, moment = (
-                inputs[:4],
-                inputs[4:7],
-                inputs[7:10],
-                inputs[10:],
+            x, y, z, w, wx, wy, wz, ax, ay, az, *moment = inputs
+            torque, determinant = kernel.actuator_torque(
+                self.model,
+                (x, y, z, w),
+                (wx, wy, wz),
+                (ax, ay, az),
+                triple(moment) if moment else None,
             )
-            found = kernel.actuator_torque(
-                self.model, q, rate, acceleration, moment or None
-            )
-            return (
-                *found[0],
-                found[1],
-                *(at.u for at in kernel.leg_motions(self.model, inputs)),
-            )
+            squares = [leg.u for leg in kernel.leg_motions(self.model, inputs)]
+            return (*torque, determinant, *squares)
 
-        more = MOMENT if self.has_moment_topic else ()
-        return compile_program(trace(torques, (*MOTION, *BODY_ACCELERATION, *more)))
+        names: tuple[str, ...] = (*MOTION, *BODY_ACCELERATION)
+        if self.has_moment_topic:
+            names = (*names, *MOMENT)
+        return compile_program(trace(torques, names))
 
     @cached_property
     def actuator_motion(self) -> Function:
-        """Coordinates x and x_dot of state and drive.
+        """Coordinates x and their rates, then both by each number of state and torque.
 
-        Both by each number of the state, and torque.
-
-        They are x = (gamma, gamma_dot, lagged torques if any).
+        x has gamma, gamma_dot, and the lagged torques if any. The inputs are the state
+        and the drive.
         """
         size = len(self.state)
 
         def motion(*inputs: Any) -> tuple[Any, ...]:
-            state, torque, moment = (
-                inputs[:size],
-                inputs[size : size + 3],
-                inputs[size + 3 :],
+            state, drive = inputs[:size], inputs[size:]
+            torque, moment = triple(drive[:LEGS]), drive[LEGS:]
+            slope = kernel.derivative(
+                self.model, state, torque, triple(moment) if moment else None
             )
-            slope = kernel.derivative(self.model, state, torque, moment or None)
-            gamma_ddot = kernel.actuator_acceleration(self.model, state, slope[4:7])
+            body_acceleration = triple(slope[len(QUATERNION) : STATE_SIZE])
+            gamma_ddot = kernel.actuator_acceleration(
+                self.model, state, body_acceleration
+            )
             joints = kernel.joints(self.model, state)
-            x = (*joints.gamma, *joints.gamma_dot, *state[7:])
-            return (*x, *joints.gamma_dot, *gamma_ddot, *slope[7:])
+            x = (*joints.gamma, *joints.gamma_dot, *state[STATE_SIZE:])
+            return (*x, *joints.gamma_dot, *gamma_ddot, *slope[STATE_SIZE:])
 
         inputs = (*self.state, *self.drive)
         return compile_program(trace(motion, inputs, (*self.state, *TORQUE)))
@@ -157,7 +167,7 @@ class Dynamics:
         return compile_program(trace(energies, self.state))
 
     def total_energy(self, state: Sequence[float]) -> float:
-        """Kinetic and potential energy [J] of a state, whose further numbers are not looked at."""
+        """Kinetic and potential energy [J] of a state, which may have further numbers."""
         return sum(self.energies(*state[: len(self.state)]))
 
     @cached_property
@@ -173,10 +183,10 @@ recent = lru_cache(maxsize=32)(Dynamics)
 class ODE:
     """Derivative of a scene's state, as programs with the inputs t, `state` and `drive`.
 
-    These are those of `dynamics`, but for: `torque` over time, clamped to `limit` [N
-    m], replaces the torques of the drive; with `phases` the drive keeps three numbers
-    for them, the phases [rad]. `work` appends to the state the work [J] that actuators
-    and moments have put in, less what friction has taken out.
+    These are those of `dynamics`, with these differences: `torque` over time, clamped
+    to `limit` [N m], replaces the torques of the drive; with `phases` the drive keeps
+    three numbers for them, the phases [rad]. `work` appends to the state the work [J]
+    that actuators and moments have put in, less what friction has taken out.
     """
 
     def __init__(
@@ -188,10 +198,15 @@ class ODE:
         work: bool = False,
         phases: bool = False,
     ) -> None:
-        self.dynamics, self._torque, self._limit = dynamics, torque, limit
-        self._work, self._phases = work, phases
-        self.state = (*dynamics.state, *(("work",) if work else ()))
-        self.drive = dynamics.drive if torque is None or phases else dynamics.drive[3:]
+        self.dynamics = dynamics
+        self._torque = torque
+        self._limit = limit
+        self._work = work
+        self._phases = phases
+        self.state = (*dynamics.state, "work") if work else dynamics.state
+        self.drive = dynamics.drive
+        if torque is not None and not phases:
+            self.drive = dynamics.drive[LEGS:]
         self._inputs = ("t", *self.state, *self.drive)
         self._of_numbers = partial(self.derivative, numbered=True)
 
@@ -231,7 +246,7 @@ class ODE:
         flat = np.array(self.linearised(t, *y, *d)[2 * size :])
         if not np.isfinite(flat).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return flat.reshape(size, size).T
+        return np.asarray(flat.reshape(size, size).T, dtype=float)
 
     @cached_property
     def slope(self) -> Function:
@@ -245,7 +260,7 @@ class ODE:
 
     @cached_property
     def linearised_by_torque(self) -> Function:
-        """The derivative, and its derivatives by t, the state and the torques of the drive."""
+        """The derivative, and its derivatives by t, the state and the drive's torques."""
         program = trace(self._of_numbers, self._inputs, ("t", *self.state, *TORQUE))
         return compile_functions({"linearised": program}, ("linearised",))["linearised"]
 
@@ -256,27 +271,34 @@ class ODE:
 
         If `numbered` it is that of constants that may be others in another scene.
         """
-        model, sine, limit = self.dynamics.model, self._torque, self._limit
+        model = self.dynamics.model
+        sine = self._torque
+        limit = self._limit
         if numbered:
-            model, sine = self.dynamics.numbers, number_constants(sine, ("torque",))
+            model = self.dynamics.numbers
+            sine = number_constants(sine, ("torque",))
             limit = number_constants(limit, ("limit",))
-        state, drive = inputs[: len(self.dynamics.state)], inputs[len(self.state) :]
-        torque, moment = drive[:3], drive[3:]
+        state = inputs[: len(self.dynamics.state)]
+        drive = inputs[len(self.state) :]
+        torque, moment = drive[:LEGS], drive[LEGS:]
         if sine is not None:
-            phase = torque if self._phases else sine.phase
-            moment = moment if self._phases else drive
+            phase = torque
+            if not self._phases:
+                phase, moment = sine.phase, drive
             rows = zip(sine.amplitude, sine.frequency, phase, strict=True)
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
-            if limit is not None:  # clamps to -limit and limit, numbers of any kind
-                most = 2.0 * limit
-                torque = tuple(
-                    limit - positive(most - positive(tau + limit)) for tau in torque
-                )
-        slope = kernel.derivative(model, state, torque, moment or None)
-        work = (
-            (kernel.power(model, state, torque, moment or None),) if self._work else ()
-        )
-        return (*slope, *work)
+            if limit is not None:
+                torque = tuple(_clamp(tau, limit) for tau in torque)
+        external = triple(moment) if moment else None
+        slope = kernel.derivative(model, state, triple(torque), external)
+        if not self._work:
+            return slope
+        return (*slope, kernel.power(model, state, triple(torque), external))
+
+
+def _clamp(torque: Any, limit: Any) -> Any:
+    """Clamp a torque to -limit and limit, numbers of any kind."""
+    return limit - positive(2.0 * limit - positive(torque + limit))
 
 
 recent_ode = lru_cache(maxsize=64)(ODE)  # traced once for all runs of the same dynamics
@@ -296,25 +318,24 @@ def limit_distances(
     legs = list(kernel.leg_motions(model, state))
     distances, rates = [], []
     for limit, (cosine, sine) in zip(limits, ends, strict=True):
-        kind, at = limit.joint // 3, legs[limit.joint % 3]
+        kind, number = divmod(limit.joint, LEGS)
+        leg = legs[number]
         if kind == 1:  # sin(mu)^2 - sin(end)^2
-            distance, rate = at.u - sine * sine, -2.0 * at.a * at.a_dot
+            distance = leg.u - sine * sine
+            rate = -2.0 * leg.a * leg.a_dot
         else:  # sqrt(u) sin(sign * (angle - end))
-            across, along = kernel.direction_of(at, kind)
+            across, along = kernel.direction_of(leg, kind)
             distance = limit.sign * (across * cosine - along * sine)
-            rate = (
-                limit.sign
-                * (along * cosine + across * sine)
-                * kernel.joint_rate(at, kind)
-            )
-            rate = rate - distance * at.a * at.a_dot / at.u
+            turned = along * cosine + across * sine
+            rate = limit.sign * turned * kernel.joint_rate(leg, kind)
+            rate = rate - distance * leg.a * leg.a_dot / leg.u
         distances.append(distance)
         rates.append(rate)
     return (*distances, *rates)
 
 
 class Constants(NamedTuple):
-    """All numbers that the traced programs of a scene are made of: a tree of numbers or columns."""
+    """All numbers of the traced programs of a scene: a tree of numbers or columns."""
 
     model: kernel.Model
     # cosine and sine of the end of each of `limits_of`
@@ -333,24 +354,25 @@ class ParameterColumns(NamedTuple):
 
 
 class ParametricModel:
-    """The programs of a scene, with the numbers that differ between scenarios, `names`, as inputs.
+    """The programs of a scene whose inputs are the numbers that differ, `names`.
 
     With `profile` the scene's own torques act. `ode` has the names of the state and the
     drive.
     """
 
     def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
-        self.scene, self.profile, self._scenarios = (
-            scenarios.document,
-            profile,
-            scenarios,
-        )
-        self._tree = self._constants_of(scenarios)[0]
-        numbers = leaves(self._tree)
-        self._varied = [place for place, x in numbers.items() if np.max(x) != np.min(x)]
+        self.scene = scenarios.document
+        self.profile = profile
+        self._scenarios = scenarios
+        self._tree, _, _ = self._constants_of(scenarios)
+        self._varied: list[Place] = []
+        self._fixed: dict[Place, float] = {}
+        for place, number in leaves(self._tree).items():
+            if np.max(number) != np.min(number):
+                self._varied.append(place)
+            else:
+                self._fixed[place] = float(np.ravel(number)[0])
         self.names = tuple(f"p{i}" for i in range(len(self._varied)))
-        rest = (place for place in numbers if place not in self._varied)
-        self._fixed = {place: float(np.ravel(numbers[place])[0]) for place in rest}
         self.ode = ODE(Dynamics.of(self.scene), self.scene.torque if profile else None)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -358,9 +380,10 @@ class ParametricModel:
         return _make_model, (self._scenarios, self.profile)
 
     def columns(self, scenarios: Scenarios) -> ParameterColumns:
-        """Return the numbers of scenarios, of which none may differ that is fixed in this model.
+        """Return the numbers of scenarios.
 
-        Refused are actuators that cannot give the torques of the profile, too.
+        Refused are numbers that differ and are fixed in this model, and actuators that
+        cannot give the torques of the profile.
         """
         tree, geometries, which = self._constants_of(scenarios)
         numbers = leaves(tree)
@@ -375,29 +398,18 @@ class ParametricModel:
             elif place[-1] == "rest":
                 # of a spring without stiffness any will do
                 np.nan_to_num(row, copy=False)
-        given = getattr(scenarios.columns().actuators, "torque_limit", None)
-        limit = np.full(len(which), np.inf if given is None else given)
+        torque_limit = getattr(scenarios.columns().actuators, "torque_limit", None)
+        limit = np.full(len(which), np.inf if torque_limit is None else torque_limit)
         limit[limit == 0.0] = np.inf  # of actuators that are left out
-        lagging, lags = (
-            tree.model.time_constant,
-            "must be > 0 [s] in every scenario, or in none",
-        )
-        checks = [("actuators.time_constant", 0.0, not np.any(lagging == 0.0), lags)]
-        for place, x in self._fixed.items():
-            allowed = f"must be {x} in all scenarios of this model"
-            checks.append(
-                (str(place), numbers[place], bool(np.all(numbers[place] == x)), allowed)
-            )
-        # a fixed step does not resolve the kinks of a clamped torque
+        all_lag = not np.any(tree.model.time_constant == 0.0)
+        allowed = "must be > 0 [s] in every scenario, or in none"
+        checks: list[Check] = [("actuators.time_constant", 0.0, all_lag, allowed)]
+        for place, fixed in self._fixed.items():
+            is_fixed = bool(np.all(numbers[place] == fixed))
+            allowed = f"must be {fixed} in all scenarios of this model"
+            checks.append((str(place), numbers[place], is_fixed, allowed))
         if tree.torque is not None:
-            amplitudes = np.array(
-                np.broadcast_arrays(*tree.torque.amplitude, limit)[:3]
-            )
-            largest = np.abs(amplitudes).max(axis=0)
-            n = int(np.argmax(largest > limit))
-            key = f"scenario {n}: " * bool(scenarios.count) + "actuators.torque_limit"
-            allowed = f"must not be less than the amplitude {largest[n]} of the profile"
-            checks.append((key, float(limit[n]), bool(largest[n] <= limit[n]), allowed))
+            checks.append(_check_limit(scenarios, tree.torque, limit))
         refuse_unless(self.scene.name, *checks)
         return ParameterColumns(inputs, geometries, which, limit)
 
@@ -410,71 +422,88 @@ class ParametricModel:
 
     def derivative(self, *inputs: Any) -> tuple[Any, ...]:
         """Return the derivative at the inputs of `program`, of any kind."""
-        known = 1 + len(self.ode.state) + len(self.ode.drive)
-        at = self.constants(inputs[known:])
+        count = 1 + len(self.ode.state) + len(self.ode.drive)
+        constants = self.constants(inputs[count:])
         topic = self.ode.dynamics.has_moment_topic
-        ode = ODE(Dynamics(at.model, has_moment_topic=topic), at.torque)
-        return ode.derivative(*inputs[:known])
+        dynamics = Dynamics(constants.model, has_moment_topic=topic)
+        return ODE(dynamics, constants.torque).derivative(*inputs[:count])
 
     @cached_property
     def limit_distances(self) -> Program:
-        """Distances to the limits, and their rates.
-
-        inputs: state (7) and the varied numbers.
-        """
+        """Distances to the limits, and their rates, of state (7) and varied numbers."""
         return trace(self.distances, (*MOTION, *self.names))
 
     def distances(self, *inputs: Any) -> tuple[Scalar, ...]:
         """Return the results of `limit_distances` at its inputs, of any kind."""
         limits = tuple(limits_of(self.scene, Geometry.of(self.scene)))
-        at = self.constants(inputs[7:])
-        return limit_distances(limits, at.ends, at.model, inputs[:7])
+        state, numbers = inputs[:STATE_SIZE], inputs[STATE_SIZE:]
+        constants = self.constants(numbers)
+        return limit_distances(limits, constants.ends, constants.model, state)
 
     def joints(self, *inputs: Any) -> Joints:
         """Return angles and rates of the joints at the inputs of `limit_distances`."""
-        return kernel.joints(self.constants(inputs[7:]).model, inputs[:7])
+        state, numbers = inputs[:STATE_SIZE], inputs[STATE_SIZE:]
+        return kernel.joints(self.constants(numbers).model, state)
 
     @cached_property
     def outputs(self) -> dict[str, Callable[..., tuple[Any, ...]]]:
         """Functions of arrays for quantities of OUTPUTS by name.
 
-        Inputs as `limit_distances`.
-
-        Three angles [rad] or rates [rad/s] each, or the energy [J].
+        They have the inputs of `limit_distances`, and give three angles [rad] or rates
+        [rad/s] each, or the energy [J].
         """
 
         def values(*inputs: Expression) -> tuple[Any, ...]:
-            model, state = self.constants(inputs[7:]).model, inputs[:7]
-            joints = (number for kind in self.joints(*inputs) for number in kind)
+            state, numbers = inputs[:STATE_SIZE], inputs[STATE_SIZE:]
+            model = self.constants(numbers).model
             kinetic = kernel.kinetic_energy(model, state)
-            return (*joints, kinetic + kernel.potential_energy(model, state))
+            energy = kinetic + kernel.potential_energy(model, state)
+            return (*chain(*self.joints(*inputs)), energy)
 
-        whole = trace(values, (*MOTION, *self.names))
-        parts = (whole.prune(whole.outputs[i : i + 3]) for i in range(0, 19, 3))
-        return dict(zip(OUTPUTS, map(compile_for_arrays, parts), strict=True))
+        program = trace(values, (*MOTION, *self.names))
+        functions = {}
+        for number, name in enumerate(OUTPUTS):
+            first = LEGS * number
+            own = program.prune(program.outputs[first : first + LEGS])
+            functions[name] = compile_for_arrays(own)
+        return functions
 
     def constants(self, inputs: Sequence[Any]) -> Constants:
         """Return the constants, with expressions or columns where they differ."""
-        given = dict(zip(self._varied, map(mark_present, inputs), strict=True))
-        tree: Constants = rebuild(self._tree, self._fixed | given)
+        varied = dict(zip(self._varied, map(mark_present, inputs), strict=True))
+        tree: Constants = rebuild(self._tree, self._fixed | varied)
         return tree
 
     def _constants_of(
         self, scenarios: Scenarios
     ) -> tuple[Constants, Geometry, NDArray[np.intp]]:
-        """Return the constants of scenarios, as columns.
-
-        Their geometries, and that of each row.
-        """
+        """Return constants of scenarios, as columns; geometries, and that of each row."""
         geometries, which = Geometry.of_scenarios(scenarios)
-        columns, geometry = scenarios.columns(), geometries.of_rows(which)
+        geometry = geometries.of_rows(which)
+        columns = scenarios.columns()
         limits = limits_of(self.scene, geometry)
         ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
-        # 0/0 is the rest of springs without stiffness
-        with np.errstate(invalid="ignore"):
+        with np.errstate(
+            invalid="ignore"
+        ):  # 0/0: the rest of springs without stiffness
             model = kernel.model_of(columns, geometry)
         torque = columns.torque if self.profile else None
         return Constants(model, ends, torque), geometries, which
+
+
+def _check_limit(scenarios: Scenarios, torque: SineTorque, limit: Array) -> Check:
+    """Return whether actuators can give a profile.
+
+    A fixed step does not resolve the kinks of a clamped torque.
+    """
+    *amplitudes, limits = np.broadcast_arrays(*torque.amplitude, limit)
+    largest = np.abs(amplitudes).max(axis=0)
+    row = int(np.argmax(largest > limits))
+    key = "actuators.torque_limit"
+    if scenarios.count:
+        key = f"scenario {row}: {key}"
+    allowed = f"must not be less than the amplitude {largest[row]} of the profile"
+    return key, float(limits[row]), bool(largest[row] <= limits[row]), allowed
 
 
 def _make_model(scenarios: Scenarios, profile: bool) -> ParametricModel:

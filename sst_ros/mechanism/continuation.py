@@ -25,11 +25,12 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen
 from sst_ros.mechanism.kinematics import ROUNDING, rotate
 
-SAFE = 0.18  # largest step in gamma [rad] over sigma^2 that cannot leave the branch
-SINGULAR = 1e-5  # least sigma at which a branch is followed
-_NEWTON_STEPS = 20
-_BUDGET = 20_000
-_SQRT2 = 2.0**0.5
+SAFE_STEP = 0.18  # in gamma [rad] over sigma^2; a longer one might leave the branch
+LEAST_SIGMA = 1e-5  # at which a branch is followed
+CLOSED = 1e-9  # largest abs(r_k . t_k) of a rotation that is given as an assembly
+ITERATIONS = 20  # of Newton's method
+MOST_STEPS = 20_000  # between two points
+SQRT2 = 2.0**0.5
 
 
 class BranchEnds(SingularConfiguration):
@@ -76,15 +77,17 @@ def follow(
         rotation = kinematics.admissible(geometry, points[0]).rotation
     rotations = np.empty((len(points), 3, 3))
     rotations[0] = rotate(np.array(rotation, dtype=float), np.zeros(3))
-    if np.abs(kinematics.closure(geometry, points[0], rotations[0])).max() > 1e-9:
+    residual = kinematics.closure(geometry, points[0], rotations[0])
+    if np.abs(residual).max() > CLOSED:
         raise AssemblyError("rotation does not close the loops", points[0])
     rotations[0] = _newton(geometry, points[0], rotations[0])
     for row in range(1, len(points)):
-        before = rotations[row - 1], points[row - 1]
-        rotations[row] = advance(geometry, *before, points[row], row)
-    sigma = np.linalg.svd(_slope(geometry, points, rotations), compute_uv=False)[:, 2]
-    first, second = frozen(rotations, np.asarray(sigma, dtype=float))
-    return first, second
+        rotations[row] = advance(
+            geometry, rotations[row - 1], points[row - 1], points[row], row
+        )
+    sigma = _least_singular(_slope(geometry, points, rotations))
+    frozen(rotations, sigma)
+    return rotations, sigma
 
 
 def advance(
@@ -94,45 +97,54 @@ def advance(
     end: ArrayLike,
     row: int = 1,
 ) -> Array:
-    """Return R, shape (3, 3), at gamma = end [rad] of the branch that has `rotation` at start.
+    """Return R, shape (3, 3), at the end of a segment in gamma [rad], from its start.
 
-    Its steps are proved not to leave the branch. Where a parallel singularity lies on
+    The branch is that of the assembly `rotation` at the start. The steps are proved not to leave the branch. Where a parallel singularity lies on
     the path, BranchEnds is raised; it says that the end is point `row` of a motion.
     """
-    here, end, rotation = (
-        np.array(given, dtype=float) for given in (start, end, rotation)
-    )
-    start = here
-    length, done = float(np.linalg.norm(end - start)), 0.0
-    for _ in range(_BUDGET):
-        slope = _slope(geometry, here, rotation)
-        sigma = float(np.linalg.svd(slope, compute_uv=False)[2])
-        if done >= length:
-            return rotation
-        if sigma < SINGULAR:
+    begin = np.array(start, dtype=float)
+    goal = np.array(end, dtype=float)
+    here = np.array(rotation, dtype=float)
+    gamma = begin
+    length = float(np.linalg.norm(goal - begin))
+    travelled = 0.0
+    for _ in range(MOST_STEPS):
+        slope = _slope(geometry, gamma, here)
+        sigma = float(_least_singular(slope))
+        if travelled >= length:
+            return here
+        if sigma < LEAST_SIGMA:
             break
-        step = SAFE * sigma * sigma
-        done = length if done + step >= length else done + step
-        there = end if done == length else start + (done / length) * (end - start)
-        moved = _newton(geometry, there, rotation)
+        step = SAFE_STEP * sigma * sigma
+        travelled = min(travelled + step, length)
+        following = goal
+        if travelled < length:
+            following = begin + (travelled / length) * (goal - begin)
+        moved = _newton(geometry, following, here)
         # The theorem speaks of a ball about R; a result beyond it would be another
         # assembly.
-        if np.linalg.norm(moved - rotation) > _SQRT2 * (sigma - step) / 2.0:
+        if np.linalg.norm(moved - here) > SQRT2 * (sigma - step) / 2.0:
             break
-        here, rotation = there, moved
-    raise BranchEnds(sigma, row, here, rotation, slope)
+        gamma, here = following, moved
+    raise BranchEnds(sigma, row, gamma, here, slope)
+
+
+def _least_singular(matrices: Array) -> Array:
+    """Return the least singular values of matrices (..., 3, 3)."""
+    return np.asarray(np.linalg.svd(matrices, compute_uv=False)[..., -1], dtype=float)
 
 
 def _slope(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
     """Matrices A (..., 3, 3), equal to J2: rows t_k x r_k = -(r_k x t_k)."""
-    t = geometry.e @ np.swapaxes(rotation, -1, -2)
+    t = kinematics.star_axes(geometry, rotation)
     return cross(t, kinematics.carriage_directions(geometry, gamma))
 
 
 def _newton(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
+    """Return the best iterate R of Newton's method at gamma, shape (3, 3)."""
     r = kinematics.carriage_directions(geometry, gamma)
     best, least = rotation, np.inf
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(ITERATIONS):
         t = geometry.e @ rotation.T
         residual = np.sum(r * t, axis=1)
         largest = float(np.abs(residual).max())

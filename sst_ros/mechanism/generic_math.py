@@ -19,7 +19,7 @@ Quadruple = tuple[Scalar, Scalar, Scalar, Scalar]
 Rows = tuple[Triple, Triple, Triple]
 Symmetric = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 
-_ARRAYS = (np.ndarray, np.generic, complex)
+ARRAYS = (np.ndarray, np.generic, complex)
 
 
 def _function(name: str) -> Callable[[Any], Any]:
@@ -31,15 +31,14 @@ sqrt, exp, log, sin, cos = map(_function, ("sqrt", "exp", "log", "sin", "cos"))
 
 
 def positive(x: Any) -> Any:
-    """Return x where x > 0 and 0 elsewhere.
-
-    Of a complex number the real part decides.
-    """
+    """Return x where x > 0 and 0 elsewhere; of a complex number the real part decides."""
     if type(x) is float:
         return x if x > 0.0 else 0.0
     if hasattr(x, "apply"):
         return x.apply("positive")
-    return np.where(np.real(x) > 0, x, 0.0) if isinstance(x, _ARRAYS) else max(x, 0)
+    if isinstance(x, ARRAYS):
+        return np.where(np.real(x) > 0, x, 0.0)
+    return max(x, 0)
 
 
 def absolute(x: Any) -> Any:
@@ -67,10 +66,7 @@ def select(condition: Any, x: Any, y: Any) -> Any:
 
 
 def atan2(y: Any, x: Any) -> Any:
-    """Angle of the point (x, y).
-
-    Complex numbers as the analytic continuation near the reals.
-    """
+    """Angle of the point (x, y); of complex numbers its continuation near the reals."""
     if type(y) is float and type(x) is float:
         return math.atan2(y, x)
     for number in (y, x):
@@ -144,7 +140,7 @@ def _other(name: str, *arguments: Any) -> Any:
     first = arguments[0]
     if hasattr(first, "apply"):
         return first.apply(name)
-    if isinstance(first, (*_ARRAYS, int)):
+    if isinstance(first, (*ARRAYS, int)):
         return getattr(np, {"atan2": "arctan2"}.get(name, name))(*arguments)
     import mpmath
 
@@ -157,7 +153,8 @@ def rotation_rows(q: Quadruple) -> Rows:
     s = 2.0 / (x * x + y * y + z * z + w * w)
     sx, sy, sz = s * x, s * y, s * z
     xx, yy, zz = sx * x, sy * y, sz * z
-    xy, xz, yz, wx, wy, wz = sx * y, sx * z, sy * z, sx * w, sy * w, sz * w
+    xy, xz, yz = sx * y, sx * z, sy * z
+    wx, wy, wz = sx * w, sy * w, sz * w
     return (
         (1.0 - (yy + zz), xy - wz, xz + wy),
         (xy + wz, 1.0 - (xx + zz), yz - wx),
@@ -191,21 +188,22 @@ def quaternion_rate(q: Quadruple, rate: Triple) -> tuple[Scalar, ...]:
 
 def add(a: Triple, b: Triple) -> Triple:
     """Return a + b."""
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+    ax, ay, az = a
+    bx, by, bz = b
+    return (ax + bx, ay + by, az + bz)
 
 
 def multiply(factor: Scalar, a: Triple) -> Triple:
     """Return factor a."""
-    return (factor * a[0], factor * a[1], factor * a[2])
+    x, y, z = a
+    return (factor * x, factor * y, factor * z)
 
 
 def axpy(alpha: Scalar, a: Triple, beta: Scalar, b: Triple) -> Triple:
     """Return alpha a + beta b."""
-    return (
-        alpha * a[0] + beta * b[0],
-        alpha * a[1] + beta * b[1],
-        alpha * a[2] + beta * b[2],
-    )
+    ax, ay, az = a
+    bx, by, bz = b
+    return (alpha * ax + beta * bx, alpha * ay + beta * by, alpha * az + beta * bz)
 
 
 def triple(numbers: Iterable[Scalar]) -> Triple:
@@ -222,8 +220,10 @@ def symmetric_rows(matrix: Symmetric) -> Rows:
 
 def solve_symmetric(matrix: Symmetric, right: Triple) -> Triple:
     """Solve a positive definite system (xx, yy, zz, xy, xz, yz) by L D L^T."""
-    (xx, yy, zz, xy, xz, yz), (fx, fy, fz) = matrix, right
-    l21, l31 = xy / xx, xz / xx
+    xx, yy, zz, xy, xz, yz = matrix
+    fx, fy, fz = right
+    l21 = xy / xx
+    l31 = xz / xx
     d2 = yy - l21 * xy
     e32 = yz - l31 * xy
     l32 = e32 / d2
@@ -243,13 +243,13 @@ def rotate_back(rows: Rows, vector: Triple) -> Triple:
 
 def dot3(a: Triple, b: Triple) -> Scalar:
     """Scalar product of two triples."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    ax, ay, az = a
+    bx, by, bz = b
+    return ax * bx + ay * by + az * bz
 
 
 def cross3(a: Triple, b: Triple) -> Triple:
     """Vector product of two triples."""
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    ax, ay, az = a
+    bx, by, bz = b
+    return (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The constant vectors of one manipulator, and the arrays of three numbers that all rooms use.
+"""The constant vectors of a manipulator, and arithmetic of arrays of three numbers.
 
 Vectors lie along the last axis; rotations are matrices, quaternions (x, y, z, w) or ZYZ
 angles.
@@ -17,10 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.state import Array as Array
 
-# what a geometry is made from
-_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
-_SMALL = 1000  # numbers of an array below which `take` is faster than slices
-_AHEAD, _BEHIND = np.array([1, 2, 0]), np.array([2, 0, 1])
+KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
+"""Numbers of a scene that its geometry is made from."""
+
+SMALL = 1000  # numbers of an array below which `take` is faster than slices
+NEXT = np.array([1, 2, 0])  # components after x, y, z
+LAST = np.array([2, 0, 1])  # components before them
 
 
 def frozen(*arrays: Any) -> tuple[Any, ...]:
@@ -41,8 +43,7 @@ class Geometry:
     w: Array  #: actuator axes, Eq. 1, shape (3, 3)
     e: Array  #: axes t_k of the star's arcs in {E}, shape (3, 3); t_k = R e_k
     alpha: Array  #: angles between the arcs [rad], shape (3,)
-    # : lengths of the base arcs P_k P_k+1, the upper ends of the stroke [rad], shape
-    # (3,)
+    #: lengths of the base arcs P_k P_k+1, upper ends of the strokes [rad], shape (3,)
     arc: Array
     beta_max: Any  #: largest admissible beta_k [rad]
 
@@ -58,77 +59,74 @@ class Geometry:
     def build(
         cls, v: ArrayLike, alpha: ArrayLike, beta_max: ArrayLike = np.pi / 2
     ) -> Geometry:
-        """Derive the geometry from directions v, shape (3, 3), and angles alpha [rad], (3,).
+        """Derive the geometry from directions v, shape (3, 3), and angles alpha, (3,).
 
-        Shapes (n, 3, 3), (n, 3) and (n,) of beta_max [rad] give n geometries.
+        The angles are in radians. Shapes (n, 3, 3), (n, 3) and (n,) of beta_max [rad]
+        give n geometries.
 
         The sense of the star (t_k+1 = Rot(s, +alpha_k) t_k) is the one that has
         admissible assemblies over a right-handed base triangle. InputError refuses
         other shapes.
         """
         directions = np.array(v, dtype=float)
-        shapes = v_shape, *others = (
-            directions.shape,
-            np.shape(alpha),
-            np.shape(beta_max),
-        )
-        good = v_shape[-2:] == (3, 3) and others[0] == v_shape[:-1]
-        good = good and others[1] in ((), v_shape[:-2])
+        shape = directions.shape
+        alpha_shape, beta_shape = np.shape(alpha), np.shape(beta_max)
+        fits = shape[-2:] == (3, 3) and alpha_shape == shape[:-1]
+        fits = fits and beta_shape in ((), shape[:-2])
+        shapes = (shape, alpha_shape, beta_shape)
         allowed = "must have the shapes (3, 3), (3,) and ()"
-        refuse_unless("geometry", ("v, alpha, beta_max", shapes, good, allowed))
+        refuse_unless("geometry", ("v, alpha, beta_max", shapes, fits, allowed))
         directions /= np.linalg.norm(directions, axis=-1)[..., None]
         following = np.roll(directions, -1, axis=-2)
         normals = np.cross(directions, following)
         sines = np.linalg.norm(normals, axis=-1)
         cosines = np.einsum("...j,...j->...", directions, following)
         angles = np.array(alpha, dtype=float)
-        first, second = angles[..., 0], angles[..., 1]
-        f = np.stack([np.zeros_like(first), first, first + second], axis=-1)
-        e = np.stack([-np.sin(f), np.cos(f), np.zeros_like(f)], axis=-1)
-        most: Any = beta_max if others[1] else float(np.asarray(beta_max))
-        arrays = (
-            directions,
-            normals / sines[..., None],
-            e,
-            angles,
-            np.arctan2(sines, cosines),
-        )
-        frozen(*arrays)
-        return cls(*arrays, most)
+        alpha_12, alpha_23 = angles[..., 0], angles[..., 1]
+        zero = np.zeros_like(alpha_12)
+        turns = np.stack([zero, alpha_12, alpha_12 + alpha_23], axis=-1)
+        e = np.stack([-np.sin(turns), np.cos(turns), np.zeros_like(turns)], axis=-1)
+        w = normals / sines[..., None]
+        arcs = np.arctan2(sines, cosines)
+        largest: Any = beta_max if beta_shape else float(np.asarray(beta_max))
+        frozen(directions, w, e, angles, arcs)
+        return cls(directions, w, e, angles, arcs, largest)
 
     @classmethod
     def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
-        """Derive the distinct geometries of `Scenarios`, and the index of that of each row."""
-        scene, rows = scenarios.document, [scenarios.rows.get(key) for key in _KEYS]
-        varied = [
-            values.reshape(len(values), -1) for values in rows if values is not None
-        ]
+        """Derive the distinct geometries of `Scenarios`, and the index of each row's."""
+        scene = scenarios.document
+        columns_by_key = [scenarios.rows.get(key) for key in KEYS]
+        varied = []
+        for values in columns_by_key:
+            if values is not None:
+                varied.append(values.reshape(len(values), -1))
         if not varied:
             return cls.of(scene), np.zeros(scenarios.count or 1, dtype=np.intp)
         _, first, index = np.unique(
             np.hstack(varied), axis=0, return_index=True, return_inverse=True
         )
         nominal = scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg
-        v, alpha, beta = (
-            np.repeat([value], len(first), axis=0) if values is None else values[first]
-            for values, value in zip(rows, nominal, strict=True)
-        )
-        found = cls.build(v, np.radians(alpha), np.radians(beta))
+        arrays = []
+        for values, value in zip(columns_by_key, nominal, strict=True):
+            if values is None:
+                arrays.append(np.repeat([value], len(first), axis=0))
+            else:
+                arrays.append(values[first])
+        v, alpha_deg, beta_max_deg = arrays
+        distinct = cls.build(v, np.radians(alpha_deg), np.radians(beta_max_deg))
         if len(first) == 1:  # one for all rows: its numbers are no columns
-            found = cls.build(found.v[0], found.alpha[0], found.beta_max[0])
-        return found, index.ravel()
+            distinct = cls.build(distinct.v[0], distinct.alpha[0], distinct.beta_max[0])
+        return distinct, index.ravel()
 
     def of_rows(self, rows: Any) -> Geometry:
-        """Return the geometries of rows, or of a row.
-
-        This one where it is a single one.
-        """
+        """Return the geometries of rows, or of a row; this one where it is a single one."""
         if self.v.ndim == 2:
             return self
         return Geometry(*(array[rows] for array in vars(self).values()))
 
     def of_leg(self, name: str, k: int) -> Any:
-        """Return what an array has for leg k as floats, or as columns of many geometries."""
+        """Return the row of leg k as floats, or as columns of many geometries."""
         array = getattr(self, name)
         if self.v.ndim == 2:
             return array[k].tolist()
@@ -161,24 +159,27 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
 
 
 def quaternion_of(rotation: ArrayLike) -> Array:
-    """Quaternions (x, y, z, w) with w >= 0, shape (..., 4), of rotation matrices (..., 3, 3).
+    """Quaternions (x, y, z, w) with w >= 0, shape (..., 4), of rotation matrices.
 
-    The largest component comes from the diagonal (Markley, J. Guid. Control Dyn. 31
+    The matrices have the shape (..., 3, 3). The largest component comes from the diagonal (Markley, J. Guid. Control Dyn. 31
     (2008) 440-442). Where w is zero, the first other component that is not is positive.
     """
     m = np.asarray(rotation, dtype=float)
     trace = np.trace(m, axis1=-2, axis2=-1)
-    # four times a row's own component times all four
-    found = np.empty((*m.shape[:-2], 4, 4))
+    w = 3  # index of the real part; i, j, k are those of the others
+    # Row n is four times component n times the whole quaternion.
+    products = np.empty((*m.shape[:-2], 4, 4))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        found[..., i, i] = 1.0 - trace + 2.0 * m[..., i, i]
-        found[..., i, j] = m[..., j, i] + m[..., i, j]
-        found[..., i, k] = m[..., k, i] + m[..., i, k]
-        found[..., i, 3] = found[..., 3, i] = m[..., k, j] - m[..., j, k]
-    found[..., 3, 3] = 1.0 + trace
-    diagonal = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2], trace], axis=-1)
-    largest = np.argmax(diagonal, axis=-1)
-    q = np.take_along_axis(found, largest[..., None, None], axis=-2)[..., 0, :]
+        products[..., i, i] = 1.0 - trace + 2.0 * m[..., i, i]
+        products[..., i, j] = m[..., j, i] + m[..., i, j]
+        products[..., i, k] = m[..., k, i] + m[..., i, k]
+        products[..., i, w] = m[..., k, j] - m[..., j, k]
+        products[..., w, i] = products[..., i, w]
+    products[..., w, w] = 1.0 + trace
+    diagonal = np.diagonal(m, axis1=-2, axis2=-1)
+    sizes = np.concatenate([diagonal, trace[..., None]], axis=-1)
+    largest = np.argmax(sizes, axis=-1)
+    q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.sqrt(np.sum(q * q, axis=-1, keepdims=True))
     signs = np.sign(np.roll(q, 1, axis=-1))  # w first
     first = np.argmax(signs != 0.0, axis=-1)
@@ -187,9 +188,9 @@ def quaternion_of(rotation: ArrayLike) -> Array:
 
 
 def zyz_angles(rotation: ArrayLike) -> Array:
-    """ZYZ angles [rad], (..., 3), of R = Rz(theta) Ry(phi) Rz(psi), (..., 3, 3), Eqs. 3, 6 to 8.
+    """ZYZ angles [rad], shape (..., 3), of rotations (..., 3, 3), Eqs. 3 and 6 to 8.
 
-    theta and psi are in (-pi, pi], phi in [0, pi]. Where sin(phi) = 0 only theta + psi
+    R = Rz(theta) Ry(phi) Rz(psi). theta and psi are in (-pi, pi], phi in [0, pi]. Where sin(phi) = 0 only theta + psi
     (phi = 0) or theta - psi (phi = pi) exists; there theta is 0 and psi carries it all.
     """
     r = np.asarray(rotation, dtype=float)
@@ -215,62 +216,65 @@ def unwrap_zyz(angles: ArrayLike) -> Array:
     psi at phi = 0 and theta - psi at phi = pi are kept.
     """
     result = np.array(angles, dtype=float)
-    off = np.flatnonzero(~np.isin(result[:, 1], (0.0, np.pi)))
-    start = int(off[0]) if len(off) else 0
-    ahead, back = range(start + 1, len(result)), range(start - 1, -1, -1)
-    for row in (*ahead, *back):
-        before, (theta, phi, psi) = (
-            result[row - 1 if row > start else row + 1],
-            result[row],
-        )
-        half_turn = np.pi
-        if phi in (0.0, np.pi):
-            shift, half_turn = before[0] - theta, 0.0
-            theta, psi = before[0], psi + (shift if phi else -shift)
-        forms = np.array(
-            [[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]]
-        )
-        forms += 2.0 * np.pi * np.round((before - forms) / (2.0 * np.pi))
-        result[row] = forms[np.argmin(np.abs(forms - before).sum(axis=1))]
+    off_pole = np.flatnonzero(~np.isin(result[:, 1], (0.0, np.pi)))
+    start = int(off_pole[0]) if len(off_pole) else 0
+    for row in range(start + 1, len(result)):
+        result[row] = _nearest_form(result[row], result[row - 1])
+    for row in range(start - 1, -1, -1):
+        result[row] = _nearest_form(result[row], result[row + 1])
     return result
 
 
-def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
-    """Angle of the rotation between quaternions [rad], shape (...,).
+def _nearest_form(angles: Array, near: Array) -> Array:
+    """Return the form of ZYZ angles that is nearest to others, shape (3,) each."""
+    theta, phi, psi = angles
+    half_turn = np.pi
+    if phi in (0.0, np.pi):
+        half_turn = 0.0
+        shift = near[0] - theta
+        theta = near[0]
+        psi = psi + shift if phi else psi - shift
+    forms = np.array([[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]])
+    forms += 2.0 * np.pi * np.round((near - forms) / (2.0 * np.pi))
+    return np.asarray(forms[np.argmin(np.abs(forms - near).sum(axis=1))])
 
-    Exact for tiny angles.
-    """
-    a, b = np.asarray(first), np.asarray(second)
-    difference = np.minimum(
-        np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
-    )
-    return np.asarray(4.0 * np.arcsin(np.minimum(difference / 2.0, 1.0)))
+
+def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
+    """Angle of the rotation between quaternions [rad], shape (...,); exact if tiny."""
+    a = np.asarray(first)
+    b = np.asarray(second)
+    same_sign = np.linalg.norm(a - b, axis=-1)
+    other_sign = np.linalg.norm(a + b, axis=-1)
+    chord = np.minimum(same_sign, other_sign)
+    return np.asarray(4.0 * np.arcsin(np.minimum(chord / 2.0, 1.0)))
 
 
 def cross(a: Array, b: Array) -> Array:
     """Vector product along the last axis; much faster than np.cross on small arrays."""
-    if a.size < _SMALL:
-        ahead = a.take(_AHEAD, -1) * b.take(_BEHIND, -1)
-        return np.asarray(ahead - a.take(_BEHIND, -1) * b.take(_AHEAD, -1))
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    if a.size < SMALL:
+        first = a.take(NEXT, -1) * b.take(LAST, -1)
+        second = a.take(LAST, -1) * b.take(NEXT, -1)
+        return np.asarray(first - second)
+    ax, ay, az = np.moveaxis(a, -1, 0)
+    bx, by, bz = np.moveaxis(b, -1, 0)
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0], out[..., 1], out[..., 2] = (
-        ay * bz - az * by,
-        az * bx - ax * bz,
-        ax * by - ay * bx,
-    )
+    out[..., 0] = ay * bz - az * by
+    out[..., 1] = az * bx - ax * bz
+    out[..., 2] = ax * by - ay * bx
     return out
 
 
 def dot(a: Array, b: Array) -> Array:
     """Scalar product along the last axis, of three; much faster than np.sum."""
     product = a * b
-    return np.asarray(product[..., 0] + product[..., 1] + product[..., 2])
+    x, y, z = product[..., 0], product[..., 1], product[..., 2]
+    return np.asarray(x + y + z)
 
 
 def columns(a: Array, b: Array, c: Array) -> Array:
     """Matrices (..., 3, 3) with the given columns."""
     out = np.empty((*a.shape, 3))
-    out[..., 0], out[..., 1], out[..., 2] = a, b, c
+    out[..., 0] = a
+    out[..., 1] = b
+    out[..., 2] = c
     return out

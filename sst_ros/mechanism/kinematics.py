@@ -287,7 +287,7 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
 def _largest(rows: Array) -> Array:
     """Largest size of an entry in rows of three, shape (n, 3) -> (n,)."""
     first, second, third = np.abs(rows).T
-    return np.maximum(np.maximum(first, second), third)
+    return np.asarray(np.maximum(np.maximum(first, second), third))
 
 
 def _quartic(a: Array, b: Array, c: Array) -> Array:

@@ -46,7 +46,7 @@ class BodyRates:
     beta_ddot: Array
     omega_a: Array  #: of actuated links, in {1k} [rad/s], Eqs. 53 to 57, shape (3, 3)
     omega_a_dot: Array
-    # : of intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3)
+    #: of intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, shape (3, 3)
     omega_ipl: Array
     omega_ipl_dot: Array
 
@@ -55,10 +55,8 @@ def of_actuators(
     at: Posture, gamma_dot: ArrayLike, gamma_ddot: ArrayLike = ZERO
 ) -> BodyRates:
     """Everything from gamma_dot [rad/s] and gamma_ddot [rad/s^2], each shape (3,)."""
-    rate, acceleration = (
-        np.array(gamma_dot, dtype=float),
-        np.array(gamma_ddot, dtype=float),
-    )
+    rate = np.array(gamma_dot, dtype=float)
+    acceleration = np.array(gamma_ddot, dtype=float)
     omega = at.j @ rate
     omega_dot = at.j @ acceleration + virtual_work.bias(at, rate).omega_dot
     return _motion(at.r, at.t, at.w, omega, omega_dot, rate, acceleration)
@@ -71,25 +69,25 @@ def of_star(
     omega_dot: ArrayLike = ZERO,
     gamma: ArrayLike | None = None,
 ) -> BodyRates:
-    """Everything from omega [rad/s] and omega_dot [rad/s^2] of the star in {B}, each shape (3,).
+    """Everything from omega [rad/s] and omega_dot [rad/s^2] of the star in {B}.
 
-    The rotation R of {E} in {B} has the shape (3, 3); the actuator angles gamma [rad]
+    Both have the shape (3,). The rotation R of {E} in {B} has the shape (3, 3); the actuator angles gamma [rad]
     choose the branch of each leg, by default mu_k in (0, pi). SingularConfiguration is
     raised where some c_k = 0 (serial).
     """
     matrix = np.asarray(rotation, dtype=float)
     if gamma is None:
-        gamma = kinematics.inverse(geometry, matrix)[0]
+        gamma, _, _ = kinematics.inverse(geometry, matrix)
     r = kinematics.carriage_directions(geometry, gamma)
-    t, w = geometry.e @ matrix.T, geometry.w
+    t = geometry.e @ matrix.T
+    w = geometry.w
     c = np.sum(cross(r, t) * w, axis=1)
-    if np.min(np.abs(c)) < SINGULAR:
-        raise SingularConfiguration(
-            "serial singularity, c_k = 0", float(np.min(np.abs(c)))
-        )
-    return _motion(
-        r, t, w, np.array(omega, dtype=float), np.array(omega_dot, dtype=float)
-    )
+    least = float(np.min(np.abs(c)))
+    if least < SINGULAR:
+        raise SingularConfiguration("serial singularity, c_k = 0", least)
+    rate = np.array(omega, dtype=float)
+    acceleration = np.array(omega_dot, dtype=float)
+    return _motion(r, t, w, rate, acceleration)
 
 
 def body_rates(
@@ -99,7 +97,7 @@ def body_rates(
     mu_dot: Array,
     beta_dot: Array,
 ) -> Array:
-    """Compute W in {E} [rad/s], shape (..., 3), from the rates of the joints [rad/s], (..., 3).
+    """Compute W in {E} from the rates of the joints, in rad/s and of shape (..., 3).
 
     It follows from each leg, W = w gamma_dot - r mu_dot - t beta_dot (Eq. 10), without
     a matrix that could be singular; the mean of the three is taken. Where the
@@ -107,62 +105,77 @@ def body_rates(
     """
     known = np.isfinite(quaternion).all(axis=-1, keepdims=True)
     rotation = rotation_matrix(np.where(known, quaternion, (0.0, 0.0, 0.0, 1.0)))
-    t, w = geometry.e, geometry.w @ rotation  # rows in {E}
+    t = geometry.e  # rows in {E}, as those of w and r
+    w = geometry.w @ rotation
     r = np.cross(t, w)
     r /= np.linalg.norm(r, axis=-1)[..., None]
-    of_legs = w * gamma_dot[..., None] - r * mu_dot[..., None] - t * beta_dot[..., None]
+    of_gamma = w * gamma_dot[..., None]
+    of_mu = r * mu_dot[..., None]
+    of_beta = t * beta_dot[..., None]
+    of_legs = of_gamma - of_mu - of_beta
     return np.asarray(np.where(known, of_legs.mean(axis=-2), np.nan))
 
 
 def _motion(
     r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, *actuators: Array
 ) -> BodyRates:
-    """All joints and links.
+    """Return the motion of all joints and links.
 
-    gamma_dot and gamma_ddot are those of `actuators` where given.
+    gamma_dot and gamma_ddot are those of `actuators` where they are known.
     """
-    normal, wr, turning = cross(r, t), cross(w, r), cross(omega, t)
+    normal = cross(r, t)
+    wr = cross(w, r)
+    t_dot = cross(omega, t)
     c = np.sum(normal * w, axis=1)
     gamma_dot = (normal @ omega) / c  # Eq. 10
     mu_dot = -(r @ omega)  # Eq. 18
     beta_dot = -(wr @ omega) / c  # Eq. 21
-    push = gamma_dot * mu_dot
-    gamma_ddot = (
-        normal @ omega_dot
-        + push * np.sum(normal * wr, axis=1)
-        + beta_dot * np.sum(normal * turning, axis=1)
-    ) / c  # Eq. 29
-    mu_ddot = -(r @ omega_dot) - beta_dot * np.sum(r * turning, axis=1)  # Eq. 42
-    # Eq. 46
-    beta_ddot = -(wr @ omega_dot + push + beta_dot * np.sum(wr * turning, axis=1)) / c
-    gamma_dot, gamma_ddot = actuators or (gamma_dot, gamma_ddot)
-    joints = gamma_dot, mu_dot, beta_dot, gamma_ddot, mu_ddot, beta_ddot
-    x, zero = np.array([1.0, 0.0, 0.0]), np.zeros(3)
-    omega_a, omega_a_dot = (
-        np.stack([zero, zero, x], axis=1) for x in (gamma_dot, gamma_ddot)
-    )
-    # {2k} = [r, t x r, t]; w has no component along r.
-    turn = np.stack(
-        [zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)], axis=1
-    )
-    omega_ipl = gamma_dot[:, None] * turn - mu_dot[:, None] * x
+    product = gamma_dot * mu_dot
+    along_normal = product * np.sum(normal * wr, axis=1)
+    turned = beta_dot * np.sum(normal * t_dot, axis=1)
+    gamma_ddot = (normal @ omega_dot + along_normal + turned) / c  # Eq. 29
+    mu_ddot = -(r @ omega_dot) - beta_dot * np.sum(r * t_dot, axis=1)  # Eq. 42
+    turned = beta_dot * np.sum(wr * t_dot, axis=1)
+    beta_ddot = -(wr @ omega_dot + product + turned) / c  # Eq. 46
+    if actuators:
+        gamma_dot, gamma_ddot = actuators
+    zero = np.zeros(3)
+    x = np.array([1.0, 0.0, 0.0])
+    # w in {2k} = [r, t x r, t]: it has no component along r.
+    w_ipl = [zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)]
+    turn = np.stack(w_ipl, axis=1)
     # (d/dt)(-r mu_dot) in {B} is -r mu_ddot - gamma_dot mu_dot (w x r); w is constant.
     across = cross(turn, np.broadcast_to(x, turn.shape))
-    omega_ipl_dot = (
-        gamma_ddot[:, None] * turn
-        - mu_ddot[:, None] * x
-        - (gamma_dot * mu_dot)[:, None] * across
+    of_gamma = gamma_ddot[:, None] * turn
+    of_mu = mu_ddot[:, None] * x
+    of_both = (gamma_dot * mu_dot)[:, None] * across
+    motion = BodyRates(
+        omega=omega,
+        omega_dot=omega_dot,
+        gamma_dot=gamma_dot,
+        mu_dot=mu_dot,
+        beta_dot=beta_dot,
+        gamma_ddot=gamma_ddot,
+        mu_ddot=mu_ddot,
+        beta_ddot=beta_ddot,
+        omega_a=np.stack([zero, zero, gamma_dot], axis=1),
+        omega_a_dot=np.stack([zero, zero, gamma_ddot], axis=1),
+        omega_ipl=gamma_dot[:, None] * turn - mu_dot[:, None] * x,
+        omega_ipl_dot=of_gamma - of_mu - of_both,
     )
-    links = omega_a, omega_a_dot, omega_ipl, omega_ipl_dot
-    return BodyRates(*frozen(omega, omega_dot, *joints, *links))
+    frozen(*vars(motion).values())
+    return motion
 
 
 class OrientationSensitivity(NamedTuple):
-    """Derivatives of the orientation, as rotation vectors in {E} [rad]: components first."""
+    """Derivatives of the orientation, as rotation vectors in {E} [rad].
+
+    Their components come first.
+    """
 
     gamma: Array  #: by the actuator angles, shape (..., 3, 3)
     v: Array  #: by the unit directions v_k, leg and axis, shape (..., 3, 3, 3)
-    # : by the angles of the star [rad], the last of which is 2 pi less the others
+    #: by the angles of the star [rad], the last of which is 2 pi less the others
     alpha: Array
 
 
@@ -190,44 +203,49 @@ def orientation_sensitivity(
     """
     matrix = np.asarray(rotation, dtype=float)
     if gamma is None:
-        gamma = kinematics.inverse(geometry, matrix)[0]
+        gamma, _, _ = kinematics.inverse(geometry, matrix)
     angles = np.asarray(gamma, dtype=float)
     v, w = geometry.v, geometry.w
     r = kinematics.carriage_directions(geometry, angles)
-    t = geometry.e @ np.swapaxes(matrix, -1, -2)
+    t = kinematics.star_axes(geometry, matrix)
     shape = angles.shape[:-1]
     by_gamma = np.zeros((*shape, 3, 3))  # change of F by leg, then by parameter
     by_v = np.zeros((*shape, 3, 3, 3))
     by_alpha = np.zeros((*shape, 3, 3))
-    axes = np.eye(3)
-    turns = np.cumsum([0.0, *geometry.alpha[:2]])
+    alpha_12, alpha_23, _ = geometry.alpha
+    turns = np.cumsum([0.0, alpha_12, alpha_23])
     for k in range(3):
         following = (k + 1) % 3
-        sine, cosine = np.sin(angles[..., k, None]), np.cos(angles[..., k, None])
-        by_gamma[..., k, k] = _dot(np.cross(w[k], r[..., k, :]), t[..., k, :])
-        for axis in range(3):
-            for leg in (k, following):
-                moved = axes[axis] - v[leg] * v[leg][axis]  # of a unit vector
+        r_k, t_k = r[..., k, :], t[..., k, :]
+        sine = np.sin(angles[..., k, None])
+        cosine = np.cos(angles[..., k, None])
+        by_gamma[..., k, k] = _dot(np.cross(w[k], r_k), t_k)
+        for leg in (k, following):
+            for axis in range(3):
+                moved = np.eye(3)[axis] - v[leg] * v[leg][axis]  # of a unit vector
                 if leg == k:
-                    normal, along = cross(moved, v[following]), moved
+                    along = moved
+                    normal = cross(moved, v[following])
                 else:
-                    normal, along = cross(v[k], moved), np.zeros(3)
+                    along = np.zeros(3)
+                    normal = cross(v[k], moved)
                 normal = (normal - w[k] * (w[k] @ normal)) / np.sin(geometry.arc[k])
                 across = cross(normal, v[k]) + cross(w[k], along)
                 change = cosine * along + sine * across
-                by_v[..., k, leg, axis] = _dot(change, t[..., k, :])
-        turned = np.array([-np.cos(turns[k]), -np.sin(turns[k]), 0.0])
-        by_turn = _dot(r[..., k, :], matrix @ turned)
+                by_v[..., k, leg, axis] = _dot(change, t_k)
+        e_slope = np.array([-np.cos(turns[k]), -np.sin(turns[k]), 0.0])
+        by_turn = _dot(r_k, matrix @ e_slope)
         by_alpha[..., k, :k] = by_turn[..., None]
     j2 = cross(t, r)
-    determinant = np.linalg.det(j2)
-    if np.min(np.abs(determinant)) < SINGULAR:
-        least = float(np.min(np.abs(determinant)))
+    least = float(np.min(np.abs(np.linalg.det(j2))))
+    if least < SINGULAR:
         raise SingularConfiguration("parallel singularity, det J2 = 0", least)
-    solved = -np.swapaxes(matrix, -1, -2) @ np.linalg.inv(j2)
-    of_v = solved @ by_v.reshape(*shape, 3, 9)
+    by_residual = -np.swapaxes(matrix, -1, -2) @ np.linalg.inv(j2)
+    of_v = by_residual @ by_v.reshape(*shape, 3, 9)
     return OrientationSensitivity(
-        solved @ by_gamma, of_v.reshape(*shape, 3, 3, 3), solved @ by_alpha
+        gamma=by_residual @ by_gamma,
+        v=of_v.reshape(*shape, 3, 3, 3),
+        alpha=by_residual @ by_alpha,
     )
 
 

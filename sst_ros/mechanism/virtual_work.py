@@ -39,11 +39,13 @@ class Mechanism:
     @classmethod
     def of(cls, scene: Scene) -> Mechanism:
         """Collect what the equations need: payload and rotors are part of the bodies."""
-        star, payload, motor = scene.star.inertia.matrix, scene.payload, scene.actuators
+        star = scene.star.inertia.matrix
+        if scene.payload is not None:
+            star = star + scene.payload.about_o
         actuated = np.stack([link.tensor for link in scene.actuated_links])
+        motor = scene.actuators
         if motor is not None:
             actuated[:, 2, 2] += motor.gear_ratio**2 * motor.rotor_inertia
-        star = star if payload is None else star + payload.about_o
         intermediate = np.stack([link.tensor for link in scene.intermediate_links])
         return cls(Geometry.of(scene), star, actuated, intermediate)
 
@@ -103,10 +105,9 @@ def posture(
     determinant = float(np.linalg.det(j2))
     if abs(determinant) < SINGULAR:
         raise SingularConfiguration("parallel singularity, det J2 = 0", determinant)
-    if np.min(np.abs(c)) < SINGULAR:
-        raise SingularConfiguration(
-            "serial singularity, c_k = 0", float(np.min(np.abs(c)))
-        )
+    least = float(np.min(np.abs(c)))
+    if least < SINGULAR:
+        raise SingularConfiguration("serial singularity, c_k = 0", least)
     j = np.asarray(-np.linalg.solve(j2, np.diag(c)), dtype=float)
     a = -r @ j
     wr = cross(w, r)
@@ -118,7 +119,9 @@ def posture(
 def bias(at: Posture, gamma_dot: ArrayLike) -> Bias:
     """Acceleration analysis at gamma_ddot = 0, Eqs. 24 to 49."""
     rate = np.asarray(gamma_dot, dtype=float)
-    omega, mu_dot, beta_dot = at.j @ rate, at.a @ rate, at.b @ rate
+    omega = at.j @ rate
+    mu_dot = at.a @ rate
+    beta_dot = at.b @ rate
     tw = np.sum(at.t * at.w, axis=1)
     m = mu_dot * tw  # Eq. 38
     n = -beta_dot * (at.r @ omega)  # Eq. 39
@@ -138,25 +141,27 @@ def link_frames(at: Posture) -> tuple[Array, Array]:
 
 
 def link_jacobians(at: Posture) -> tuple[Array, Array]:
-    """Direct link Jacobians J_a in {1k} and J_ipl in {2k}, Eqs. 57 and 61, each (3, 3, 3)."""
+    """Direct link Jacobians J_a in {1k} and J_ipl in {2k}, Eqs. 57 and 61.
+
+    Shape (3, 3, 3) each, legs first.
+    """
     first, second = link_frames(at)
     d = np.eye(3)
-    ja = np.stack([first[k].T @ np.outer(at.w[k], d[k]) for k in range(3)])
-    jipl = np.stack(
-        [
-            second[k].T @ (np.outer(at.w[k], d[k]) - np.outer(at.r[k], at.a[k]))
-            for k in range(3)
-        ]
-    )
+    ja, jipl = np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    for k in range(3):
+        of_gamma = np.outer(at.w[k], d[k])
+        of_mu = np.outer(at.r[k], at.a[k])
+        ja[k] = first[k].T @ of_gamma
+        jipl[k] = second[k].T @ (of_gamma - of_mu)
     return ja, jipl
 
 
 def equation_of_motion(
     mechanism: Mechanism, at: Posture, gamma_dot: Three, moment: Three = ZERO
 ) -> tuple[Array, Array]:
-    """T1 (3, 3) [kg m^2] and T2 (3,) [N m] of T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
+    """T1 and T2 of the equation of motion T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
 
-    M = -T1 is the mass matrix, positive definite; -T2 without a moment has the velocity
+    T1 has the shape (3, 3) [kg m^2], T2 (3,) [N m]. M = -T1 is the mass matrix, positive definite; -T2 without a moment has the velocity
     products. gamma_dot is in rad/s, the moment n_ext on the star in {B} in N m. Inertia
     tensors may be full.
     """
@@ -171,13 +176,13 @@ def equation_of_motion(
     first, second = link_frames(at)
     for k in range(3):
         turn = second[k].T @ first[k]
-        r, ia, iipl = (
-            second[k].T @ at.r[k],
-            mechanism.actuated[k],
-            mechanism.intermediate[k],
-        )
-        omega_a, omega_ipl = ja[k] @ rate, jipl[k] @ rate
-        big_l, small_l = -ia @ ja[k], -cross(omega_a, ia @ omega_a)  # Eqs. 73, 74
+        r = second[k].T @ at.r[k]
+        ia = mechanism.actuated[k]
+        iipl = mechanism.intermediate[k]
+        omega_a = ja[k] @ rate
+        omega_ipl = jipl[k] @ rate
+        big_l = -ia @ ja[k]  # Eq. 73
+        small_l = -cross(omega_a, ia @ omega_a)  # Eq. 74
         big_p = turn @ ja[k] + np.outer(r, at.r[k] @ at.j)  # Eq. 78
         mu_dot = at.a[k] @ rate
         small_p = -cross(turn @ omega_a, r * mu_dot) - products.mu_ddot[k] * r  # Eq. 79

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the star can go, how far every limit is, how well the actuators hold it, what is singular.
+"""Where the star can go, how far its limits are, how well it is held, what is singular.
 
 A pose is admissible when E lies on the base triangle (Eq. 4), 0 < beta_k <= beta_max,
 and gamma_k lies in its stroke. The map is over orientations (direction of s, turn psi
 about it), where the inverse kinematics has one answer.
 
-Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means t_k =
-+-w_k, so w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever
+Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means
+t_k = +-w_k, so w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever
 at the edge of what is admissible, never inside. Parallel (det J2 = 0): may lie inside
 when some alpha_k > 180 deg; none for all alpha_k < 180 deg and beta_k < 90 deg.
 """
@@ -26,27 +26,28 @@ from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
 from sst_ros.progress import slices
 from sst_ros.scene.scene import SceneInput, scene_of
 
-_BLOCK, _BISECTIONS = 20_000, 55
-_RAYS, _RAY, _REFINED = 400, 64, 6
-"""Rays from a pose, points of each, and the nearest changes of sign that are refined."""
+BLOCK = 20_000  # poses that are measured at a time
+BISECTIONS = 55  # of psi between two samples: to rounding
+MOST_POSES = 20_000_000  # of a map: 4 GB
+SMOOTH = 1.0  # change of gamma [rad] between two samples that is no jump by pi
 
-_MOST = 20_000_000  # poses of a map: 4 GB
+RAYS = 400  # from a pose, along which det J2 is looked at
+RAY_POINTS = 64
+REFINED = 6  # nearest changes of sign that are refined
+FOUND = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
 
 
 @dataclass(frozen=True)
 class Measures:
-    """What a designer asks of poses; arrays share the shape (...) of the poses.
-
-    Read-only.
-    """
+    """What a designer asks of poses, in read-only arrays of the shape (...) of the poses."""
 
     gamma: Array  #: joint angles [rad], shape (..., 3)
     mu: Array
     beta: Array
     admissible: NDArray[np.bool_]  #: the manipulator can be there
-    # : distance of the nearest gamma_k to an end of its stroke [rad], negative beyond
+    #: distance of the nearest gamma_k to an end of its stroke [rad], negative beyond
     stroke: Array
-    # : smallest beta_k [rad]: distance to the edge of the workspace, negative beyond
+    #: smallest beta_k [rad]: distance to the edge of the workspace, negative beyond
     edge: Array
     reach: Array  #: smallest beta_max - beta_k [rad]
     det_j1: Array  #: 0 at a serial singularity
@@ -74,12 +75,16 @@ class OrientationMap:
 
         The ends between two samples are interpolated by the margin.
         """
-        here, margin = self.measures.admissible, self.measures.margin
-        after, beyond = np.roll(here, -1, axis=1), np.roll(margin, -1, axis=1)
-        inner, outer = np.where(here, margin, beyond), np.where(here, beyond, margin)
+        first = self.measures.admissible
+        second = np.roll(first, -1, axis=1)
+        first_margin = self.measures.margin
+        second_margin = np.roll(first_margin, -1, axis=1)
+        inner = np.where(first, first_margin, second_margin)
+        outer = np.where(first, second_margin, first_margin)
         with np.errstate(divide="ignore", invalid="ignore"):
-            part = np.where(outer < 0.0, inner / (inner - outer), 0.5)
-        share = np.where(here & after, 1.0, np.where(here | after, part, 0.0))
+            crossing = np.where(outer < 0.0, inner / (inner - outer), 0.5)
+        share = np.where(first | second, crossing, 0.0)
+        share = np.where(first & second, 1.0, share)
         return np.asarray(share.sum(axis=1) * (2.0 * np.pi / len(self.psi)))
 
     @property
@@ -90,37 +95,54 @@ class OrientationMap:
 
     @property
     def best_margin(self) -> Array:
-        """Largest distance to all limits over psi [rad], shape (m,).
-
-        NaN where there is none.
-        """
+        """Largest distance to all limits over psi [rad], shape (m,); NaN without any."""
         values = np.where(self.measures.admissible, self.measures.margin, np.nan)
         return np.asarray(np.fmax.reduce(values, axis=1))
 
 
 def measures(geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike) -> Measures:
     """Measure assemblies: gamma [rad], shape (..., 3), with R, shape (..., 3, 3)."""
-    angles, matrices = np.array(gamma, dtype=float), np.asarray(rotation, dtype=float)
+    angles = np.array(gamma, dtype=float)
+    matrices = np.asarray(rotation, dtype=float)
     r = kinematics.carriage_directions(geometry, angles)
     mu, beta, det_j2, admissible = kinematics.describe_assemblies(geometry, r, matrices)
-    t = geometry.e @ np.swapaxes(matrices, -1, -2)
-    n = cross(r, t)
-    c = np.sum(n * geometry.w, axis=-1)
+    normal = cross(r, kinematics.star_axes(geometry, matrices))
+    c = np.sum(normal * geometry.w, axis=-1)
     stroke = np.minimum(angles, geometry.arc - angles).min(axis=-1)
-    # J is det J2 times this up to its sign: the condition number needs no division.
-    rows = [
-        cross(n[..., i, :], n[..., i - 2, :]) * c[..., i - 1, None] for i in range(3)
-    ]
-    singular = np.linalg.svd(np.nan_to_num(np.stack(rows, axis=-2)), compute_uv=False)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cond_j = np.where(
-            singular[..., 2] > 0.0, singular[..., 0] / singular[..., 2], np.inf
-        )
-    edge, reach = beta.min(axis=-1), geometry.beta_max - beta.max(axis=-1)
-    limits = (admissible & (stroke >= 0.0), stroke, edge, reach)
-    return Measures(
-        *frozen(angles, mu, beta, *limits, np.prod(c, axis=-1), det_j2, cond_j)
+    result = Measures(
+        gamma=angles,
+        mu=mu,
+        beta=beta,
+        admissible=admissible & (stroke >= 0.0),
+        stroke=stroke,
+        edge=beta.min(axis=-1),
+        reach=geometry.beta_max - beta.max(axis=-1),
+        det_j1=np.prod(c, axis=-1),
+        det_j2=det_j2,
+        cond_j=_condition(normal, c),
     )
+    frozen(*vars(result).values())
+    return result
+
+
+def _condition(normal: Array, c: Array) -> Array:
+    """Condition number of J, shape (...), from N_k = r_k x t_k and c_k, rows by leg.
+
+    J is det J2 times a matrix of their products, up to its sign, so that no division is
+    needed.
+    """
+    first, second, third = np.moveaxis(normal, -2, 0)
+    c_1, c_2, c_3 = np.moveaxis(c[..., None], -2, 0)
+    rows = [
+        cross(first, second) * c_3,
+        cross(second, third) * c_1,
+        cross(third, first) * c_2,
+    ]
+    matrix = np.nan_to_num(np.stack(rows, axis=-2))
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    largest, smallest = singular[..., 0], singular[..., -1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(smallest > 0.0, largest / smallest, np.inf))
 
 
 @check_kinds
@@ -134,18 +156,15 @@ def workspace(
     a full turn. InputError refuses less than 1 of them. With `progress` a bar is drawn
     on a terminal.
     """
-    counts, poses = (
-        {"divisions": divisions, "turns": turns},
-        int(divisions) ** 2 * int(turns) // 2,
+    is_small = int(divisions) ** 2 * int(turns) // 2 <= MOST_POSES
+    allowed = f"must be at least 1, and make no more than {MOST_POSES:g} poses"
+    refuse_unless(
+        "workspace",
+        ("divisions", divisions, divisions >= 1 and is_small, allowed),
+        ("turns", turns, turns >= 1 and is_small, allowed),
     )
-    allowed = f"must be at least 1, and make no more than {_MOST:g} poses"
-    checks = (
-        (name, n, n >= 1 and poses <= _MOST, allowed) for name, n in counts.items()
-    )
-    refuse_unless("workspace", *checks)
-    return over_orientations(
-        geometry, triangle_directions(geometry, divisions)[0], turns, progress
-    )
+    s, _ = triangle_directions(geometry, divisions)
+    return over_orientations(geometry, s, turns, progress)
 
 
 def over_orientations(
@@ -157,57 +176,54 @@ def over_orientations(
     """
     directions = np.array(s, dtype=float)
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    psi = np.asarray(
-        (np.arange(turns) + 0.5) * (2.0 * np.pi / turns) - np.pi, dtype=float
-    )
-    parts = []
-    for block in slices(
-        len(directions), max(1, _BLOCK // turns), "orientations", progress
-    ):
+    step = 2.0 * np.pi / turns
+    psi = np.asarray((np.arange(turns) + 0.5) * step - np.pi, dtype=float)
+    measured = []
+    size = max(1, BLOCK // turns)
+    for block in slices(len(directions), size, "orientations", progress):
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
-        parts.append(measures(geometry, gamma, rotation))
-    frozen(directions, psi)
-    columns_of_parts = zip(*(vars(part).values() for part in parts), strict=True)
-    joined = Measures(*frozen(*map(np.concatenate, columns_of_parts)))
+        measured.append(measures(geometry, gamma, rotation))
+    by_name = zip(*(vars(block).values() for block in measured), strict=True)
+    joined = Measures(*map(np.concatenate, by_name))
+    frozen(directions, psi, *vars(joined).values())
     return OrientationMap(geometry, directions, psi, joined)
 
 
 def orientations(s: Array, psi: ArrayLike) -> Array:
-    """R of directions s (..., 3) and third ZYZ angles psi (...) [rad], shape (..., 3, 3).
+    """R of directions s, shape (..., 3), and third ZYZ angles psi [rad], shape (...).
 
-    theta and phi are those of s; where s = +-z, theta is 0.
+    theta and phi are those of s; where s = +-z, theta is 0. R has the shape (..., 3, 3).
     """
-    sine = np.hypot(s[..., 0], s[..., 1])
-    pole = sine == 0.0
-    safe = np.where(pole, 1.0, sine)
-    ct, st = (
-        np.where(pole, 1.0, s[..., 0] / safe),
-        np.where(pole, 0.0, s[..., 1] / safe),
-    )
-    along = np.stack([ct * s[..., 2], st * s[..., 2], -sine], axis=-1)
-    across = np.stack([-st, ct, np.zeros_like(st)], axis=-1)
+    s_x, s_y, s_z = s[..., 0], s[..., 1], s[..., 2]
+    sine_phi = np.hypot(s_x, s_y)
+    at_pole = sine_phi == 0.0
+    divisor = np.where(at_pole, 1.0, sine_phi)
+    cosine = np.where(at_pole, 1.0, s_x / divisor)  # of theta
+    sine = np.where(at_pole, 0.0, s_y / divisor)
+    along = np.stack([cosine * s_z, sine * s_z, -sine_phi], axis=-1)
+    across = np.stack([-sine, cosine, np.zeros_like(sine)], axis=-1)
     angle = np.asarray(psi, dtype=float)[..., None]
     x = np.cos(angle) * along + np.sin(angle) * across
-    return columns(
-        x, np.cos(angle) * across - np.sin(angle) * along, np.broadcast_to(s, x.shape)
-    )
+    y = np.cos(angle) * across - np.sin(angle) * along
+    return columns(x, y, np.broadcast_to(s, x.shape))
 
 
 def triangle_directions(
     geometry: Geometry, divisions: int = 40
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Directions inside the base triangle, shape (m, 3), and their triangles, shape (n, 3)."""
-    i, j = np.nonzero(
-        np.add.outer(range(divisions + 1), range(divisions + 1)) <= divisions
-    )
-    number = np.full((divisions + 2, divisions + 2), -1)
+    """Directions inside the base triangle, (m, 3), and their triangles, (n, 3)."""
+    steps = range(divisions + 1)
+    i, j = np.nonzero(np.add.outer(steps, steps) <= divisions)
+    number = np.full((divisions + 2, divisions + 2), -1)  # -1 for none
     number[i, j] = np.arange(len(i))
-    upward = number[i, j], number[i + 1, j], number[i, j + 1]
-    downward = number[i, j], np.where(j > 0, number[i + 1, j - 1], -1), number[i + 1, j]
+    corner, right, above = number[i, j], number[i + 1, j], number[i, j + 1]
+    below = np.where(j > 0, number[i + 1, j - 1], -1)
+    upward = corner, right, above
+    downward = corner, below, right
     faces = np.stack([upward, downward], axis=-1).reshape(3, -1).T
-    s = np.column_stack([i, j, divisions - i - j]) + 0.1
-    s = s @ geometry.v
+    weights = np.column_stack([i, j, divisions - i - j]) + 0.1
+    s = weights @ geometry.v
     inside = np.asarray(faces[faces.min(axis=1) >= 0], dtype=np.intp)
     return s / np.linalg.norm(s, axis=1)[:, None], inside
 
@@ -221,7 +237,7 @@ class SingularPoses:
     #: joint angles [rad], shape (m, 3); NaN of the singular leg at a serial one
     gamma: Array
     beta: Array
-    # : index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
+    #: index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
     leg: Array
     determinant: Array  #: det J2 or c_k that was found, shape (m,): 0 up to rounding
 
@@ -230,71 +246,75 @@ class SingularPoses:
 
 
 def parallel_singularities(chart: OrientationMap) -> SingularPoses:
-    """Admissible poses with det J2 = 0, one for each change of sign along psi in the map.
+    """Admissible poses with det J2 = 0, one for each change of sign along psi.
 
     The poses fill a surface in (s, psi); the resolution of the map sets how many points
     of it are found. Each is exact to rounding.
     """
-    measured, geometry = chart.measures, chart.geometry
-    after = np.roll(np.arange(len(chart.psi)), -1)
-    change = np.sign(measured.det_j2) * np.sign(measured.det_j2[:, after]) < 0
+    geometry, measured = chart.geometry, chart.measures
+    following = np.roll(np.arange(len(chart.psi)), -1)
+    signs = np.sign(measured.det_j2)
+    changes = signs * signs[:, following] < 0
     # gamma jumps by pi where the pose passes t_k = +-w_k, and det J2 with it: these are
     # serial.
-    smooth = np.abs(measured.gamma[:, after] - measured.gamma).max(axis=2) < 1.0
-    rows, starts = np.nonzero(
-        change & smooth & measured.admissible & measured.admissible[:, after]
-    )
+    jump = np.abs(measured.gamma[:, following] - measured.gamma).max(axis=2)
+    inside = measured.admissible & measured.admissible[:, following]
+    rows, starts = np.nonzero(changes & (jump < SMOOTH) & inside)
     s = chart.s[rows]
+    sign = signs[rows, starts]
     low = chart.psi[starts].copy()
     high = low + (chart.psi[1] - chart.psi[0])
-    sign = np.sign(measured.det_j2[rows, starts])
 
-    def at(psi: Array) -> tuple[Array, ...]:
+    def det_j2(psi: Array) -> Array:
         rotation = orientations(s, psi)
-        gamma, _, beta = kinematics.inverse(geometry, rotation)
-        return rotation, gamma, beta, measures(geometry, gamma, rotation).det_j2
+        gamma, _, _ = kinematics.inverse(geometry, rotation)
+        return measures(geometry, gamma, rotation).det_j2
 
-    for _ in range(_BISECTIONS):
+    for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        same = np.sign(at(middle)[-1]) == sign
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    *found, determinant = at(low)
-    return SingularPoses(
-        "parallel", *frozen(*found, np.full(len(rows), -1), determinant)
-    )
+        is_below = np.sign(det_j2(middle)) == sign
+        low = np.where(is_below, middle, low)
+        high = np.where(is_below, high, middle)
+    rotation = orientations(s, low)
+    gamma, _, beta = kinematics.inverse(geometry, rotation)
+    no_leg = np.full(len(rows), -1)
+    determinant = det_j2(low)
+    frozen(rotation, gamma, beta, no_leg, determinant)
+    return SingularPoses("parallel", rotation, gamma, beta, no_leg, determinant)
 
 
 def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
-    """Poses with c_k = 0 at the edge of what is admissible: all other conditions hold there."""
-    found = []
+    """Poses with c_k = 0 at the edge of what is admissible, where all else is inside."""
+    rows = []
+    z = np.array([0.0, 0.0, 1.0])
     for k, sign in product(range(3), (1.0, -1.0)):
         angles = np.linspace(0.0, geometry.arc[k], points)
         s = np.cos(angles)[:, None] * geometry.v[k]
         s = s + np.sin(angles)[:, None] * cross(geometry.w[k], geometry.v[k])
         t = np.broadcast_to(sign * geometry.w[k], s.shape)
         # R maps e_k to t_k and z to s; in {E} the triad is (e_k x z, e_k, z).
-        e, z = geometry.e[k], np.array([0.0, 0.0, 1.0])
-        rotation = columns(cross(t, s), t, s) @ np.stack([np.cross(e, z), e, z])
+        e = geometry.e[k]
+        triad = np.stack([np.cross(e, z), e, z])
+        rotation = columns(cross(t, s), t, s) @ triad
         gamma, _, beta = kinematics.inverse(geometry, rotation)
-        valid = (s @ geometry.w.T > 0.0) & (beta > 0.0) & (beta <= geometry.beta_max)
-        valid &= (gamma >= 0.0) & (gamma <= geometry.arc)
-        valid[:, k] = True
-        gamma[:, k] = beta[:, k] = np.nan
+        on_triangle = s @ geometry.w.T > 0.0
+        in_reach = (beta > 0.0) & (beta <= geometry.beta_max)
+        in_stroke = (gamma >= 0.0) & (gamma <= geometry.arc)
+        is_inside = on_triangle & in_reach & in_stroke
+        is_inside[:, k] = True
+        gamma[:, k] = np.nan
+        beta[:, k] = np.nan
         c = np.linalg.norm(cross(t, np.broadcast_to(geometry.w[k], t.shape)), axis=1)
-        inside = valid.all(axis=1)
-        found.append(
-            [part[inside] for part in (rotation, gamma, beta, np.full(points, k), c)]
-        )
-    arrays = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        kept = is_inside.all(axis=1)
+        leg = np.full(points, k)
+        rows.append((rotation[kept], gamma[kept], beta[kept], leg[kept], c[kept]))
+    arrays = [np.concatenate(column) for column in zip(*rows, strict=True)]
     return SingularPoses("serial", *frozen(*arrays))
 
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """The singular pose that the least turn of the star reaches.
-
-    Arrays are read-only.
-    """
+    """The singular pose that the least turn of the star reaches, in read-only arrays."""
 
     kind: str  #: "parallel" or "serial"
     leg: int  #: index k of the singular leg; -1 of a parallel one, which involves all
@@ -328,59 +348,81 @@ def distance_to_singularity(
 
     geometry = where if isinstance(where, Geometry) else Geometry.of(scene_of(where))
     start = kinematics.admissible(geometry, gamma).rotation
-    t = start.T @ geometry.w.T  # columns: w_k in {E}
-    cosines = np.sum(geometry.e.T * t, axis=0)
-    angles = np.arctan2(
-        np.linalg.norm(np.cross(geometry.e, t.T), axis=1), np.abs(cosines)
-    )
-    leg = int(angles.argmin())
-    kind, turn = (
-        "serial",
-        np.cross(geometry.e[leg], np.copysign(1.0, cosines[leg]) * t[:, leg]),
-    )
-    turn = angles[leg] * turn / np.linalg.norm(turn)
+    leg, turn = _turn_to_serial(geometry, start)
+    kind = "serial"
+    longest = np.linalg.norm(turn)
 
     def det_j2(turns: Array) -> Array:
         # A list of vectors: SciPy before 1.16 takes no arrays of more dimensions.
         matrices = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
         rotation = start @ matrices.reshape(*turns.shape[:-1], 3, 3)
-        found, _, _ = kinematics.inverse(geometry, rotation)
-        return measures(geometry, found, rotation).det_j2
+        angles, _, _ = kinematics.inverse(geometry, rotation)
+        return measures(geometry, angles, rotation).det_j2
 
-    lengths = np.linspace(0.0, 1.0 - 1e-9, _RAY) * angles[leg]
-    # Even directions: points of a Fibonacci lattice on the sphere.
-    z = 1.0 - (2.0 * np.arange(_RAYS) + 1.0) / _RAYS
-    phi, rim = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(_RAYS), np.sqrt(1.0 - z * z)
-    rays = np.column_stack([rim * np.cos(phi), rim * np.sin(phi), z])
     at_pose = det_j2(np.zeros(3))
-    values = det_j2(rays[:, None] * lengths[:, None]) / at_pose
-    first = np.where(values.min(axis=1) <= 0.0, (values <= 0.0).argmax(axis=1), _RAY)
-    equal: Any = {"type": "eq", "fun": lambda turn: det_j2(turn) / at_pose}
-    for row in np.argsort(first, kind="stable")[:_REFINED]:
-        if first[row] < _RAY:
-            begin, most = (
-                rays[row] * lengths[first[row]],
-                {"ftol": 1e-12, "maxiter": 60},
-            )
-            found = minimize(lambda x: x @ x, begin, constraints=equal, options=most).x
-            if abs(equal["fun"](found)) < 1e-9 and np.linalg.norm(
-                found
-            ) < np.linalg.norm(turn):
-                kind, leg, turn = "parallel", -1, found
+
+    def ratio(turns: Array) -> Array:
+        return det_j2(turns) / at_pose
+
+    def square(turn: Array) -> Any:
+        return turn @ turn
+
+    rays = _even_directions(RAYS)
+    lengths = np.linspace(0.0, 1.0 - 1e-9, RAY_POINTS) * longest
+    is_beyond = ratio(rays[:, None] * lengths[:, None]) <= 0.0
+    first = np.where(is_beyond.any(axis=1), is_beyond.argmax(axis=1), RAY_POINTS)
+    singular: Any = {"type": "eq", "fun": ratio}
+    limits = {"ftol": 1e-12, "maxiter": 60}
+    for row in np.argsort(first, kind="stable")[:REFINED]:
+        if first[row] == RAY_POINTS:
+            continue
+        begin = rays[row] * lengths[first[row]]
+        least = minimize(square, begin, constraints=singular, options=limits).x
+        is_singular = abs(ratio(least)) < FOUND
+        if is_singular and np.linalg.norm(least) < np.linalg.norm(turn):
+            kind, leg, turn = "parallel", -1, least
     distance = float(np.linalg.norm(turn))
     rotation = start @ Rotation.from_rotvec(turn).as_matrix()
-    return NearestSingularity(kind, leg, distance, *frozen(turn / distance, rotation))
+    axis = turn / distance
+    frozen(axis, rotation)
+    return NearestSingularity(kind, leg, distance, axis, rotation)
+
+
+def _turn_to_serial(geometry: Geometry, rotation: Array) -> tuple[int, Array]:
+    """Return the leg, and the least turn in {E} [rad], that bring t_k onto +-w_k."""
+    w = geometry.w @ rotation  # rows in {E}
+    cosines = np.sum(geometry.e * w, axis=1)
+    sines = np.linalg.norm(np.cross(geometry.e, w), axis=1)
+    angles = np.arctan2(sines, np.abs(cosines))
+    leg = int(angles.argmin())
+    axis = np.cross(geometry.e[leg], np.copysign(1.0, cosines[leg]) * w[leg])
+    return leg, angles[leg] * axis / np.linalg.norm(axis)
+
+
+def _even_directions(count: int) -> Array:
+    """Return unit vectors of a Fibonacci lattice on the sphere, shape (count, 3)."""
+    number = np.arange(count)
+    z = 1.0 - (2.0 * number + 1.0) / count
+    angle = np.pi * (3.0 - np.sqrt(5.0)) * number
+    radius = np.sqrt(1.0 - z * z)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
 def report_singularities(geometry: Geometry, chart: OrientationMap) -> str:
     """Summarise the singular poses in a few lines."""
-    lines, found = [], (parallel_singularities(chart), serial_singularities(geometry))
-    for poses, where in zip(found, ("inside", "at the edge"), strict=True):
-        said, row = f"none {where}", len(poses) // 2
-        if len(poses):
-            gamma = ", ".join(f"{x:.4f}" for x in np.degrees(poses.gamma[row]))
-            s = ", ".join(f"{x:.4f}" for x in poses.rotation[row, :, 2])
-            said = f"{len(poses)} found; for example s = ({s}), gamma = ({gamma}) deg"
-            said += f", leg {poses.leg[row] + 1}" if poses.kind == "serial" else ""
-        lines.append(f"{poses.kind}: {said}")
-    return "\n".join(lines)
+    parallel = _report_poses(parallel_singularities(chart), "inside")
+    serial = _report_poses(serial_singularities(geometry), "at the edge")
+    return f"{parallel}\n{serial}"
+
+
+def _report_poses(poses: SingularPoses, place: str) -> str:
+    """Say how many poses of a kind there are, and give one."""
+    if not len(poses):
+        return f"{poses.kind}: none {place}"
+    row = len(poses) // 2
+    gamma = ", ".join(f"{x:.4f}" for x in np.degrees(poses.gamma[row]))
+    s = ", ".join(f"{x:.4f}" for x in poses.rotation[row, :, 2])
+    text = f"{len(poses)} found; for example s = ({s}), gamma = ({gamma}) deg"
+    if poses.kind == "serial":
+        text += f", leg {poses.leg[row] + 1}"
+    return f"{poses.kind}: {text}"

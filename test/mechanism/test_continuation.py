@@ -74,7 +74,7 @@ def test_a_parallel_singularity_ends_the_branch_and_says_so():
         except SingularConfiguration as error:
             ended += 1
             assert isinstance(error, continuation.BranchEnds)
-            assert 0 < error.measure <= continuation.SINGULAR
+            assert 0 < error.measure <= continuation.LEAST_SIGMA
             # rows of J2 are unit vectors
             assert abs(error.det_j2) <= 1.5 * error.measure
             assert 1 <= error.row < 8
