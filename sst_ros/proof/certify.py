@@ -367,7 +367,7 @@ class Follower:
                         return
                     if self.steps >= max_steps and step.end < breaks[-1]:
                         raise Refused(f"{max_steps} steps are not enough")
-                here = enclosure.region_at_end(step)
+                here = enclosure.region_at_end(step, boxed=loop is not None)
             if loop is not None:
                 self._sample(loop, here)
         except (Refused, SstError) as refused:
@@ -704,6 +704,7 @@ class ProofTask(NamedTuple):
         exact = {place: arb(x.mid()) for place, x in ranges.items()}
         if follower.is_whole and self.prove(exact, "no range").until <= follower.until:
             return follower  # a limit that ends the motion without a range, too
+        share = 1.0
         for halvings in range(1, NARROWER + 1):
             share = 0.5**halvings
             narrow = {

@@ -4,10 +4,9 @@
 Between ticks the torques are held, so that a motion is one of a smooth equation with
 three more numbers that never change. At a tick the law of `control.law`, traced as the
 controllers of a batch have it, is a function of state, memory and noise. A region goes
-through it by the mean value theorem: its axes by the Jacobian at the middle, what the
-Jacobian varies by over the region as new errors. Noise is new at every tick: its
-columns are kept among those of what the motion began with, so that later ticks may take
-them back.
+through it by the mean value theorem: its directions by the Jacobian at the middle, what
+the Jacobian varies by over the region as new ones. Noise is new at every tick: it adds
+directions, so that the feedback of later ticks takes them back.
 """
 
 from __future__ import annotations
@@ -17,6 +16,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from itertools import islice
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from sst_ros.control.actuator_space import Reference
 from sst_ros.control.controller import Controller
@@ -44,12 +45,12 @@ from sst_ros.proof.enclosure import (
     Region,
     SideRecord,
     compile_on_balls,
-    fit_axes,
 )
 from sst_ros.proof.root import krawczyk
 from sst_ros.proof.scene_balls import Parts, SceneBalls
 
-NOISE_COLUMNS = 180  # of a region, the oldest beyond it become part of its box
+MOST_DIRECTIONS = 900  # of a region, beyond which the smallest are put into a box
+KEPT_DIRECTIONS = 700  # of them behind that
 TERMS = 40  # of the series of atan(t) / t
 SMALL = 0.25  # largest square of the tangent of half an error on SO(3)
 LOST = "the orientation at the measured angles is not proven to be the only one near"
@@ -393,37 +394,86 @@ class SampledLoop:
         widths = column(self._noise)
         error = magnitude(slopes - middle) * column(spread)
         error += magnitude(noise - noise_middle) * widths + column(rest)
-        moved = middle * here.c
-        c = moved.mid()
-        error += magnitude(moved - c) * here.a
-        c, a, folded = self._keep(c, here.a, noise_middle)
-        error = magnitude(error + folded)
-        turned = middle * here.axes
-        sizes = magnitude(c) * a + magnitude(turned) * here.b + error
-        scale = [float(x.upper()) or 1.0 for x in entries(sizes)]
-        axes = fit_axes(turned, here.b, scale)
-        back = axes.inv()
-        b = magnitude(magnitude(back * turned) * here.b + magnitude(back) * error)
-        return here._replace(centre=centre, c=c, a=a, axes=axes, b=b)
+        generators = _Generators.of(here)
+        moved = middle * generators.directions
+        directions = moved.mid()
+        error += magnitude(moved - directions) * generators.widths
+        moved_generators = _Generators(directions, generators.widths)
+        moved_generators = moved_generators.join(noise_middle, self._noise)
+        moved_generators = moved_generators.join_box(entries(error))
+        return moved_generators.reduce(self._first).region(here, centre)
 
-    def _keep(self, c: Any, a: Any, noise: Any) -> tuple[Any, Any, Any]:
-        """Add the columns of noise; those that are too many become part of the box."""
-        n, first = c.nrows(), self._first
-        columns = [*zip(*c.tolist(), strict=True)]
-        widths = entries(a)
-        for k, width in enumerate(self._noise):
+
+class _Generators(NamedTuple):
+    """A set of all sums of directions times numbers between bounds.
+
+    No box is put around it from one tick to the next, as a box around a set that turns
+    grows; the feedback makes each direction smaller, and the smallest are put together.
+    """
+
+    directions: Any  # a column each
+    widths: Any  # a column of their bounds
+
+    @classmethod
+    def of(cls, region: Region) -> _Generators:
+        """Return a region as one set."""
+        first = cls(region.c, region.a)
+        return first.join(region.axes, entries(region.b))
+
+    def join(self, directions: Any, widths: Sequence[Any]) -> _Generators:
+        """Add directions, those of no width left out."""
+        columns = [*zip(*self.directions.tolist(), strict=True)]
+        bounds = entries(self.widths)
+        for k, width in enumerate(widths):
             if width > 0:
-                columns.append(tuple(noise[i, k] for i in range(n)))
-                widths.append(width)
-        folded = column([0] * n)
-        most = first + NOISE_COLUMNS
-        if len(columns) > most:
-            old = range(first, first + len(columns) - most)
-            for k in old:
-                folded += magnitude(column(list(columns[k]))) * widths[k]
-            columns = columns[:first] + columns[old.stop :]
-            widths = widths[:first] + widths[old.stop :]
-        return arb_mat([*zip(*columns, strict=True)]), column(widths), folded
+                columns.append(tuple(row[k] for row in directions.tolist()))
+                bounds.append(width.upper())
+        return _Generators(_of_columns(columns), column(bounds))
+
+    def join_box(self, radii: Sequence[Any]) -> _Generators:
+        """Add a box."""
+        n = len(radii)
+        one = arb_mat([[arb(int(i == j)) for j in range(n)] for i in range(n)])
+        return self.join(one, [arb(x) for x in radii])
+
+    def reduce(self, first: int) -> _Generators:
+        """Put the smallest directions into a box where they are too many, not the first."""
+        columns = [*zip(*self.directions.tolist(), strict=True)]
+        if len(columns) <= MOST_DIRECTIONS:
+            return self
+        bounds = entries(self.widths)
+        floats = np.abs([[float(x) for x in row] for row in self.directions.tolist()])
+        sizes = floats * np.array([float(x) for x in bounds])
+        scale = sizes.sum(axis=1, keepdims=True)
+        shares = np.max(sizes / np.where(scale > 0.0, scale, 1.0), axis=0)
+        shares[:first] = np.inf
+        order = np.argsort(shares)
+        fold = set(order[: len(columns) - KEPT_DIRECTIONS].tolist())
+        kept = [k for k in range(len(columns)) if k not in fold]
+        folded = _Generators(
+            _of_columns([columns[k] for k in fold]), column([bounds[k] for k in fold])
+        )
+        box = entries(magnitude(folded.directions) * folded.widths)
+        rest = _Generators(
+            _of_columns([columns[k] for k in kept]), column([bounds[k] for k in kept])
+        )
+        return rest.join_box(box)
+
+    def region(self, here: Region, centre: Sequence[Any]) -> Region:
+        """Return a region of the set about another centre."""
+        n = len(centre)
+        one = arb_mat(n, n, [0] * (n * n)) + 1
+        return here._replace(
+            centre=list(centre),
+            c=self.directions,
+            a=self.widths,
+            axes=one,
+            b=column([0] * n),
+        )
+
+
+def _of_columns(columns: Sequence[Sequence[Any]]) -> Any:
+    return arb_mat([list(row) for row in zip(*columns, strict=True)])
 
 
 def _angles(parts: Parts, *state: Any) -> list[Any]:

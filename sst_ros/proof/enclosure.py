@@ -54,6 +54,7 @@ TIGHT = 1.1  # room of a tube around what a step was proven to reach
 # of a set in a step, relative to it: more is tried to be avoided by shorter steps
 LOSS = 1e-4
 KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
+UNSEEN = 0.01  # share of the tolerance below which a step may widen the set
 REGAIN = 1.25  # longest next step by the last one, after a step was refused
 KINK_STEPS = 400  # steps across one kink before the proof ends
 # of a set in a step across a kink, below which the next is twice as long
@@ -541,23 +542,55 @@ def prove(
     rest = _remainder(j, step)
     whole = _values_of(j, step.half)
     weights = _weights(whole)
-    source = entries(step.begin.spread(rest))
-    size = magnitude(whole)
-    growth, largest = arb(0), arb(0)  # logarithmic norm of J; norm of (J V - V') e(0)
-    for i in range(n):
-        others = sum((size[i, k] * weights[k] for k in range(n) if k != i), arb(0))
-        growth = growth.max((whole[i, i] + others / weights[i]).upper())
+    source = entries(step.begin.spread(rest))  # of (J V - V') e(0)
+    integrals = [x * step.length for x in source]
+    for k in range(defect_order + 1):
+        for i, row in enumerate(d):
+            integrals[i] += 2 * row[k] * step.half ** (k + 1) / (k + 1)
+    by_norm = _bound_by_norm(whole, weights, source, d[: step.begin.moving], step)
+    by_number = _bound_by_number(whole, integrals[: step.begin.moving], step.length)
+    w = [x.min(y).upper() for x, y in zip(by_norm, by_number, strict=True)]
+    w += [arb(0)] * step.begin.fixed
+    step = step._replace(w=column(w), weights=weights)
+    return _check_tube(step, tolerance)
+
+
+def _bound_by_norm(
+    jacobian: Any,
+    weights: Sequence[Any],
+    source: Sequence[Any],
+    d: Sequence[Sequence[Any]],
+    step: Advance,
+) -> list[Any]:
+    """Bound w by the logarithmic norm of J, that of what moves."""
+    every, size = range(len(d)), magnitude(jacobian)
+    growth, largest = arb(0), arb(0)  # of J; norm of (J V - V') e(0)
+    for i in every:
+        others = sum((size[i, k] * weights[k] for k in every if k != i), arb(0))
+        growth = growth.max((jacobian[i, i] + others / weights[i]).upper())
         largest = largest.max((source[i] / weights[i]).upper())
     most = largest * step.length  # integral of the norm of both: not less than its norm
-    for k in range(defect_order + 1):
-        sizes = [(row[k] / x).upper() for row, x in zip(d, weights, strict=True)]
+    for k in range(len(d[0])):
+        sizes = [(d[i][k] / weights[i]).upper() for i in every]
         largest_size = reduce(arb.max, sizes)
         most += 2 * largest_size * step.half ** (k + 1) / (k + 1)
     bound = (growth * step.length).exp() * most
-    w = [(bound * x).upper() for x in weights]
-    w[step.begin.moving :] = [arb(0)] * step.begin.fixed
-    step = step._replace(w=column(w), weights=weights)
-    return _check_tube(step, tolerance)
+    return [(bound * weights[i]).upper() for i in every]
+
+
+def _bound_by_number(jacobian: Any, integrals: Sequence[Any], length: Any) -> list[Any]:
+    """Bound w number by number, by integrals of what makes it grow.
+
+    |w_i|' <= J_ii |w_i| + sum |J_ik| |w_k| + |g_i|, whose right side grows with all w_k,
+    so that |w| <= exp(A h) (integral of |g|) where A bounds |J_ik|, and J_ii from 0 on.
+    """
+    every, size = range(len(integrals)), magnitude(jacobian)
+    rates = [[size[i, k] * length for k in every] for i in every]
+    for i in every:
+        rates[i][i] = jacobian[i, i].upper().max(arb(0)) * length
+    grown = arb_mat(rates).exp() * column([x.upper() for x in integrals])
+    bounds = [x.upper() for x in entries(grown)]
+    return [x if x.is_finite() else arb("inf") for x in bounds]
 
 
 def _measure_defect(
@@ -640,20 +673,26 @@ def _weights(jacobian: Any) -> list[Any]:
     return [arb(x) for x in found.tolist()]
 
 
-def region_at_end(step: Advance) -> Region:
-    """Return where the solution is at the end of a step, in axes that fit it."""
+def region_at_end(step: Advance, *, boxed: bool = False) -> Region:
+    """Return where the solution is at the end of a step, in axes that fit it.
+
+    What is `boxed` has the axes of its numbers.
+    """
     h, here = step.length, step.begin
     flow, reached = step.flow(h), [p(h) for p in step.p]
     moved, c = flow * here.axes, flow * here.c
-    error = (
-        magnitude(c - c.mid()) * here.a + step.w + column([x.rad() for x in reached])
-    )
-    axes = fit_axes(moved, here.b, [float(x) for x in step.weights])
-    back = axes.inv()
-    b = magnitude(magnitude(back * moved) * here.b + magnitude(back) * error)
-    return Region(
-        step.end, [x.mid() for x in reached], c.mid(), here.a, axes, b, here.fixed
-    )
+    rounding = column([x.rad() for x in reached])
+    error = magnitude(c - c.mid()) * here.a + step.w + rounding
+    centre = [x.mid() for x in reached]
+    if boxed:
+        n = len(centre)
+        axes = arb_mat(n, n, [0] * (n * n)) + 1
+        b = magnitude(magnitude(moved) * here.b + error)
+    else:
+        axes = fit_axes(moved, here.b, [float(x) for x in step.weights])
+        back = axes.inv()
+        b = magnitude(magnitude(back * moved) * here.b + magnitude(back) * error)
+    return Region(step.end, centre, c.mid(), here.a, axes, b, here.fixed)
 
 
 def _loss(step: Advance) -> float:
@@ -813,7 +852,7 @@ class ProvenSteps:
     def _is_lossy(self, step: Advance) -> bool:
         """Whether a step widens the set by more than its tolerance, and by much."""
         widened = max(map(float, entries(step.w)))
-        return widened > self._tolerance and _loss(step) > LOSS
+        return widened > UNSEEN * self._tolerance and _loss(step) > LOSS
 
     def _prove(self, step: Advance) -> Advance:
         return prove(self._f, self._jacobian, step, self._order, self._tolerance)
