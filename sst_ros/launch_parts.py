@@ -72,7 +72,7 @@ class Values(dict[str, str]):
     is_ending = False  # the actions of this launch file have been asked to end
 
     def is_true(self, name: str) -> bool:
-        """Tell whether a flag is set."""
+        """Return whether a flag is set."""
         return self[name] == "true"
 
     @property
