@@ -10,40 +10,44 @@ from launch.action import Action
 
 from sst_ros import launch_parts
 from sst_ros.control.law import MODES
-from sst_ros.launch_parts import Argument, Values, flag
+from sst_ros.launch_parts import LaunchArgument, Values, flag
 
 CONTROL = {
-    "motion": Argument(
+    "motion": LaunchArgument(
         "",
         "scene, or topic: trajectories from ~/joint_trajectory",
         ("", "scene", "topic"),
     ),
-    "mode": Argument("", "control law", ("", *MODES)),
-    "feedforward_at": Argument(
+    "mode": LaunchArgument("", "control law", ("", *MODES)),
+    "feedforward_at": LaunchArgument(
         "middle",
         "instant of a control period whose torque is held over it",
         ("start", "middle"),
     ),
-    "bandwidth": Argument("", "natural frequency of the error [rad/s]"),
-    "hold": Argument("0.3", "time for which the end of the motion is held [s]"),
+    "bandwidth": LaunchArgument("", "natural frequency of the error [rad/s]"),
+    "hold": LaunchArgument("0.3", "time for which the end of the motion is held [s]"),
 }
 RUN = {
-    "scene": Argument("reach", "simulated scene, by name or path of a .yaml file"),
-    "rate": Argument("", "steps per second of simulated time [Hz]"),
-    "duration": Argument("0.0", "length of the run [s]; 0 until the motion has ended"),
-    "real_time_factor": Argument(
+    "scene": LaunchArgument(
+        "reach", "simulated scene, by name or path of a .yaml file"
+    ),
+    "rate": LaunchArgument("", "steps per second of simulated time [Hz]"),
+    "duration": LaunchArgument(
+        "0.0", "length of the run [s]; 0 until the motion has ended"
+    ),
+    "real_time_factor": LaunchArgument(
         "", "simulated time per time of the clock; 0 for as fast as possible"
     ),
-    "sync": Argument(
+    "sync": LaunchArgument(
         "lockstep", "free, or lockstep with the commands", ("free", "lockstep")
     ),
 }
 ARGUMENTS = {
     **RUN,
-    "model": Argument(
+    "model": LaunchArgument(
         "", "scene of the controller's model; default: the simulated one"
     ),
-    "control_rate": Argument(
+    "control_rate": LaunchArgument(
         "500", "commands per second of simulated time [Hz], a divisor of rate"
     ),
     **CONTROL,

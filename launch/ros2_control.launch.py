@@ -10,17 +10,17 @@ from launch import LaunchDescription
 from launch.action import Action
 
 from sst_ros import launch_parts
-from sst_ros.launch_parts import Argument, Values, flag
+from sst_ros.launch_parts import LaunchArgument, Values, flag
 
 RUN = {
-    "scene": Argument("example2", "scene, by name or path of a .yaml file"),
-    "rate": Argument("", "steps per second of simulated time [Hz]"),
-    "publish_rate": Argument("", "published samples per second [Hz]"),
-    "duration": Argument("0.0", "length of the run [s]; 0 for no end"),
-    "real_time_factor": Argument(
+    "scene": LaunchArgument("example2", "scene, by name or path of a .yaml file"),
+    "rate": LaunchArgument("", "steps per second of simulated time [Hz]"),
+    "publish_rate": LaunchArgument("", "published samples per second [Hz]"),
+    "duration": LaunchArgument("0.0", "length of the run [s]; 0 for no end"),
+    "real_time_factor": LaunchArgument(
         "", "simulated time per time of the clock; 0.0 for as fast as possible"
     ),
-    "sync": Argument(
+    "sync": LaunchArgument(
         "",
         "free, or lockstep: one update of the controllers for each sample",
         ("", "free", "lockstep"),
@@ -29,12 +29,12 @@ RUN = {
 }
 ARGUMENTS = {
     **RUN,
-    "controller": Argument(
+    "controller": LaunchArgument(
         "trajectory_controller",
         "controller that is started; config/controllers.yaml has effort_controller,"
         " trajectory_controller and pid_controller",
     ),
-    "controllers": Argument(
+    "controllers": LaunchArgument(
         "", "parameters of the controllers; by default config/controllers.yaml"
     ),
 }

@@ -10,20 +10,20 @@ from launch import LaunchDescription
 from launch.action import Action
 
 from sst_ros import launch_parts
-from sst_ros.launch_parts import Argument, Default, Values, flag
+from sst_ros.launch_parts import Default, LaunchArgument, Values, flag
 
 RUN = {
-    "scene": Argument("example2", "scene, by name or path of a .yaml file"),
-    "rate": Argument("", "steps per second of simulated time [Hz]"),
-    "publish_rate": Argument("", "published samples per second [Hz]"),
-    "duration": Argument(
+    "scene": LaunchArgument("example2", "scene, by name or path of a .yaml file"),
+    "rate": LaunchArgument("", "steps per second of simulated time [Hz]"),
+    "publish_rate": LaunchArgument("", "published samples per second [Hz]"),
+    "duration": LaunchArgument(
         "", "length of the run [s]; 0 for no end; in lockstep by default the scene's"
     ),
-    "real_time_factor": Argument(
+    "real_time_factor": LaunchArgument(
         "", "simulated time per time of the clock; 0 for as fast as possible"
     ),
     "publish_clock": flag("", "publish the simulated time on /clock"),
-    "sync": Argument(
+    "sync": LaunchArgument(
         "",
         "free, or lockstep with the commands; by default lockstep with play:=true",
         ("", "free", "lockstep"),

@@ -5,17 +5,17 @@ from launch import LaunchDescription
 from launch.action import Action
 
 from sst_ros import launch_parts
-from sst_ros.launch_parts import Argument, Values, flag
+from sst_ros.launch_parts import LaunchArgument, Values, flag
 
 RUN = {
-    "scene": Argument("swing", "scene, by name or path of a .yaml file"),
-    "publish_rate": Argument("100", "published samples per second [Hz]"),
-    "duration": Argument("0.0", "length of the run [s]; 0 for no end"),
+    "scene": LaunchArgument("swing", "scene, by name or path of a .yaml file"),
+    "publish_rate": LaunchArgument("100", "published samples per second [Hz]"),
+    "duration": LaunchArgument("0.0", "length of the run [s]; 0 for no end"),
 }
 ARGUMENTS = {
     **RUN,
     "browser": flag("true", "serve the page"),
-    "port": Argument(
+    "port": LaunchArgument(
         "", "port of the page on this machine; the next free one is taken"
     ),
     "rviz": flag("false", "start robot_state_publisher and RViz"),

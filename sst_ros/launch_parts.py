@@ -2,7 +2,7 @@
 """Arguments, nodes, recorders and RViz for the launch files, and when a launch ends.
 
 Only launch files import this module: it needs `launch` and `launch_ros` of a ROS
-installation. A launch file names its arguments, each an `Argument`, and a function that
+installation. A launch file names its arguments, each an `LaunchArgument`, and a function that
 makes its actions from their values; `description` does the rest. The actions of one
 launch file end together: when one that `ends` has exited, or when any has failed.
 """
@@ -51,7 +51,7 @@ from sst_ros.scene.yaml_document import read_file, read_values, resolve_numbers
 from sst_ros.state import BASE_FRAME
 
 
-class Argument(NamedTuple):
+class LaunchArgument(NamedTuple):
     """A launch argument; an empty default leaves the value to params_file or the node."""
 
     default: str
@@ -59,10 +59,10 @@ class Argument(NamedTuple):
     choices: Sequence[str] = ()
 
 
-def flag(default: str, description: str) -> Argument:
+def flag(default: str, description: str) -> LaunchArgument:
     """Describe an argument that is true or false."""
     choices = ["true", "false"]
-    return Argument(default, description, choices if default else ["", *choices])
+    return LaunchArgument(default, description, choices if default else ["", *choices])
 
 
 class Values(dict[str, str]):
@@ -72,7 +72,7 @@ class Values(dict[str, str]):
     is_ending = False  # the actions of this launch file have been asked to end
 
     def is_true(self, name: str) -> bool:
-        """Tell whether a flag is set."""
+        """Return whether a flag is set."""
         return self[name] == "true"
 
     @property
@@ -100,11 +100,11 @@ WAIT_S = "60.0"
 """Time that nodes wait for each other [s]; on a busy machine one starts in 20 s."""
 
 _SHARED = {
-    "namespace": Argument("", "namespace of the nodes"),
-    "params_file": Argument(
+    "namespace": LaunchArgument("", "namespace of the nodes"),
+    "params_file": LaunchArgument(
         "", "YAML file of parameters; arguments given here take precedence"
     ),
-    "log_level": Argument("info", "log level of the nodes", LOG_LEVELS),
+    "log_level": LaunchArgument("info", "log level of the nodes", LOG_LEVELS),
     USE_SIM_TIME: flag(
         "false",
         "true: the nodes read the time from /clock, which the simulator publishes;"
@@ -113,12 +113,14 @@ _SHARED = {
 }
 
 
-def recording_arguments(name: str) -> dict[str, Argument]:
+def recording_arguments(name: str) -> dict[str, LaunchArgument]:
     """Return the launch arguments of `recorder`; the default of output is dated."""
     dated = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
     return {
-        "output": Argument(dated, "folder of the recording, which must not exist yet"),
-        "bag": Argument(
+        "output": LaunchArgument(
+            dated, "folder of the recording, which must not exist yet"
+        ),
+        "bag": LaunchArgument(
             "ros2",
             "recorder: ros2 for `ros2 bag record`, sst for the node of this package",
             ("ros2", "sst"),
@@ -128,7 +130,7 @@ def recording_arguments(name: str) -> dict[str, Argument]:
 
 def description(
     file: str,
-    arguments: Mapping[str, Argument],
+    arguments: Mapping[str, LaunchArgument],
     actions: Callable[[Values], list[Action]],
 ) -> LaunchDescription:
     """Describe a launch: `actions` makes its nodes from the values of its arguments."""
@@ -180,7 +182,7 @@ def description(
 
 
 def _refuse_unknown_arguments(
-    file: str, context: LaunchContext, declared: Mapping[str, Argument]
+    file: str, context: LaunchContext, declared: Mapping[str, LaunchArgument]
 ) -> None:
     """Raise for a misspelt NAME:=VALUE, which launch would ignore.
 

@@ -6,6 +6,8 @@ failed.
 others. With CI=true such a skip fails the session: see unexpected_skips.py.
 """
 
+import importlib.util
+
 import pytest
 
 from sst_ros.errors import explanation
@@ -15,6 +17,16 @@ def skip_if_missing(error):
     """Skip where an ImportError is that of an optional package, with what installs it."""
     if isinstance(error, ImportError) and (how := explanation(error)):
         pytest.skip(how, allow_module_level=True)
+
+
+def needs(*modules):
+    """Mark a test whose commands or child processes need optional packages.
+
+    Its own imports need no mark: see the hooks below.
+    """
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    reasons = [explanation(ModuleNotFoundError(name=name)) or name for name in missing]
+    return pytest.mark.skipif(bool(missing), reason="; ".join(reasons))
 
 
 class TestModule(pytest.Module):

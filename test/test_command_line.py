@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from missing_packages import needs
 from programs import HIDDEN, python
 
 from sst_ros.__main__ import main
@@ -97,7 +98,8 @@ def test_the_version_is_that_of_the_package(capsys):
         (["simulate", "example2", "--duration", "ten"], "invalid float value: 'ten'"),
         (["identify", "design", "reach", "--seed", "\u0661"], "must be a number, not"),
         (["demo", "feedforward", "--mode", "pdd"], "did you mean 'pd'?"),
-        (["demo", "--scene", "swing"], "are options of `demo feedforward`"),
+        pytest.param(["demo", "--scene", "swing"], "are options of `demo feedforward`",
+                     marks=needs("rosbags")),
     ],
 )  # fmt: skip
 def test_words_that_are_none_of_the_command_are_refused(words, said, capsys):
@@ -263,7 +265,7 @@ def test_what_needs_an_extra_says_which(line, modules, tmp_path):
     [
         (
             "recover bag",
-            "rosbags is not installed: pip install mcap rosbags, or pip install 'sst_",
+            "is not installed: pip install mcap rosbags, or pip install 'sst_",
         ),
         (
             "simulate example2 --plot",

@@ -12,6 +12,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from missing_packages import needs
 from programs import python
 
 import sst_ros
@@ -218,6 +219,7 @@ files, where they were generated text before.
 """
 
 
+@needs("rosbags", "mcap")
 @pytest.mark.timeout(320)  # where nothing is compiled yet
 def test_calls_pass_few_files_and_those_that_contributing_names(tmp_path):
     ros, here = importlib.util.find_spec("rclpy") is not None, Path(__file__).parent

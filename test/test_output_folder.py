@@ -2,6 +2,7 @@
 from pathlib import Path
 
 import pytest
+from missing_packages import needs
 
 from sst_ros.__main__ import main
 from sst_ros.cli.commands import results_folder
@@ -41,7 +42,12 @@ def test_what_is_there_is_overwritten_only_with_force(tmp_path):
 
 @pytest.mark.parametrize(
     "words",
-    [["export", "{bag}"], ["plot", "{bag}"], ["report", "run", "{bag}"], ["demo"]],
+    [
+        ["export", "{bag}"],
+        pytest.param(["plot", "{bag}"], marks=needs("rosbags", "zstandard")),
+        pytest.param(["report", "run", "{bag}"], marks=needs("rosbags", "zstandard")),
+        pytest.param(["demo"], marks=needs("rosbags", "mcap")),
+    ],
     ids=["export", "plot", "report", "demo"],
 )
 def test_every_command_refuses_to_overwrite_before_it_reads(words, tmp_path, capsys):

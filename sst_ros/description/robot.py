@@ -516,8 +516,10 @@ def solids(shape: Shape, step: float = STEP) -> Iterator[Solid]:
     elif isinstance(shape, Box):
         yield Solid("box", {"size": shape.size}, shape.centre, upright, colour)
     else:
-        is_arc = isinstance(shape, Arc)
-        ends = shape.points(step) if is_arc else (shape.begin, shape.end)
+        if isinstance(shape, Arc):
+            ends = shape.points(step)
+        else:
+            ends = np.array([shape.begin, shape.end])
         for begin, end in pairwise(ends):
             x, y, z = end - begin
             # The cylinder's axis is z.

@@ -277,6 +277,8 @@ def _first_zeros(
     beyond = sign * every.reshape(len(axes), TURNS) <= 0.0
     meets = beyond.any(axis=1) & ~beyond[:, 0]
     axes, first = axes[meets], beyond.argmax(axis=1)[meets]
+    if not len(axes):  # SciPy before 1.16 makes no rotations of none
+        return axes, np.zeros(0), np.zeros((0, 3, 3))
     low, high = angles[first - 1], angles[first]
     for _ in range(40):
         middle = 0.5 * (low + high)

@@ -349,7 +349,7 @@ class Scenarios:
             raise InputError(self.document.name, faults) from None
 
     def columns(self) -> Any:
-        """Return the scene, unchecked, with columns (N,) for the numbers that vary."""
+        """Return the scene, unchecked; numbers that vary are columns, shape (N,)."""
         columns = {
             place: _columns(self.rows[key]) for place, key in self._places.items()
         }

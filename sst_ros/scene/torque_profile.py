@@ -198,7 +198,8 @@ class PolynomialTorque(TorqueProfile):
         """See `TorqueProfile`."""
         from scipy.interpolate import PPoly
 
-        legs = [PPoly(c, self.x) for c in np.moveaxis(self.c, 2, 0)]
+        # SciPy before 1.13 finds no roots where the coefficients are read-only.
+        legs = [PPoly(c.copy(), self.x) for c in np.moveaxis(self.c, 2, 0)]
         bounds = () if limit is None else (limit, -limit)
         roots = [
             leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds

@@ -7,10 +7,18 @@ The whole is run by hand.
 import pytest
 
 from benchmark.campaign.ledger import PARTS, Ledger, run_part
-from sst_ros.errors import SstError
+from sst_ros.errors import EXTRAS, SstError
 
 ROS = {part for part, (room, _) in PARTS.items() if room == "nodes"}
 LONG = {"bits", "estimates", "workers", "interrupts", "cold_threads"}
+NEEDS = {
+    "bits": ("llvmlite",),
+    "damage": ("mcap", "rosbags"),
+    "invariants": ("flint",),
+    "messages": ("flint",),
+    "saves": ("mcap", "rosbags"),
+}
+"""Optional packages of a part."""
 QUICK = {"messages", *(PARTS.keys() - ROS - LONG)}
 
 
@@ -24,8 +32,9 @@ QUICK = {"messages", *(PARTS.keys() - ROS - LONG)}
 def test_nothing_is_found_in_a_share_of(part):
     if part in ROS:
         pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
-    if part == "bits":
-        pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
+    for module in NEEDS.get(part, ()):
+        reason = f"needs {module}: pip install .[{EXTRAS[module]}]"
+        pytest.importorskip(module, reason=reason)
     # Other tests run at the same time: only what takes ten times its bound is a hang
     # here.
     ledger = run_part(part, 0.02, seed=7, patience=10.0)

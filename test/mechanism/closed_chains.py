@@ -62,6 +62,8 @@ def random_pose(rng, geometry, least=0.2):
 
 def rotation_of(q):
     """R of quaternions (w, x, y, z), shape (4,) or (n, 4)."""
+    if not np.size(q):  # SciPy before 1.16 makes no rotations of none
+        return np.zeros((0, 3, 3))
     return Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix()
 
 

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 from matplotlib import image
+from missing_packages import needs
 
 from sst_ros import __main__ as cli
 from sst_ros.integration.methods import METHODS
@@ -150,6 +151,7 @@ def test_the_figure_and_the_page_show_every_method_and_run(found):
     assert {"rk4", "dopri5", "dop853", "rodas5p: every step", "decay"} <= lines
 
 
+@needs("zstandard", "rosbags")
 def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
     words = [
         "report",

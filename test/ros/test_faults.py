@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
+from missing_packages import needs
 from rclpy.qos import QoSProfile
 from ros.conftest import (
     COMMANDS,
@@ -255,7 +256,10 @@ def test_a_fault_is_held_still_until_a_reset_and_ends_the_player(
     assert "held until ~/reset" in err and "gamma_1 > 1.570796 rad" in err
 
 
-@pytest.mark.parametrize("command", ["simulator", "recorder", "torque_player"])
+RECORDER = pytest.param("recorder", marks=needs("rosbags", "mcap"))
+
+
+@pytest.mark.parametrize("command", ["simulator", RECORDER, "torque_player"])
 def test_signals_twice_end_a_node_once(nodes, observer, tmp_path, command):
     is_recorder = command == "recorder"
     process = nodes.run(

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import rclpy
 import yaml
+from missing_packages import needs
 from rcl_interfaces.msg import ParameterType
 
 from sst_ros.nodes.process import Worker
@@ -203,8 +204,14 @@ def test_descriptors_carry_type_words_bounds_and_read_only(domain, command, text
             {"stiffness": "[]"},
             "stiffness = []: must be 3 finite numbers",
         ),
-        ("recorder", {"topics": "[]"}, "topics = []: must name a topic"),
-        ("recorder", {"output": "/"}, "must be a new folder"),
+        pytest.param(
+            *("recorder", {"topics": "[]"}, "topics = []: must name a topic"),
+            marks=needs("rosbags", "mcap"),
+        ),
+        pytest.param(
+            *("recorder", {"output": "/"}, "must be a new folder"),
+            marks=needs("rosbags", "mcap"),
+        ),
     ],
 )
 def test_a_node_ends_that_cannot_do_its_work(run_here, command, given, said):
