@@ -46,7 +46,7 @@ class BodyRates:
     beta_ddot: Array
     omega_a: Array  #: of actuated links, in {1k} [rad/s], Eqs. 53 to 57, shape (3, 3)
     omega_a_dot: Array
-    # : of intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3)
+    #: of intermediate links, in {2k}, Eqs. 58 to 62 and 75 to 79, (3, 3)
     omega_ipl: Array
     omega_ipl_dot: Array
 
@@ -162,7 +162,7 @@ class OrientationSensitivity(NamedTuple):
 
     gamma: Array  #: by the actuator angles, shape (..., 3, 3)
     v: Array  #: by the unit directions v_k, leg and axis, shape (..., 3, 3, 3)
-    # : by the angles of the star [rad], the last of which is 2 pi less the others
+    #: by the angles of the star [rad], the last of which is 2 pi less the others
     alpha: Array
 
 

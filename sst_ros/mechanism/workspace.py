@@ -25,6 +25,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
 from sst_ros.progress import slices
 from sst_ros.scene.scene import SceneInput, scene_of
+from sst_ros.state import Explained
 
 _BLOCK, _BISECTIONS = 20_000, 55
 _RAYS, _RAY, _REFINED = 400, 64, 6
@@ -33,8 +34,8 @@ _RAYS, _RAY, _REFINED = 400, 64, 6
 _MOST = 20_000_000  # poses of a map: 4 GB
 
 
-@dataclass(frozen=True)
-class Measures:
+@dataclass(frozen=True, repr=False)
+class Measures(Explained):
     """What a designer asks of poses; arrays share the shape (...) of the poses.
 
     Read-only.
@@ -44,14 +45,30 @@ class Measures:
     mu: Array
     beta: Array
     admissible: NDArray[np.bool_]  #: the manipulator can be there
-    # : distance of the nearest gamma_k to an end of its stroke [rad], negative beyond
+    #: distance of the nearest gamma_k to an end of its stroke [rad], negative beyond
     stroke: Array
-    # : smallest beta_k [rad]: distance to the edge of the workspace, negative beyond
+    #: smallest beta_k [rad]: distance to the edge of the workspace, negative beyond
     edge: Array
     reach: Array  #: smallest beta_max - beta_k [rad]
     det_j1: Array  #: 0 at a serial singularity
     det_j2: Array  #: 0 at a parallel singularity
     cond_j: Array  #: condition number of J = -J2^-1 J1, infinite at both
+
+    def _facts(self) -> dict[str, object]:
+        finite = self.cond_j[np.isfinite(self.cond_j)]
+        smallest = {
+            "least way to an end of the stroke [rad]": self.stroke,
+            "least beta, way to the edge [rad]": self.edge,
+            "least way to the largest beta [rad]": self.reach,
+            "least |det J1|, 0 is serially singular": np.abs(self.det_j1),
+            "least |det J2|, 0 is parallelly singular": np.abs(self.det_j2),
+        }
+        facts: dict[str, object] = {"poses": self.cond_j.size}
+        facts["admissible"] = int(np.count_nonzero(self.admissible))
+        for name, values in smallest.items():
+            facts[name] = float(np.min(values, initial=np.inf))
+        facts["largest finite cond J"] = float(np.max(finite, initial=1.0))
+        return facts
 
     @property
     def margin(self) -> Array:
@@ -221,7 +238,7 @@ class SingularPoses:
     #: joint angles [rad], shape (m, 3); NaN of the singular leg at a serial one
     gamma: Array
     beta: Array
-    # : index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
+    #: index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
     leg: Array
     determinant: Array  #: det J2 or c_k that was found, shape (m,): 0 up to rounding
 
@@ -289,8 +306,8 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
     return SingularPoses("serial", *frozen(*arrays))
 
 
-@dataclass(frozen=True)
-class NearestSingularity:
+@dataclass(frozen=True, repr=False)
+class NearestSingularity(Explained):
     """The singular pose that the least turn of the star reaches.
 
     Arrays are read-only.
@@ -301,6 +318,14 @@ class NearestSingularity:
     distance: float  #: angle of the turn [rad]
     axis: Array  #: of the turn, in {E}, shape (3,)
     rotation: Array  #: R of the singular pose, shape (3, 3)
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "kind": self.kind,
+            "leg": "all" if self.leg < 0 else self.leg + 1,
+            "turn of the star to it [rad]": self.distance,
+            "axis of the turn, in {E}": self.axis.tolist(),
+        }
 
 
 @check_kinds
