@@ -3,6 +3,8 @@
 completion.
 """
 
+import dataclasses
+import pydoc
 import re
 from xml.etree import ElementTree
 
@@ -15,6 +17,7 @@ from sst_ros import (
     Simulation,
     certify,
     certify_zone,
+    distance_to_singularity,
     equations,
     linearize,
     load_scene,
@@ -22,9 +25,14 @@ from sst_ros import (
     reference_motion,
     simulate,
 )
+from sst_ros import __main__ as cli
 from sst_ros.control.actuator_space import ReferenceMotion
 from sst_ros.dynamics.motion_table import MotionTable
+from sst_ros.mechanism.geometry import Geometry
+from sst_ros.mechanism.kinematics import admissible
+from sst_ros.mechanism.workspace import measures
 from sst_ros.scene.scene import TERMS, names
+from sst_ros.scene.yaml_document import dump
 from sst_ros.state import Explained
 
 
@@ -50,6 +58,13 @@ def made(bag):
         certify_zone("general", tilt=0.4, max_boxes=1_000),
         linearize(scene, None, (0.0, 0.0, 0.0)),
         equations("example2", "numpy"),
+    )
+    geometry, gamma = Geometry.of(scene), np.array(scene.initial.gamma)
+    rotation = admissible(geometry, gamma).rotation
+    yield from (
+        geometry,
+        measures(geometry, gamma, rotation),
+        distance_to_singularity(scene, gamma),
     )
 
 
@@ -96,3 +111,26 @@ def test_tab_completion_shows_a_document_and_not_its_checks():
         hidden = {"SPECS", "ONE_OF", "EFFECTS", "ORIGIN", "check", "rules", "settle"}
         assert not hidden & set(dir(part))
     assert "with_values" in dir(scene)
+
+
+def test_the_help_of_a_batch_is_short():
+    text = pydoc.plain(pydoc.render_doc(Batch))
+    assert len(text) < 8_000 and max(map(len, text.splitlines())) < 400
+
+
+def test_geometries_of_a_map_say_how_many_they_are():
+    one = Geometry.of(load_scene("general"))
+    many = Geometry.build(np.stack([one.v] * 4), np.stack([one.alpha] * 4), [1.5] * 4)
+    assert re.search(r"geometries +4\n", repr(many))
+
+
+def test_no_heading_of_a_scene_is_empty(tmp_path, capsys):
+    bare = dataclasses.replace(load_scene("example1"), provenance=())
+    path = tmp_path / "bare.yaml"
+    path.write_text(dump(bare), encoding="utf-8")
+    for name in (str(path), "friction"):
+        assert cli.main(["scene", "show", name]) == 0
+        lines = capsys.readouterr().out.splitlines()[1:]
+        for line, after in zip(lines, [*lines[1:], ""], strict=True):
+            if line and not line.startswith(" "):
+                assert after.startswith("  "), line

@@ -39,7 +39,7 @@ class BatchState(NamedTuple):
     gamma_dot: Array  #: their rates [rad/s], shape (N, 3)
     quaternion: Array  #: orientations (x, y, z, w) of {E} in {B}, shape (N, 4)
     body_rate: Array  #: angular velocities of the star in {E} [rad/s], shape (N, 3)
-    # : 0 while a robot runs on, else why not, see `BatchResult`; (N,)
+    #: 0 while a robot runs on, else why not, see `BatchResult`; (N,)
     code: NDArray[np.int64]
 
 

@@ -30,7 +30,7 @@ class DenseOutput(NamedTuple):
     weights: tuple[tuple[float, ...], ...]  # of all slopes in F_3, F_4, ..
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tableau:
     """An explicit method: stages a and c, weights b, and weights of its error estimates."""
 
@@ -44,6 +44,10 @@ class Tableau:
     # weights of a second estimate that scales the first (DOP853)
     damping: tuple[float, ...] = ()
     dense: DenseOutput | None = None  # inside of a step
+
+    def __repr__(self) -> str:
+        """Return the name alone: the numbers would fill a page of `help`."""
+        return f"{type(self).__name__}({self.name!r})"
 
     def __reduce__(self) -> Any:
         """Copy a method of `METHODS` as itself: methods are compared by identity."""

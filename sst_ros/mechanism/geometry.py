@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.state import Array as Array
+from sst_ros.state import Explained
 
 KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 """Numbers of a scene that its geometry is made from."""
@@ -32,8 +33,8 @@ def frozen(*arrays: Any) -> tuple[Any, ...]:
     return arrays
 
 
-@dataclass(frozen=True)
-class Geometry:
+@dataclass(frozen=True, repr=False)
+class Geometry(Explained):
     """Base triangle and star; rows belong to legs. All arrays are read-only.
 
     Many geometries are one object whose arrays have one more axis in front.
@@ -46,6 +47,20 @@ class Geometry:
     #: lengths of the base arcs P_k P_k+1, upper ends of the strokes [rad], shape (3,)
     arc: Array
     beta_max: Any  #: largest admissible beta_k [rad]
+
+    def _facts(self) -> dict[str, object]:
+        arcs_deg, alpha_deg = np.degrees(self.arc), np.degrees(self.alpha)
+        facts: dict[str, object] = {}
+        if self.v.ndim > 2:
+            facts["geometries"] = len(self.v)
+            arcs_deg, alpha_deg = arcs_deg[0], alpha_deg[0]
+        else:
+            for leg, vertex in enumerate(self.v.tolist(), start=1):
+                facts[f"P{leg} in {{B}}, unit vector"] = vertex
+        facts["base arcs P1 P2, P2 P3, P3 P1 [deg]"] = arcs_deg.tolist()
+        facts["angles of the star [deg]"] = alpha_deg.tolist()
+        facts["largest beta [deg]"] = float(np.degrees(np.ravel(self.beta_max)[0]))
+        return facts
 
     @classmethod
     def of(cls, scene: Any) -> Geometry:

@@ -25,6 +25,7 @@ from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
 from sst_ros.progress import slices
 from sst_ros.scene.scene import SceneInput, scene_of
+from sst_ros.state import Explained
 
 BLOCK = 20_000  # poses that are measured at a time
 BISECTIONS = 55  # of psi between two samples: to rounding
@@ -37,8 +38,8 @@ REFINED = 6  # nearest changes of sign that are refined
 FOUND = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
 
 
-@dataclass(frozen=True)
-class Measures:
+@dataclass(frozen=True, repr=False)
+class Measures(Explained):
     """What a designer asks of poses, in read-only arrays of the shape (...) of the poses."""
 
     gamma: Array  #: joint angles [rad], shape (..., 3)
@@ -53,6 +54,22 @@ class Measures:
     det_j1: Array  #: 0 at a serial singularity
     det_j2: Array  #: 0 at a parallel singularity
     cond_j: Array  #: condition number of J = -J2^-1 J1, infinite at both
+
+    def _facts(self) -> dict[str, object]:
+        finite = self.cond_j[np.isfinite(self.cond_j)]
+        smallest = {
+            "least way to an end of the stroke [rad]": self.stroke,
+            "least beta, way to the edge [rad]": self.edge,
+            "least way to the largest beta [rad]": self.reach,
+            "least |det J1|, 0 is serially singular": np.abs(self.det_j1),
+            "least |det J2|, 0 is parallelly singular": np.abs(self.det_j2),
+        }
+        facts: dict[str, object] = {"poses": self.cond_j.size}
+        facts["admissible"] = int(np.count_nonzero(self.admissible))
+        for name, values in smallest.items():
+            facts[name] = float(np.min(values, initial=np.inf))
+        facts["largest finite cond J"] = float(np.max(finite, initial=1.0))
+        return facts
 
     @property
     def margin(self) -> Array:
@@ -312,8 +329,8 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
     return SingularPoses("serial", *frozen(*arrays))
 
 
-@dataclass(frozen=True)
-class NearestSingularity:
+@dataclass(frozen=True, repr=False)
+class NearestSingularity(Explained):
     """The singular pose that the least turn of the star reaches, in read-only arrays."""
 
     kind: str  #: "parallel" or "serial"
@@ -321,6 +338,14 @@ class NearestSingularity:
     distance: float  #: angle of the turn [rad]
     axis: Array  #: of the turn, in {E}, shape (3,)
     rotation: Array  #: R of the singular pose, shape (3, 3)
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "kind": self.kind,
+            "leg": "all" if self.leg < 0 else self.leg + 1,
+            "turn of the star to it [rad]": self.distance,
+            "axis of the turn, in {E}": self.axis.tolist(),
+        }
 
 
 @check_kinds

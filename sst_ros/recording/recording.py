@@ -70,7 +70,7 @@ class Signals:
     bag: Bag  #: the recording: its path, topics, damage
     scene: Scene | None  #: what was simulated; None where it was not recorded
     start_ns: int  #: stamp of the start of the run [ns]
-    # : rows of each topic, none if not recorded, by its key
+    #: rows of each topic, none if not recorded, by its key
     topic_series: dict[str, Series]
     idle_states: int  #: number of joint states that are no samples of the run
     foreign_states: int  #: number of joint states of other robots on the same topic

@@ -89,9 +89,9 @@ class Series:
     """Rows of one table: of one topic, or of all topics at the stamps of samples."""
 
     columns: tuple[Column, ...]  #: what the numbers are
-    # : stamps of the messages [ns], shape (n,); 0 where they have none
+    #: stamps of the messages [ns], shape (n,); 0 where they have none
     stamp_ns: Integers
-    # : by the recorder's clock [ns], shape (n,); 0 where it failed
+    #: by the recorder's clock [ns], shape (n,); 0 where it failed
     received_ns: Integers
     values: Array  #: shape (n, number of columns); nan where a message was lost
 

@@ -3,12 +3,15 @@
 
 import dataclasses
 import itertools
+import sys
 
 import numpy as np
 import pytest
 
 from sst_ros import __main__ as cli
-from sst_ros import read_bag
+from sst_ros import identify, read_bag
+from sst_ros.figures import DEGREES
+from sst_ros.identification.parameters import values
 from sst_ros.plot import pictures
 from sst_ros.report.run import evaluate_run
 from sst_ros.scene import scene
@@ -158,3 +161,48 @@ def test_pictures_show_the_truth_and_what_was_measured(
     left = kinetic - kinetic[0] - pictures.work(run).sum(axis=1)
     assert np.abs(left).max() < 1e-9 * kinetic.max()
     assert cli.main(["plot", str(path), "--out", str(tmp_path / "plots")]) == 0
+
+
+@pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
+def test_pictures_of_each_combination_show_truth_and_measurement(
+    written, bags, exact, monkeypatch, kinds
+):
+    path = written(measure(bags, exact, kinds, monkeypatch, truth=True))
+    run = read_bag(path).signals
+    for name in ("joint_angles", "joint_rates", "power", "margins"):
+        figure = pictures.PICTURES[name].make(run, run.scene)
+        assert figure.axes[0].get_lines()
+    dots = pictures.PICTURES["joint_angles"].make(run, run.scene).axes[0].lines[:3]
+    true = DEGREES * run.true_legs("gamma")
+    apart = [
+        np.nanmax(np.abs(dot.get_ydata() - column))
+        for dot, column in zip(dots, true.T, strict=True)
+    ]
+    same = set(kinds) == {"dropped"}
+    assert max(apart) < 1e-9 if same else min(apart) > 1e-3  # deg
+    assert np.isfinite(true).all()
+
+
+@pytest.fixture(scope="module")
+def longer(bags):
+    return bags.simulated(scene.load("example2_heavy"), 1.2)
+
+
+@pytest.mark.parametrize("truth", [True, False], ids=["with the truth", "without"])
+@pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
+def test_each_combination_is_identified(read, bags, longer, monkeypatch, kinds, truth):
+    """By what was measured: the delay, and inertias within five deviations."""
+    monkeypatch.setattr(sys.modules[__name__], "NOISE", 2e-5)
+    monkeypatch.setattr(sys.modules[__name__], "COUNT", 2.0 * np.pi / 65536)
+    run = read(measure(bags, longer, kinds, monkeypatch, truth=truth))
+    found = identify(run, parameters=["star.inertia"])
+    if "delayed" in kinds:
+        assert found.delay == pytest.approx(DELAY * 2e-3, abs=4e-4)
+    else:
+        assert abs(found.delay) < 4e-4
+    true = found.base.transform @ values(run.scene, found.names)
+    size = np.abs(true).max()
+    # Without noise the deviations are those of nothing: what is left is interpolation.
+    allowed = 5.0 * found.deviation + 1e-4 * size
+    assert np.all(np.abs(found.estimate - true) < allowed)
+    assert found.deviation.max() < 0.1 * size
