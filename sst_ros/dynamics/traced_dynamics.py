@@ -231,7 +231,8 @@ class ODE:
         flat = np.array(self.linearised(t, *y, *d)[2 * size :])
         if not np.isfinite(flat).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return flat.reshape(size, size).T
+        columns: Array = flat.reshape(size, size)
+        return columns.T
 
     @cached_property
     def slope(self) -> Function:
