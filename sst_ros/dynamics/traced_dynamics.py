@@ -232,7 +232,7 @@ class ODE:
         if not np.isfinite(flat).all():
             raise ArithmeticError("the Jacobian is not finite")
         columns: Array = flat.reshape(size, size)
-        return columns.T
+        return np.asarray(columns.T)
 
     @cached_property
     def slope(self) -> Function:

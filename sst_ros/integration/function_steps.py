@@ -144,7 +144,7 @@ class FunctionSteps:
         columns: Array = np.array(self._linearise(t, y, drive).columns, dtype=float)
         if not np.isfinite(columns).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return columns.T
+        return np.asarray(columns.T)
 
     def interpolate(self, step: Step) -> Polynomial | None:
         """Return the states inside a step, through states and slopes at its quarters.
