@@ -9,12 +9,20 @@ from collections.abc import Iterator
 from typing import Any
 
 from sst_ros.dynamics import traced_dynamics
+from sst_ros.integration.function_steps import (
+    compile_by_stage,
+    compile_rows_by_stage,
+    compile_stages,
+)
 from sst_ros.integration.method_steps import steps_of
 
 _CACHED: tuple[Any, ...] = (
     traced_dynamics.recent,
     traced_dynamics.recent_ode,
     steps_of,
+    compile_by_stage,
+    compile_rows_by_stage,
+    compile_stages,
 )
 """What keeps functions that are machine code or not."""
 

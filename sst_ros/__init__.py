@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 
+from sst_ros import removed
 from sst_ros.version import VERSION
 
 # typing takes long to import, and a node handles signals only after this
@@ -103,6 +104,8 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
     __all__ = ["__version__", *sorted(_EXPORTS)]
 
     def __getattr__(name: str) -> object:
+        if name in removed.FUNCTIONS:
+            return _refuse_function(name)
         if name not in _EXPORTS:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module, word = _EXPORTS[name]
@@ -110,6 +113,15 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
         value: object = getattr(found, word.rpartition(":")[2])
         globals()[name] = value
         return value
+
+    def _refuse_function(name: str) -> object:
+        """Return a function that refuses to be called, and says what to use instead."""
+
+        def refuse(*_: object, **__: object) -> None:
+            errors = importlib.import_module("sst_ros.errors")
+            raise errors.refusal("sst_ros", name, "called", removed.FUNCTIONS[name])
+
+        return refuse
 
     def __dir__() -> list[str]:
         return __all__

@@ -19,7 +19,7 @@ import sst_ros
 
 PACKAGE = Path(sst_ros.__file__).parent
 FLOORS = (
-    {"state", "version"},
+    {"removed", "state", "version"},
     {"errors", "figures", "files", "progress"},
     {"scene"},
     {"mechanism", "programs"},

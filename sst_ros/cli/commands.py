@@ -20,7 +20,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sst_ros.errors import SstError, explanation, printable, require, suggestion
+from sst_ros import removed
+from sst_ros.errors import (
+    SstError,
+    explanation,
+    printable,
+    refusal,
+    require,
+    suggestion,
+)
 from sst_ros.files import require_free
 from sst_ros.version import VERSION
 
@@ -556,6 +564,9 @@ def _run(words: list[str]) -> int:
         importlib.import_module("argcomplete").autocomplete(parser())
     if words and words[0] in NODES:
         return int(function("nodes.process:run")(words))
+    for word in words[:1]:
+        if word in removed.COMMANDS:
+            raise refusal("command", word, "given", removed.COMMANDS[word])
     options, unknown = parser().parse_known_args(words)
     if unknown:
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")

@@ -15,7 +15,7 @@ I, section I.14).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,14 +24,25 @@ import numpy as np
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import GRAZING, limits_of
-from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.dynamics.variational import VariationalEquations, trace_derivatives
+from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
+from sst_ros.dynamics.variational import trace_derivatives
 from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
+from sst_ros.integration.held_flow import HeldFlow, follow_held_torque
+from sst_ros.integration.method_steps import steps_of
+from sst_ros.integration.methods import DOP853
+from sst_ros.integration.point import Drive
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
-from sst_ros.scene.torque_profile import ConstantTorque
-from sst_ros.state import ZERO, Array, Explained, ReadOnly, State, finite_vector
+from sst_ros.state import (
+    ZERO,
+    Array,
+    Explained,
+    ReadOnly,
+    State,
+    Vector3,
+    finite_vector,
+)
 
 COORDINATES = {
     "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
@@ -165,60 +176,78 @@ def linearize(
     by_gamma = coordinates == "gamma"
     if by_gamma:
         InverseDynamics(given).torque(quaternion, rate, ZERO)  # refuses singularities
+    dynamics = Dynamics.of(given)
+    by_star = None if by_gamma else trace_derivatives(given, (), by_torque=True)
     now = np.array((*quaternion, *rate, *(lagged if given.lags else ())))
     try:
-        _, from_x, a, b, slope = _differentiate(given, now, acting, by_gamma)
+        _, from_x, a, b, slope = _differentiate(dynamics, by_star, now, acting)
     except (ArithmeticError, ValueError):
         raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
     at_equilibrium = np.abs(slope).max() <= _REST * np.abs(a).max()
     if dt is not None:
         dt = float(dt)
-        equations = VariationalEquations(
-            given, (), ConstantTorque(acting), by_torque=True
-        )
-        begin = np.hstack([from_x, np.zeros((len(now), 3))])
-        run = equations.integrate(
-            now, begin, np.linspace(0.0, dt, _CHECKS + 1), most=_MOST
-        )
+        with np.errstate(all="ignore"):  # of steps that are too long
+            flow = follow_held_torque(
+                recent_ode(dynamics),
+                now.tolist(),
+                acting,
+                dt,
+                _MOST,
+                elastic=given.stroke.at_end == "elastic",
+            )
         lasts = (
             "must be a period for which the motion lasts: it meets a singularity or is"
             " too long"
         )
-        if run is not None:
-            angles = [Dynamics.of(given).joints(*y[:7]) for y in run[0]]
-            limits = limits_of(given, Geometry.of(given))
-            passed = (
-                one
-                for one in limits
-                if min(map(one.distance, angles)) < -GRAZING <= one.distance(angles[0])
-            )
-            lasts = next(
-                (f"must end before a limit: {one.reason}" for one in passed), ""
-            )
+        if flow is not None:
+            lasts = _find_limit(given, dynamics, flow, acting, dt)
         refuse_unless("linearize", ("dt", dt, not lasts, lasts))
-        assert run is not None
-        end, flow = (part[-1] for part in run)
-        found = _differentiate(given, end, acting, by_gamma)[0] @ flow
-        a, b = found[:, :-3], found[:, -3:]
+        assert flow is not None
+        to_x = _differentiate(dynamics, by_star, flow.states[-1], acting)[0]
+        a, b = to_x @ flow.by_start @ from_x, to_x @ flow.by_torque
     lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []
     states = (*COORDINATES[coordinates], *lag)
     return LinearModel(a, b, states, dt, bool(at_equilibrium))
 
 
+def _find_limit(
+    scene: Scene, dynamics: Dynamics, flow: HeldFlow, torque: Vector3, length: float
+) -> str:
+    """Say which limit a motion passes that it began inside of, "" if none."""
+    steps = steps_of(recent_ode(dynamics, work=True), DOP853)
+    drive = Drive((*torque, *(0.0 for _ in dynamics.drive[3:])))
+    states = flow.states.tolist()
+    angles = [dynamics.joints(*y[:7]) for y in (states[0], states[-1])]
+    for time in np.linspace(0.0, length, _CHECKS + 1)[1:-1].tolist():
+        last = int(np.searchsorted(flow.times, time, side="right")) - 1
+        x = time - float(flow.times[last])
+        y = steps.single(0.0, x, (*states[last], 0.0), drive)
+        angles.append(dynamics.joints(*y[:7]))
+    for limit in limits_of(scene, Geometry.of(scene)):
+        nearest = min(map(limit.distance, angles))
+        if nearest < -GRAZING <= limit.distance(angles[0]):
+            return f"must end before a limit: {limit.reason}"
+    return ""
+
+
 def _differentiate(
-    scene: Scene, y: Array, torque: Sequence[float], by_gamma: bool
+    dynamics: Dynamics,
+    by_star: Callable[..., Sequence[float]] | None,
+    y: Array,
+    torque: Sequence[float],
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return D = dx/dy, R of the state's own changes (D R = 1), A, B, and the slope.
 
     A and B are those of the continuous model; the slope is the derivative of x, or of y
     where x are deviations. Shapes are (n, n + 1), (n + 1, n), (n, n), (n, 3), (n,).
+    `by_star` gives the slope of y and its derivatives for coordinates of the star; None
+    stands for those of gamma.
     """
     size, q = len(y), y[:4]
     turn = np.array([quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]).T
     from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)
     from_star[:4, :3], to_star[:3, :4] = turn, 4.0 * turn.T / (q @ q)
-    if by_gamma:
-        dynamics = Dynamics.of(scene)
+    if by_star is None:
         drive = (*torque, *(0.0 for _ in dynamics.drive[3:]))
         found = np.array(dynamics.actuator_motion(*y.tolist(), *drive)).reshape(
             size + 4, -1
@@ -228,8 +257,9 @@ def _differentiate(
         from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
         a = x_dot[:, :size] @ from_gamma
         return x[:, :size], from_gamma, a, x_dot[:, size:], slope
-    found = np.array(trace_derivatives(scene, (), by_torque=True)(*y.tolist(), *torque))
-    rows = found.reshape(size + 4, size)
+    rows = np.array(by_star(*y.tolist(), *torque)).reshape(size + 4, size)
+    if not np.isfinite(rows).all():
+        raise ArithmeticError("the derivatives are not finite")
     slopes = to_star @ rows[1:].T
     a = slopes[:, :size] @ from_star
     a[:3, :3] = np.cross(y[4:7], np.eye(3))  # in the turning frame d' = dW - W x d

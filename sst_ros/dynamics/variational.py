@@ -41,9 +41,9 @@ from sst_ros.mechanism.generic_math import (
     triple,
 )
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.programs.compiled import compile_functions
 from sst_ros.programs.expression import (
     compile_for_arrays,
-    compile_program,
     mark_present,
     trace,
 )
@@ -379,7 +379,8 @@ def trace_derivatives(
         return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
 
     by = (*state, *(TORQUE if by_torque else ()), *varied)
-    return compile_program(trace(derivative, (*state, *TORQUE, *varied), by))
+    program = trace(derivative, (*state, *TORQUE, *varied), by)
+    return compile_functions({"derivatives": program}, ("derivatives",))["derivatives"]
 
 
 @lru_cache(maxsize=32)

@@ -101,7 +101,7 @@ class FunctionSteps:
         self._size = len(ode.state)
 
     @cached_property
-    def _slope(self) -> Function:
+    def _slope(self) -> Callable[..., Sequence[float]]:
         """The derivative under torques that are numbers."""
         if self._derivative is not None:
             return without_errors(self._derivative, self._size)
@@ -137,14 +137,14 @@ class FunctionSteps:
     def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
         """See `MethodSteps.slope`."""
         torque = self._torque.of_drive(drive, t, y)
-        return self._slope(t, *y, *torque, *drive.numbers[3:])
+        return [*self._slope(t, *y, *torque, *drive.numbers[3:])]
 
     def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
         """See `MethodSteps.jacobian`."""
-        columns: Array = np.array(self._linearise(t, y, drive).columns)
+        columns: Array = np.array(self._linearise(t, y, drive).columns, dtype=float)
         if not np.isfinite(columns).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return columns.T
+        return np.asarray(columns.T)
 
     def interpolate(self, step: Step) -> Polynomial | None:
         """Return the states inside a step, through states and slopes at its quarters.
@@ -342,7 +342,7 @@ def fit_of(method: Tableau) -> Fit:
         nearest = min(left, key=lambda stage: abs(shares[stage] - target))
         fitted.append(nearest)
         left.remove(nearest)
-    solution = np.linalg.inv(_basis(shares[fitted], size))
+    solution = np.asarray(np.linalg.inv(_basis(shares[fitted], size)), dtype=float)
     return Fit(fitted, left, solution, _basis(shares[left], size))
 
 
@@ -505,11 +505,11 @@ def trace_stages(
     def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
         y, z, rest = inputs[:size], inputs[size : 2 * size], inputs[2 * size :]
         half = len(rest) // 2
-        ends = [
+        first, second = (
             NewState([*end[:size]], [*end[size:]] or None)
             for end in (rest[:half], rest[half:])
-        ]
-        pair = compare(h, y, z, *ends, lagged)
+        )
+        pair = compare(h, y, z, first, second, lagged)
         angles = joints(*pair.y[:7])
         total = pair.total + add_up(angles)
         return (*pair.y, *pair.z, *angles, pair.size, total)

@@ -23,6 +23,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_ros.dynamics.model import (
     Limit,
@@ -394,7 +395,7 @@ class Stepper:
             and h * bound_of_eigenvalues(jacobian[:-1, :-1]) <= _STIFF
         ):
             return at
-        eigenvalues = np.linalg.eigvals(jacobian)
+        eigenvalues = np.asarray(np.linalg.eigvals(jacobian), dtype=complex)
         method, reason = better_method(
             at.method, self._tolerance, h * eigenvalues, only_stiff=early
         )
@@ -470,7 +471,7 @@ def methods_of(name: str) -> tuple[Method, ...]:
 
 
 def better_method(
-    method: Method, tolerance: float, steps: Array, *, only_stiff: bool
+    method: Method, tolerance: float, steps: NDArray[Any], *, only_stiff: bool
 ) -> tuple[Method, str]:
     """Choose the method that would take longer steps, the one in use if none is, and state why.
 

@@ -8,12 +8,15 @@ then.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_ros import removed
+from sst_ros.errors import refusal
 from sst_ros.programs.expression import FUNCTIONS, Program, compile_program
 from sst_ros.programs.llvm import (
     LANES,
@@ -37,6 +40,7 @@ def compile_functions(
         names: of those that are wanted.
 
     """
+    _refuse_variables()
     if llvmlite_version() is not None:
         module = write_module(programs)
         return {name: module.function(name) for name in names}
@@ -46,6 +50,13 @@ def compile_functions(
         known[name] = compile_program(programs[name], {**FUNCTIONS, **known})
         functions[name] = without_errors(known[name], len(programs[name].outputs))
     return {name: functions[name] for name in names}
+
+
+def _refuse_variables() -> None:
+    """Refuse variables by which earlier versions were told how to compile."""
+    for name, advice in removed.VARIABLES.items():
+        if name in os.environ:
+            raise refusal("environment", name, os.environ[name], advice)
 
 
 def compile_rows(programs: Mapping[str, Program], name: str) -> RowsFunction:

@@ -164,7 +164,7 @@ class RowFunction:
             outputs: where the results go, shape (outputs, n), contiguous.
 
         """
-        self._check_rows(inputs, outputs)
+        self._check_rows([*inputs], [*outputs])
         count = outputs.shape[1]
         if count % LANES:
             raise ValueError(f"{count} columns: must be a multiple of {LANES}")

@@ -19,6 +19,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
+from sst_ros import removed
 from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.dynamics.reactions import LINK_JOINTS
 from sst_ros.errors import Check, refuse_errors, refuse_unless, suggestion
@@ -515,6 +516,9 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
 def unknown_name(name: str, known: Iterable[str]) -> Check:
     """Return the failed check of a name that is no parameter or option."""
     names = [*known]
+    advice = removed.ARGUMENTS.get(name.lstrip("-"))
+    if advice is not None:
+        return "parameter", name, False, advice
     near = suggestion(name, names) or f"; known are {', '.join(names)}"
     behind = ", unless behind --ros-args" if name.startswith("-") else ""
     return (

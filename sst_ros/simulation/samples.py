@@ -36,7 +36,7 @@ class _Run(NamedTuple):
     first: int  # number of the first sample
     step: Step
     begin: float  # time at which the step begins [s]
-    count: int
+    number: int  # of samples
 
 
 class Samples:
@@ -107,7 +107,7 @@ class Samples:
             by_steps.setdefault(id(run.step.steps), []).append(run)
         for runs in by_steps.values():
             taken = [run.step for run in runs]
-            counts = [run.count for run in runs]
+            counts = [run.number for run in runs]
             before = np.cumsum([0, *counts[:-1]])
             offsets = np.array([run.first for run in runs]) - before
             numbers = np.arange(sum(counts)) + offsets.repeat(counts)

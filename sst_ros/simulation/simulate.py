@@ -11,6 +11,7 @@ from typing import Any, NoReturn, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sst_ros import removed
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.variational import Sensitivities
 from sst_ros.errors import check_kinds, read_numbers, refusal, refuse_unless
@@ -62,7 +63,6 @@ answer.
 """
 
 _METHODS = "must be one of " + ", ".join(INTEGRATORS)
-_METHOD = {"gauss": f"has left: auto and dop853 are as accurate and faster; {_METHODS}"}
 
 TorqueInput: TypeAlias = (
     Sequence[float]
@@ -160,7 +160,7 @@ def simulate(
     shortest = f"must be > 0 s, at least {least:.3g} s for this duration"
     refuse_unless(
         "simulate",
-        ("method", method, method in INTEGRATORS, _METHOD.get(str(method), _METHODS)),
+        ("method", method, method in INTEGRATORS, _allow_methods(method)),
         (
             "tolerance",
             tolerance,
@@ -267,6 +267,12 @@ def _trajectory(
 
 def _refuse(name: str, value: object, allowed: str) -> NoReturn:
     raise refusal("simulate", name, value, allowed) from None
+
+
+def _allow_methods(method: object) -> str:
+    """Say which methods there are, and what to use instead of one that has left."""
+    advice = removed.METHODS.get(str(method))
+    return _METHODS if advice is None else f"{advice}; {_METHODS}"
 
 
 def _nanoseconds(name: str, value: float) -> int:

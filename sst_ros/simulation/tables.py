@@ -106,5 +106,5 @@ def compute_checksum(
     """CRC-32 of texts and of the bits of columns."""
     checksum = zlib.crc32("".join(texts.values()).encode())
     for column in columns.values():
-        checksum = zlib.crc32(np.ascontiguousarray(column), checksum)
+        checksum = zlib.crc32(np.ascontiguousarray(column).data, checksum)
     return f"{checksum:08x}"

@@ -48,13 +48,6 @@ BRIEF = dataclasses.replace(SHORT, duration=0.1)
 EXACT = np.finfo(np.longdouble).eps < 1e-18
 
 
-@pytest.fixture(scope="module", autouse=True)
-def plain_python():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_NUMBA", "0")
-        yield
-
-
 def study_quickly(studied, longest_s):
     """Study a scene, with no finer settings after a run that took longer."""
     with pytest.MonkeyPatch.context() as patch:

@@ -29,7 +29,6 @@ for module in ("distributed", "pandas", "pyarrow"):
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.timeout(300),
-    pytest.mark.usefixtures("cache"),
 ]
 LIMIT_S = 60
 VARY = {
@@ -56,14 +55,6 @@ NOTED = BEFORE_A_CHUNK.format(
     "open('noted', 'a').write(f'{index}\\n'); time.sleep(0.3)"
 )
 SLOW = BEFORE_A_CHUNK.format("time.sleep(0.1)")
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    """A folder of compiled code apart from the user's, as that of another machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SST_ROS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture(scope="module")
