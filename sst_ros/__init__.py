@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import importlib
 
-from sst_ros import removed
+from sst_ros.removed import REMOVED_FUNCTIONS
 from sst_ros.version import VERSION
 
 # typing takes long to import, and a node handles signals only after this
@@ -104,7 +104,7 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
     __all__ = ["__version__", *sorted(_EXPORTS)]
 
     def __getattr__(name: str) -> object:
-        if name in removed.FUNCTIONS:
+        if name in REMOVED_FUNCTIONS:
             return _refuse_function(name)
         if name not in _EXPORTS:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -119,7 +119,7 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
 
         def refuse(*_: object, **__: object) -> None:
             errors = importlib.import_module("sst_ros.errors")
-            raise errors.refusal("sst_ros", name, "called", removed.FUNCTIONS[name])
+            raise errors.refusal("sst_ros", name, "called", REMOVED_FUNCTIONS[name])
 
         return refuse
 

@@ -25,7 +25,7 @@ from typing import Any, TypeAlias, TypeVar, Union, cast, get_args, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros import removed
+from sst_ros.removed import REMOVED_ARGUMENTS
 from sst_ros.state import Array, NotNumbers, TimesLike, real_numbers
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
@@ -226,8 +226,8 @@ def check_kinds(function: F, *, late: bool = False) -> F:
         }
 
     def find_fault(name: str, value: Any) -> str:
-        if name not in names and name in removed.ARGUMENTS:
-            return removed.ARGUMENTS[name]
+        if name not in names and name in REMOVED_ARGUMENTS:
+            return REMOVED_ARGUMENTS[name]
         kind, optional = kinds().get(name, (None, False))
         if kind is None or (optional and value is None):
             return ""

@@ -20,7 +20,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sst_ros import removed
 from sst_ros.errors import (
     SstError,
     explanation,
@@ -30,6 +29,7 @@ from sst_ros.errors import (
     suggestion,
 )
 from sst_ros.files import require_free
+from sst_ros.removed import REMOVED_COMMANDS
 from sst_ros.version import VERSION
 
 PROGRAM = "sst-ros"
@@ -565,8 +565,8 @@ def _run(words: list[str]) -> int:
     if words and words[0] in NODES:
         return int(function("nodes.process:run")(words))
     for word in words[:1]:
-        if word in removed.COMMANDS:
-            raise refusal("command", word, "given", removed.COMMANDS[word])
+        if word in REMOVED_COMMANDS:
+            raise refusal("command", word, "given", REMOVED_COMMANDS[word])
     options, unknown = parser().parse_known_args(words)
     if unknown:
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")

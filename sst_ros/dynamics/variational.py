@@ -364,7 +364,7 @@ def _open_model(scene: Scene, symbols: dict[str, Any]) -> Any:
 @lru_cache(maxsize=32)
 def trace_derivatives(
     scene: Scene, names: tuple[str, ...], by_torque: bool
-) -> Callable[..., tuple[float, ...]]:
+) -> Callable[..., list[float]]:
     """Return y', then its derivatives by each component of y, torque if needed, and parameter."""
     state = Dynamics.of(scene).state
     size, varied = len(state), tuple(f"p{i}" for i in range(len(names)))

@@ -15,7 +15,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_ros import removed
 from sst_ros.errors import refusal
 from sst_ros.programs.expression import FUNCTIONS, Program, compile_program
 from sst_ros.programs.llvm import (
@@ -25,6 +24,7 @@ from sst_ros.programs.llvm import (
     llvmlite_version,
     write_module,
 )
+from sst_ros.removed import REMOVED_VARIABLES
 
 Array: TypeAlias = NDArray[np.float64]
 RowsFunction: TypeAlias = Callable[[Array], Array]
@@ -54,7 +54,7 @@ def compile_functions(
 
 def _refuse_variables() -> None:
     """Refuse variables by which earlier versions were told how to compile."""
-    for name, advice in removed.VARIABLES.items():
+    for name, advice in REMOVED_VARIABLES.items():
         if name in os.environ:
             raise refusal("environment", name, os.environ[name], advice)
 

@@ -19,10 +19,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sst_ros import removed
 from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.dynamics.reactions import LINK_JOINTS
 from sst_ros.errors import Check, refuse_errors, refuse_unless, suggestion
+from sst_ros.removed import REMOVED_ARGUMENTS
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
 from sst_ros.scene.schema import TURN, Rules, Section, Spec, accept, choice, entry
@@ -516,7 +516,7 @@ def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
 def unknown_name(name: str, known: Iterable[str]) -> Check:
     """Return the failed check of a name that is no parameter or option."""
     names = [*known]
-    advice = removed.ARGUMENTS.get(name.lstrip("-"))
+    advice = REMOVED_ARGUMENTS.get(name.lstrip("-"))
     if advice is not None:
         return "parameter", name, False, advice
     near = suggestion(name, names) or f"; known are {', '.join(names)}"

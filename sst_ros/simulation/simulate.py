@@ -11,13 +11,13 @@ from typing import Any, NoReturn, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sst_ros import removed
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.variational import Sensitivities
 from sst_ros.errors import check_kinds, read_numbers, refusal, refuse_unless
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET, EvaluationBudget
 from sst_ros.mechanism.geometry import Geometry
+from sst_ros.removed import REMOVED_METHODS
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import (
@@ -271,7 +271,7 @@ def _refuse(name: str, value: object, allowed: str) -> NoReturn:
 
 def _allow_methods(method: object) -> str:
     """Say which methods there are, and what to use instead of one that has left."""
-    advice = removed.METHODS.get(str(method))
+    advice = REMOVED_METHODS.get(str(method))
     return _METHODS if advice is None else f"{advice}; {_METHODS}"
 
 
