@@ -21,7 +21,7 @@ REMOVED_METHODS = dict.fromkeys(
 REMOVED_COMMANDS = {
     "compile": "has left: nothing has to be compiled in advance, it takes tenths of a "
     "second in each process",
-    "--compiled": ARGUMENTS["compiled"],
+    "--compiled": REMOVED_ARGUMENTS["compiled"],
 }
 """Words of the command line."""
 

@@ -32,7 +32,7 @@ def test_prepare_says_what_to_call():
 
 def test_arguments_say_what_to_do_instead():
     line = refuse(Simulation, "example2", compiled=True)
-    assert line == f"simulation: compiled = True: {removed.ARGUMENTS['compiled']}"
+    assert line == f"simulation: compiled = True: {removed.REMOVED_ARGUMENTS['compiled']}"
     with pytest.raises(TypeError, match="unexpected keyword argument 'compile'"):
         Simulation("example2", compile=True)
 
@@ -48,16 +48,16 @@ def test_methods_say_which_are_as_good(name):
     [["--compiled"], ["--ros-args", "-p", "compiled:=true"]],
 )
 def test_parameters_of_nodes_say_what_to_do_instead(words):
-    assert removed.ARGUMENTS["compiled"] in refuse(ros_arguments, "simulator", words)
+    assert removed.REMOVED_ARGUMENTS["compiled"] in refuse(ros_arguments, "simulator", words)
 
 
 def test_commands_say_what_to_do_instead(capsys):
     assert main(["compile", "example2"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert removed.COMMANDS["compile"] in line
+    assert removed.REMOVED_COMMANDS["compile"] in line
 
 
-@pytest.mark.parametrize("name", removed.VARIABLES)
+@pytest.mark.parametrize("name", removed.REMOVED_VARIABLES)
 def test_variables_are_refused_where_code_is_compiled(name):
     command = [sys.executable, "-m", "sst_ros", "simulate", "example2"]
     result = subprocess.run(
@@ -69,4 +69,4 @@ def test_variables_are_refused_where_code_is_compiled(name):
     )
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
-    assert f"environment: {name} = '0': {removed.VARIABLES[name]}" in line
+    assert f"environment: {name} = '0': {removed.REMOVED_VARIABLES[name]}" in line
