@@ -204,7 +204,7 @@ class RunDiagnostics:
         return Status(OK, text, news)
 
     def _news_of(self, values: dict[str, Any], last_refusal: str) -> list[str]:
-        """Say which counts have grown since the last status that nobody wants to grow."""
+        """Say which counts of faults have grown since the last status."""
         words = {
             "commands_dropped": f"command dropped: {last_refusal}",
             "commands_clamped": "commands clamped to the scene's torque limit",
