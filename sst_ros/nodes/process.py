@@ -51,6 +51,8 @@ _PROFILES = {
 _POLL_S = 0.1
 _CALLBACK_S = 1.0
 """Wait for a callback in progress: a service that waits for the run ends once that is closed."""
+_ACKNOWLEDGE_AT_END_S = 6.0
+"""Longest wait for subscribers of a node whose work is done, within _CLEAN_UP_S."""
 _ACKNOWLEDGE_S = 1.2
 """A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
 _CLEAN_UP_S = 10.0  # longer than any clean-up of the middleware, also on a busy machine
@@ -491,15 +493,30 @@ def spin(worker: Worker[Any]) -> None:
             worker.close()
         finally:
             with _bound_time():
-                # What was published is received first, if that takes no longer than
-                # this.
-                deadline = time.monotonic() + _ACKNOWLEDGE_S
-                for publisher in node.publishers:
-                    left = max(0.0, deadline - time.monotonic())
-                    publisher.wait_for_all_acked(Duration(seconds=left))
+                _wait_for_subscribers(node)
                 callbacks.join(_CALLBACK_S)
                 executor.shutdown()
                 node.destroy_node()
+
+
+def _wait_for_subscribers(node: Node) -> None:
+    """Wait until what was published is received; say where that takes too long.
+
+    After a signal a node ends within 2 s. Where its work is done it waits longer: a
+    recorder on a busy machine would lose the end of the run.
+    """
+    longest_s = _ACKNOWLEDGE_S if signals.came else _ACKNOWLEDGE_AT_END_S
+    deadline = time.monotonic() + longest_s
+    unheard = []
+    for publisher in node.publishers:
+        left = max(0.0, deadline - time.monotonic())
+        if not publisher.wait_for_all_acked(Duration(seconds=left)):
+            unheard.append(publisher.topic_name)
+    if unheard:
+        topics_named = ", ".join(unheard)
+        node.get_logger().warning(
+            f"subscribers have not received all of {topics_named} within {longest_s:g} s"
+        )
 
 
 def configure_middleware() -> None:

@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -24,6 +25,7 @@ MS = 1_000_000
 SPEAKER = """
 import time
 from pathlib import Path
+from types import SimpleNamespace
 import rclpy
 from rclpy.duration import Duration
 from std_msgs.msg import String
@@ -273,3 +275,27 @@ def test_a_node_ends_though_its_middleware_hangs(domain):
     ended = python(HANGS, status=1)
     assert time.monotonic() - began < 50.0  # it would wait for 60 s
     assert ended.stdout == "closed\n" and "in destroy_node" in ended.stderr
+
+
+@pytest.mark.parametrize(("came", "longest_s"), [({2}, 1.2), (set(), 6.0)])
+def test_a_node_whose_work_is_done_waits_longer_for_its_subscribers(
+    monkeypatch, came, longest_s
+):
+    """One that got a signal ends within 2 s; both say what was not received."""
+    monkeypatch.setattr(signals, "came", came)
+    waited, warnings = [], []
+
+    def acknowledge(duration):
+        waited.append(duration.nanoseconds)
+        return False
+
+    silent = SimpleNamespace(topic_name="/states", wait_for_all_acked=acknowledge)
+    heard = SimpleNamespace(topic_name="/phase", wait_for_all_acked=lambda _: True)
+    log = SimpleNamespace(warning=warnings.append)
+    process._wait_for_subscribers(
+        SimpleNamespace(publishers=[silent, heard], get_logger=lambda: log)
+    )
+    assert waited[0] == pytest.approx(1e9 * longest_s, rel=0.05)
+    assert warnings == [
+        f"subscribers have not received all of /states within {longest_s:g} s"
+    ]
