@@ -25,7 +25,7 @@ from benchmark.measure import describe_machine, join_line, read_options
 from sst_ros import load_scene, sweep
 from sst_ros.integration.many_runs import run_many
 from sst_ros.sweeps.sweep import PreparedSweep, read_sweep, run_chunk
-from sst_ros.sweeps.sweep_study import CHUNK, SweepStudy
+from sst_ros.sweeps.sweep_study import CHUNK_ROWS, SweepStudy
 
 BODIES = (
     "star",
@@ -110,7 +110,7 @@ def _ratios(steps: int) -> dict[str, float]:
 
     Also in processor time, which a busy machine changes less.
     """
-    ready = PreparedSweep(study_of(CHUNKS * CHUNK), steps)
+    ready = PreparedSweep(study_of(CHUNKS * CHUNK_ROWS), steps)
     study = ready.study
     batch, (y, given, code) = _arrays(ready)
     times = []

@@ -19,13 +19,13 @@ from sst_ros.scene.scene import load
 
 EXAMPLES = ("example1", "example2")
 FOLLOWED = "reach"
-MODES = ("feedforward", "feedforward_pd")
+DEMO_MODES = ("feedforward", "feedforward_pd")
 """The first is the paper's double check: nothing but the torques of the inverse dynamics."""
 
 _HOLD_S = 0.3
-_RATE = 500
+_DEMO_RATE = 500
 _READY_S = 60.0  # a first start compiles, on a busy machine for half a minute
-_END_S = 30.0
+_DEMO_END_S = 30.0
 
 
 def record(name: str, folder: Path) -> Path:
@@ -37,7 +37,7 @@ def record(name: str, folder: Path) -> Path:
     """
     seconds = load(name).duration or 1.0
     run = {"scene": name, "duration": seconds}
-    return _record(folder, run, "torque_player", {"scene": name}, seconds + _END_S)
+    return _record(folder, run, "torque_player", {"scene": name}, seconds + _DEMO_END_S)
 
 
 def follow(name: str, folder: Path, mode: str, *, model: str | None = None) -> Path:
@@ -48,16 +48,23 @@ def follow(name: str, folder: Path, mode: str, *, model: str | None = None) -> P
     refused before the folder is touched.
     """
     motion = reference_motion(load(model or name))
-    seconds = math.ceil((motion.duration + _HOLD_S) * _RATE) / _RATE
+    seconds = math.ceil((motion.duration + _HOLD_S) * _DEMO_RATE) / _DEMO_RATE
     run = {
         "scene": name,
         "duration": seconds,
-        "publish_rate": _RATE,
+        "publish_rate": _DEMO_RATE,
         "real_time_factor": 0.0,
     }
-    followed = {"scene": model or name, "mode": mode, "hold": _HOLD_S, "rate": _RATE}
+    followed = {
+        "scene": model or name,
+        "mode": mode,
+        "hold": _HOLD_S,
+        "rate": _DEMO_RATE,
+    }
     followed |= {"feedforward_at": "middle", "wait_for_recorder": True}
-    return _record(folder, run, "inverse_dynamics", followed, 20.0 * seconds + _END_S)
+    return _record(
+        folder, run, "inverse_dynamics", followed, 20.0 * seconds + _DEMO_END_S
+    )
 
 
 def _record(
@@ -75,8 +82,8 @@ def _record(
     if bag.exists():
         shutil.rmtree(bag)
     folder.mkdir(parents=True, exist_ok=True)
-    with _node("recorder", _END_S, output=str(bag), timeout=_READY_S) as recorder:
-        with _node("simulator", _END_S, sync="lockstep", **run):
+    with _node("recorder", _DEMO_END_S, output=str(bag), timeout=_READY_S) as recorder:
+        with _node("simulator", _DEMO_END_S, sync="lockstep", **run):
             # One line when it receives all topics, none where it gives up, or is stuck.
             said = recorder.stdout
             if not (

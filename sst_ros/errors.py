@@ -29,7 +29,10 @@ from sst_ros.removed import REMOVED_ARGUMENTS
 from sst_ros.state import Array, NotNumbers, TimesLike, real_numbers
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
-SHOWN, LONGEST_PATH = 80, 4096  # characters of a value in a message, and of a path
+SHOWN_CHARACTERS, LONGEST_PATH = (
+    80,
+    4096,
+)  # characters of a value in a message, and of a path
 
 
 class SstError(Exception):
@@ -51,14 +54,17 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
-        text, half = f"{type(self.value).__name__} without a text", SHOWN // 2 - 2
+        text, half = (
+            f"{type(self.value).__name__} without a text",
+            SHOWN_CHARACTERS // 2 - 2,
+        )
         if isinstance(self.value, int) and self.value:  # of 5,000 digits has no text
             text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
         with contextlib.suppress(Exception):
             text = repr(self.value)
         # is whole: it can be copied
         path = isinstance(self.value, str) and os.sep in text
-        if len(text) > (LONGEST_PATH if path else SHOWN):
+        if len(text) > (LONGEST_PATH if path else SHOWN_CHARACTERS):
             text = f"{text[:half]}...{text[-half:]}"
         return f"{where}{self.key or 'document'} = {text}: {self.allowed}"
 
@@ -142,7 +148,7 @@ def _all_text(values: Iterable[Any]) -> bool:
     return all(isinstance(value, str) for value in values)
 
 
-_KINDS = {
+_ARGUMENT_KINDS = {
     _key(hint): kind
     for hint, kind in (
         (
@@ -183,7 +189,7 @@ _KINDS = {
 
 def _kind_of(hint: Any) -> Kind | None:
     """Return the kind that an annotation asks for; None if the function itself checks."""
-    kind = _KINDS.get(_key(hint))
+    kind = _ARGUMENT_KINDS.get(_key(hint))
     if kind is not None:
         return kind
     parts = list(_parts(hint))
@@ -210,7 +216,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 def check_kinds(function: F, *, late: bool = False) -> F:
     """Refuse arguments of another kind than the annotations of a function say, by InputError.
 
-    Annotations are those of `_KINDS`, and classes, with or without `| None`. What else
+    Annotations are those of `_ARGUMENT_KINDS`, and classes, with or without `| None`. What else
     an argument must be is checked by the function itself.
     """
     names = list(inspect.signature(function).parameters)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 Result = TypeVar("Result")
-_PARTS = 50
+_DEFAULT_PARTS = 50
 
 
 class Bar:
@@ -34,7 +34,7 @@ def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
 
     Where `shown`, draw a bar on a terminal.
     """
-    size = size or max(1, total // _PARTS)
+    size = size or max(1, total // _DEFAULT_PARTS)
     bar = Bar(label, shown)
     for start in range(0, total, size):
         done = min(start + size, total)

@@ -46,7 +46,7 @@ SI_UNITS = frozenset(
 """Units that an array may carry, as those of `to_xarray` do: its numbers are taken as they are."""
 
 _DOUBLE = np.dtype(float)
-_DEEPEST = 32
+_DEEPEST_LIST = 32
 """Levels of lists that are looked into: NumPy allows 64 dimensions, a list in itself has more."""
 
 
@@ -139,7 +139,7 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
     if type(value) in (float, int):
         return ""
     if isinstance(value, (list, tuple)):
-        if depth == _DEEPEST:
+        if depth == _DEEPEST_LIST:
             return "must be numbers, in rows of equal length"
         suspects = tuple(kind for kind in set(map(type, value)) if not _is_plain(kind))
         for each in value if suspects else ():
@@ -349,12 +349,12 @@ DIMENSIONS: dict[str, list[str] | list[int]] = {
     "angle": ["theta", "phi", "psi"],
 }
 
-UNITS = {"t": "s"}
+MOTION_UNITS = {"t": "s"}
 """Unit of each column of a table of states: of one motion, or of many at their end."""
 
 for _name, (_unit, _dimension) in QUANTITIES.items():
-    UNITS |= {f"{_name}_{_part}": _unit for _part in DIMENSIONS[_dimension]}
-UNITS["energy"] = "J"
+    MOTION_UNITS |= {f"{_name}_{_part}": _unit for _part in DIMENSIONS[_dimension]}
+MOTION_UNITS["energy"] = "J"
 
 
 BASE_FRAME = "base_link"  # root of the robot (REP 105): frame {B} of the paper

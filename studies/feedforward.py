@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sst_ros.control.controller import InverseDynamics, TrackingMetrics
-from sst_ros.control.law import INSTANTS, MODES
+from sst_ros.control.law import HELD_INSTANTS, MODES
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.figures import BLUE, GREEN, GREY, INK, ORANGE, VERMILION, styled
 from sst_ros.report.results import data_frame, publish, records, render
@@ -171,7 +171,7 @@ def feedforward_study(
             feedforward_at=at,
             period=plan.period_ns * n / NANOSECONDS,
         )
-        for at in INSTANTS
+        for at in HELD_INSTANTS
         for n in plan.multiples
     ]
     tracked = list(itertools.product(errors, schemes))

@@ -37,11 +37,11 @@ from sst_ros.mechanism.geometry import (
 )
 from sst_ros.plot.pictures import (
     ASSUMPTION,
+    FIGURE_NUMBERS,
     LEAST_ANGLE_DEG,
     LEAST_POSITION_M,
-    NUMBERS,
-    PICTURES,
     POSITION,
+    RUN_PICTURES,
     ZYZ,
     caption,
     draw_path,
@@ -206,8 +206,8 @@ def _difference(
 def _draw(scene: Scene, times: Array, solutions: Solutions, out: Path) -> list[Path]:
     """Draw the paper's figures of a scene."""
     paths: list[Path] = []
-    for name in NUMBERS[scene.name]:
-        stem, title = caption(name, PICTURES[name].title, scene.name)
+    for name in FIGURE_NUMBERS[scene.name]:
+        stem, title = caption(name, RUN_PICTURES[name].title, scene.name)
         if name == "path_of_E":
             figure = draw_path(scene, solutions)
         elif name == "position_of_E":

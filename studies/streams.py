@@ -23,7 +23,7 @@ from rclpy.duration import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.runtime.child_process import keep_domain, run_beside
-from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene import scene
 
 AHEAD_S, ROUND_S = 1.0, 8.0  # time of the point from now, and of a round of the path
@@ -117,7 +117,7 @@ def _message(start: Any, passed: float) -> JointTrajectory:
     steps = zip(start, AMPLITUDES, strict=True)
     point = JointTrajectoryPoint(positions=[x + a * math.sin(turn) for x, a in steps])
     point.time_from_start = Duration(seconds=AHEAD_S).to_msg()
-    return JointTrajectory(joint_names=list(ACTUATORS), points=[point])
+    return JointTrajectory(joint_names=list(ACTUATED_JOINTS), points=[point])
 
 
 if __name__ == "__main__":

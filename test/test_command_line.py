@@ -12,7 +12,7 @@ from programs import HIDDEN, python
 
 from sst_ros.__main__ import main
 from sst_ros.cli import commands
-from sst_ros.cli.commands import COMMANDS, NODES, function, parser
+from sst_ros.cli.commands import NODE_HELP, SUBCOMMANDS, function, parser
 from sst_ros.control.law import MODES
 from sst_ros.errors import EXTRAS
 from sst_ros.simulation.simulation import INTEGRATORS
@@ -33,7 +33,7 @@ OPTIONAL = (
     "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "llvmlite",
 )  # fmt: skip
 
-TOP = [name for name in COMMANDS if " " not in name]
+TOP = [name for name in SUBCOMMANDS if " " not in name]
 
 
 INTERRUPTED = """
@@ -65,7 +65,7 @@ def test_alone_it_prints_help_with_every_command_and_node(capsys):
     assert main([]) == 0
     said = capsys.readouterr().out
     assert said.startswith("usage: sst-ros ")
-    for name in (*TOP, *NODES):
+    for name in (*TOP, *NODE_HELP):
         assert f"\n    {name}" in said
 
 
@@ -223,7 +223,7 @@ def test_a_stdout_that_was_closed_before_the_start_is_no_error():
 
 BAGS = "mcap|rosbags|zstandard"
 NEEDED = {
-    "rclpy": [*NODES, "demo", "demo feedforward"],
+    "rclpy": [*NODE_HELP, "demo", "demo feedforward"],
     "rosbags|mcap|zstandard": [
         "export bag",
         "export bag --format parquet",
@@ -304,7 +304,7 @@ def test_choices_are_those_of_the_rooms():
 
 
 def test_every_command_names_itself_and_a_function_that_exists(capsys):
-    for name, entry in COMMANDS.items():
+    for name, entry in SUBCOMMANDS.items():
         with pytest.raises(SystemExit):
             parser().parse_args([*name.split(), "--help"])
         assert capsys.readouterr().out.startswith(f"usage: sst-ros {name} ")

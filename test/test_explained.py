@@ -31,7 +31,7 @@ from sst_ros.dynamics.motion_table import MotionTable
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.mechanism.kinematics import admissible
 from sst_ros.mechanism.workspace import measures
-from sst_ros.scene.scene import TERMS, names
+from sst_ros.scene.scene import SCENE_TERMS, names
 from sst_ros.scene.yaml_document import dump
 from sst_ros.state import Explained
 
@@ -93,7 +93,7 @@ def test_a_scene_has_each_term_or_has_it_not(name):
     lines = repr(load_scene(name)).splitlines()[1:]
     said = dict(re.split(r"  +", line.strip(), maxsplit=1) for line in lines)
     listed = [*said["has"].split(", "), *said["has not"].split(", ")]
-    assert sorted(set(listed) & set(TERMS)) == sorted(TERMS)
+    assert sorted(set(listed) & set(SCENE_TERMS)) == sorted(SCENE_TERMS)
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, RuntimeError])

@@ -12,7 +12,7 @@ from sst_ros import simulate
 from sst_ros.errors import InputError
 from sst_ros.simulation.tables import load_table, write_table
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import UNITS
+from sst_ros.state import MOTION_UNITS
 
 KEY = "sst_ros"
 
@@ -25,12 +25,12 @@ def saved(tmp_path_factory):
 
 
 def crafted(saved, folder, suffix, change):
-    columns, texts = load_table(saved, list(UNITS), [KEY])
+    columns, texts = load_table(saved, list(MOTION_UNITS), [KEY])
     columns = {name: np.array(column) for name, column in columns.items()}
     about = json.loads(texts[KEY])
     about = change(columns, about) or about
     path = folder / f"crafted{suffix}"
-    units = {name: {"unit": unit} for name, unit in UNITS.items()}
+    units = {name: {"unit": unit} for name, unit in MOTION_UNITS.items()}
     write_table(columns, path, units, {KEY: json.dumps(about)})
     return path
 

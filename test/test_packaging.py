@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 import sst_ros
-from sst_ros.cli.commands import NODES
+from sst_ros.cli.commands import NODE_HELP
 from sst_ros.errors import EXTRAS
 from tools import changelog_rst, metadata, rosdep_keys
 
@@ -110,8 +110,8 @@ def test_every_extra_that_a_message_names_brings_the_module():
 
 
 def test_every_node_has_an_executable_for_ros2_run():
-    assert {path.name for path in (ROOT / "executables").iterdir()} == set(NODES)
-    assert all(os.access(ROOT / "executables" / name, os.X_OK) for name in NODES)
+    assert {path.name for path in (ROOT / "executables").iterdir()} == set(NODE_HELP)
+    assert all(os.access(ROOT / "executables" / name, os.X_OK) for name in NODE_HELP)
 
 
 @pytest.fixture(scope="module")
@@ -267,7 +267,7 @@ def check_installed(python, folder):
         return subprocess.run(words, cwd=folder, env=environment, **pipes)
 
     command = python.parent / "sst-ros"
-    assert not {path.name for path in python.parent.iterdir()} & {*NODES}
+    assert not {path.name for path in python.parent.iterdir()} & {*NODE_HELP}
     assert run(command, "--version").stdout == f"sst-ros {sst_ros.__version__}\n"
     assert "example2" in run(command, "scene", "list").stdout
     done = run(
@@ -279,7 +279,7 @@ def check_installed(python, folder):
     for words in (
         [command, "plot", "bag"],
         [command, "demo"],
-        *([nodes / name] for name in NODES),
+        *([nodes / name] for name in NODE_HELP),
     ):
         done = run(*words)
         assert done.returncode == 1, words

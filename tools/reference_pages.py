@@ -26,7 +26,7 @@ from benchmark import measure
 from sst_ros.cli import commands
 from sst_ros.nodes import inverse_dynamics, simulation_interfaces, topics
 from sst_ros.nodes.topics import (
-    CALLS,
+    CALLED_SERVICES,
     EXECUTES,
     PUBLISHES,
     SERVES,
@@ -65,17 +65,20 @@ class Described(NamedTuple):
 
 NODES = tuple(
     Described(
-        command, f"sst_{command}", parameters, tuple(topics.NODES[command].values())
+        command,
+        f"sst_{command}",
+        parameters,
+        tuple(topics.NODE_TOPICS[command].values()),
     )
-    for command, (_, parameters) in settings.COMMANDS.items()
+    for command, (_, parameters) in settings.NODE_COMMANDS.items()
 )
 
 
 def commands_tables() -> Iterator[tuple[str, str]]:
     """Yield the parts of docs/commands.md: name and text."""
-    yield "nodes", ", ".join(f"`{name}`" for name in commands.NODES) + ".\n"
+    yield "nodes", ", ".join(f"`{name}`" for name in commands.NODE_HELP) + ".\n"
     text = ""
-    for name, entry in commands.COMMANDS.items():
+    for name, entry in commands.SUBCOMMANDS.items():
         if not isinstance(entry, str):
             rows = [*map(_argument_row, entry.arguments)]
             arguments_of = (
@@ -156,7 +159,7 @@ def nodes_tables() -> Iterator[tuple[str, str]]:
     """Yield the parts of docs/nodes.md: name and text."""
     for name, keys in (
         ("diagnostics", diagnostics.KEYS),
-        ("inverse_dynamics diagnostics", inverse_dynamics.KEYS),
+        ("inverse_dynamics diagnostics", inverse_dynamics.FOLLOWER_KEYS),
     ):
         yield (
             name,
@@ -218,7 +221,7 @@ def policy(node: Described) -> str:
             *_rules("topics", "topic", "publish", publish),
             *_rules("topics", "topic", "subscribe", subscribe),
             *_rules("services", "service", "reply", reply),
-            *_rules("services", "service", "request", _names(node, CALLS)),
+            *_rules("services", "service", "request", _names(node, CALLED_SERVICES)),
             *_rules("actions", "action", "execute", executed),
             "        </profile>",
             "      </profiles>",

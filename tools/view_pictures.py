@@ -22,7 +22,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sst_ros.description.robot import ACTUATED, BASE, INTERMEDIATE, LEGS, STAR
+from sst_ros.description.robot import (
+    ACTUATED_LINKS,
+    BASE,
+    INTERMEDIATE,
+    LEGS,
+    STAR_LINK,
+)
 from sst_ros.errors import SstError
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, load
@@ -80,7 +86,7 @@ def _build(server: PageServer, scene: Scene) -> None:
     at = state.joints
     shown = ViewState(None, at.gamma, at.mu, at.beta, at.gamma_dot, (0.0, 0.0, 0.0))
     drawing.show(shown.angles, shown.torque)
-    for name in (f"{BASE}/0", f"{STAR}/s", f"{STAR}/E"):
+    for name in (f"{BASE}/0", f"{STAR_LINK}/s", f"{STAR_LINK}/E"):
         server.scene.remove_by_name(f"/manipulator/{name}")
     size = max(scene.base.radius, scene.star.radius)
     _add_frames(server, scene, size)
@@ -94,9 +100,9 @@ def _build(server: PageServer, scene: Scene) -> None:
 
 LABELS = {
     BASE: (-0.3, -0.3, -0.3),
-    STAR: (0.45, 0.0, 0.8),
-    ACTUATED[0]: (0.65, 0.7, 0.0),
-    ACTUATED[1]: (-0.3, -0.7, 0.3),
+    STAR_LINK: (0.45, 0.0, 0.8),
+    ACTUATED_LINKS[0]: (0.65, 0.7, 0.0),
+    ACTUATED_LINKS[1]: (-0.3, -0.7, 0.3),
 }
 """Places of names that would lie on an axis of their frame, in lengths of its axes."""
 
@@ -105,9 +111,9 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
     thick, base, star = 0.02 * scene.base.radius, scene.base.radius, scene.star.radius
     end = np.array([0.0, 0.0, star])
     bar = 1.04 * (base + 1.5 * thick) * np.array([np.cos(_ALONG), 0.0, np.sin(_ALONG)])
-    places = {BASE: ("{B}", np.zeros(3), 0.42), STAR: ("{E}", 1.05 * end, 0.24)}
+    places = {BASE: ("{B}", np.zeros(3), 0.42), STAR_LINK: ("{E}", 1.05 * end, 0.24)}
     for k in LEGS:
-        places[ACTUATED[k - 1]] = (f"{{1{k}}}", bar, 0.15)
+        places[ACTUATED_LINKS[k - 1]] = (f"{{1{k}}}", bar, 0.15)
         places[INTERMEDIATE[k - 1]] = (
             f"{{2{k}}}",
             1.07 * star * np.array([1.0, 0.0, 0.0]),

@@ -105,15 +105,15 @@ _INTEGRATORS = ("auto", "rk4", "dopri5", "dop853", "rodas5p")
 _MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 _TARGETS = ("c", "numpy", "jax", "casadi", "mpmath", "sympy", "fmu", "mjcf")
 _OF_SCENE = "name of a scene, or path of a .yaml file"
-SCENE = _scene("scene", _OF_SCENE, metavar="SCENE")
+SCENE_ARGUMENT = _scene("scene", _OF_SCENE, metavar="SCENE")
 BAG = _path("bag", "folder of the bag", metavar="BAG")
 _RUN_OF = "namespace of the simulator, where the bag has several runs"
-_NAMESPACE = Arg("--namespace", _RUN_OF, metavar="NS")
-COMMANDS: dict[str, Subcommand | str] = {
+_NAMESPACE_ARGUMENT = Arg("--namespace", _RUN_OF, metavar="NS")
+SUBCOMMANDS: dict[str, Subcommand | str] = {
     "simulate": Subcommand(
         "simulate a scene under its own torques",
         "cli.runs:run_simulation",
-        SCENE,
+        SCENE_ARGUMENT,
         _number("--duration", "length [s]; default: that of the scene"),
         Arg("--method", "integrator; default: auto", default="auto"),
         _number("--tolerance", "allowed error [rad]; default: 1e-9", default=1e-9),
@@ -133,7 +133,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     "certify": Subcommand(
         "enclose the true motion of a scene: a proven bound of the error of simulate",
         "cli.runs:certify_scene",
-        SCENE,
+        SCENE_ARGUMENT,
         _number("--duration", "length [s]; default: that of the scene"),
         _number("--bound", "angle to be proven [rad]; default: 1e-9", default=1e-9),
         Arg(
@@ -153,13 +153,13 @@ COMMANDS: dict[str, Subcommand | str] = {
     "workspace": Subcommand(
         "map the workspace of a scene: reach, condition, singular poses",
         "cli.runs:map_workspace",
-        SCENE,
+        SCENE_ARGUMENT,
         *_out("picture, .png, .pdf or .svg", "SCENE_workspace.png"),
     ),
     "zone": Subcommand(
         "prove a part of the workspace: regular and inside all limits, with tolerances",
         "cli.runs:prove_zone",
-        SCENE,
+        SCENE_ARGUMENT,
         _number(
             "--tilt", "of E from the reference pose [deg]; default: to all corners"
         ),
@@ -191,7 +191,9 @@ COMMANDS: dict[str, Subcommand | str] = {
     "scene": "list, show and check scenes",
     "scene list": Subcommand("list the shipped scenes", "cli.scenes:list_all"),
     "scene show": Subcommand(
-        "show contents, cost of a step and advice on the method", "cli.runs:show", SCENE
+        "show contents, cost of a step and advice on the method",
+        "cli.runs:show",
+        SCENE_ARGUMENT,
     ),
     "scene check": Subcommand(
         "check scene files and report all faults",
@@ -205,7 +207,7 @@ COMMANDS: dict[str, Subcommand | str] = {
     "plan check": Subcommand(
         "check feasibility and the shortest duration; exit status 0 if feasible",
         "cli.motions:check_plan",
-        SCENE,
+        SCENE_ARGUMENT,
         _flag("--json", "print JSON instead of a table"),
         _path("--csv", "write the torques to play", metavar="OUT"),
         _flag("--force", "overwrite the file of --csv"),
@@ -234,7 +236,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write the equations of a scene for another program: C, CasADi, JAX, FMI,"
         " MuJoCo",
         "cli.runs:write_equations",
-        SCENE,
+        SCENE_ARGUMENT,
         Arg("--target", "what to write", choices=_TARGETS, required=True),
         Arg(
             "--parameters",
@@ -287,7 +289,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "cli.reports:report_run",
         BAG,
         *_out("folder of the results", "BAG_report, beside the bag"),
-        _NAMESPACE,
+        _NAMESPACE_ARGUMENT,
         _flag("--verbose", "print all figures"),
         _flag("--damaged", "evaluate the intact part of a damaged recording"),
     ),
@@ -301,7 +303,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "stable steps along the motion of a scene; runs at its limits and with other"
         " numbers",
         "cli.reports:report_stability",
-        SCENE,
+        SCENE_ARGUMENT,
         Arg(
             "--only",
             "rows of the table; default: all",
@@ -318,7 +320,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         _path("bag", "folder of the bag", nargs="?", metavar="BAG"),
         *_out("folder of the pictures", "BAG_plots, beside the bag"),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
-        _NAMESPACE,
+        _NAMESPACE_ARGUMENT,
         _flag("--list", "list the pictures, and draw none"),
         _path(
             "--compare",
@@ -352,7 +354,7 @@ COMMANDS: dict[str, Subcommand | str] = {
         "write a recorded run as CSV or Parquet",
         "cli.runs:write_tables",
         BAG,
-        _NAMESPACE,
+        _NAMESPACE_ARGUMENT,
         Arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
         *_out("folder of the tables", "BAG_tables, beside the bag"),
     ),
@@ -402,7 +404,7 @@ COMMANDS: dict[str, Subcommand | str] = {
             nargs="+",
             metavar="P",
         ),
-        _NAMESPACE,
+        _NAMESPACE_ARGUMENT,
         Arg(
             "--method",
             "default: inverse_dynamics",
@@ -434,7 +436,7 @@ COMMANDS: dict[str, Subcommand | str] = {
 }
 """A word names a group of commands."""
 
-NODES = {
+NODE_HELP = {
     "simulator": "node: integrate the equation of motion in real time",
     "torque_player": "node: play the torques of a scene",
     "inverse_dynamics": "node: follow a motion by feedforward and feedback",
@@ -489,7 +491,7 @@ def parser() -> Parser:
             dest="command", metavar="COMMAND", parser_class=Parser
         )
     }
-    for name, entry in COMMANDS.items():
+    for name, entry in SUBCOMMANDS.items():
         group, _, last = name.rpartition(" ")
         if isinstance(entry, str):
             below = groups[group].add_parser(last, help=entry)
@@ -505,7 +507,7 @@ def parser() -> Parser:
             action: Any = command.add_argument(each.name, **each.options)
             if each.completer:
                 action.completer = lambda names=each.completer, **_: function(names)()
-    for name, what in NODES.items():
+    for name, what in NODE_HELP.items():
         groups[""].add_parser(name, help=what, add_help=False)
     return result
 
@@ -562,7 +564,7 @@ def run_command(words: list[str]) -> int:
 def _run(words: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:
         importlib.import_module("argcomplete").autocomplete(parser())
-    if words and words[0] in NODES:
+    if words and words[0] in NODE_HELP:
         return int(function("nodes.process:run")(words))
     for word in words[:1]:
         if word in REMOVED_COMMANDS:

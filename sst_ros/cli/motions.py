@@ -9,7 +9,7 @@ import math
 
 from sst_ros.cli.commands import free_out, function
 from sst_ros.control.plan import (
-    UNITS,
+    DEMAND_UNITS,
     examine_motion,
     examine_reactions,
     plan_json,
@@ -51,7 +51,7 @@ def check_plan(options: argparse.Namespace) -> int:
         print(plan_json(plan, speeds))
     else:
         reactions = examine_reactions(plan)
-        shown = {"plan": plan, "speeds": speeds, "units": UNITS}
+        shown = {"plan": plan, "speeds": speeds, "units": DEMAND_UNITS}
         print(render("plan.txt", **shown, reactions=reactions, sizes=SIZES), end="")
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)

@@ -42,9 +42,9 @@ def report_stability(options: argparse.Namespace) -> int:
 def draw_pictures(options: argparse.Namespace) -> int:
     """Draw a recorded run, or list the pictures."""
     if options.list:
-        for name, picture in pictures.PICTURES.items():
+        for name, picture in pictures.RUN_PICTURES.items():
             print(f"{name:<18}{picture.title}; needs {', '.join(picture.needs)}")
-        print(f"{'sst-ros compare':<18}{', '.join(compare.PICTURES)}")
+        print(f"{'sst-ros compare':<18}{', '.join(compare.COMPARISON_PICTURES)}")
         return 0
     if options.compare:
         print("plot --compare is deprecated: use sst-ros compare", file=sys.stderr)
@@ -110,7 +110,7 @@ def run_demo(options: argparse.Namespace) -> None:
     out = free_out(options, "demo_out/feedforward" if following else "demo_out")
     if following:
         name = options.scene or demo.FOLLOWED
-        for mode in options.mode or demo.MODES:
+        for mode in options.mode or demo.DEMO_MODES:
             print(f"{name}, {mode}: {load(name).description}", flush=True)
             bag = demo.follow(name, out / mode, mode)
             print(

@@ -40,8 +40,8 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.simulation.tables import SUFFIXES
 from sst_ros.view.source import Replay, run_simulator
 
-PICTURES = (".png", ".pdf", ".svg")
-ROUNDING = 1e-6  # relative, of inertias that a person has typed
+PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
+INERTIA_ROUNDING = 1e-6  # relative, of inertias that a person has typed
 
 
 def show(options: argparse.Namespace) -> None:
@@ -94,7 +94,7 @@ def implausible(scene: Scene) -> str:
     star = scene.star
     # A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O.
     trace, most = float(star.inertia.matrix.trace()), 2.0 * star.mass * star.radius**2
-    if star.mass == 0.0 or trace <= most * (1.0 + ROUNDING):
+    if star.mass == 0.0 or trace <= most * (1.0 + INERTIA_ROUNDING):
         return ""
     return (
         f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass ="
@@ -107,8 +107,10 @@ def map_workspace(options: argparse.Namespace) -> None:
     """Draw the workspace of a scene and print its singular poses."""
     scene = load(options.scene)
     out = options.out or Path(f"{Path(options.scene).stem}_workspace.png")
-    allowed = f"must end in {' or '.join(PICTURES)}"
-    refuse_unless("workspace", ("--out", str(out), out.suffix in PICTURES, allowed))
+    allowed = f"must end in {' or '.join(PICTURE_SUFFIXES)}"
+    refuse_unless(
+        "workspace", ("--out", str(out), out.suffix in PICTURE_SUFFIXES, allowed)
+    )
     free_out(options, out)
     require("matplotlib")
     geometry = Geometry.of(scene)
@@ -178,8 +180,8 @@ def prove_zone(options: argparse.Namespace) -> int:
     if out is not None:
         free_out(options, out)
     if picture is not None:
-        is_picture = picture.suffix in PICTURES
-        allowed = f"must end in {' or '.join(PICTURES)}"
+        is_picture = picture.suffix in PICTURE_SUFFIXES
+        allowed = f"must end in {' or '.join(PICTURE_SUFFIXES)}"
         refuse_unless("zone", ("--picture", str(picture), is_picture, allowed))
         require_free(picture, "zone", force=options.force, option="--picture")
         require("matplotlib")

@@ -37,7 +37,7 @@ INPUTS = (
     *(f"torque_{leg}" for leg in (1, 2, 3)),
     *(f"moment_{axis}" for axis in "xyz"),
 )
-OUTPUTS = (
+FMU_OUTPUTS = (
     *JOINTS,
     *(f"{name}_rate" for name in JOINTS),
     "kinetic_energy",
@@ -45,7 +45,7 @@ OUTPUTS = (
 )
 STATE_UNITS = ("1",) * 4 + ("rad/s",) * 3 + ("N.m",) * 3
 OUTPUT_UNITS = ("rad",) * 9 + ("rad/s",) * 9 + ("J",) * 2
-UNITS: dict[str, dict[str, int]] = {
+FMU_UNITS: dict[str, dict[str, int]] = {
     "1": {},
     "rad": {"rad": 1},
     "rad/s": {"rad": 1, "s": -1},
@@ -98,7 +98,7 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
             f"{whole.scene.description} SHA-256 of the scene: {whole.scene_hash}"
         ),
         version=VERSION,
-        units=UNITS,
+        units=FMU_UNITS,
         duration=whole.scene.duration,
         variables=[*_variables(whole)],
         structure=[*_structure(whole)],
@@ -141,7 +141,7 @@ def _variables(equations: SceneEquations) -> Iterator[dict[str, Any]]:
         for name, quantity in zip(names, argument.quantities, strict=True):
             about = {"causality": "input", "unit": "N.m", "description": quantity}
             rows.append({"name": name, "start": "0.0"} | about | continuous)
-    for name, unit in zip(OUTPUTS, OUTPUT_UNITS, strict=True):
+    for name, unit in zip(FMU_OUTPUTS, OUTPUT_UNITS, strict=True):
         calculated = {"initial": "calculated", "unit": unit}
         rows.append({"name": name, "causality": "output"} | continuous | calculated)
     fixed = {"causality": "parameter", "variability": "fixed", "initial": "exact"}
@@ -167,7 +167,7 @@ def _structure(equations: SceneEquations) -> Iterator[tuple[str, int]]:
     states = range(1, 1 + size)
     derivatives = range(1 + size, 1 + 2 * size)
     first = 1 + 2 * size + sum(argument.size for argument in equations.acting)
-    outputs = range(first, first + len(OUTPUTS))
+    outputs = range(first, first + len(FMU_OUTPUTS))
     yield from (("Output", reference) for reference in (*states, *outputs))
     yield from (("ContinuousStateDerivative", reference) for reference in derivatives)
     yield from (("InitialUnknown", reference) for reference in (*derivatives, *outputs))

@@ -37,7 +37,12 @@ from sst_ros.version import VERSION
 
 CALLER = "equations"  # heads the messages of what is refused
 
-STATE, TORQUES, MOMENTS, PARAMETERS = "state", "torque", "moment", "parameters"
+STATE_ARGUMENT, TORQUES, MOMENT_ARGUMENT, PARAMETERS = (
+    "state",
+    "torque",
+    "moment",
+    "parameters",
+)
 """Names of the arguments of the equations."""
 
 STATE_QUANTITIES = (
@@ -94,7 +99,7 @@ class SceneEquations:
         scene: what is described.
         parameters: keys of numbers of the scene, which become arguments. A vector means
             each of its components, a list each of its entries.
-        outputs: names of OUTPUTS; None for all that there are.
+        outputs: names of PROGRAM_OUTPUTS; None for all that there are.
 
     Raises:
         InputError: a parameter is no number of the equations of motion, or there is no
@@ -109,7 +114,9 @@ class SceneEquations:
         self.parameters = _list_parameters(scene, parameters)
         self.values = tuple(_value_of(scene, key) for key in self.parameters)
         self.dynamics = Dynamics.of(scene)
-        known = [name for name in OUTPUTS if self.parameters or name != BY_PARAMETERS]
+        known = [
+            name for name in PROGRAM_OUTPUTS if self.parameters or name != BY_PARAMETERS
+        ]
         self.outputs = tuple(known if outputs is None else outputs)
         for name in self.outputs:
             if name not in known:
@@ -122,8 +129,8 @@ class SceneEquations:
         return tuple(self.named(name) for name in self.outputs)
 
     def named(self, name: str) -> NamedProgram:
-        """Trace one of OUTPUTS."""
-        return OUTPUTS[name](self)
+        """Trace one of PROGRAM_OUTPUTS."""
+        return PROGRAM_OUTPUTS[name](self)
 
     @property
     def initial(self) -> tuple[float, ...]:
@@ -143,7 +150,7 @@ class SceneEquations:
     def state(self) -> Argument:
         """The state, 7 numbers, or 10 where the actuators lag."""
         symbols = self.dynamics.state
-        return Argument(STATE, symbols, STATE_QUANTITIES[: len(symbols)])
+        return Argument(STATE_ARGUMENT, symbols, STATE_QUANTITIES[: len(symbols)])
 
     @property
     def acting(self) -> tuple[Argument, ...]:
@@ -156,7 +163,7 @@ class SceneEquations:
         if not self.dynamics.has_moment_topic:
             return (torque,)
         moments = tuple(f"moment on the star, {axis} in {{B}} [N m]" for axis in "xyz")
-        return torque, Argument(MOMENTS, symbols[3:], moments)
+        return torque, Argument(MOMENT_ARGUMENT, symbols[3:], moments)
 
     @property
     def open(self) -> tuple[Argument, ...]:
@@ -280,7 +287,7 @@ def _jacobian(equations: SceneEquations, by: Argument) -> NamedProgram:
 
 
 BY_PARAMETERS = "derivative_by_parameters"
-OUTPUTS: dict[str, Callable[[SceneEquations], NamedProgram]] = {
+PROGRAM_OUTPUTS: dict[str, Callable[[SceneEquations], NamedProgram]] = {
     "derivative": _derivative,
     "joints": _joints,
     "energies": _energies,

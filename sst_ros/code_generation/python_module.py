@@ -19,7 +19,7 @@ def _collect(values, *shape):
     whole = {library}.stack({library}.broadcast_arrays(*values))
     return whole.reshape(*shape, *whole.shape[1:])
 """
-ARRAYS = """\
+ARRAYS_NOTE = """\
 An argument is an array whose first axis has the numbers below, in their order; further
 axes, of many runs, follow, also in the results. {numbers}"""
 DOUBLES = "Numbers are doubles."
@@ -91,7 +91,7 @@ def library_of_arrays(name: str, module: str, numbers: str) -> Library:
     return Library(
         name=name,
         imports=f"import {module}\nfrom {module} import {functions}",
-        about=ARRAYS.format(numbers=numbers),
+        about=ARRAYS_NOTE.format(numbers=numbers),
         collect=STACK.format(library=module),
         words={"atan2": "arctan2"},
     )

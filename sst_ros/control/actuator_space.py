@@ -35,13 +35,18 @@ from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_
 from sst_ros.programs.expression import compile_program, trace
 from sst_ros.state import ZERO, Explained, Quaternion, Vector3, find_lost_meaning
 
-ROUNDING = 4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
+ANGLE_ROUNDING = (
+    4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
+)
 # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
 CLOSED = 1e-14
-_STEPS = 20
-_STAR = (*"xyzw", "wx", "wy", "wz", "ax", "ay", "az")
-_MOVING = (*_STAR[:4], "d1", "d2", "d3", "dd1", "dd2", "dd3")
-_POSE = (*_STAR[:4], *(f"r{k}{axis}" for k in range(3) for axis in "xyz"))
+_INVERSION_STEPS = 20
+_STAR_MOTION = (*"xyzw", "wx", "wy", "wz", "ax", "ay", "az")
+_MOVING = (*_STAR_MOTION[:4], "d1", "d2", "d3", "dd1", "dd2", "dd3")
+_POSE_NUMBERS = (
+    *_STAR_MOTION[:4],
+    *(f"r{k}{axis}" for k in range(3) for axis in "xyz"),
+)
 
 
 @dataclass(frozen=True)
@@ -255,12 +260,12 @@ class ActuatorSpaceMap:
         """Quaternion, of length 1, of the assembly at gamma that is closest to `near`."""
         carriages = self.carriages(gamma)
         best, least, q = near, math.inf, near
-        for _ in range(_STEPS):
+        for _ in range(_INVERSION_STEPS):
             x, y, z, w, *residuals = self._newton(*q, *carriages)
             largest = max(map(abs, residuals))
             if largest < least:
                 best, least = q, largest
-            if not largest > ROUNDING:
+            if not largest > ANGLE_ROUNDING:
                 break
             q = (x, y, z, w)
         if least > CLOSED:
@@ -275,7 +280,9 @@ class ActuatorSpaceMap:
             found += [c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)]
         return found
 
-    def orientations(self, near: Array, gamma: Array, steps: int = _STEPS) -> Array:
+    def orientations(
+        self, near: Array, gamma: Array, steps: int = _INVERSION_STEPS
+    ) -> Array:
         """Quaternions (n, 4) at gamma (n, 3) by steps of Newton's method from `near` (n, 4)."""
         carriages, q = self.carriages(gamma.T), list(near.T)
         for _ in range(steps):
@@ -351,10 +358,10 @@ class ActuatorSpaceMap:
 def _compile(space: ActuatorSpaceMap) -> tuple[Callable[..., Any], ...]:
     """Compile the programs of a map once for all that are equal: that takes 20 ms."""
     return (
-        compile_program(trace(space._of_star, _STAR)),
+        compile_program(trace(space._of_star, _STAR_MOTION)),
         compile_program(trace(space.star_accelerations, _MOVING)),
-        compile_program(trace(space.postures, _STAR[:4])),
-        compile_program(trace(space.newton_step, _POSE)),
+        compile_program(trace(space.postures, _STAR_MOTION[:4])),
+        compile_program(trace(space.newton_step, _POSE_NUMBERS)),
     )
 
 

@@ -43,7 +43,7 @@ from sst_ros.state import (
 )
 
 # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
-SINGULAR = 1e-10
+SINGULAR_MASS = 1e-10
 
 
 class InverseDynamics(Explained):
@@ -98,8 +98,8 @@ class InverseDynamics(Explained):
                     squares[0] * squares[1] * squares[2]
                 )
                 # Comparisons with NaN are false: what is not finite is refused, too.
-                sound = math.isfinite(first + second + third) and det_j2 > SINGULAR
-                if sound and min(squares) > SINGULAR * SINGULAR:
+                sound = math.isfinite(first + second + third) and det_j2 > SINGULAR_MASS
+                if sound and min(squares) > SINGULAR_MASS * SINGULAR_MASS:
                     return first, second, third
         raise self._refusal(quaternion, given)
 
@@ -219,10 +219,10 @@ class InverseDynamics(Explained):
         t = geometry.e @ rotation_matrix(quaternion).T
         across = np.cross(t, geometry.w)
         sines = np.linalg.norm(across, axis=1)
-        if (least := float(sines.min())) <= SINGULAR:
+        if (least := float(sines.min())) <= SINGULAR_MASS:
             return SingularConfiguration("serial singularity, sin(mu)", least)
         determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
-        parallel = abs(determinant) <= 2.0 * SINGULAR
+        parallel = abs(determinant) <= 2.0 * SINGULAR_MASS
         said = (
             "parallel singularity,"
             if parallel
@@ -470,10 +470,10 @@ class Controller:
         return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
 
 
-BAND = 0.02  # settling band: share of the largest range of a joint
+SETTLING_BAND = 0.02  # settling band: share of the largest range of a joint
 
-_PARTS = ("gamma", "gamma_dot", "error", "feedforward", "feedback", "torque")
-TRACK = np.dtype([("time", float), *((name, float, 3) for name in _PARTS)])
+_ANSWER_PARTS = ("gamma", "gamma_dot", "error", "feedforward", "feedback", "torque")
+TRACK = np.dtype([("time", float), *((name, float, 3) for name in _ANSWER_PARTS)])
 """A sample of a tracking record, 19 numbers: the time since the start of the motion or
 of the run [s], gamma and gamma_dot as desired [rad], [rad/s], desired - measured gamma
 [rad], the two parts of the controller's command [N m], and the torque that was
@@ -551,8 +551,8 @@ class TrackingMetrics:
 
     @property
     def band(self) -> float:
-        """Settling band [rad], BAND times the largest range of a joint."""
-        return BAND * float(np.max(self._highest - self._lowest))
+        """Settling band [rad], SETTLING_BAND times the largest range of a joint."""
+        return SETTLING_BAND * float(np.max(self._highest - self._lowest))
 
     @property
     def settling(self) -> float | None:

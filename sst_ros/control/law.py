@@ -43,7 +43,7 @@ from sst_ros.state import ZERO, Array, Vector3, clamp
 
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 SPACES = ("gamma", "so3")
-INSTANTS = ("start", "middle")
+HELD_INSTANTS = ("start", "middle")
 # added and subtracted, it rounds to whole numbers, halves to even
 _ROUND = 1.5 * 2.0**52
 
@@ -94,7 +94,7 @@ class ControllerSettings(Section):
         most=1e9,
     )
     feedforward_at: str = choice(
-        "instant of a control period whose feedforward is held over it", INSTANTS
+        "instant of a control period whose feedforward is held over it", HELD_INSTANTS
     )
 
     def rules(self) -> Rules:

@@ -48,7 +48,7 @@ COORDINATES = {
     "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
     "star": [f"{name}_{axis}" for name in ("rotation", "body_rate") for axis in "xyz"],
 }
-_MOST, _CHECKS = 20_000, 8
+_MOST_PERIOD_EVALUATIONS, _CHECKS = 20_000, 8
 """Evaluations for a period: without end in a singularity.
 
 Parts after which limits are checked.
@@ -192,7 +192,7 @@ def linearize(
                 now.tolist(),
                 acting,
                 dt,
-                _MOST,
+                _MOST_PERIOD_EVALUATIONS,
                 elastic=given.stroke.at_end == "elastic",
             )
         lasts = (

@@ -33,17 +33,22 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import values_at
 from sst_ros.simulation.trajectory import Trajectory
 
-SAMPLES = 16  # parts of a piece of the motion; even, for Simpson's rule
+PIECE_PARTS = 16  # parts of a piece of the motion; even, for Simpson's rule
 SINGULAR_J2 = 1e-6  # det J2 within which a motion counts as singular
 SLOWEST, FASTEST = 1e-4, 1e8  # factors of speed between which ends are looked for
-UNITS = {"torque": "N m", "power": "W", "velocity": "rad/s", "acceleration": "rad/s^2"}
+DEMAND_UNITS = {
+    "torque": "N m",
+    "power": "W",
+    "velocity": "rad/s",
+    "acceleration": "rad/s^2",
+}
 """Of what a motion demands of an actuator.
 
 Power is negative where the actuator brakes.
 """
 _GRID = 360  # factors to try
-_FINE = 33  # instants between two samples beside a peak of a reaction
-_ROUNDING = 1e-13
+_FINE_INSTANTS = 33  # instants between two samples beside a peak of a reaction
+_LIMIT_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True)
@@ -83,9 +88,11 @@ class MotionPlan:
     motion: ReferenceMotion
     # the motion where it was sampled, with the torques that it demands
     trajectory: Trajectory
-    # by quantity of UNITS and leg, the largest, with their signs
+    # by quantity of DEMAND_UNITS and leg, the largest, with their signs
     peaks: dict[str, list[Peak]]
-    limits: dict[str, float]  # those that the actuators have, by quantity of UNITS
+    limits: dict[
+        str, float
+    ]  # those that the actuators have, by quantity of DEMAND_UNITS
     torque_rms: list[float]  # root of the mean square over the duration, by leg [N m]
     distances: tuple[LimitDistance, ...]  # from all limits
     problems: tuple[Problem, ...]  # reasons of a refusal; empty where it is feasible
@@ -118,17 +125,21 @@ def examine_motion(
     torque is defined there.
     """
     ends = pairwise(motion.pieces)
-    parts = (np.linspace(begin, end, SAMPLES, endpoint=False) for begin, end in ends)
+    parts = (
+        np.linspace(begin, end, PIECE_PARTS, endpoint=False) for begin, end in ends
+    )
     times = np.concatenate([*parts, motion.pieces[-1:]])
     desired = tuple(map(motion.at, times.tolist()))
     distances = tuple(_distances(motion, scene, times, desired, exact))
     limits = {
-        name: x for name in UNITS for x in values_at(scene, f"actuators.{name}_limit")
+        name: x
+        for name in DEMAND_UNITS
+        for x in values_at(scene, f"actuators.{name}_limit")
     }
     inverse = InverseDynamics(scene)
 
     def measure(at: Reference) -> tuple[float, ...]:
-        """Quantities of UNITS, each of three actuators."""
+        """Quantities of DEMAND_UNITS, each of three actuators."""
         torque = inverse.reference_torque(at)
         power = (x * rate for x, rate in zip(torque, at.gamma_dot, strict=True))
         return (*torque, *power, *at.gamma_dot, *at.gamma_ddot)
@@ -151,12 +162,14 @@ def examine_motion(
         law=lambda time: inverse.reference_torque(motion.at(time)), dense=states,
     )  # fmt: skip
     peaks = {}
-    for first, name in zip(range(0, 12, 3), UNITS, strict=True):
+    for first, name in zip(range(0, 12, 3), DEMAND_UNITS, strict=True):
         floor = -math.inf if exact else limits.get(name, math.inf)
         legs = range(first, first + 3)
         both = ([find(index, sign, floor) for sign in (1.0, -1.0)] for index in legs)
         peaks[name] = [max(ends, key=lambda peak: abs(peak.value)) for ends in both]
-    pieces = np.arange(0, len(times) - 1, SAMPLES)[:, None] + np.arange(SAMPLES + 1)
+    pieces = np.arange(0, len(times) - 1, PIECE_PARTS)[:, None] + np.arange(
+        PIECE_PARTS + 1
+    )
     squares = simpson(samples[pieces, :3] ** 2, x=times[pieces][..., None], axis=1).sum(
         axis=0
     )
@@ -207,7 +220,9 @@ def maximum(
     below = np.minimum(
         np.append(values[0], values[:-1]), np.append(values[1:], values[-1])
     )
-    high = 2.0 * values - below > max(best.value + _ROUNDING * abs(best.value), floor)
+    high = 2.0 * values - below > max(
+        best.value + _LIMIT_ROUNDING * abs(best.value), floor
+    )
     for index in np.flatnonzero((values >= left) & (values >= right) & high):
         bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
         options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
@@ -217,7 +232,7 @@ def maximum(
             method="bounded",
             options=options,
         )
-        if -found.fun > best.value + _ROUNDING * abs(best.value):
+        if -found.fun > best.value + _LIMIT_ROUNDING * abs(best.value):
             best = Peak(float(-found.fun), float(found.x))
     return best
 
@@ -299,7 +314,7 @@ def _faults(
         for leg, peak in enumerate(peaks[name], start=1):
             if abs(peak.value) > limit:
                 allowed = (
-                    f"exceeds the limit {limit:g} {UNITS[name]} at t ="
+                    f"exceeds the limit {limit:g} {DEMAND_UNITS[name]} at t ="
                     f" {peak.time:.9g} s"
                 )
                 yield Problem(f"{name}_{leg}", peak.value, allowed)
@@ -401,7 +416,7 @@ def examine_reactions(plan: MotionPlan) -> dict[str, dict[str, LoadFigures]]:
         for size in SIZES:
             for top in np.searchsorted(t, figures[size].time):
                 begin, end = max(int(top) - 1, 0), min(int(top) + 1, len(t) - 1)
-                windows.append(np.linspace(t[begin], t[end], _FINE))
+                windows.append(np.linspace(t[begin], t[end], _FINE_INSTANTS))
     return plan.trajectory.at(np.unique(np.concatenate(windows))).reactions.figures
 
 

@@ -52,8 +52,8 @@ from sst_ros.state import ZERO, Quaternion, Vector3
 PIECES = 8  # pieces of a minimum-jerk motion, and of a quarter of a turn
 # of a recording, whose samples lie much denser than the motion turns
 SAMPLES_A_PIECE = 8
-STEP = 0.03  # distance in gamma [rad] between orientations that are kept
-LONGEST = 100.0  # longest path in gamma [rad] within a piece of a motion
+KEPT_STEP = 0.03  # distance in gamma [rad] between orientations that are kept
+LONGEST_PIECE = 100.0  # longest path in gamma [rad] within a piece of a motion
 NEAR = 0.1  # largest distance of a first point at time 0 from the start [rad]
 _SAMPLES = 16
 
@@ -246,7 +246,7 @@ def move_actuators(
     of these. The motion therefore does not depend on what was asked before. It starts
     from an orientation (x, y, z, w). Raises SingularConfiguration, with the time, where
     the path meets a parallel singularity, InputError where a piece is longer than
-    LONGEST, AssemblyError where it does not begin at that orientation.
+    LONGEST_PIECE, AssemblyError where it does not begin at that orientation.
     """
     space, times = ActuatorSpaceMap(geometry), _space(path, pieces)
     gammas = [path(time)[0] for time in times]
@@ -286,26 +286,24 @@ def _on_path(
 
 
 def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
-    """Return times from the first to the last between which gamma moves by no more than STEP."""
+    """Return times from the first to the last between which gamma moves by no more than KEPT_STEP."""
     times = [np.zeros(1)]
     for begin, end in pairwise(pieces):
         rough = [
             path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()
         ]
         length = sum(math.dist(a, b) for a, b in pairwise(rough))
-        allowed = (
-            f"must be less than {LONGEST:g} rad between {begin:.9g} s and {end:.9g} s"
-        )
+        allowed = f"must be less than {LONGEST_PIECE:g} rad between {begin:.9g} s and {end:.9g} s"
         refuse_unless(
-            "motion", ("path length of gamma", length, length < LONGEST, allowed)
+            "motion", ("path length of gamma", length, length < LONGEST_PIECE, allowed)
         )
-        count = max(_SAMPLES, math.ceil(4.0 * length / STEP))
+        count = max(_SAMPLES, math.ceil(4.0 * length / KEPT_STEP))
         times.append(np.linspace(begin, end, count + 1)[1:])
     fine = np.concatenate(times)
     gammas = np.array([path(time)[0] for time in fine.tolist()])
     passed = np.cumsum(np.linalg.norm(np.diff(gammas, axis=0), axis=1))
-    # The first of each half a STEP of the path.
-    _, kept = np.unique(np.append(0.0, passed) // (0.5 * STEP), return_index=True)
+    # The first of each half a KEPT_STEP of the path.
+    _, kept = np.unique(np.append(0.0, passed) // (0.5 * KEPT_STEP), return_index=True)
     return [*fine[kept].tolist(), pieces[-1]]
 
 
@@ -463,7 +461,7 @@ def _on_curve(curve: PPoly, time: float) -> tuple[Vector3, Vector3, Vector3]:
     return triple(map(triple, curve(time).tolist()))
 
 
-_UNIT = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))
+_UNIT_QUINTIC = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))
 """The quintics on [0, 1] that have one of (p0, v0, a0, p1, v1, a1) and no other."""
 
 
@@ -487,7 +485,7 @@ def quintic(
     ends = (
         np.concatenate([nodes[:-1], nodes[1:]], axis=1) * powers[:, [0, 1, 2] * 2, None]
     )
-    unit = PPoly.from_bernstein_basis(_UNIT).c[:, 0]
+    unit = PPoly.from_bernstein_basis(_UNIT_QUINTIC).c[:, 0]
     path = PPoly(np.einsum("ij,njm->inm", unit, ends) / powers.T[::-1, :, None], at)
     parts = [path.derivative(order).c for order in range(3)]
     padded = [np.pad(c, ((6 - len(c), 0), (0, 0), (0, 0))) for c in parts]
@@ -500,7 +498,7 @@ def _complete(nodes: Array, lengths: Array) -> None:
     # A velocity times the usual length has the size of a position: the system stays
     # well scaled.
     scale = np.array([1.0, usual, usual * usual])[:, None]
-    jerk = PPoly.from_bernstein_basis(_UNIT.derivative(3)).c[::-1, 0]
+    jerk = PPoly.from_bernstein_basis(_UNIT_QUINTIC.derivative(3)).c[::-1, 0]
     h = (lengths / usual)[:, None, None]
     powers = h ** np.array([0, 1, 2] * 2)
     # The integral of the jerk squared, as a form in the six numbers at the ends of each

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from sst_ros.description.robot import (
-    ACTUATED,
+    ACTUATED_LINKS,
     BASE,
     INTERMEDIATE,
-    LEAST,
+    LEAST_MASS,
     LEGS,
-    STAR,
+    STAR_LINK,
     STARS,
     Body,
     Joint,
@@ -46,7 +46,7 @@ from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
-KINDS = ("gamma", "mu", "beta")
+JOINT_KINDS = ("gamma", "mu", "beta")
 
 
 def mjcf(scene: Scene) -> str:
@@ -67,7 +67,7 @@ def mjcf(scene: Scene) -> str:
             bodies[body.name] = body
         else:
             carried.setdefault(body.link, []).append(body)
-    star = bodies[STAR]
+    star = bodies[STAR_LINK]
     if star is not None:
         third = star._replace(mass=star.mass / 3.0, tensor=star.tensor / 3.0)
         bodies.update(dict.fromkeys(STARS, third))
@@ -79,7 +79,7 @@ def mjcf(scene: Scene) -> str:
         .render(
             name=xml_name(scene),
             left_out=[*_left_out(scene)],
-            least=LEAST,
+            least=LEAST_MASS,
             gravity=ZERO if scene.gravity is None else scene.gravity.acceleration,
             base=BASE,
             visuals=solids_of_links(shapes(scene)),
@@ -93,7 +93,7 @@ def mjcf(scene: Scene) -> str:
             sites=_sites(scene, geometry),
             end=[0.0, 0.0, scene.star.radius],
             ties=[
-                (f"{STAR}_{end}{k}", f"{STARS[k - 1]}_{end}")
+                (f"{STAR_LINK}_{end}{k}", f"{STARS[k - 1]}_{end}")
                 for k in (2, 3)
                 for end in "et"
             ],
@@ -109,7 +109,7 @@ def mjcf(scene: Scene) -> str:
 def _nest(joints: dict[str, Joint]) -> Iterator[tuple[bool, str, Joint | None]]:
     """Yield where each body begins, with its joint, and where it ends."""
     for k in range(3):
-        chained = (ACTUATED[k], INTERMEDIATE[k], STARS[k])
+        chained = (ACTUATED_LINKS[k], INTERMEDIATE[k], STARS[k])
         for link in chained:
             yield True, link, joints[link]
         for link in reversed(chained):
@@ -120,10 +120,13 @@ def _sites(scene: Scene, geometry: Geometry) -> dict[str, list[tuple[str, Array]
     """Return the points that the ties connect, by link: along e_k, and at the end E."""
     radius = scene.star.radius
     end = np.array([0.0, 0.0, radius])
-    found: dict[str, list[tuple[str, Array]]] = {STAR: []}
+    found: dict[str, list[tuple[str, Array]]] = {STAR_LINK: []}
     for leg in LEGS[1:]:
         along = radius * geometry.e[leg - 1]
-        found[STAR] += [(f"{STAR}_e{leg}", along), (f"{STAR}_t{leg}", end)]
+        found[STAR_LINK] += [
+            (f"{STAR_LINK}_e{leg}", along),
+            (f"{STAR_LINK}_t{leg}", end),
+        ]
         name = STARS[leg - 1]
         found[name] = [(f"{name}_e", along), (f"{name}_t", end)]
     return found
@@ -143,10 +146,10 @@ def _joint_attributes(scene: Scene, geometry: Geometry) -> dict[str, dict[str, A
         if (friction := model.legs[leg].friction[kind]) is not None:
             given["damping"] = [friction.viscous]
             given["frictionloss"] = [friction.coulomb]
-        if KINDS[kind] != "mu" and np.isfinite(ranges.get(number, np.inf)).all():
+        if JOINT_KINDS[kind] != "mu" and np.isfinite(ranges.get(number, np.inf)).all():
             given["range"] = ranges[number]
         motor = scene.actuators
-        if KINDS[kind] == "gamma" and motor is not None and motor.rotor_inertia:
+        if JOINT_KINDS[kind] == "gamma" and motor is not None and motor.rotor_inertia:
             given["armature"] = [motor.gear_ratio**2 * motor.rotor_inertia]
         found[name] = given
     return found
@@ -164,7 +167,7 @@ def _motor(scene: Scene) -> dict[str, object]:
 
 def _left_out(scene: Scene) -> Iterator[str]:
     """Say what the scene has and MuJoCo has not, or has otherwise."""
-    kinds = [getattr(scene.friction, kind, None) for kind in KINDS]
+    kinds = [getattr(scene.friction, kind, None) for kind in JOINT_KINDS]
     if any(one is not None and (one.coulomb or one.static) for one in kinds):
         yield "Dry friction is MuJoCo's own, without breakaway torque and smoothing."
     if scene.stroke.at_end == "elastic":

@@ -40,10 +40,10 @@ from sst_ros.scene.loads import JOINTS, Friction
 from sst_ros.scene.scene import Scene
 from sst_ros.state import BASE_FRAME, Vector3
 
-BASE, STAR, PAYLOAD = BASE_FRAME, "star", "payload"
+BASE, STAR_LINK, PAYLOAD = BASE_FRAME, "star", "payload"
 LEGS = (1, 2, 3)
-STARS = (STAR, "star_from_2", "star_from_3")  # {E} as seen from legs 1, 2 and 3
-ACTUATED = ("actuated_1", "actuated_2", "actuated_3")
+STARS = (STAR_LINK, "star_from_2", "star_from_3")  # {E} as seen from legs 1, 2 and 3
+ACTUATED_LINKS = ("actuated_1", "actuated_2", "actuated_3")
 """Links with the frames {1k} = [r, w x r, w] of the legs."""
 INTERMEDIATE = ("intermediate_1", "intermediate_2", "intermediate_3")
 """Links with the frames {2k} = [r, t x r, t] of the legs."""
@@ -60,10 +60,10 @@ LEG_COLOURS: tuple[Colour, ...] = (
 )
 """Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
 
-LEAST = 1e-10
+LEAST_MASS = 1e-10
 """Mass [kg] and moments of inertia [kg m^2] that MuJoCo gives a link without them."""
 
-STEP = np.radians(6.0)
+ARC_STEP = np.radians(6.0)
 """Arcs are drawn as chords of this angle or less: 0.14 % of the radius off."""
 COLLISION_STEP = np.radians(15.0)
 """The same of collision shapes: 0.9 % off, by which they are thicker."""
@@ -88,7 +88,7 @@ Beside the star's inertia, some 1e-2 kg m^2, they are lost in the rounding of a 
 operations.
 """
 
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class Joint(NamedTuple):
@@ -114,7 +114,7 @@ def joints_of(geometry: Geometry) -> list[Joint]:
         geometry.v,
         geometry.w,
         geometry.e,
-        ACTUATED,
+        ACTUATED_LINKS,
         INTERMEDIATE,
         STARS,
         strict=True,
@@ -159,7 +159,7 @@ class Arc(NamedTuple):
     thickness: float
     colour: Colour
 
-    def points(self, step: float = STEP) -> Array:
+    def points(self, step: float = ARC_STEP) -> Array:
         """Return points along the arc, `step` [rad] apart or less, shape (n, 3) [m]."""
         count = max(2, int(np.ceil(self.angle / step)) + 1)
         angles = np.linspace(0.0, self.angle, count)[:, None]
@@ -216,19 +216,19 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
             *(Ball(base * v, 1.6 * bar, TRIANGLE) for v in geometry.v),
         ],
         # In {E} the carriage k is at s turned about e by +beta.
-        STAR: [
+        STAR_LINK: [
             *(Arc(z, e, geometry.beta_max, star, bar, STAR_COLOUR) for e in geometry.e),
             Ball(star * z, 2.2 * bar, STAR_COLOUR),
         ],
     }
     if scene.payload is not None:
         centre = np.array(scene.payload.centre)
-        drawn[STAR].append(Rod(star * z, centre, 0.8 * bar, STEEL))
-        drawn[STAR].append(Ball(centre, 2.8 * bar, STEEL))
+        drawn[STAR_LINK].append(Rod(star * z, centre, 0.8 * bar, STEEL))
+        drawn[STAR_LINK].append(Ball(centre, 2.8 * bar, STEEL))
     # A quarter arc goes from the motor at w to the carriage at r, just above the base.
     quarter = base + 1.5 * bar
     for actuated, intermediate, colour in zip(
-        ACTUATED, INTERMEDIATE, LEG_COLOURS, strict=True
+        ACTUATED_LINKS, INTERMEDIATE, LEG_COLOURS, strict=True
     ):
         bearing = z * (base - bar), z * (quarter + 2.0 * bar)
         drawn[actuated] = [
@@ -256,14 +256,14 @@ def collision_shapes(scene: Scene) -> dict[str, list[Shape]]:
     # Around the drawn bearings, but below the carriages and the arms of the star.
     ball = max(bar, min(scene.base.radius + 4.0 * bar, star - 3.0 * bar))
     parts: dict[str, list[Shape]] = {BASE: [Ball(np.zeros(3), ball, GLOBE)]}
-    parts[STAR] = []
-    for shape in shapes(scene)[STAR]:
+    parts[STAR_LINK] = []
+    for shape in shapes(scene)[STAR_LINK]:
         if isinstance(shape, Arc):
             # A chord lies below its arc, by less than this share of the radius.
             sag = 1.0 - np.cos(COLLISION_STEP / 2.0)
-            parts[STAR].append(shape._replace(thickness=bar + sag * star))
+            parts[STAR_LINK].append(shape._replace(thickness=bar + sag * star))
         else:
-            parts[STAR].append(shape)
+            parts[STAR_LINK].append(shape)
     for intermediate in INTERMEDIATE:
         parts[intermediate] = [
             Rod(x * (ball + 0.5 * bar), x * star, 0.9 * bar, STEEL),
@@ -341,7 +341,7 @@ def _render_urdf(
         joints=_limited_joints(scene, joints),
         starts=list(starts),
         topics=topics,
-        least=LEAST,
+        least=LEAST_MASS,
         passive=JOINTS[3:],
         plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
         roll_pitch_yaw=roll_pitch_yaw,
@@ -413,22 +413,22 @@ class Body(NamedTuple):
     def inertia(self) -> dict[str, float]:
         """Entries of the tensor by their names in URDF."""
         return dict(
-            zip(_INERTIA, self.tensor[np.triu_indices(3)].tolist(), strict=True)
+            zip(_INERTIA_NAMES, self.tensor[np.triu_indices(3)].tolist(), strict=True)
         )
 
 
 def bodies_of(scene: Scene) -> Iterator[Body]:
     """Yield all bodies that have mass or inertia."""
     star = scene.star
-    yield _body(STAR, star.radius, star.tensor, star.mass, star.centre)
+    yield _body(STAR_LINK, star.radius, star.tensor, star.mass, star.centre)
     payload = scene.payload
     if payload is not None:
         tensor = np.zeros((3, 3)) if payload.inertia is None else payload.inertia.matrix
-        yield Body(PAYLOAD, STAR, payload.mass, np.array(payload.centre), tensor)
+        yield Body(PAYLOAD, STAR_LINK, payload.mass, np.array(payload.centre), tensor)
     motor = scene.actuators
     for k, leg in enumerate(LEGS):
         for name, link, radius in (
-            (ACTUATED[k], scene.actuated_links[k], scene.base.radius),
+            (ACTUATED_LINKS[k], scene.actuated_links[k], scene.base.radius),
             (INTERMEDIATE[k], scene.intermediate_links[k], star.radius),
         ):
             if link.mass or link.inertia is not None:
@@ -438,7 +438,7 @@ def bodies_of(scene: Scene) -> Iterator[Body]:
             reflected = motor.gear_ratio**2 * motor.rotor_inertia
             disc = np.diag([reflected / 2.0, reflected / 2.0, reflected])
             rotor = _body(f"rotor_{leg}", scene.base.radius, disc)
-            yield rotor._replace(link=ACTUATED[k])
+            yield rotor._replace(link=ACTUATED_LINKS[k])
 
 
 def _body(
@@ -497,7 +497,7 @@ class Solid(NamedTuple):
 
 
 def solids_of_links(
-    links: Mapping[str, Iterable[Shape]], step: float = STEP
+    links: Mapping[str, Iterable[Shape]], step: float = ARC_STEP
 ) -> dict[str, list[Solid]]:
     """Return the primitives of each link's shapes; arcs are chords of `step` [rad]."""
     found = {}
@@ -506,7 +506,7 @@ def solids_of_links(
     return found
 
 
-def solids(shape: Shape, step: float = STEP) -> Iterator[Solid]:
+def solids(shape: Shape, step: float = ARC_STEP) -> Iterator[Solid]:
     """Yield the primitives that a shape is in URDF; an arc is chords of `step` [rad]."""
     colour = (*shape.colour, getattr(shape, "opacity", 1.0))
     upright = np.zeros(3)

@@ -20,7 +20,7 @@ from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
-SINGULAR = 1.5e-5
+SINGULAR_START = 1.5e-5
 """det J2 below which rounding, over its square, leaves gamma_dot less than six digits."""
 
 # Codes of runs that cannot start.
@@ -52,7 +52,7 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     if gamma_dot.any():  # rest needs no Jacobian, which a singular posture has not
         posture = virtual_work.posture(geometry, gamma, rotation)
         determinant = float(np.linalg.det(posture.j2))
-        if abs(determinant) < SINGULAR:
+        if abs(determinant) < SINGULAR_START:
             message = "gamma_dot does not determine the body rate: parallel singularity"
             raise SingularConfiguration(f"{message}, det J2", determinant)
         rate = rotation.T @ posture.j @ gamma_dot
@@ -89,7 +89,7 @@ def initial_states(
         selected = assembly_of[index[unique]]
         quaternions[:, rows] = quaternion_of(assemblies.rotation[selected]).T
         moves = gamma_dot[rows].any(axis=1)
-        singular = moves & (np.abs(assemblies.det_j2[selected]) < SINGULAR)
+        singular = moves & (np.abs(assemblies.det_j2[selected]) < SINGULAR_START)
         codes[rows] = np.where(singular, NO_RATE, 0)
         moves &= ~singular
         rows = rows[moves]

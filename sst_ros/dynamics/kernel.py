@@ -52,7 +52,7 @@ from sst_ros.mechanism.generic_math import (
 )
 from sst_ros.scene.bodies import PLACES
 from sst_ros.scene.loads import Friction
-from sst_ros.scene.own_loads import ANGLES, BODY_RATE, OMEGA, ROTATION
+from sst_ros.scene.own_loads import ANGLE_NAMES, BODY_RATE, OMEGA, ROTATION
 from sst_ros.state import ZERO, Joints
 
 __all__ = ["Leg", "Model", "model_of"]
@@ -408,7 +408,7 @@ def _run_load(
 
 
 def _quantity(name: str, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) -> Scalar:
-    """Return what a name in a formula means: see `scene.own_loads.STATE`."""
+    """Return what a name in a formula means: see `scene.own_loads.STATE_NAMES`."""
     if name in ROTATION:
         return rows[int(name[1]) - 1][int(name[2]) - 1]
     if name in OMEGA:
@@ -419,7 +419,7 @@ def _quantity(name: str, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) ->
         ("gamma", "mu", "beta").index(name.partition("_")[0]),
         legs[int(name[-1]) - 1],
     )
-    return joint_angle(leg, kind) if name in ANGLES else joint_rate(leg, kind)
+    return joint_angle(leg, kind) if name in ANGLE_NAMES else joint_rate(leg, kind)
 
 
 def friction_torque(friction: Friction, v: Scalar) -> Scalar:

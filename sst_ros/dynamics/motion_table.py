@@ -12,13 +12,20 @@ import numpy as np
 from sst_ros.errors import require
 from sst_ros.mechanism.geometry import Array, rotation_matrix, zyz_angles
 from sst_ros.scene.scene import Scene
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Explained, ReadOnly, freeze
+from sst_ros.state import (
+    DIMENSIONS,
+    MOTION_UNITS,
+    QUANTITIES,
+    Explained,
+    ReadOnly,
+    freeze,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-JOINTS = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
+JOINT_QUANTITIES = ("gamma", "mu", "beta", "gamma_dot", "mu_dot", "beta_dot")
 
 
 def _of_joints(name: str, meaning: str) -> Any:
@@ -52,7 +59,7 @@ class MotionTable(Explained, ReadOnly):
     energy: Any
 
     def _joint(self, name: str) -> Array:
-        """Return one of JOINTS, shape (..., 3)."""
+        """Return one of JOINT_QUANTITIES, shape (..., 3)."""
         raise NotImplementedError
 
     gamma = _of_joints("gamma", "Angles of the actuators [rad]")
@@ -70,7 +77,7 @@ class MotionTable(Explained, ReadOnly):
     def columns(
         self, names: Iterable[str] = (*QUANTITIES, "energy")
     ) -> dict[str, Array]:
-        """Return the time and these quantities, a column a number, by the names of `state.UNITS`.
+        """Return the time and these quantities, a column a number, by the names of `state.MOTION_UNITS`.
 
         Each has the shape of t.
         """
@@ -98,7 +105,7 @@ class MotionTable(Explained, ReadOnly):
         columns = {name: values for name, (values, _) in more.items()} | self.columns()
         table: pd.DataFrame = require("pandas").DataFrame(columns)
         units = {name: unit for name, (_, unit) in more.items() if unit}
-        table.attrs = {"units": UNITS | units, "scene": self.scene.name}
+        table.attrs = {"units": MOTION_UNITS | units, "scene": self.scene.name}
         table.index.name = None if self._axes == ("time",) else self._axes[-1]
         return table
 

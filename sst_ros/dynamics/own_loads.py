@@ -24,13 +24,13 @@ from sst_ros.mechanism import generic_math
 from sst_ros.mechanism.generic_math import Scalar
 from sst_ros.programs.expression import Expression, Program, trace
 from sst_ros.scene.own_loads import (
-    ANGLES,
+    ANGLE_NAMES,
     BODY_RATE,
     OMEGA,
-    POSE,
-    RATES,
+    POSE_NAMES,
+    RATE_NAMES,
     ROTATION,
-    STATE,
+    STATE_NAMES,
     FormulaLoad,
     LoadParameter,
     names_in,
@@ -93,7 +93,7 @@ def load_program(formula: LoadFormula) -> LoadProgram:
     """
     texts = [text for _, text in formula.terms] + [*formula.outputs]
     used = names_in(iter(texts))
-    quantities = tuple(name for name in STATE if name in used)
+    quantities = tuple(name for name in STATE_NAMES if name in used)
     inputs = (*quantities, *formula.parameters)
 
     def run(*values: Any) -> list[Any]:
@@ -122,12 +122,12 @@ def _evaluate(node: ast.expr, known: Mapping[str, Any]) -> Any:
     if isinstance(node, ast.Call):
         assert isinstance(node.func, ast.Name)
         arguments = [_evaluate(argument, known) for argument in node.args]
-        return _CALLS[node.func.id](*arguments)
+        return _CALL_FUNCTIONS[node.func.id](*arguments)
     assert isinstance(node, ast.BinOp)
     left = _evaluate(node.left, known)
     if isinstance(node.op, ast.Pow):
         return _raise(left, power_of(node) or 1)
-    return _OPERATORS[type(node.op)](left, _evaluate(node.right, known))
+    return _OPERATOR_FUNCTIONS[type(node.op)](left, _evaluate(node.right, known))
 
 
 def _raise(base: Any, power: int) -> Any:
@@ -154,13 +154,13 @@ def _largest(x: Any, y: Any) -> Any:
     return x + generic_math.positive(y - x)
 
 
-_OPERATORS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
+_OPERATOR_FUNCTIONS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
 }
-_CALLS: dict[str, Callable[..., Any]] = {
+_CALL_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sqrt": generic_math.sqrt,
     "exp": generic_math.exp,
     "sin": generic_math.sin,
@@ -186,7 +186,7 @@ def _step(x: Any) -> Any:
     )
 
 
-_STEPS: dict[str, Callable[..., Any]] = {
+_STEP_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
     "sub": operator.sub,
     "mul": operator.mul,
@@ -194,7 +194,7 @@ _STEPS: dict[str, Callable[..., Any]] = {
     "neg": operator.neg,
     "step": _step,
     **{
-        name: _CALLS[name]
+        name: _CALL_FUNCTIONS[name]
         for name in ("sqrt", "exp", "sin", "cos", "tanh", "atan2", "positive")
     },
 }
@@ -209,7 +209,7 @@ def run_program(program: Program, values: Sequence[Scalar]) -> list[Scalar]:
 
     for operation, operands in program.steps:
         assert isinstance(operation, str)  # no routine: a load has none
-        numbers.append(_STEPS[operation](*map(number, operands)))
+        numbers.append(_STEP_FUNCTIONS[operation](*map(number, operands)))
     return [number(operand) for operand in program.outputs]
 
 
@@ -347,14 +347,14 @@ class LoadState:
 
         return cls(
             rotation=array(ROTATION).reshape(3, 3),
-            gamma=array(ANGLES[0:3]),
-            mu=array(ANGLES[3:6]),
-            beta=array(ANGLES[6:9]),
+            gamma=array(ANGLE_NAMES[0:3]),
+            mu=array(ANGLE_NAMES[3:6]),
+            beta=array(ANGLE_NAMES[6:9]),
             omega=array(OMEGA),
             body_rate=array(BODY_RATE),
-            gamma_dot=array(RATES[0:3]),
-            mu_dot=array(RATES[3:6]),
-            beta_dot=array(RATES[6:9]),
+            gamma_dot=array(RATE_NAMES[0:3]),
+            mu_dot=array(RATE_NAMES[3:6]),
+            beta_dot=array(RATE_NAMES[6:9]),
         )
 
 
@@ -396,10 +396,12 @@ def own_load(
         LoadParameter(name=key, value=x) for key, x in given.items()
     )
     if callable(potential):
-        document["terms"], (energy,) = _write(potential, given, POSE, 1, "potential")
+        document["terms"], (energy,) = _write(
+            potential, given, POSE_NAMES, 1, "potential"
+        )
         document["potential"] = energy
     elif callable(moment):
-        document["terms"], texts = _write(moment, given, STATE, 3, "moment")
+        document["terms"], texts = _write(moment, given, STATE_NAMES, 3, "moment")
         document["moment"] = texts
     elif potential is not None:
         document["potential"] = potential

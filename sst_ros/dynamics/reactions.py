@@ -37,7 +37,7 @@ from sst_ros.dynamics.model import Model
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     MOTION,
-    TORQUE,
+    TORQUE_SYMBOLS,
     Dynamics,
     Function,
 )
@@ -271,7 +271,9 @@ def reaction_at(scene: Scene, joint: str, leg: int) -> Function:
         force, moment = getattr(legs[leg], joint)
         return (*force, *moment)
 
-    return compile_program(trace(wrench, (*MOTION, *TORQUE, *BODY_ACCELERATION)))
+    return compile_program(
+        trace(wrench, (*MOTION, *TORQUE_SYMBOLS, *BODY_ACCELERATION))
+    )
 
 
 class ScenarioReactions:
@@ -290,7 +292,7 @@ class ScenarioReactions:
             place: x for place, x in numbers.items() if isinstance(x, np.ndarray)
         }
         self._columns = list(columns.values())
-        names = (*MOTION, *TORQUE, *(f"p{i}" for i in range(len(columns))))
+        names = (*MOTION, *TORQUE_SYMBOLS, *(f"p{i}" for i in range(len(columns))))
 
         def run(*inputs: Any) -> list[Any]:
             given = map(mark_present, inputs[10:])

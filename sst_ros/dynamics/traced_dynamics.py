@@ -38,18 +38,18 @@ from sst_ros.state import Joints
 
 Function = Callable[..., Sequence[float]]
 
-QUATERNION = ("x", "y", "z", "w")
-RATE = ("wx", "wy", "wz")
-MOTION = (*QUATERNION, *RATE)
+QUATERNION_SYMBOLS = ("x", "y", "z", "w")
+RATE_SYMBOLS = ("wx", "wy", "wz")
+MOTION = (*QUATERNION_SYMBOLS, *RATE_SYMBOLS)
 LAG = ("l1", "l2", "l3")
-TORQUE = ("t1", "t2", "t3")
-MOMENT = ("n1", "n2", "n3")
+TORQUE_SYMBOLS = ("t1", "t2", "t3")
+MOMENT_SYMBOLS = ("n1", "n2", "n3")
 BODY_ACCELERATION = ("ax", "ay", "az")
 
 STATE_SIZE = len(MOTION)  # of a state without lagged torques
 LEGS = 3
 
-OUTPUTS = (*Joints._fields, "energy")
+DYNAMICS_OUTPUTS = (*Joints._fields, "energy")
 """Quantities of a state that depend on the numbers of its scenario."""
 
 
@@ -67,9 +67,9 @@ class Dynamics:
         self.state: tuple[str, ...] = MOTION
         if model.time_constant is not None:
             self.state = (*MOTION, *LAG)
-        self.drive: tuple[str, ...] = TORQUE
+        self.drive: tuple[str, ...] = TORQUE_SYMBOLS
         if has_moment_topic:
-            self.drive = (*TORQUE, *MOMENT)
+            self.drive = (*TORQUE_SYMBOLS, *MOMENT_SYMBOLS)
 
     @staticmethod
     def of(scene: Scene) -> Dynamics:
@@ -127,7 +127,7 @@ class Dynamics:
 
         names: tuple[str, ...] = (*MOTION, *BODY_ACCELERATION)
         if self.has_moment_topic:
-            names = (*names, *MOMENT)
+            names = (*names, *MOMENT_SYMBOLS)
         return compile_program(trace(torques, names))
 
     @cached_property
@@ -145,7 +145,7 @@ class Dynamics:
             slope = kernel.derivative(
                 self.model, state, torque, triple(moment) if moment else None
             )
-            body_acceleration = triple(slope[len(QUATERNION) : STATE_SIZE])
+            body_acceleration = triple(slope[len(QUATERNION_SYMBOLS) : STATE_SIZE])
             gamma_ddot = kernel.actuator_acceleration(
                 self.model, state, body_acceleration
             )
@@ -154,7 +154,7 @@ class Dynamics:
             return (*x, *joints.gamma_dot, *gamma_ddot, *slope[STATE_SIZE:])
 
         inputs = (*self.state, *self.drive)
-        return compile_program(trace(motion, inputs, (*self.state, *TORQUE)))
+        return compile_program(trace(motion, inputs, (*self.state, *TORQUE_SYMBOLS)))
 
     @cached_property
     def energies(self) -> Function:
@@ -261,7 +261,9 @@ class ODE:
     @cached_property
     def linearised_by_torque(self) -> Function:
         """The derivative, and its derivatives by t, the state and the drive's torques."""
-        program = trace(self._of_numbers, self._inputs, ("t", *self.state, *TORQUE))
+        program = trace(
+            self._of_numbers, self._inputs, ("t", *self.state, *TORQUE_SYMBOLS)
+        )
         return compile_functions({"linearised": program}, ("linearised",))["linearised"]
 
     def derivative(
@@ -447,7 +449,7 @@ class ParametricModel:
 
     @cached_property
     def outputs(self) -> dict[str, Callable[..., tuple[Any, ...]]]:
-        """Functions of arrays for quantities of OUTPUTS by name.
+        """Functions of arrays for quantities of DYNAMICS_OUTPUTS by name.
 
         They have the inputs of `limit_distances`, and give three angles [rad] or rates
         [rad/s] each, or the energy [J].
@@ -462,7 +464,7 @@ class ParametricModel:
 
         program = trace(values, (*MOTION, *self.names))
         functions = {}
-        for number, name in enumerate(OUTPUTS):
+        for number, name in enumerate(DYNAMICS_OUTPUTS):
             first = LEGS * number
             own = program.prune(program.outputs[first : first + LEGS])
             functions[name] = compile_for_arrays(own)

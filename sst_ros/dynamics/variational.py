@@ -27,7 +27,7 @@ import numpy as np
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE, Dynamics
+from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE_SYMBOLS, Dynamics
 from sst_ros.errors import SingularConfiguration, refusal
 from sst_ros.mechanism.generic_math import (
     Triple,
@@ -62,29 +62,29 @@ from sst_ros.scene.yaml_document import find_fields, find_number, plain, replace
 from sst_ros.state import Array, clamp, freeze
 
 # of a step, relative and absolute; the latter over the size of a parameter
-TOLERANCE = 1e-12
+SENSITIVITY_TOLERANCE = 1e-12
 # of it where stops are elastic: a step across a jump of derivatives loses its order
 AT_STOPS = 0.1
-MOST = 4_000_000
+MOST_MOTION_EVALUATIONS = 4_000_000
 """Evaluations of a motion: minutes, where a stiff motion needs hours by an explicit method."""
 GEOMETRY = ("base.v", "star.alpha_deg")
 """Keys of the geometry that the equations of motion have.
 
 The third alpha is what is left.
 """
-ACTUATORS = (
+ACTUATOR_PARAMETERS = (
     "actuators.torque_limit",
     "actuators.idle_damping",
     "actuators.velocity_limit",
     "actuators.acceleration_limit",
 )
-OUTSIDE = (
+OUTSIDE_PARAMETERS = (
     "torque", "motion", "duration", "initial.orientation", "base.radius", "star.radius",
-    "workspace", "stroke.at_end", *ACTUATORS,
+    "workspace", "stroke.at_end", *ACTUATOR_PARAMETERS,
 )  # fmt: skip
 # known to the equations as one damping
 REBOUND = ("stroke.restitution", "stroke.impact_rate")
-FIRST = np.zeros(1)
+FIRST_TIME = np.zeros(1)
 OWN_TORQUE = "torque"
 """Parameter that means all numbers of the torques."""
 
@@ -147,7 +147,7 @@ class VariationalEquations:
         values: Array | None = None,
         *,
         scene: Scene | None = None,
-        most: int = MOST,
+        most: int = MOST_MOTION_EVALUATIONS,
     ) -> tuple[Array, Array] | None:
         """Integrate from a state, shape (m,), and its derivatives, shape (m, k), to times t [s].
 
@@ -191,7 +191,9 @@ class VariationalEquations:
             )
             return np.concatenate([rate[0], flow.ravel()])
 
-        tolerance = TOLERANCE * (AT_STOPS if scene.stroke.at_end == "elastic" else 1.0)
+        tolerance = SENSITIVITY_TOLERANCE * (
+            AT_STOPS if scene.stroke.at_end == "elastic" else 1.0
+        )
         sizes = np.append(np.ones(free), np.abs(own))
         least = np.append(np.ones(size), np.tile(1.0 / (sizes + (sizes == 0.0)), size))
         end = max(float(t[-1]), 1e-9)
@@ -302,7 +304,7 @@ def refuse_other_numbers(scene: Scene, names: Sequence[str], caller: str) -> Non
         allowed = ""
         if name.startswith(GEOMETRY) and caller != "simulate":
             allowed = "is geometry, which is taken as known"
-        elif name.startswith(OUTSIDE):
+        elif name.startswith(OUTSIDE_PARAMETERS):
             allowed = "is no number of the equations of motion"
         elif find_number(scene, name) is None:
             allowed = "must be the key of a number that the scene has"
@@ -378,8 +380,8 @@ def trace_derivatives(
         model = _open_model(scene, symbols)
         return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
 
-    by = (*state, *(TORQUE if by_torque else ()), *varied)
-    program = trace(derivative, (*state, *TORQUE, *varied), by)
+    by = (*state, *(TORQUE_SYMBOLS if by_torque else ()), *varied)
+    program = trace(derivative, (*state, *TORQUE_SYMBOLS, *varied), by)
     return compile_functions({"derivatives": program}, ("derivatives",))["derivatives"]
 
 
@@ -406,7 +408,7 @@ def _numbers(torque: TorqueProfile) -> Array:
     if isinstance(torque, PolynomialTorque):
         return torque.c.ravel()
     return np.ravel(
-        torque.torques if isinstance(torque, TorqueTable) else torque.values(FIRST)
+        torque.torques if isinstance(torque, TorqueTable) else torque.values(FIRST_TIME)
     )
 
 

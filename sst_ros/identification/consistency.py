@@ -38,16 +38,16 @@ from sst_ros.identification.parameters import STANDARD
 from sst_ros.mechanism.geometry import Array
 
 # noise over RMS terms that is assumed at least: simulations have no other
-EXACT = 1e-12
+LEAST_NOISE = 1e-12
 INTERIOR = 1e-3  # share of its size by which a parameter is lifted at the start
 BARRIERS = tuple(
     10.0**-k for k in range(0, 11)
 )  # the last: chi^2 off by 1e-10 at each boundary
 # squared decrement over the barrier below which Newton converges quadratically
 CENTRED = 1e-2
-_NEWTON_STEPS = 100
+_BARRIER_NEWTON_STEPS = 100
 SMALLEST_STEP = 1e-12  # share of a step below which it is rounding
-LARGEST = float(np.finfo(float).max)
+LARGEST_DOUBLE = float(np.finfo(float).max)
 _CLOSE = 0.95  # share of the distance to the boundary that a step may cover
 
 _PSEUDO = np.zeros((10, 4, 4))  # J of each of the ten parameters alone
@@ -72,7 +72,7 @@ def fit_weighted(
     """Fit torque = columns estimate, with b independent columns, shape (m, 3, b).
 
     Torques are measured less known ones [N m], shape (m, 3), and the noise their
-    standard deviations, three, by default estimated: at least EXACT of the torques, and
+    standard deviations, three, by default estimated: at least LEAST_NOISE of the torques, and
     of the RMS of the `terms` that sum up to them [N m], which cancel in a free motion.
     Returns the estimates, shape (b,), R of the weighted regressor, R^T R =
     covariance^-1, shape (b, b), and the noise, (3,).
@@ -80,7 +80,7 @@ def fit_weighted(
     if noise is not None:
         given = np.array(noise)
         return (*_solve(columns, torque, given)[:2], given)
-    floor = EXACT * max(float(np.sqrt(np.mean(torque**2))), terms) + 1e-300
+    floor = LEAST_NOISE * max(float(np.sqrt(np.mean(torque**2))), terms) + 1e-300
     found = np.ones(3)
     for _ in range(2):
         estimate, _, leverage = _solve(columns, torque, found)
@@ -155,7 +155,7 @@ def find_consistent_values(
     ]
     values = given + INTERIOR * sizes * lifted
     for barrier in BARRIERS:
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(_BARRIER_NEWTON_STEPS):
             inverse = np.linalg.inv(
                 np.linalg.cholesky(constant + np.tensordot(values, basis, 1))
             )
@@ -176,7 +176,7 @@ def find_consistent_values(
             )
             size = 1.0 if least > -_CLOSE else -_CLOSE / least
             centred = part @ part < CENTRED * barrier
-            most = LARGEST if centred else cost(values, barrier)
+            most = LARGEST_DOUBLE if centred else cost(values, barrier)
             size = shorten(values, step, size, barrier, most)
             values = values + size * step
             if centred or size == 0.0:

@@ -41,11 +41,13 @@ from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import values_at
 
-POINTS = 12  # samples, and points of the scene, in a period of the highest harmonic
+POINTS_A_PERIOD = (
+    12  # samples, and points of the scene, in a period of the highest harmonic
+)
 # of each range that the motion may use: the manipulator is not quite its model
-SHARE = 0.9
+RANGE_SHARE = 0.9
 LEAST_SINE = 0.15  # of mu_k, and det J2: torques and rates grow with their inverse
-_FIRST = 0.05  # amplitude of the first guess [rad]
+_FIRST_AMPLITUDE = 0.05  # amplitude of the first guess [rad]
 _PENALTY = 100.0
 _POINT = ("time", "gamma", "gamma_dot", "gamma_ddot")  # of a quintic between waypoints
 _HOMOTOPY = 8  # steps from the centre to all samples
@@ -111,7 +113,7 @@ def design(
     names = parameters.select_names(scene, requested)
     trial = _Trial(scene, names, duration, harmonics)
     free = np.random.default_rng(seed).normal(size=trial.size)
-    free *= _FIRST / np.abs(trial.series(free)[0] - trial.centre).max()
+    free *= _FIRST_AMPLITUDE / np.abs(trial.series(free)[0] - trial.centre).max()
     found = minimize(
         trial.cost, free, method="L-BFGS-B", options={"maxiter": iterations}
     ).x
@@ -141,7 +143,7 @@ class _Trial:
     """Fourier series of free numbers about `centre`, at `times`, and how far they determine `base`.
 
     `base` are the parameters that some motion of the scene determines; samples are
-    POINTS in a period of the highest harmonic, n of them.
+    POINTS_A_PERIOD in a period of the highest harmonic, n of them.
     """
 
     def __init__(
@@ -157,7 +159,9 @@ class _Trial:
         self._start = np.array(initial_state(scene, self._space.geometry)[:4])
         self.centre = np.array(scene.initial.gamma)
         self.times = (
-            np.arange(1, POINTS * harmonics + 1) * duration / (POINTS * harmonics)
+            np.arange(1, POINTS_A_PERIOD * harmonics + 1)
+            * duration
+            / (POINTS_A_PERIOD * harmonics)
         )
         n = np.arange(1, harmonics + 1)
         # gamma, gamma_dot, gamma_ddot at the beginning
@@ -200,14 +204,16 @@ class _Trial:
             torque = known + columns @ self._values
             posture = np.stack(space.postures(*quaternion.T), axis=1)
         sines, beta, det_j2 = posture[:, :3], posture[:, 3:6], posture[:, 6:]
-        # How far numbers lie beyond SHARE of their range, over the range.
+        # How far numbers lie beyond RANGE_SHARE of their range, over the range.
         ranges = (gamma, space.geometry.arc), (beta, space.geometry.beta_max)
-        excess = [np.abs(values / high - 0.5) - 0.5 * SHARE for values, high in ranges]
+        excess = [
+            np.abs(values / high - 0.5) - 0.5 * RANGE_SHARE for values, high in ranges
+        ]
         excess.append(LEAST_SINE - np.hstack([sines, np.abs(det_j2)]))
         reached = {"torque": torque, "velocity": rate, "acceleration": acceleration}
         for name, values in reached.items():
             for limit in values_at(self._scene, f"actuators.{name}_limit"):
-                excess.append(np.abs(values) / limit - SHARE)
+                excess.append(np.abs(values) / limit - RANGE_SHARE)
         beyond = np.hstack(excess)
         columns = columns[..., chosen].reshape(-1, len(chosen))
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(beyond))):

@@ -89,9 +89,9 @@ SIGNIFICANT = 25.0
 # double the frequencies of torques. From 2 to 5, 95 % intervals cover 0.90 to 0.99 in
 # 200 long recordings; the bias of short ones grows.
 BAND = 3.0
-MARGIN = 10.0  # default cut-off over the bandwidth of the motion
+CUTOFF_MARGIN = 10.0  # default cut-off over the bandwidth of the motion
 # between poses that continuation follows [rad]; Newton's method takes the rest
-STEP = 0.03
+CONTINUATION_STEP = 0.03
 POSITIVE = re.compile(
     r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$"
 )
@@ -584,7 +584,7 @@ class _Path(NamedTuple):
     """Angles, rates and accelerations along one segment, and where the equation is taken.
 
     Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at
-    MARGIN times the bandwidth of the motion.
+    CUTOFF_MARGIN times the bandwidth of the motion.
     """
 
     measured: MeasuredMotion
@@ -729,7 +729,11 @@ def _follow_orientations(
     """
     begin, first = measured.quaternion, measured.gamma[:1]
     length = np.cumsum(np.linalg.norm(np.diff(gamma, axis=0, prepend=first), axis=1))
-    known = np.unique(np.searchsorted(length, np.arange(0.0, length[-1] + STEP, STEP)))
+    known = np.unique(
+        np.searchsorted(
+            length, np.arange(0.0, length[-1] + CONTINUATION_STEP, CONTINUATION_STEP)
+        )
+    )
     points = np.vstack([first, gamma[known[known < len(gamma)]]])
     refused = "gamma", first[0].tolist(), "must be angles of this manipulator"
     failures = AssemblyError, continuation.BranchEnds
@@ -756,7 +760,7 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
     period = float(np.median(spacing))
     even = np.abs(spacing - period).max() <= 1e-3 * period
     if cutoff is None:
-        cutoff = min(MARGIN * find_bandwidth(period, gamma), 0.4 / period)
+        cutoff = min(CUTOFF_MARGIN * find_bandwidth(period, gamma), 0.4 / period)
     settled = int(np.ceil(1.0 / (cutoff * period))) if cutoff > 0.0 else 0
     least = 4 * settled + 10
     slow = f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz"

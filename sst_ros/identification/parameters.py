@@ -30,7 +30,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.traced_dynamics import BODY_ACCELERATION, QUATERNION, RATE
+from sst_ros.dynamics.traced_dynamics import (
+    BODY_ACCELERATION,
+    QUATERNION_SYMBOLS,
+    RATE_SYMBOLS,
+)
 from sst_ros.errors import Check, refuse_unless, suggestion
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
@@ -49,11 +53,11 @@ NEGLIGIBLE = 1e-12  # friction coefficient below which a scene has no such frict
 # mechanism tried (1e-4).
 DEPENDENT = 1e-8
 ROUNDED = 1e-10  # share of a column's length that is rounding
-INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
+INERTIA_ENTRIES = ("xx", "yy", "zz", "xy", "xz", "yz")
 STANDARD = (
     "mass",
     *(f"moment.{axis}" for axis in "xyz"),
-    *(f"inertia.{part}" for part in INERTIA),
+    *(f"inertia.{part}" for part in INERTIA_ENTRIES),
 )
 """The ten inertial parameters of a body about O, in the order of a body's columns."""
 
@@ -243,7 +247,7 @@ class Regressor:
             ]
 
         symbols = tuple(f"p{i}" for i in range(len(traced)))
-        inputs = (*QUATERNION, *RATE, *BODY_ACCELERATION, *symbols)
+        inputs = (*QUATERNION_SYMBOLS, *RATE_SYMBOLS, *BODY_ACCELERATION, *symbols)
         self._torques = compile_for_arrays(trace(torques, inputs, symbols))
         places = [self.names.index(name) for name in traced]
         self._traced = np.array(places, dtype=int)

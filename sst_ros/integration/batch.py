@@ -19,13 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import MotionTable
-from sst_ros.dynamics.traced_dynamics import TORQUE, ParameterColumns, ParametricModel
+from sst_ros.dynamics.traced_dynamics import (
+    TORQUE_SYMBOLS,
+    ParameterColumns,
+    ParametricModel,
+)
 from sst_ros.errors import check_kinds, read_numbers, refuse_unless
 from sst_ros.integration.batch_session import BatchSession
 from sst_ros.integration.batch_step import (
-    BLOCK,
     EARLIEST,
-    NOT_FINITE,
+    LANE_BLOCK,
+    NOT_FINITE_CODE,
     Advance,
     Block,
     ColumnStep,
@@ -38,7 +42,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.llvm import LANES
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
-from sst_ros.scene.schema import TURN
+from sst_ros.scene.schema import FULL_TURN
 from sst_ros.state import Explained, freeze
 
 _UNUSED = {
@@ -46,22 +50,22 @@ _UNUSED = {
     **dict.fromkeys(("motion", "duration"), "has no effect on a batch"),
 }
 
-_BLOCK = 1024
+_BATCH_BLOCK = 1024
 """States whose joints are computed at once: all numbers of the program are arrays as long."""
 
-_MOST = 10**9
+_MOST_BATCH_STEPS = 10**9
 """Steps of a run."""
 
-_SHARE = 64
+_THREAD_COLUMNS = 64
 """Columns that are worth a thread of their own."""
 
-OUTSIDE = -3
+OUTSIDE_STATUS = -3
 _REASONS = {
     0: "reached the end",
     NO_ASSEMBLY: "no unique admissible assembly",
     NO_RATE: "gamma_dot does not determine the body rate: singular start",
-    OUTSIDE: "initial gamma outside the stroke",
-    NOT_FINITE: "not finite",
+    OUTSIDE_STATUS: "initial gamma outside the stroke",
+    NOT_FINITE_CODE: "not finite",
 }
 """How a scenario ended, by the codes that are no limit's: below zero it did not start."""
 
@@ -190,12 +194,15 @@ class Batch(Explained):
             InputError: an argument is not allowed; names it and what is.
 
         """
-        allowed = f"must be >= 0 and <= {_MOST:g}"
+        allowed = f"must be >= 0 and <= {_MOST_BATCH_STEPS:g}"
         whole = {"count": count, "keep_every": keep_every, "threads": threads}
         refuse_unless(
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
-            *((name, n, 0 <= n <= _MOST, allowed) for name, n in whole.items()),
+            *(
+                (name, n, 0 <= n <= _MOST_BATCH_STEPS, allowed)
+                for name, n in whole.items()
+            ),
         )
         step, count = float(step), int(count)
         loop = advance or partial(self.advance, threads=threads)
@@ -258,12 +265,12 @@ class Batch(Explained):
                 torques.
 
         """
-        allowed = f"must be >= 1 and <= {_MOST:g}"
-        torque = self.model.ode.drive[:3] == TORQUE
+        allowed = f"must be >= 1 and <= {_MOST_BATCH_STEPS:g}"
+        torque = self.model.ode.drive[:3] == TORQUE_SYMBOLS
         refuse_unless(
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
-            ("substeps", substeps, 1 <= substeps <= _MOST, allowed),
+            ("substeps", substeps, 1 <= substeps <= _MOST_BATCH_STEPS, allowed),
             (
                 "profile",
                 True,
@@ -302,7 +309,7 @@ class Batch(Explained):
         start, code = initial_states(columns.geometries, which, angles, rates)
         if self.scene.stroke.at_end == "stop":
             outside = (angles < 0.0) | (angles > columns.geometries.of_rows(which).arc)
-            code[outside.any(axis=1)] = OUTSIDE
+            code[outside.any(axis=1)] = OUTSIDE_STATUS
         y = np.zeros((len(self.model.ode.state), len(angles)))
         y[:7] = start
         if alike and count:
@@ -313,7 +320,7 @@ class Batch(Explained):
         """Return what acts from outside and what differs, a column a scenario."""
         drive, columns = self.model.ode.drive, self.columns.inputs
         given = np.zeros((max(len(drive) + len(columns), 1), number))
-        if drive[:3] == TORQUE:
+        if drive[:3] == TORQUE_SYMBOLS:
             limit = self.columns.torque_limit
             given[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
         given[len(drive) : len(drive) + len(columns)] = columns
@@ -359,7 +366,9 @@ class Batch(Explained):
 
 def block_width(number: int, threads: int = 1) -> int:
     """Return how many of a number of columns are advanced together."""
-    blocks = max(-(-number // BLOCK), min(threads, -(-number // _SHARE)), 1)
+    blocks = max(
+        -(-number // LANE_BLOCK), min(threads, -(-number // _THREAD_COLUMNS)), 1
+    )
     width = -(-number // blocks)
     return max(1, -(-width // LANES)) * LANES
 
@@ -376,7 +385,7 @@ def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
         rows = np.tile(rows, (count, 1))
     expected = "(N, 3)" if count is None else f"(3,) or ({count}, 3)"
     fits = rows.ndim == 2 and rows.shape[1] == 3 and count in (None, len(rows))
-    most = TURN if name == "gamma" else np.inf
+    most = FULL_TURN if name == "gamma" else np.inf
     refuse_unless(
         "batch",
         (name, rows.shape, fits, f"must have the shape {expected}"),
@@ -397,7 +406,7 @@ class BatchResult(MotionTable):
         body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3).
         status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where
             it has no start or its numbers ceased to be finite, shape (N,).
-        code: 0 at the end, 1 + the index of a limit, NOT_FINITE, < 0 without a start,
+        code: 0 at the end, 1 + the index of a limit, NOT_FINITE_CODE, < 0 without a start,
             shape (N,).
         fault_time: when a scenario passed a limit [s], the end of the step in which its
             numbers ceased to be finite, 0 without a start, nan where it reached its
@@ -424,7 +433,9 @@ class BatchResult(MotionTable):
         self.scene = model.scene
         self._axes = ("time", "scenario") if t.ndim == 2 else ("scenario",)
         self.code, self.fault_time, self.local_error = code, fault_time, local_error
-        self.status = np.where((code < 0) | (code == NOT_FINITE), -1, np.sign(code))
+        self.status = np.where(
+            (code < 0) | (code == NOT_FINITE_CODE), -1, np.sign(code)
+        )
         self.t, self._state = t, np.moveaxis(y, -2, -1)
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
@@ -444,7 +455,7 @@ class BatchResult(MotionTable):
             function, inputs = self._model.outputs[name], self._columns.inputs
             states, count = np.moveaxis(self._state, -1, 0)[:7], self.t.shape[-1]
             found = np.empty((1 if name == "energy" else 3, *self.t.shape))
-            size = max(1, _BLOCK * count // max(self.t.size, 1))
+            size = max(1, _BATCH_BLOCK * count // max(self.t.size, 1))
             with np.errstate(all="ignore"):
                 for first in range(0, count, size):
                     rows = slice(first, first + size)
@@ -484,9 +495,9 @@ class BatchResult(MotionTable):
         """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
         geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
         # only these depend on the geometry
-        limited = (self.code > 0) & (self.code < NOT_FINITE)
+        limited = (self.code > 0) & (self.code < NOT_FINITE_CODE)
         # One number for both: of pairs np.unique takes a tenth of the time of a sweep.
-        both = np.where(limited, geometry, 0) * 4 * NOT_FINITE + self.code
+        both = np.where(limited, geometry, 0) * 4 * NOT_FINITE_CODE + self.code
         _, first, index = np.unique(both, return_index=True, return_inverse=True)
         texts = []
         for row, code in zip(first, self.code[first].tolist(), strict=True):

@@ -43,14 +43,14 @@ from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
 from sst_ros.programs.llvm import LANES
 
-BLOCK = 192
+LANE_BLOCK = 192
 """Columns of a block at most: their numbers fit the cache of a core, and a step of all
 takes a hundred times as long as the interpreter between two steps."""
 
 CACHE_LINE = 8
 """Doubles."""
 
-NOT_FINITE = 1000
+NOT_FINITE_CODE = 1000
 """Code of a scenario whose numbers are no longer finite.
 
 Others are 1 + the limit's index.
@@ -62,7 +62,7 @@ EARLIEST = 1e-8
 _NO_SHARE = 2.0
 """In place of the share of a step at which a limit is passed, where none is."""
 
-_HALVINGS = 52
+_EVENT_HALVINGS = 52
 """Of a step, until the share is known to all digits of a double."""
 
 
@@ -238,7 +238,7 @@ class Block:
         """Advance the columns that were taken over by `count` steps.
 
         Step `number` begins at `number` times h [s]. Codes and times of columns that
-        end change: to 1 + the index of a limit, or NOT_FINITE, and to when that was
+        end change: to 1 + the index of a limit, or NOT_FINITE_CODE, and to when that was
         [s].
         """
         _, _, code, time, _ = columns
@@ -264,7 +264,7 @@ class Block:
         found, share = self._first_crossings(before, after, h, columns)
         with np.errstate(all="ignore"):
             total = reduce(add, after[: self._size, columns])
-            found[~np.isfinite(total)] = NOT_FINITE
+            found[~np.isfinite(total)] = NOT_FINITE_CODE
         ends = found > 0
         ended = columns[ends]
         code[ended], time[ended] = found[ends], (number + share[ends]) * h
@@ -342,7 +342,7 @@ def share_of_crossing(
     least = value(high)
     least = select(-after, after, least)
     end, low = high, 0.0
-    for _ in range(_HALVINGS):
+    for _ in range(_EVENT_HALVINGS):
         middle = 0.5 * (low + end)
         outside = -value(middle)
         low, end = select(outside, low, middle), select(outside, middle, end)
@@ -387,7 +387,7 @@ def advance_blocks(
         block.store(part, *columns)
 
 
-FINE = 16
+REFINED_PARTS = 16
 """Parts of a step that is repeated to locate an end: the error of a cubic falls 65,536 times."""
 
 Advance = Callable[..., None]
@@ -410,7 +410,7 @@ def locate_ends(
 
     `code` and `time` change.
     """
-    ended = np.flatnonzero((code > 0) & (code < NOT_FINITE))
+    ended = np.flatnonzero((code > 0) & (code < NOT_FINITE_CODE))
     for number in np.unique(steps[ended]):
         rows = ended[steps[ended] == number]
         found, when = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), np.nan)
@@ -420,7 +420,14 @@ def locate_ends(
             found,
             when,
         )
-        first = int(number) * FINE
-        advance(first, FINE, step / FINE, *arrays, np.zeros(len(rows)), rows=rows)
-        located = (found > 0) & (found < NOT_FINITE)
+        first = int(number) * REFINED_PARTS
+        advance(
+            first,
+            REFINED_PARTS,
+            step / REFINED_PARTS,
+            *arrays,
+            np.zeros(len(rows)),
+            rows=rows,
+        )
+        located = (found > 0) & (found < NOT_FINITE_CODE)
         code[rows[located]], time[rows[located]] = found[located], when[located]

@@ -23,7 +23,7 @@ from sst_ros.dynamics.traced_dynamics import ODE
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.method_steps import (
     JACOBIAN_COST,
-    JOINTS,
+    JOINT_NUMBERS,
     has_error,
     lagged_torques,
     read_outcome,
@@ -488,7 +488,7 @@ def trace_stages(
     `trace_steps`.
     """
     slope = Routine("slope", 1 + size + drive, size)
-    joints = Routine("joints", 7, JOINTS)
+    joints = Routine("joints", 7, JOINT_NUMBERS)
     stages = len(method.a)
 
     def take_stage(number: int, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:

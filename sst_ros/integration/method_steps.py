@@ -40,7 +40,7 @@ from sst_ros.programs.llvm import Function
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
 
-JOINTS = 18
+JOINT_NUMBERS = 18
 """Numbers of `joints`: nine angles and nine rates."""
 
 
@@ -182,7 +182,7 @@ def trace_steps(
     """
     implicit = isinstance(method, Rosenbrock)
     slope = Routine("slope", 1 + size + drive, size)
-    joints = Routine("joints", 7, JOINTS)
+    joints = Routine("joints", 7, JOINT_NUMBERS)
     stages = len(method.a) if by_stage else 1
     state = [f"y{i}" for i in range(size)]
     near = [f"near{i}" for i in range(size)] if implicit else []
@@ -268,7 +268,7 @@ def read_outcome(
     after = Point(  # a call of `_replace` takes three times as long
         [*numbers[:size]],
         [*numbers[size : 2 * size]],
-        tuple(numbers[2 * size : 2 * size + JOINTS]),
+        tuple(numbers[2 * size : 2 * size + JOINT_NUMBERS]),
         at.method,
         at.h,
         at.attempts,

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from sst_ros.integration.methods import Method
 
-_MARGIN = 2.0
+_ERROR_MARGIN = 2.0
 """Of the distance of both solutions: an error that only halves with the steps is twice as large."""
-_ROUNDING = 8 * 2.220446049250313e-16
+_STEP_ROUNDING = 8 * 2.220446049250313e-16
 """Error of a step by rounding, which a run of n steps has at least sqrt(n) times."""
 
 
@@ -59,7 +59,7 @@ class Point(NamedTuple):
 
 def estimate_error(distance: float, steps: int) -> float:
     """Estimate the error of a solution by that of a second one, by steps of half the length."""
-    return max(_MARGIN * distance, _ROUNDING * math.sqrt(steps + 1.0))
+    return max(_ERROR_MARGIN * distance, _STEP_ROUNDING * math.sqrt(steps + 1.0))
 
 
 def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:

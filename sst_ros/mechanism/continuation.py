@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import AssemblyError, SingularConfiguration
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen
-from sst_ros.mechanism.kinematics import ROUNDING, rotate
+from sst_ros.mechanism.kinematics import CLOSURE_ROUNDING, rotate
 
 SAFE_STEP = 0.18  # in gamma [rad] over sigma^2; a longer one might leave the branch
 LEAST_SIGMA = 1e-5  # at which a branch is followed
@@ -150,7 +150,7 @@ def _newton(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
         largest = float(np.abs(residual).max())
         if largest < least:
             best, least = rotation, largest
-        if largest < ROUNDING:
+        if largest < CLOSURE_ROUNDING:
             break
         rotation = rotate(rotation, np.linalg.solve(cross(t, r), -residual))
     return best

@@ -48,12 +48,12 @@ from sst_ros.state import Assembly
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 NEAR = 0.1  # how near an assembly must be to the rotation that names it [rad]
-ROUNDING = 1e-15  # largest abs(r_k . t_k) that is rounding and not a residual
+CLOSURE_ROUNDING = 1e-15  # largest abs(r_k . t_k) that is rounding and not a residual
 NOT_ISOLATED = 1e-13  # quartic forms with smaller coefficients vanish identically
 NEAR_REAL = 1e-3  # imaginary part, over 1 + abs(z)^2, of a root that may be real
 SAME_ROOT = 1e-3  # entries of two rotations that may be one root differ by less
 MISFIT = 1e-2  # residual of leg 2 or 3 at an angle y that is worth polishing
-NEWTON_STEPS = 40
+POSE_NEWTON_STEPS = 40
 LONGEST_TURN = 0.3  # of a Newton step [rad]
 LAST_STEP = 1e-9  # a Newton step [rad] after which rounding is reached
 REGULAR = 1e-5  # abs(det J2) above which a Newton step is solved by the adjugate
@@ -278,7 +278,7 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     s = np.cos(y) * r_1[owner] + np.sin(y) * cross(t_1, r_1[owner])
     start = columns(cross(t_1, s), t_1, s)
     rotation, residual = _polish(r[owner], e[owner], start)
-    closed = residual <= ROUNDING
+    closed = residual <= CLOSURE_ROUNDING
     owner, rotation = _distinct(r, e, owner[closed], rotation[closed])
     owner, rotation = _arrange(owner, rotation)
     return owner, rotation, isolated
@@ -387,7 +387,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
     least = np.full(len(rotation), np.inf)  # residual of `best`
     active = np.arange(len(rotation))  # which start each row of `rotation` is of
     length = np.full(len(rotation), np.inf)  # of the last step
-    for _ in range(NEWTON_STEPS):
+    for _ in range(POSE_NEWTON_STEPS):
         t = e @ rotation.transpose(0, 2, 1)
         residual = dot(r, t)
         largest = _largest(residual)
@@ -465,7 +465,7 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
             mean = 0.5 * (new[close] + old[close])
             middle = rotate(mean, np.zeros((len(rows), 3)))
             t = e[owner[rows]] @ middle.transpose(0, 2, 1)
-            fresh[rows] = _largest(dot(r[owner[rows]], t)) > ROUNDING
+            fresh[rows] = _largest(dot(r[owner[rows]], t)) > CLOSURE_ROUNDING
     return owner[fresh], rotation[fresh]
 
 

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
-from sst_ros.mechanism.virtual_work import SINGULAR, Posture
+from sst_ros.mechanism.virtual_work import SINGULAR_MATRIX, Posture
 from sst_ros.state import ZERO
 
 
@@ -83,7 +83,7 @@ def of_star(
     w = geometry.w
     c = np.sum(cross(r, t) * w, axis=1)
     least = float(np.min(np.abs(c)))
-    if least < SINGULAR:
+    if least < SINGULAR_MATRIX:
         raise SingularConfiguration("serial singularity, c_k = 0", least)
     rate = np.array(omega, dtype=float)
     acceleration = np.array(omega_dot, dtype=float)
@@ -238,7 +238,7 @@ def orientation_sensitivity(
         by_alpha[..., k, :k] = by_turn[..., None]
     j2 = cross(t, r)
     least = float(np.min(np.abs(np.linalg.det(j2))))
-    if least < SINGULAR:
+    if least < SINGULAR_MATRIX:
         raise SingularConfiguration("parallel singularity, det J2 = 0", least)
     by_residual = -np.swapaxes(matrix, -1, -2) @ np.linalg.inv(j2)
     of_v = by_residual @ by_v.reshape(*shape, 3, 9)

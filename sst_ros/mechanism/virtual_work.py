@@ -24,7 +24,7 @@ from sst_ros.state import ZERO
 
 Three: TypeAlias = ArrayLike  # three numbers, one a leg or an axis
 # smallest abs(det J2) and abs(c_k) for which the velocity analysis is done
-SINGULAR = 1e-12
+SINGULAR_MATRIX = 1e-12
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,10 @@ def posture(
     c = np.sum(normal * w, axis=1)
     j2 = -normal
     determinant = float(np.linalg.det(j2))
-    if abs(determinant) < SINGULAR:
+    if abs(determinant) < SINGULAR_MATRIX:
         raise SingularConfiguration("parallel singularity, det J2 = 0", determinant)
     least = float(np.min(np.abs(c)))
-    if least < SINGULAR:
+    if least < SINGULAR_MATRIX:
         raise SingularConfiguration("serial singularity, c_k = 0", least)
     j = np.asarray(-np.linalg.solve(j2, np.diag(c)), dtype=float)
     a = -r @ j

@@ -28,13 +28,13 @@ from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker, every
 from sst_ros.report.results import render
 from sst_ros.runtime.settings import ControllerNodeParameters
-from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.runtime.trajectory_following import Order, Stage, TrajectoryFollower
 from sst_ros.runtime.trajectory_messages import ErrorCode, TrajectoryGoal
 from sst_ros.scene import scene
 from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 
-KEYS = {
+FOLLOWER_KEYS = {
     "stage": "stage of the motion",
     "mode": "control law",
     "samples": "samples answered",
@@ -50,7 +50,7 @@ KEYS = {
 }
 """Keys of the controller's /diagnostics, in order."""
 _FEEDBACK_PERIOD_S = 0.05
-_LOG_PERIOD_S = 1.0  # trajectories of a stream are not logged more often
+_STREAM_LOG_PERIOD_S = 1.0  # trajectories of a stream are not logged more often
 _SPINS_AT_END = 20
 # least time to deliver the result of a goal that the end of the node aborts: 0.2 s
 _SPIN_S = 0.01
@@ -180,7 +180,10 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         ):
             position, velocity, effort = (array("d", triple) for triple in numbers)
             message = JointState(position=position, velocity=velocity, effort=effort)
-            message.header.stamp, message.name = state.header.stamp, list(ACTUATORS)
+            message.header.stamp, message.name = (
+                state.header.stamp,
+                list(ACTUATED_JOINTS),
+            )
             publisher.publish(message)
 
     def _replace(self, trajectory: JointTrajectory) -> None:
@@ -218,7 +221,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             self._refuse(error)
             return False
         self.node.get_logger().info(
-            "trajectory taken", throttle_duration_sec=_LOG_PERIOD_S
+            "trajectory taken", throttle_duration_sec=_STREAM_LOG_PERIOD_S
         )
         return True
 
@@ -252,7 +255,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             "a trajectory was refused": self._refused,
         }
         said = [stage, *(text for text, count in doubts.items() if count)]
-        values, level = dict(zip(KEYS, row, strict=True)), int(len(said) > 1)
+        values, level = dict(zip(FOLLOWER_KEYS, row, strict=True)), int(len(said) > 1)
         message = topics.diagnostics(
             self.node, "control", level, "; ".join(said), values
         )
@@ -329,7 +332,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             return
         (stamp, index, time, measured, command), self._feedback = self._feedback, None
         desired = command.desired
-        message = self._action_type.Feedback(joint_names=list(ACTUATORS))
+        message = self._action_type.Feedback(joint_names=list(ACTUATED_JOINTS))
         message.header.stamp, message.index = stamp, index
         message.desired = _point(
             time, desired.gamma, desired.gamma_dot, command.feedforward
@@ -349,7 +352,7 @@ def _measure(state: JointState) -> Measurement:
     names = list(state.name)
     if not len(names) == len(state.position) == len(state.velocity):
         raise SstError("joint_states must have a position and a velocity for each name")
-    i, j, k = map(names.index, ACTUATORS)
+    i, j, k = map(names.index, ACTUATED_JOINTS)
     p, v = state.position, state.velocity
     return Measurement((p[i], p[j], p[k]), (v[i], v[j], v[k]))
 

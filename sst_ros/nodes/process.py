@@ -37,7 +37,7 @@ from sst_ros.errors import Check, InputError, SstError, refuse_unless
 from sst_ros.nodes import signals, topics
 from sst_ros.runtime import settings
 from sst_ros.runtime.child_process import is_orphan
-from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene.schema import Spec
 from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds
 
@@ -48,7 +48,7 @@ _PROFILES = {
 }
 """Our profile, by the variable that names it: for Fast DDS 2, libfastrtps, and 3, libfastdds."""
 # longest delay of a signal. The executor would take half a millisecond for each look
-_POLL_S = 0.1
+_ORPHAN_POLL_S = 0.1
 _CALLBACK_S = 1.0
 """Wait for a callback in progress: a service that waits for the run ends once that is closed."""
 _ACKNOWLEDGE_AT_END_S = 6.0
@@ -60,7 +60,7 @@ _WATCH_S = 0.25
 _LOG_PERIOD_S = 5.0  # of what a node waits for
 _STDERR = 2
 
-_TYPES = {
+_PARAMETER_TYPES = {
     "number": Parameter.Type.DOUBLE,
     "integer": Parameter.Type.INTEGER,
     "flag": Parameter.Type.BOOL,
@@ -69,7 +69,7 @@ _TYPES = {
     "texts": Parameter.Type.STRING_ARRAY,
 }
 _LISTS = (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.STRING_ARRAY)
-_WIDEST = 1e300
+_WIDEST_RANGE = 1e300
 
 Defaults: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 """Defaults of some parameters, by the values that others are given."""
@@ -158,7 +158,7 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
             checks.append((name, value, False, spec.describe()))
     ours = {
         name
-        for _, parameters in settings.COMMANDS.values()
+        for _, parameters in settings.NODE_COMMANDS.values()
         for name in parameters.SPECS
     }
     for name in sorted(given.keys() - values.keys()):
@@ -188,7 +188,7 @@ def _declare_empty_list(node: Node, name: str, spec: Spec, *, read_only: bool) -
 
 
 def _type_of(spec: Spec) -> Parameter.Type:
-    return Parameter.Type.DOUBLE_ARRAY if spec.shape else _TYPES[spec.kind]
+    return Parameter.Type.DOUBLE_ARRAY if spec.shape else _PARAMETER_TYPES[spec.kind]
 
 
 def _descriptor(name: str, spec: Spec, *, read_only: bool) -> ParameterDescriptor:
@@ -200,8 +200,8 @@ def _descriptor(name: str, spec: Spec, *, read_only: bool) -> ParameterDescripto
         additional_constraints=spec.describe(),
         read_only=read_only,
     )
-    least = max(spec.least, -_WIDEST)
-    most = min(spec.most, _WIDEST)
+    least = max(spec.least, -_WIDEST_RANGE)
+    most = min(spec.most, _WIDEST_RANGE)
     if spec.kind == "number" and not spec.shape:
         # Only a parameter with a range refuses NaN.
         if math.isfinite(spec.above):
@@ -245,7 +245,7 @@ class AnsweringWorker(Worker[A]):
             array("d", ZERO),
         )
         if given.stamped:
-            self._message: Any = topic.kind(name=list(ACTUATORS), effort=torques)
+            self._message: Any = topic.kind(name=list(ACTUATED_JOINTS), effort=torques)
         else:
             self._message = topic.kind(data=torques)
         self._torques = self._message.effort if given.stamped else self._message.data
@@ -304,8 +304,8 @@ class AnsweringWorker(Worker[A]):
             SstError: some actuators are missing, or the simulator is in a fault.
 
         """
-        absent = [name for name in ACTUATORS if name not in state.name]
-        if len(absent) == len(ACTUATORS):
+        absent = [name for name in ACTUATED_JOINTS if name not in state.name]
+        if len(absent) == len(ACTUATED_JOINTS):
             self._ignore(state)
             return
         if absent:
@@ -365,7 +365,7 @@ class AnsweringWorker(Worker[A]):
         if silent > self.parameters.timeout:
             reason = "is the simulator running?"
             if self.foreign_states:
-                named = ", ".join(ACTUATORS)
+                named = ", ".join(ACTUATED_JOINTS)
                 reason = f"{self.foreign_states} messages without {named} were ignored"
             others = topics.other_types(self.node, self._own["joint_states"])
             reasons = "; ".join([reason, *others])
@@ -385,7 +385,7 @@ class AnsweringWorker(Worker[A]):
         """Count a message of another robot; say so the first time."""
         if self.foreign_states == 0:
             self.node.get_logger().warning(
-                f"joint_states without {', '.join(ACTUATORS)} are ignored: another"
+                f"joint_states without {', '.join(ACTUATED_JOINTS)} are ignored: another"
                 f" robot publishes there, too (its names are {list(state.name)})"
             )
         self.foreign_states += 1
@@ -399,7 +399,7 @@ def run(words: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker
-    close. Words are a key of `settings.COMMANDS` and the arguments behind it. The exit
+    close. Words are a key of `settings.NODE_COMMANDS` and the arguments behind it. The exit
     status is 0, 1 for a failure, 2 for arguments that are refused.
     """
     signals.handle()
@@ -421,7 +421,7 @@ def run(words: Sequence[str]) -> int:
     try:
         if not signals.came:
             module = importlib.import_module(f"sst_ros.nodes.{command}")
-            worker = getattr(module, settings.COMMANDS[command][0])()
+            worker = getattr(module, settings.NODE_COMMANDS[command][0])()
             for line in settings.unused_files(
                 ros, worker.node.get_fully_qualified_name()
             ):
@@ -480,7 +480,7 @@ def spin(worker: Worker[Any]) -> None:
     callbacks.start()
     try:
         while callbacks.is_alive() and not (signals.came or is_orphan()):
-            if worker.done.wait(_POLL_S):
+            if worker.done.wait(_ORPHAN_POLL_S):
                 break
         ends.set()  # no other callback begins
         wake.trigger()

@@ -28,7 +28,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros.description.robot import ACTUATED, INTERMEDIATE, urdf
+from sst_ros.description.robot import ACTUATED_LINKS, INTERMEDIATE, urdf
 from sst_ros.dynamics.reactions import reaction_at
 from sst_ros.errors import refuse_unless
 from sst_ros.nodes import topics
@@ -40,7 +40,7 @@ from sst_ros.nodes.sensors import (
     StateMessages,
 )
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
@@ -53,7 +53,7 @@ _HISTORY_S = 2
 _FAST = 10
 _LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
 _AT_REST = (0.0,) * len(JOINTS)
-_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATORS))
+_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATED_JOINTS))
 _SENSORS = ("imu", "reaction")
 """Topics of samples only, for which the acceleration of the star is computed."""
 
@@ -146,7 +146,7 @@ class TorqueLog:
         self, period_ns: int, *, moments: bool = False, base_frame: str = BASE_FRAME
     ) -> None:
         self._period_ns, self._moments = period_ns, moments
-        names = (*ACTUATORS, *MOMENTS) if moments else ACTUATORS
+        names = (*ACTUATED_JOINTS, *MOMENTS) if moments else ACTUATED_JOINTS
         self._message = JointTrajectory(joint_names=list(names))
         self._message.header.frame_id = base_frame
         self._points: list[JointTrajectoryPoint] = []  # those of the longest log
@@ -201,7 +201,7 @@ def sensor_messages(scene: Scene, settings: SimulatorParameters) -> StateMessage
     if settings.reaction != "none":
         joint, _, number = settings.reaction.partition("_")
         leg = int(number) - 1
-        link = ACTUATED[leg] if joint == "actuated" else INTERMEDIATE[leg]
+        link = ACTUATED_LINKS[leg] if joint == "actuated" else INTERMEDIATE[leg]
         prefix = settings.base_frame.removesuffix(BASE_FRAME)
         if prefix == settings.base_frame:
             prefix = ""

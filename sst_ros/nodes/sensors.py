@@ -28,13 +28,13 @@ from sst_ros.mechanism.generic_math import (
     triple,
 )
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene.loads import JOINTS
 from sst_ros.state import ZERO, Quaternion, Vector3
 
-_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATORS))
-_KINDS = len(JOINTS) // 3  # gamma, mu, beta
-_IMU_SEED = _KINDS  # the joints' noise has the seeds before it
+_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATED_JOINTS))
+_KIND_COUNT = len(JOINTS) // 3  # gamma, mu, beta
+_IMU_SEED = _KIND_COUNT  # the joints' noise has the seeds before it
 
 
 class Numbers(NamedTuple):
@@ -79,7 +79,7 @@ class MeasuredJointStateMessage:
     def restart(self) -> None:
         """Begin anew at the first sample of a run: the same seed gives the same noise."""
         self._random = np.random.default_rng(self._seed)
-        kinds = range(_KINDS)
+        kinds = range(_KIND_COUNT)
         self._angles = [
             ChannelState(self._channel, (self._seed, kind)) for kind in kinds
         ]
@@ -90,7 +90,7 @@ class MeasuredJointStateMessage:
         """Return the message; None for a sample that is dropped."""
         angles: list[float] = []
         rates: list[float] = []
-        for kind in range(_KINDS):
+        for kind in range(_KIND_COUNT):
             legs = slice(3 * kind, 3 * kind + 3)
             measured = self._angles[kind].measure(
                 triple(numbers.angles[legs]), triple(numbers.rates[legs])

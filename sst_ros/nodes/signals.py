@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import signal
 
-_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNAL_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 came: set[int] = set()
 """Signals that ask the node to end.
 
@@ -19,7 +19,7 @@ def handle() -> None:
     A SIGINT that the executables have blocked until now is delivered; a SIGHUP that is
     ignored, as by nohup, stays so.
     """
-    for number in _NUMBERS:
+    for number in _SIGNAL_NUMBERS:
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda number, _: came.add(number))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
@@ -34,5 +34,5 @@ def interrupt(*, at_once: bool) -> None:
 
 def ignore() -> None:
     """Ignore signals from now on: Python gives up its handlers before it has exited."""
-    for number in _NUMBERS:
+    for number in _SIGNAL_NUMBERS:
         signal.signal(number, signal.SIG_IGN)

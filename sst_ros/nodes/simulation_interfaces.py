@@ -29,12 +29,14 @@ from sst_ros.nodes import topics
 from sst_ros.runtime.run_loop import Phase, Reply, RunLoop
 from sst_ros.state import NANOSECONDS, ZERO, Quaternion, Vector3
 
-NAME = "star"
-UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
+ENTITY_NAME = "star"
+UNSUPPORTED, RESULT_OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 """Codes of Result."""
 INVALID_POSE = 101
 
-_UNIT = 1e-3  # largest deviation of a quaternion's length from 1; it is normalised
+_LENGTH_DEVIATION = (
+    1e-3  # largest deviation of a quaternion's length from 1; it is normalised
+)
 # largest angle between an orientation and the assembly at its actuator angles [rad]
 _SAME = 1e-6
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
@@ -50,9 +52,9 @@ SERVICES = (
     *("reset_simulation", "step_simulation", "spawn_entity"),
 )
 """Names of the services, and of the methods that answer them."""
-_KINDS = {name: name.title().replace("_", "") for name in SERVICES}
-_TYPES = (
-    *(f"simulation_interfaces/srv/{kind}" for kind in _KINDS.values()),
+_SERVICE_KINDS = {name: name.title().replace("_", "") for name in SERVICES}
+_INTERFACE_TYPES = (
+    *(f"simulation_interfaces/srv/{kind}" for kind in _SERVICE_KINDS.values()),
     "simulation_interfaces/action/SimulateSteps",
     "simulation_interfaces/msg/EntityState",
 )
@@ -69,12 +71,12 @@ def offer(
 
     `leave` ends the node.
     """
-    types = topics.optional_types(node, _TYPES)
+    types = topics.optional_types(node, _INTERFACE_TYPES)
     if types is None:
         return
     answers = SimulationInterfaces(loop, leave, base_frame, types)
     qos = topics.SERVICE_QOS
-    for name, kind in _KINDS.items():
+    for name, kind in _SERVICE_KINDS.items():
         node.create_service(
             types[kind], f"~/{name}", getattr(answers, name), qos_profile=qos
         )
@@ -111,7 +113,7 @@ class SimulationInterfaces:
         response.state.state = self._state()
         if self._loop.phase is Phase.FAULT:
             return answer(response, FAILED, f"fault: {self._loop.fault}")
-        return answer(response, OK)
+        return answer(response, RESULT_OK)
 
     def set_simulation_state(self, request: Any, response: Any) -> Any:
         """Change the state of the simulation.
@@ -134,7 +136,7 @@ class SimulationInterfaces:
             return self._ask(response, pause)
         if requested == QUITTING:
             self._leave()
-            return answer(response, OK)
+            return answer(response, RESULT_OK)
         return answer(
             response, UNSUPPORTED, "the scene is loaded at the start and stays"
         )
@@ -146,7 +148,7 @@ class SimulationInterfaces:
             return answer(response, UNSUPPORTED, "ROS time continues; reset the state")
         if scope & SCOPE_STATE:
             return self._ask(response, self._loop.reset)
-        return answer(response, OK)
+        return answer(response, RESULT_OK)
 
     def step_simulation(self, request: Any, response: Any) -> Any:
         """Step a paused run by some samples."""
@@ -167,11 +169,11 @@ class SimulationInterfaces:
                 response, UNSUPPORTED, "the one entity is filtered by its name only"
             )
         try:
-            found = re.search(filters.filter, NAME) is not None
+            found = re.search(filters.filter, ENTITY_NAME) is not None
         except re.error as error:
             return answer(response, FAILED, f"filter {filters.filter!r}: {error}")
-        response.entities = [NAME] if found else []
-        return answer(response, OK)
+        response.entities = [ENTITY_NAME] if found else []
+        return answer(response, RESULT_OK)
 
     def get_entities_states(self, request: Any, response: Any) -> Any:
         """List the star and its state."""
@@ -185,7 +187,7 @@ class SimulationInterfaces:
         if unknown := _refuse_other(request, response):
             return unknown
         self._fill(response.state)
-        return answer(response, OK)
+        return answer(response, RESULT_OK)
 
     def set_entity_state(self, request: Any, response: Any) -> Any:
         """Set the state of a run that waits or is paused.
@@ -208,7 +210,10 @@ class SimulationInterfaces:
         try:
             if getattr(request, "set_pose", True):  # the flags are new in 2.1
                 given = _numbers(pose.orientation, "xyzw")
-                if not abs((length := float(np.linalg.norm(given))) - 1.0) < _UNIT:
+                if (
+                    not abs((length := float(np.linalg.norm(given))) - 1.0)
+                    < _LENGTH_DEVIATION
+                ):
                     raise ValueError(f"orientation has length {length:.6g}, must be 1")
                 quaternion = tuple(part / length for part in given)
                 if any(_numbers(pose.position, "xyz")):
@@ -296,7 +301,7 @@ def answer(response: Any, code: int, text: str = "") -> Any:
 def answer_with(response: Any, reply: Reply) -> Any:
     """Fill the result of a response from a reply of the run, and return the response."""
     return (
-        answer(response, OK)
+        answer(response, RESULT_OK)
         if reply.success
         else answer(response, FAILED, reply.message)
     )
@@ -304,8 +309,8 @@ def answer_with(response: Any, reply: Reply) -> Any:
 
 def _refuse_other(request: Any, response: Any) -> Any:
     """Return the filled response where another entity than the star is meant, else None."""
-    text = f"there is no entity {request.entity!r}, only {NAME!r}"
-    return None if request.entity == NAME else answer(response, NOT_FOUND, text)
+    text = f"there is no entity {request.entity!r}, only {ENTITY_NAME!r}"
+    return None if request.entity == ENTITY_NAME else answer(response, NOT_FOUND, text)
 
 
 def _turn(quaternion: Quaternion, vector: Vector3) -> Vector3:

@@ -32,13 +32,13 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
 
-_END_S = 0.5  # wait for the thread of the run, where a step does not end
+_RUN_END_S = 0.5  # wait for the thread of the run, where a step does not end
 FOLLOWED_STEP_NS = 200_000_000
 """Steps of a followed clock up to this length are simulated.
 
 Longer ones are dropped time.
 """
-_LONGEST_WAIT_S = 0.05
+_LONGEST_NODE_WAIT_S = 0.05
 _STANDSTILL_S = 1.0  # of a followed clock, which is reported
 
 
@@ -89,7 +89,7 @@ class Simulator(Worker[SimulatorParameters]):
         """
         self._loop.stop()
         self.done.set()
-        self._thread.join(_END_S)
+        self._thread.join(_RUN_END_S)
         if not self._thread.is_alive():
             self._read_gauges()
         self._report()
@@ -316,7 +316,7 @@ class FollowedClock(SteadyTime):
 
     def sleep(self, seconds: float) -> None:
         """Wait for the next /clock."""
-        self._moved.wait(_LONGEST_WAIT_S)
+        self._moved.wait(_LONGEST_NODE_WAIT_S)
         self._moved.clear()
 
     def warnings(self) -> Iterator[str]:

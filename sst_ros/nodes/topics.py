@@ -27,7 +27,12 @@ from rclpy.type_support import check_for_type_support
 
 from sst_ros.runtime.torque_input import MOST_WAITING
 
-PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
+PUBLISHES, SUBSCRIBES, SERVES, CALLED_SERVICES = (
+    "publishes",
+    "subscribes",
+    "serves",
+    "calls",
+)
 EXECUTES = "executes"
 
 SERVICE_QOS = QoSProfile(depth=1000)
@@ -45,7 +50,7 @@ UNNAMED = "a node whose name is not known yet"
 class Endpoint(NamedTuple):
     """One topic, service or action of a node."""
 
-    use: str  # PUBLISHES, SUBSCRIBES, SERVES, CALLS or EXECUTES, the last of an action
+    use: str  # PUBLISHES, SUBSCRIBES, SERVES, CALLED_SERVICES or EXECUTES, the last of an action
     name: str
     type_name: str
     doc: str
@@ -243,7 +248,7 @@ SIMULATOR: dict[str, Endpoint] = {
     ),
 }
 
-_COMMANDS: dict[str, Endpoint] = {
+_COMMAND_TOPICS: dict[str, Endpoint] = {
     "commands": Endpoint(
         PUBLISHES,
         "{simulator}/commands",
@@ -261,7 +266,7 @@ _COMMANDS: dict[str, Endpoint] = {
         when="stamped is true",
     ),
     "get_parameters": Endpoint(
-        CALLS,
+        CALLED_SERVICES,
         "{simulator}/get_parameters",
         "rcl_interfaces/srv/GetParameters",
         "whether it runs in lockstep, where a command without a stamp is of no"
@@ -271,7 +276,7 @@ _COMMANDS: dict[str, Endpoint] = {
 }
 
 PLAYER: dict[str, Endpoint] = {
-    **_COMMANDS,
+    **_COMMAND_TOPICS,
     "joint_states": Endpoint(
         SUBSCRIBES,
         "joint_states",
@@ -289,7 +294,7 @@ PLAYER: dict[str, Endpoint] = {
 }
 
 CONTROLLER: dict[str, Endpoint] = {
-    **_COMMANDS,
+    **_COMMAND_TOPICS,
     "reference": Endpoint(
         PUBLISHES,
         "~/reference",
@@ -381,26 +386,26 @@ VIEWER: dict[str, Endpoint] = {
         when="a slider was moved and no other node publishes commands",
     ),
     "pause": Endpoint(
-        CALLS,
+        CALLED_SERVICES,
         "{simulator}/pause",
         "std_srvs/srv/SetBool",
         "the button Pause, or Resume",
     ),
     "step": Endpoint(
-        CALLS,
+        CALLED_SERVICES,
         "{simulator}/step",
         "std_srvs/srv/Trigger",
         "the button Step",
     ),
     "reset": Endpoint(
-        CALLS,
+        CALLED_SERVICES,
         "{simulator}/reset",
         "std_srvs/srv/Trigger",
         "the button Reset",
     ),
 }
 
-NODES = {
+NODE_TOPICS = {
     "simulator": SIMULATOR,
     "torque_player": PLAYER,
     "inverse_dynamics": CONTROLLER,

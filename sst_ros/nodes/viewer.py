@@ -56,7 +56,7 @@ class Viewer(Worker[ViewerParameters]):
                 qos_profile=topics.SERVICE_QOS,
             )
             for name, one in topics.VIEWER.items()
-            if one.use == topics.CALLS
+            if one.use == topics.CALLED_SERVICES
         }
         heard = {"joint_states": self._take_state, "scene": self._take_scene}
         heard |= {"phase": self._take_phase, "diagnostics": self._take_diagnostics}

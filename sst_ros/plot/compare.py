@@ -27,9 +27,15 @@ from sst_ros.figures import (
 )
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.plot import pictures, workspace
-from sst_ros.plot.pictures import KINDS, LegCurves, Picture, draw_legs, tick_torques
+from sst_ros.plot.pictures import (
+    JOINT_LETTERS,
+    LegCurves,
+    Picture,
+    draw_legs,
+    tick_torques,
+)
 from sst_ros.recording.recording import Signals
-from sst_ros.recording.topic_tables import SCENE
+from sst_ros.recording.topic_tables import SCENE_TOPIC
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -85,24 +91,28 @@ def _sphere(runs: Drawn) -> Figure:
     return workspace.draw_paths(scene, paths)
 
 
-JOINTS, ERROR, TICKS, TURN = (
+JOINT_STATES_KEY, ERROR_KEY, TICKS, TURN_KEY = (
     "joint_states",
     "tracking_error",
     "applied_torques",
     "orientation",
 )
-PICTURES = {
+COMPARISON_PICTURES = {
     "gamma": Picture(
-        "Actuator angles", (JOINTS,), _overlay("gamma", "γ [deg]", DEGREES)
+        "Actuator angles", (JOINT_STATES_KEY,), _overlay("gamma", "γ [deg]", DEGREES)
     ),
     "gamma_dot": Picture(
-        "Actuator rates", (JOINTS,), _overlay("gamma_dot", "γ̇ [rad/s]")
+        "Actuator rates", (JOINT_STATES_KEY,), _overlay("gamma_dot", "γ̇ [rad/s]")
     ),
     "tracking_error": Picture(
-        "Desired less measured angles", (ERROR,), _overlay("gamma_error", "Δγ [rad]")
+        "Desired less measured angles",
+        (ERROR_KEY,),
+        _overlay("gamma_error", "Δγ [rad]"),
     ),
     "torques": Picture("Applied torques", (TICKS,), _torques),
-    "sphere": Picture("Path of E in the workspace", (TURN, SCENE.key), _sphere),
+    "sphere": Picture(
+        "Path of E in the workspace", (TURN_KEY, SCENE_TOPIC.key), _sphere
+    ),
 }
 
 
@@ -118,8 +128,8 @@ def draw_comparison(
     refuse_unless("compare", ("bags", len(runs), 2 <= len(runs) <= len(LINES), allowed))
     paths: list[Path] = []
     missing: dict[str, str] = {}
-    for name in pictures.known(only, PICTURES):
-        title, needs, make = PICTURES[name]
+    for name in pictures.known(only, COMPARISON_PICTURES):
+        title, needs, make = COMPARISON_PICTURES[name]
         all_runs = list(zip(runs, labels(runs), LINES, strict=False))
         drawn = [each for each in all_runs if not set(needs) & set(each[0].missing)]
         if left := [
@@ -144,13 +154,13 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
     from pandas import DataFrame, Series, concat
 
     first, tables = runs[0], {}
-    joints = [f"{kind}_{leg}" for kind in KINDS for leg in (1, 2, 3)]
-    rated = [f"{kind}_dot_{leg}" for kind in KINDS for leg in (1, 2, 3)]
+    joints = [f"{kind}_{leg}" for kind in JOINT_LETTERS for leg in (1, 2, 3)]
+    rated = [f"{kind}_dot_{leg}" for kind in JOINT_LETTERS for leg in (1, 2, 3)]
     for run, label in zip(runs[1:], labels(runs)[1:], strict=True):
         here, there = _common(first, run)
         absent = {*first.missing, *run.missing}
         angles, rates = (DataFrame(columns=joints, dtype=float) for _ in range(2))
-        if JOINTS not in absent:
+        if JOINT_STATES_KEY not in absent:
             angles, rates = (
                 DataFrame(
                     run.take(*names)[there] - first.take(*names)[here], columns=joints
@@ -158,8 +168,10 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
                 for names in (joints, rated)
             )
         turn = Series(dtype=float)
-        if TURN not in absent:
-            one, other = (each.take(*pictures.QUATERNION) for each in (first, run))
+        if TURN_KEY not in absent:
+            one, other = (
+                each.take(*pictures.QUATERNION_COLUMNS) for each in (first, run)
+            )
             turn = Series(angle_between(one[here], other[there]))
         angles = concat([angles, turn.rename("star")], axis=1)
         table = DataFrame(index=angles.columns)

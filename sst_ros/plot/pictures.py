@@ -34,14 +34,14 @@ from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_ang
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot import workspace
 from sst_ros.recording.recording import Signals
-from sst_ros.recording.topic_tables import SCENE, TRUE_JOINT_STATES
+from sst_ros.recording.topic_tables import SCENE_TOPIC, TRUE_JOINT_STATES
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS
 
 FORMATS = ("pdf", "png")
-QUATERNION = ("q_x", "q_y", "q_z", "q_w")
-ACTUATORS = [f"actuator {leg}" for leg in (1, 2, 3)]
-NUMBERS = {
+QUATERNION_COLUMNS = ("q_x", "q_y", "q_z", "q_w")
+ACTUATOR_LABELS = [f"actuator {leg}" for leg in (1, 2, 3)]
+FIGURE_NUMBERS = {
     "example1": {"position_of_E": 8, "psi": 9},
     "example2": {
         "path_of_E": 10,
@@ -159,7 +159,7 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
     The paper's figures have their number and name the assumption behind them.
     """
     title += f", {scene}" if scene else ""
-    number = NUMBERS.get(scene or "", {}).get(name)
+    number = FIGURE_NUMBERS.get(scene or "", {}).get(name)
     if number is None:
         return name, title
     return (
@@ -178,7 +178,7 @@ def zyz_degrees(quaternion: Array, which: int) -> Array:
 
 def _position(run: Signals, scene: Scene) -> Figure:
     """Draw the coordinates of E over time."""
-    values = position_of_e(scene, run.take(*QUATERNION))
+    values = position_of_e(scene, run.take(*QUATERNION_COLUMNS))
     panel = Panel(POSITION, "xyz", values)
     looks: figures.Looks = {"least_span": LEAST_POSITION_M, "gaps": run.gaps()}
     return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
@@ -186,7 +186,7 @@ def _position(run: Signals, scene: Scene) -> Figure:
 
 def _angle(run: Signals, _: Scene | None, which: int) -> Figure:
     """Draw one of the ZYZ angles over time."""
-    degrees = zyz_degrees(run.take(*QUATERNION), which)
+    degrees = zyz_degrees(run.take(*QUATERNION_COLUMNS), which)
     panel = Panel(f"{ZYZ[which]} [deg]", ZYZ[which], degrees)
     looks: figures.Looks = {"least_span": LEAST_ANGLE_DEG, "gaps": run.gaps()}
     return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
@@ -313,7 +313,7 @@ def energies(run: Signals, scene: Scene) -> tuple[Array, Array]:
 
     Nan where it was lost.
     """
-    quaternion = run.take(*QUATERNION)
+    quaternion = run.take(*QUATERNION_COLUMNS)
     rates = [run.true_legs(name) for name in ("gamma_dot", "mu_dot", "beta_dot")]
     turned = body_rates(Geometry.of(scene), quaternion, *rates)
     model, state = model_of(scene), (*quaternion.T, *turned.T)
@@ -391,7 +391,7 @@ def _margins(run: Signals, scene: Scene) -> Figure:
 
 def broken_quaternions(run: Signals) -> Array:
     """Return the orientations of the samples, with a row of nan in each gap, (n, 4)."""
-    quaternions = run.take(*QUATERNION)
+    quaternions = run.take(*QUATERNION_COLUMNS)
     return figures.break_lines(run.seconds(), quaternions, run.gaps())[1]
 
 
@@ -411,15 +411,15 @@ def _power(run: Signals) -> Array:
     return run.true_legs("tau") * run.true_legs("gamma_dot")
 
 
-JOINTS, ORIENTATION, TICKS, S = (
+JOINT_STATES_KEY, ORIENTATION, TICKS, SCENE_KEY = (
     "joint_states",
     "orientation",
     "applied_torques",
-    SCENE.key,
+    SCENE_TOPIC.key,
 )
-ERROR, REFERENCE = "tracking_error", "reference"
-KINDS = {"gamma": "γ", "mu": "μ", "beta": "β"}
-_ERRORS = curves(  # as the controller received them
+ERROR_KEY, REFERENCE = "tracking_error", "reference"
+JOINT_LETTERS = {"gamma": "γ", "mu": "μ", "beta": "β"}
+_ERROR_CURVES = curves(  # as the controller received them
     legs("γ desired − γ [rad]", "gamma_error", "γ"),
     legs("γ̇ desired − γ̇ [rad/s]", "gamma_dot_error", "γ̇"),
 )
@@ -428,34 +428,44 @@ _CONTROL = curves(
     legs("feedback [N m]", "tau_feedback", "τ"),
 )
 _POWERS = curves(
-    ("power τₖ γ̇ₖ [W]", ACTUATORS, _power),
+    ("power τₖ γ̇ₖ [W]", ACTUATOR_LABELS, _power),
     ("all three [W]", ["sum"], lambda run: _power(run).sum(axis=1)[:, None]),
 )
-_ANGLES = joints(KINDS, "deg", DEGREES)
-_RATES = joints({f"{name}_dot": f"{letter}̇" for name, letter in KINDS.items()}, "rad/s")
-_WORK = curves(("work [J]", ACTUATORS, work), height=3.2)
-PICTURES = {
-    "path_of_E": Picture("Path of point E", (ORIENTATION, S), _path),
-    "position_of_E": Picture("Position of point E", (ORIENTATION, S), _position),
+_ANGLE_CURVES = joints(JOINT_LETTERS, "deg", DEGREES)
+_RATE_CURVES = joints(
+    {f"{name}_dot": f"{letter}̇" for name, letter in JOINT_LETTERS.items()}, "rad/s"
+)
+_WORK = curves(("work [J]", ACTUATOR_LABELS, work), height=3.2)
+RUN_PICTURES = {
+    "path_of_E": Picture("Path of point E", (ORIENTATION, SCENE_KEY), _path),
+    "position_of_E": Picture(
+        "Position of point E", (ORIENTATION, SCENE_KEY), _position
+    ),
     **{
         name: Picture(f"The angle {letter}", (ORIENTATION,), partial(_angle, which=k))
         for k, (name, letter) in enumerate(
             zip(("theta", "phi", "psi"), ZYZ, strict=True)
         )
     },
-    "tracking": Picture("Desired and measured angles", (JOINTS, REFERENCE), _tracking),
-    "tracking_error": Picture("Tracking error", (ERROR,), _ERRORS),
+    "tracking": Picture(
+        "Desired and measured angles", (JOINT_STATES_KEY, REFERENCE), _tracking
+    ),
+    "tracking_error": Picture("Tracking error", (ERROR_KEY,), _ERROR_CURVES),
     "control_torques": Picture(
-        "Torques of the controller", (REFERENCE, ERROR), _CONTROL
+        "Torques of the controller", (REFERENCE, ERROR_KEY), _CONTROL
     ),
     "torques": Picture("Torques", (TICKS,), _torques),
-    "power": Picture("Power of the actuators", (JOINTS,), _POWERS),
-    "work": Picture("Work of the actuators", (JOINTS, TICKS), _WORK),
-    "energy": Picture("Energy", (JOINTS, ORIENTATION, TICKS, S), _energy),
-    "joint_angles": Picture("Joint angles", (JOINTS,), _ANGLES),
-    "joint_rates": Picture("Joint rates", (JOINTS,), _RATES),
-    "margins": Picture("Distance to the limits", (JOINTS, S), _margins),
-    "sphere": Picture("Path of E in the workspace", (ORIENTATION, S), _sphere),
+    "power": Picture("Power of the actuators", (JOINT_STATES_KEY,), _POWERS),
+    "work": Picture("Work of the actuators", (JOINT_STATES_KEY, TICKS), _WORK),
+    "energy": Picture(
+        "Energy", (JOINT_STATES_KEY, ORIENTATION, TICKS, SCENE_KEY), _energy
+    ),
+    "joint_angles": Picture("Joint angles", (JOINT_STATES_KEY,), _ANGLE_CURVES),
+    "joint_rates": Picture("Joint rates", (JOINT_STATES_KEY,), _RATE_CURVES),
+    "margins": Picture(
+        "Distance to the limits", (JOINT_STATES_KEY, SCENE_KEY), _margins
+    ),
+    "sphere": Picture("Path of E in the workspace", (ORIENTATION, SCENE_KEY), _sphere),
 }
 
 
@@ -466,13 +476,13 @@ def draw_run(
     """Write the pictures of a run, those that `only` names or all, into the folder `out`.
 
     Returns the paths written, and for each picture that could not be drawn what is
-    missing. Raises InputError where a name is none of PICTURES, or `out` cannot be
+    missing. Raises InputError where a name is none of RUN_PICTURES, or `out` cannot be
     written.
     """
     paths: list[Path] = []
     missing: dict[str, str] = {}
-    for name in known(only, PICTURES):
-        picture = PICTURES[name]
+    for name in known(only, RUN_PICTURES):
+        picture = RUN_PICTURES[name]
         if absent := [key for key in picture.needs if key in run.missing]:
             missing[name] = "the bag has no " + ", no ".join(absent)
             continue

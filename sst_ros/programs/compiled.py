@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.errors import refusal
-from sst_ros.programs.expression import FUNCTIONS, Program, compile_program
+from sst_ros.programs.expression import MATH_FUNCTIONS, Program, compile_program
 from sst_ros.programs.llvm import (
     LANES,
     Function,
@@ -47,7 +47,7 @@ def compile_functions(
     known: dict[str, Callable[..., Sequence[float]]] = {}
     functions: dict[str, Function] = {}
     for name in _in_order(programs):
-        known[name] = compile_program(programs[name], {**FUNCTIONS, **known})
+        known[name] = compile_program(programs[name], {**MATH_FUNCTIONS, **known})
         functions[name] = without_errors(known[name], len(programs[name].outputs))
     return {name: functions[name] for name in names}
 

@@ -32,7 +32,7 @@ def tanh_of_float(x: float) -> float:
     return result
 
 
-FUNCTIONS: dict[str, Callable[..., float]] = {
+MATH_FUNCTIONS: dict[str, Callable[..., float]] = {
     name: getattr(math, name) for name in ("sqrt", "exp", "log", "sin", "cos", "atan2")
 } | {"tanh": tanh_of_float}
 _TEMPLATES = {
@@ -41,7 +41,7 @@ _TEMPLATES = {
     "mul": "{} * {}",
     "div": "{} / {}",
     "neg": "-{}",
-    **{name: f"{name}({{}})" for name in FUNCTIONS},
+    **{name: f"{name}({{}})" for name in MATH_FUNCTIONS},
     "atan2": "atan2({}, {})",
     "positive": "max({}, 0.0)",
     "step": "(1.0 if {} > 0.0 else 0.0)",
@@ -56,10 +56,12 @@ _ON_ARRAYS = _TEMPLATES | {
 }
 """Choices between arrays are made element by element."""
 _ON_FLOATS: dict[str, Callable[..., float]] = {
-    op: eval(f"lambda x, y=0.0, z=0.0: {text.format('x', 'y', 'z')}", {**FUNCTIONS})
+    op: eval(
+        f"lambda x, y=0.0, z=0.0: {text.format('x', 'y', 'z')}", {**MATH_FUNCTIONS}
+    )
     for op, text in _TEMPLATES.items()
 }
-_SLOPES: dict[str, Callable[..., Value]] = {
+_SLOPE_RULES: dict[str, Callable[..., Value]] = {
     "add": lambda here, x, y, dx, dy: dx + dy,
     "sub": lambda here, x, y, dx, dy: dx - dy,
     "mul": lambda here, x, y, dx, dy: dx * y + x * dy,
@@ -490,10 +492,10 @@ def trace(
             if op == "input":
                 slopes.append(direction.get(args[0], 0.0))
             elif len(args) > 1:
-                slopes.append(_SLOPES[op](here, *args, *d))
+                slopes.append(_SLOPE_RULES[op](here, *args, *d))
             else:
                 slopes.append(
-                    0.0 if _is(d[0], 0.0) else _SLOPES[op](here, *args) * d[0]
+                    0.0 if _is(d[0], 0.0) else _SLOPE_RULES[op](here, *args) * d[0]
                 )
         results += [
             slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs
@@ -517,7 +519,7 @@ def compile_program(
 
     The function raises ArithmeticError or ValueError where a float has no value.
     """
-    names: dict[str, Any] = {**(functions or FUNCTIONS)}
+    names: dict[str, Any] = {**(functions or MATH_FUNCTIONS)}
     exec(program.source("function"), names)
     function: Callable[..., tuple[Any, ...]] = names["function"]
     return function
@@ -555,7 +557,7 @@ def compile_for_arrays(
     libm's for each element, which takes ten times as long.
     """
     names: dict[str, Any] = {"where": np.where, "max": _larger, "sqrt": np.sqrt}
-    for name, of_floats in FUNCTIONS.items():
+    for name, of_floats in MATH_FUNCTIONS.items():
         of_arrays = getattr(np, {"atan2": "arctan2"}.get(name, name))
         if name != "sqrt":  # IEEE 754 leaves it no choice
             names[name] = _by_element(of_floats) if exact else of_arrays

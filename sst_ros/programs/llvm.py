@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from sst_ros.mechanism.generic_math import TO_WHOLE
 from sst_ros.programs.expression import (
-    FUNCTIONS,
+    MATH_FUNCTIONS,
     Number,
     Program,
     Routine,
@@ -269,7 +269,7 @@ def write_module(
 @lru_cache(maxsize=1)
 def count_lanes() -> int:
     """Return how many columns this machine computes at a time."""
-    with _LOCK:
+    with _ENGINE_LOCK:
         import llvmlite.binding as llvm
 
         features = llvm.get_host_cpu_features()
@@ -307,7 +307,7 @@ def _declare() -> str:
         kind, suffix = _type_of(width), _suffix(width)
         for name in ("sqrt", "fabs"):
             lines.append(f"declare {kind} @llvm.{name}.{suffix}({kind})")
-    for name in FUNCTIONS:
+    for name in MATH_FUNCTIONS:
         if name not in (*_INTRINSIC, "tanh"):
             arguments = "double, double" if name == "atan2" else "double"
             lines.append(f"declare double @{name}({arguments})")
@@ -637,7 +637,7 @@ def _write_loop(
 class MachineCode:
     """Compiled code of one module; it is freed with the last function that uses it.
 
-    LLVM is called with `_LOCK` held alone, see there.
+    LLVM is called with `_ENGINE_LOCK` held alone, see there.
     """
 
     def __init__(self, engine: Any) -> None:
@@ -646,27 +646,29 @@ class MachineCode:
 
     def address(self, name: str) -> int:
         """Return the address of a function."""
-        with _LOCK:
+        with _ENGINE_LOCK:
             return int(self._engine.get_function_address(name))
 
 
 def _close(engine: Any) -> None:
-    with _LOCK:
+    with _ENGINE_LOCK:
         engine.close()
 
 
-_LOCK = threading.RLock()
+_ENGINE_LOCK = threading.RLock()
 """Held in each call of LLVM. A fork waits for it, for the child would find LLVM halfway
 through a module, and its locks held by a thread that it does not have."""
 
 os.register_at_fork(
-    before=_LOCK.acquire, after_in_parent=_LOCK.release, after_in_child=_LOCK.release
+    before=_ENGINE_LOCK.acquire,
+    after_in_parent=_ENGINE_LOCK.release,
+    after_in_child=_ENGINE_LOCK.release,
 )
 
 
 def compile_text(text: str) -> MachineCode:
     """Compile a module, unless this process has done so already."""
-    with _LOCK:
+    with _ENGINE_LOCK:
         return _compile(text)
 
 

@@ -24,8 +24,8 @@ arb, arb_mat, arb_poly, arb_series, ctx = (
 )
 
 PRECISION = 128  # bits of all balls
-LONGEST = 100  # coefficients of a series, at most
-_LOCK = threading.RLock()
+LONGEST_SERIES = 100  # coefficients of a series, at most
+_CONTEXT_LOCK = threading.RLock()
 """python-flint has one context for all threads, so one proof runs at a time."""
 
 
@@ -42,9 +42,9 @@ def precision() -> Iterator[None]:
             "rounding mode", "not to nearest", "must be that of IEEE 754's default"
         )
         raise InputError("certify", [problem])
-    with _LOCK:
+    with _CONTEXT_LOCK:
         before = ctx.prec, ctx.cap
-        ctx.prec, ctx.cap = PRECISION, LONGEST
+        ctx.prec, ctx.cap = PRECISION, LONGEST_SERIES
         try:
             yield
         finally:

@@ -27,8 +27,13 @@ from sst_ros.control.controller import Controller
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
-from sst_ros.dynamics.motion_table import JOINTS
-from sst_ros.dynamics.traced_dynamics import MOTION, RATE, TORQUE, Dynamics
+from sst_ros.dynamics.motion_table import JOINT_QUANTITIES
+from sst_ros.dynamics.traced_dynamics import (
+    MOTION,
+    RATE_SYMBOLS,
+    TORQUE_SYMBOLS,
+    Dynamics,
+)
 from sst_ros.errors import SstError, check_kinds, refuse_unless, require
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
@@ -73,14 +78,14 @@ Span = tuple[float, float, int]
 PARALLEL = "parallel singularity, det J2 = 0"
 LIMIT_ORDER = 6  # of expansions whose signs say where limits are
 SPLITS = 200  # of a step, most of them near a limit
-TURN = ("turn_x", "turn_y", "turn_z")
-ANGLES, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
-_UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+TURN_SYMBOLS = ("turn_x", "turn_y", "turn_z")
+GAMMA_SYMBOLS, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
+_UNIT_QUATERNIONS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 KNOWN_TORQUES = "must be numbers, sines, a table, polynomials or a Controller"
 AT_START = "the posture at the start is not proven to be the only one near"
-MOST_PARTS = 10_000  # of the box of ranges
+MOST_BOX_PARTS = 10_000  # of the box of ranges
 ORDER = -1.6
-ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
+PROOF_ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
 # proofs by which the width of ranges is looked for that would do, each by half
 NARROWER = 8
 JOINT_COUNT = 18  # angles and rates of the joints
@@ -106,7 +111,7 @@ class BallEquations:
         self._held: tuple[str, ...] = ()  # numbers that a controller changes at ticks
         if control is not None:
             self.loop = SampledLoop(control, self.balls, self.state)
-            self._held = (*TORQUE, *self.loop.memory)
+            self._held = (*TORQUE_SYMBOLS, *self.loop.memory)
         self.inputs = (*self.state, *self._held, *self.balls.inputs)
 
     def start(self) -> Region:
@@ -134,7 +139,10 @@ class BallEquations:
                 leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)
             ]
 
-        unknown, initial = (*TURN, *RATE), (*ANGLES, *ANGLE_RATES)
+        unknown, initial = (
+            (*TURN_SYMBOLS, *RATE_SYMBOLS),
+            (*GAMMA_SYMBOLS, *ANGLE_RATES),
+        )
         by = (*unknown, *initial, *self.balls.inputs)
         run = self.balls.compile(equations, (*unknown, *initial), by)
         initial_numbers = [
@@ -164,7 +172,7 @@ class BallEquations:
             radii[place] = arb.max(radii[place], radius)
         rest = [x + more for x, more in zip(root.rest, off, strict=True)]
         # q is linear in the turn.
-        units = [quaternion_product((x, y, z, w), unit) for unit in _UNITS]
+        units = [quaternion_product((x, y, z, w), unit) for unit in _UNIT_QUATERNIONS]
         slopes = []
         errors = [arb(0)] * n
         for i in range(4):
@@ -218,7 +226,7 @@ class BallEquations:
             slope = kernel.derivative(parts.model, given[:size], triple(torque))
             return (*slope, *[0.0] * (len(self.inputs) - size))
 
-        inputs = ("t", *self.state, *(self._held or TORQUE))
+        inputs = ("t", *self.state, *(self._held or TORQUE_SYMBOLS))
         value = self.balls.compile(derivative, inputs)
         return value, self.balls.compile(derivative, inputs, self.inputs)
 
@@ -311,7 +319,7 @@ class BallEquations:
                 values += [(most - x) * (most + x) for x in unlimited]
             return values
 
-        inputs = ("t", *self.state, *(self._held or TORQUE))
+        inputs = ("t", *self.state, *(self._held or TORQUE_SYMBOLS))
         return self.balls.compile(distances, inputs)
 
 
@@ -518,7 +526,7 @@ class ProvenMotion(Explained):
         self._is_whole = not failed
         rows, spans = unite(parts)
         names = [*(f"body_rate_{part}" for part in "xyz")]
-        names += [f"{joint}_{leg}" for joint in JOINTS for leg in (1, 2, 3)]
+        names += [f"{joint}_{leg}" for joint in JOINT_QUANTITIES for leg in (1, 2, 3)]
         quaternion = np.array([row.quaternion for row in rows]).reshape(-1, 4)
         values = np.array([row.values for row in rows]).reshape(-1, len(names), 2)
         self.columns: dict[str, Array] = {"t": np.array([row.time for row in rows])}
@@ -679,7 +687,7 @@ class ProofTask(NamedTuple):
         """Prove the motion for all numbers of ranges."""
         scene, profile = self.trajectory.scene, self.profile
         tolerance = 1e-6 * self.bound
-        for _ in range(ATTEMPTS):
+        for _ in range(PROOF_ATTEMPTS):
             equations = BallEquations(scene, profile, ranges, self.control)
             follower = Follower(equations, self.trajectory)
             follower.follow(
@@ -797,8 +805,8 @@ def certify(
         (
             "split",
             split,
-            1 <= split <= MOST_PARTS,
-            f"must be a whole number from 1 to {MOST_PARTS}",
+            1 <= split <= MOST_BOX_PARTS,
+            f"must be a whole number from 1 to {MOST_BOX_PARTS}",
         ),
         ("split", split, split == 1 or bool(ranges), "splits ranges: give some"),
     )

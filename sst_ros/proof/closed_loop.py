@@ -51,8 +51,8 @@ from sst_ros.proof.scene_balls import Parts, SceneBalls
 
 MOST_DIRECTIONS = 900  # of a region, beyond which the smallest are put into a box
 KEPT_DIRECTIONS = 700  # of them behind that
-TERMS = 40  # of the series of atan(t) / t
-SMALL = 0.25  # largest square of the tangent of half an error on SO(3)
+ATAN_TERMS = 40  # of the series of atan(t) / t
+SMALL_TANGENT = 0.25  # largest square of the tangent of half an error on SO(3)
 LOST = "the orientation at the measured angles is not proven to be the only one near"
 FAR = "the error on SO(3) may exceed what the series of its logarithm is proven for"
 
@@ -79,13 +79,13 @@ def turn_near_zero(quaternion: Quadruple, rest: Any) -> Triple:
 
     With t = |(x, y, z)| / w it is 2 atan(t) / t (x, y, z) / w. What the alternating
     series of atan(t) / t leaves out is less than its next term, and so is its
-    derivative: both are in those of `rest` t^(2 TERMS), for a ball from -1 to 1.
+    derivative: both are in those of `rest` t^(2 ATAN_TERMS), for a ball from -1 to 1.
     """
     x, y, z, w = quaternion
     tangent: Triple = (x / w, y / w, z / w)
     square = sum(part * part for part in tangent)
     total = rest
-    for k in reversed(range(TERMS)):
+    for k in reversed(range(ATAN_TERMS)):
         total = total * square + (-1.0) ** k / (2 * k + 1)
     return multiply(2.0 * total, tangent)
 
@@ -365,7 +365,10 @@ class SampledLoop:
             signed = [-part for part in desired]
         d: Any = tuple(map(arb, signed))
         first, second, third, real = quaternion_product((-x, -y, -z, w), d)
-        if not real > 0 or not (first**2 + second**2 + third**2) / real**2 < SMALL:
+        if (
+            not real > 0
+            or not (first**2 + second**2 + third**2) / real**2 < SMALL_TANGENT
+        ):
             raise Refused(FAR)
         return signed
 

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from sst_ros.programs.expression import FUNCTIONS, Program
+from sst_ros.programs.expression import MATH_FUNCTIONS, Program
 from sst_ros.proof.balls import (
     arb,
     arb_mat,
@@ -44,12 +44,12 @@ Function = Callable[..., Sequence[Any]]
 
 J_ORDER, V_ORDER = 8, 16  # of the Jacobian and of V
 KINK_V_ORDER = 4  # of V in a step across a kink
-AHEAD = 4  # coefficients of the Jacobian that p is found by
+JACOBIAN_TERMS = 4  # coefficients of the Jacobian that p is found by
 SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogonal
-GROWTH = 0.05  # of a set by the remainder of V, largest in a step
+REMAINDER_GROWTH = 0.05  # of a set by the remainder of V, largest in a step
 CUT = "an angle may pass pi, where that of the model jumps"
 UNBOUNDED = "a number is not bounded: a singularity may be near"
-LEAST = 1e-9  # of a step, relative to the whole time: the proof ends
+LEAST_STEP = 1e-9  # of a step, relative to the whole time: the proof ends
 TIGHT = 1.1  # room of a tube around what a step was proven to reach
 # of a set in a step, relative to it: more is tried to be avoided by shorter steps
 LOSS = 1e-4
@@ -59,7 +59,7 @@ REGAIN = 1.25  # longest next step by the last one, after a step was refused
 KINK_STEPS = 400  # steps across one kink before the proof ends
 # of a set in a step across a kink, below which the next is twice as long
 KINK_LOSS = 0.02
-HALVINGS = 30  # of the time in which a kink is looked for
+KINK_HALVINGS = 30  # of the time in which a kink is looked for
 
 
 class Refused(ArithmeticError):
@@ -265,7 +265,7 @@ def cut(x: Any, _zero: float = 0.0) -> Any:
 
 
 _ON_BALLS: dict[str, Callable[..., Any]] = {
-    name: methodcaller(name) for name in FUNCTIONS
+    name: methodcaller(name) for name in MATH_FUNCTIONS
 }
 _ON_BALLS |= {"tanh": _tanh, "atan2": _atan2, "max": cut, "step": _step}
 
@@ -481,8 +481,8 @@ def approximate(
         return [_coefficients(x, size) for x in found]
 
     while (known := len(p[0])) <= order:
-        if known == AHEAD:
-            j = _matrices(run(jacobian, AHEAD)[n:], n)
+        if known == JACOBIAN_TERMS:
+            j = _matrices(run(jacobian, JACOBIAN_TERMS)[n:], n)
         slopes, new = run(f, min(known + len(j), order)), list[Any]()
         for k in range(known - 1, len(slopes[0])):
             added = (j[k - i] * x for i, x in enumerate(new, known))
@@ -654,7 +654,7 @@ def _check_tube(step: Advance, tolerance: float) -> Advance:
         return step._replace(tube=[arb(0, x.upper()) for x in reached])
     widest = max(map(float, entries(step.begin.spread())[: step.begin.moving]))
     grows = max(map(float, entries(step.w)))
-    is_slow = grows < 10.0 * tolerance + GROWTH * widest
+    is_slow = grows < 10.0 * tolerance + REMAINDER_GROWTH * widest
     wider = None
     if is_slow:
         moving = [2 * x for x in reached[: step.begin.moving]]
@@ -819,7 +819,7 @@ class ProvenSteps:
                     3,
                 )
                 tube = _tube(here, self._room, tolerance)
-                if h < LEAST * self._span or here.time + h == here.time:
+                if h < LEAST_STEP * self._span or here.time + h == here.time:
                     raise why from None
         self._plan(step.end - here.time, longest, step.defect, is_free=is_free)
         return step
@@ -877,7 +877,7 @@ class ProvenSteps:
     def _clear_length(self, step: Advance) -> float:
         """Return how long no kink is near, nearly, by halving a step that has one."""
         low, high = 0.0, step.end - step.begin.time
-        for _ in range(HALVINGS):
+        for _ in range(KINK_HALVINGS):
             middle = 0.5 * (low + high)
             try:
                 step.enclose(self._f, 2, step.tube, (arb(0), arb(middle)))
@@ -918,7 +918,7 @@ class ProvenSteps:
     def _kink_step(self, longest: float, kink: KinkMet) -> Advance:
         """Prove a step across a kink by a straight line p."""
         here, h = self._here, longest
-        for _ in range(HALVINGS):
+        for _ in range(KINK_HALVINGS):
             target = min(self._end, here.time + h)
             if target == here.time:
                 break

@@ -60,7 +60,7 @@ from sst_ros.scene.schema import Place, key_of
 from sst_ros.state import Explained
 
 PROVEN, OPEN, REFUTED = 1, 0, -1
-LIMITS = (
+ZONE_LIMITS = (
     *(
         f"{joint}_{leg} {end}"
         for leg in (1, 2, 3)
@@ -73,14 +73,14 @@ LIMITS = (
     ),
     "parallel singularity",
 )
-ROUNDING = 1e-13
+ZONE_ROUNDING = 1e-13
 """Bound of the rounding in a product or a determinant: each comes of less than 400
 operations on numbers up to 2, a unit in the last place of which is 4.4e-16."""
 
 CURVATURE = 6.0  # half of what bounds the second derivative of D
-WIDEST = 0.3  # tolerance of a vector [rad] that is still of use
-ARC_OF_CHORD = 1.01  # most ratio of an arc to its chord, up to WIDEST
-BLOCK = 20_000  # cells that are examined at a time
+WIDEST_ZONE = 0.3  # tolerance of a vector [rad] that is still of use
+ARC_OF_CHORD = 1.01  # most ratio of an arc to its chord, up to WIDEST_ZONE
+ZONE_BLOCK = 20_000  # cells that are examined at a time
 MOST_BOXES = 20_000_000  # 2 GB
 GEOMETRY_KEYS: tuple[Place, ...] = (
     ("base", "v"),
@@ -90,12 +90,12 @@ GEOMETRY_KEYS: tuple[Place, ...] = (
 )
 """Numbers of a document that a geometry is made of."""
 
-SINGULAR = 0.01  # least singular value of J2 at which an assembly is followed
-NEWTON_STEPS = 4  # from an assembly to one that is nearer than SAFE_SHARE allows
+LEAST_ZONE_SIGMA = 0.01  # least singular value of J2 at which an assembly is followed
+ZONE_NEWTON_STEPS = 4  # from an assembly to one that is nearer than SAFE_SHARE allows
 SAFE_SHARE = 0.12  # step in gamma [rad] over the square of the least singular value
 LEAST_DET_J2 = 1e-9  # abs(det J2) of a reference pose whose sign is beyond doubt
 MOST_TILT = 3.0  # [rad]: near pi the azimuth moves E the less, and rounding the more
-MOST_STEPS = 200  # from one cell to the next
+MOST_ZONE_STEPS = 200  # from one cell to the next
 LIMITS_OF_LEG = 4
 
 
@@ -131,7 +131,7 @@ class Verdicts(NamedTuple):
     """What is proven of cells, shape (n,)."""
 
     status: NDArray[np.int8]  # PROVEN, OPEN or REFUTED
-    limit: NDArray[np.int8]  # index in LIMITS of what refutes it, -1 for none
+    limit: NDArray[np.int8]  # index in ZONE_LIMITS of what refutes it, -1 for none
     det_j2: Array  # not above the least abs(det J2) in the cell
     sine_mu: Array  # not above the least sin(mu_k) in the cell
 
@@ -153,7 +153,7 @@ def enclose_geometry(scene: Scene, ranges: Mapping[Place, Any]) -> TolerantGeome
         return [component for row in rows for component in row]
 
     size = 36
-    allowed = f"must move no axis by more than {WIDEST} rad"
+    allowed = f"must move no axis by more than {WIDEST_ZONE} rad"
     named = [key_of(place) for place in ranges]
     with refuse_errors("certify_zone", "ranges", named, allowed, ArithmeticError):
         balls = SceneBalls(scene, None, ranges)
@@ -170,10 +170,10 @@ def enclose_geometry(scene: Scene, ranges: Mapping[Place, Any]) -> TolerantGeome
         for j, ball in enumerate(varied):
             first = size * j + row
             moved += _length(slopes[first : first + 3]) * ball.rad()
-        rounding.append(ARC_OF_CHORD * upper(near) + ROUNDING)
-        tolerance.append(ARC_OF_CHORD * upper(near + moved) + ROUNDING)
+        rounding.append(ARC_OF_CHORD * upper(near) + ZONE_ROUNDING)
+        tolerance.append(ARC_OF_CHORD * upper(near + moved) + ZONE_ROUNDING)
     widest = max(tolerance)
-    fits = math.isfinite(widest) and widest <= WIDEST
+    fits = math.isfinite(widest) and widest <= WIDEST_ZONE
     refuse_unless("certify_zone", ("ranges", named, fits, allowed))
     return TolerantGeometry(
         UnitVectors(*np.array(nominal).reshape(4, 3, 3)),
@@ -197,12 +197,12 @@ def decide(geometry: TolerantGeometry, poses: PoseBalls, side: float) -> Verdict
     """
     products = limit_products(geometry.vectors, poses.rotation)
     angle = poses.radius[:, None, None]
-    inside = products > _sine(angle + _spread(geometry.tolerance)) + ROUNDING
+    inside = products > _sine(angle + _spread(geometry.tolerance)) + ZONE_ROUNDING
     inside[..., :2] |= poses.in_stroke[:, None, None]
-    beyond = products < -_sine(angle + _spread(geometry.rounding)) - ROUNDING
+    beyond = products < -_sine(angle + _spread(geometry.rounding)) - ZONE_ROUNDING
 
     determinant, slope = determinant_and_slope(geometry.vectors, poses.rotation)
-    change = slope * poses.radius + CURVATURE * poses.radius**2 + ROUNDING
+    change = slope * poses.radius + CURVATURE * poses.radius**2 + ZONE_ROUNDING
     least = side * determinant - change - _sum_of_axes(geometry.tolerance)
     singular = side * determinant + change + _sum_of_axes(geometry.rounding) < 0.0
 
@@ -214,7 +214,7 @@ def decide(geometry: TolerantGeometry, poses: PoseBalls, side: float) -> Verdict
     refuted |= poses.status == REFUTED
     status = np.where(refuted, REFUTED, np.where(proven, PROVEN, OPEN))
     low, high = bound_sines(geometry, poses)
-    det_j2 = least / (high.prod(axis=1) + ROUNDING)
+    det_j2 = least / (high.prod(axis=1) + ZONE_ROUNDING)
     sine_mu = low.min(axis=1)
     return Verdicts(status.astype(np.int8), limit.astype(np.int8), det_j2, sine_mu)
 
@@ -252,7 +252,7 @@ def bound_sines(geometry: TolerantGeometry, poses: PoseBalls) -> tuple[Array, Ar
     _, of_w, of_e, _ = geometry.tolerance
     t = e @ np.swapaxes(poses.rotation, -1, -2)
     sine = np.linalg.norm(cross(t, np.broadcast_to(w, t.shape)), axis=-1)
-    moved = poses.radius[:, None] + of_w + of_e + ROUNDING
+    moved = poses.radius[:, None] + of_w + of_e + ZONE_ROUNDING
     return sine - moved, np.minimum(sine + moved, 1.0)
 
 
@@ -356,7 +356,7 @@ class OrientationCap:
         reach = self._reach(cells)
         around, _, about = reach.T
         square = dot(reach, reach) + 2.0 * np.sin(0.5 * high) * around * about
-        radius = np.sqrt(square) + ROUNDING
+        radius = np.sqrt(square) + ZONE_ROUNDING
         rotation = self.reference @ tilted(azimuth, tilt, torsion)
         count = len(tilt)
         return PoseBalls(
@@ -429,8 +429,8 @@ class GammaBox:
         self._arc = _arcs(tolerant.vectors.v)
         rows = zip(tolerant.tolerance.v, tolerant.rounding.v, strict=True)
         wide, exact = np.array(list(rows)).T
-        self._shortest = self._arc - wide - np.roll(wide, -1) - ROUNDING
-        self._longest = self._arc + exact + np.roll(exact, -1) + ROUNDING
+        self._shortest = self._arc - wide - np.roll(wide, -1) - ZONE_ROUNDING
+        self._longest = self._arc + exact + np.roll(exact, -1) + ZONE_ROUNDING
 
     def coordinates(self, gamma: ArrayLike) -> Array:
         """Coordinates of actuator angles [rad], both of shape (..., 3)."""
@@ -455,12 +455,12 @@ class GammaBox:
         half = 0.5 * cells.size * (self.high - self.low)
         gamma = self.angles(cells.middle)
         sigma = _least_singular(self._j2(gamma, rotation))
-        radius = _reach_of_assembly(half + self._moved + ROUNDING, sigma)
+        radius = _reach_of_assembly(half + self._moved + ZONE_ROUNDING, sigma)
         followed &= np.isfinite(radius)
-        below = gamma + half < -ROUNDING
+        below = gamma + half < -ZONE_ROUNDING
         above = gamma - half > self._longest
         beyond = np.stack([below, above], axis=-1)  # (n, leg, end)
-        in_stroke = (gamma - half > ROUNDING) & (gamma + half < self._shortest)
+        in_stroke = (gamma - half > ZONE_ROUNDING) & (gamma + half < self._shortest)
         outside = beyond.any(axis=(1, 2))
         leg, end = np.divmod(beyond.reshape(-1, 6).argmax(axis=1), 2)
         status = np.where(outside, REFUTED, np.where(followed, PROVEN, OPEN))
@@ -480,18 +480,21 @@ class GammaBox:
         length = np.linalg.norm(segment, axis=1)
         rotation, done = cells.known.copy(), np.zeros(len(segment))
         active = np.flatnonzero(length > 0.0)
-        for _ in range(MOST_STEPS):
+        for _ in range(MOST_ZONE_STEPS):
             if not len(active):
                 break
             here = begin[active] + done[active, None] * segment[active]
             sigma = _least_singular(self._j2(here, rotation[active]))
-            active, sigma = active[sigma > SINGULAR], sigma[sigma > SINGULAR]
+            active, sigma = (
+                active[sigma > LEAST_ZONE_SIGMA],
+                sigma[sigma > LEAST_ZONE_SIGMA],
+            )
             step = SAFE_SHARE * sigma**2
             share = np.minimum(done[active] + step / length[active], 1.0)
             there = begin[active] + share[:, None] * segment[active]
             moved, near = self._newton(there, rotation[active])
             change = np.abs(share - done[active])[:, None] * np.abs(segment[active])
-            reach = _reach_of_assembly(change + ROUNDING, sigma)
+            reach = _reach_of_assembly(change + ZONE_ROUNDING, sigma)
             safe = near & (_angle(rotation[active], moved) < reach)
             active = active[safe]
             rotation[active], done[active] = moved[safe], share[safe]
@@ -510,12 +513,12 @@ class GammaBox:
 
     def _newton(self, gamma: Array, rotation: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return assemblies near rotations, and whether each closes the loops."""
-        for _ in range(NEWTON_STEPS):
+        for _ in range(ZONE_NEWTON_STEPS):
             r, t = self._rows(gamma, rotation)
             step = np.linalg.solve(cross(t, r), -dot(r, t)[..., None])[..., 0]
             rotation = kinematics.rotate(rotation, np.asarray(step, dtype=float))
         r, t = self._rows(gamma, rotation)
-        return rotation, np.abs(dot(r, t)).max(axis=1) < 0.01 * ROUNDING
+        return rotation, np.abs(dot(r, t)).max(axis=1) < 0.01 * ZONE_ROUNDING
 
 
 def _arcs(v: Array) -> Array:
@@ -528,7 +531,7 @@ def _arcs(v: Array) -> Array:
 def _least_singular(matrices: Array) -> Array:
     """Return bounds below the least singular values of matrices (n, 3, 3), shape (n,)."""
     sigma = np.asarray(np.linalg.svd(matrices, compute_uv=False), dtype=float)
-    return np.asarray(sigma[:, 2] - ROUNDING, dtype=float)
+    return np.asarray(sigma[:, 2] - ZONE_ROUNDING, dtype=float)
 
 
 def _reach_of_assembly(moved: Array, sigma: Array) -> Array:
@@ -538,14 +541,14 @@ def _reach_of_assembly(moved: Array, sigma: Array) -> Array:
     square = slack**2 - 4.0 * math.sqrt(3.0) * d
     exists = (slack > 0.0) & (square > 0.0)
     root = np.sqrt(np.where(exists, square, 1.0))
-    reach = 2.0 * d / (slack + root) * (1.0 + ROUNDING)
+    reach = 2.0 * d / (slack + root) * (1.0 + ZONE_ROUNDING)
     return np.asarray(np.where(exists, reach, np.inf), dtype=float)
 
 
 def _angle(first: Array, second: Array) -> Array:
     """Return the angles between rotations, bounded from above [rad], shape (n,)."""
     chord = np.linalg.norm(first - second, axis=(1, 2)) / math.sqrt(2.0)
-    half = np.arcsin(np.minimum(0.5 * chord + ROUNDING, 1.0))
+    half = np.arcsin(np.minimum(0.5 * chord + ZONE_ROUNDING, 1.0))
     return np.asarray(2.0 * half, dtype=float)
 
 
@@ -570,7 +573,7 @@ def subdivide(
     examined = 0
     cells = zone.first_cell()
     while len(cells.low) and examined < max_boxes:
-        block = cells.rows(slice(0, min(BLOCK, max_boxes - examined)))
+        block = cells.rows(slice(0, min(ZONE_BLOCK, max_boxes - examined)))
         rest = cells.rows(slice(len(block.low), None))
         poses = zone.poses(block)
         verdicts = decide(geometry, poses, side)
@@ -601,7 +604,7 @@ class NearestLimit(NamedTuple):
 
     rotation: Array  # R, shape (3, 3)
     distance: float  # angle from the reference pose [rad]
-    limit: str  # which one, of LIMITS
+    limit: str  # which one, of ZONE_LIMITS
 
 
 class ProvenZone(Explained):
@@ -629,7 +632,7 @@ class ProvenZone(Explained):
 
     """
 
-    limits = LIMITS
+    limits = ZONE_LIMITS
 
     def __init__(
         self,
@@ -661,7 +664,7 @@ class ProvenZone(Explained):
         self.refuted = float(share[is_refuted].sum())
         self.open = 1.0 - self.proven - self.refuted
         self.refuted_by: dict[str, float] = {}
-        for index, name in enumerate(LIMITS):
+        for index, name in enumerate(ZONE_LIMITS):
             self.refuted_by[name] = float(share[verdicts.limit == index].sum())
         self.least_det_j2 = float(np.min(verdicts.det_j2[is_proven], initial=np.inf))
         self.least_sine_mu = float(np.min(verdicts.sine_mu[is_proven], initial=np.inf))
@@ -683,7 +686,7 @@ class ProvenZone(Explained):
         )
         row = int(distance.argmin())
         return NearestLimit(
-            poses.rotation[row], float(distance[row]), LIMITS[limits[row]]
+            poses.rotation[row], float(distance[row]), ZONE_LIMITS[limits[row]]
         )
 
     def __len__(self) -> int:

@@ -54,7 +54,7 @@ into it, or out of it."""
 _STORED = re.compile(r"(.*?)(?:_(\d+))?\.(mcap|db3)(?:\.zstd)?")
 """Name of a file of a recording: what all of them share, its number, what it is."""
 
-SIMULATOR, NAMESPACE, CONTROLLER, EVERYBODY = (
+SIMULATOR_NODE, NAMESPACE, CONTROLLER_NODE, EVERYBODY = (
     "simulator", "namespace", "controller", "everybody"
 )  # fmt: skip
 
@@ -66,14 +66,14 @@ RawMessage: TypeAlias = tuple[str, str, int, bytes]
 class Topic:
     """A topic of a run: the last part of its name, its message type, and whose it is.
 
-    The owner is SIMULATOR for a topic of the simulator's node, NAMESPACE for one that
-    lies beside the node, CONTROLLER for one of another node there, EVERYBODY for one
+    The owner is SIMULATOR_NODE for a topic of the simulator's node, NAMESPACE for one that
+    lies beside the node, CONTROLLER_NODE for one of another node there, EVERYBODY for one
     whose name is the same for all.
     """
 
     key: str
     type: str
-    owner: str = SIMULATOR
+    owner: str = SIMULATOR_NODE
 
     @property
     def ending(self) -> str:

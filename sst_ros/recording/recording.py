@@ -19,7 +19,7 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import model_of
-from sst_ros.dynamics.motion_table import JOINTS
+from sst_ros.dynamics.motion_table import JOINT_QUANTITIES
 from sst_ros.errors import InputError, Problem, refusal, require
 from sst_ros.files import require_free, write_into
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -44,9 +44,14 @@ from sst_ros.state import NANOSECONDS, Explained, ReadOnly, freeze
 if TYPE_CHECKING:
     import pandas as pd
 
-ESSENTIAL = (topics.JOINT_STATES, topics.ORIENTATION, topics.TICKS, topics.SCENE)
+ESSENTIAL = (
+    topics.JOINT_STATES,
+    topics.ORIENTATION_TABLE,
+    topics.TICK_TABLE,
+    topics.SCENE_TOPIC,
+)
 """Topics without which a recording is not that of a run."""
-OPTIONAL = (topics.EULER, topics.DIAGNOSTICS, topics.COMMANDS)
+OPTIONAL = (topics.EULER, topics.DIAGNOSTICS, topics.COMMAND_TABLE)
 MEASURED_APART = 1e-9
 """Angle [rad] by which joint_states are off the orientation where they are not the
 motion itself: those of a simulator agree to rounding.
@@ -108,7 +113,7 @@ class Signals:
     def missing(self) -> tuple[str, ...]:
         """Keys of the topics that are not in the recording, or without a row of the run."""
         missing = [key for key, series in self.topic_series.items() if not len(series)]
-        return (*missing, *([] if self.scene else [topics.SCENE.key]))
+        return (*missing, *([] if self.scene else [topics.SCENE_TOPIC.key]))
 
     def statuses_of(self, part: str, key: str) -> list[Status]:
         """Diagnostics of a part of the node that publishes a topic: other nodes send theirs, too.
@@ -200,7 +205,7 @@ class _Heard:
         """Take the numbers or the text of a message."""
         self.messages += 1
         content = message.content
-        if message.topic == topics.SCENE:
+        if message.topic == topics.SCENE_TOPIC:
             self.scenes.add(content.data)
         elif self.table is None:
             for status in content.status:
@@ -235,7 +240,7 @@ def read_signals(
     run, or of several runs none is named.
     """
     path, tables = Path(path), {table.key: table for table in topics.TOPIC_TABLES}
-    requested = [*tables.values(), topics.SCENE, topics.DIAGNOSTICS]
+    requested = [*tables.values(), topics.SCENE_TOPIC, topics.DIAGNOSTICS]
     bag = Bag(path, requested, damaged=damaged)
     heard: dict[str, _Heard] = {}
     for message in bag.messages():
@@ -263,16 +268,19 @@ def read_signals(
         endings = ", ".join(one.ending for one in tables.values())
         listed = ", ".join(sorted(bag.channels)) or None
         raise refusal(path, "topics", listed, f"must have at least one of {endings}")
-    scenes = of_run.get(topics.SCENE.key, nothing).scenes
+    scenes = of_run.get(topics.SCENE_TOPIC.key, nothing).scenes
     if len(scenes) > 1:
         raise refusal(
-            path, topics.SCENE.key, len(scenes), "the recording must hold one scene"
+            path,
+            topics.SCENE_TOPIC.key,
+            len(scenes),
+            "the recording must hold one scene",
         )
     stamped = [found[table.key] for table in topics.STAMPED if len(found[table.key])]
     starts = [int(series.stamp_ns[0]) for series in stamped]
     firsts = [int(series.received_ns[0]) for series in found.values() if len(series)]
     start_ns = min(starts or firsts)
-    origin = f"{path}: {bag.topics.get(topics.SCENE.key)}"
+    origin = f"{path}: {bag.topics.get(topics.SCENE_TOPIC.key)}"
     scene = yaml_document.read(Scene, next(iter(scenes)), origin) if scenes else None
     reported = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
     statuses = [one for one in reported if not run.is_of_another(one.name)]
@@ -391,12 +399,15 @@ class Recording(Explained, ReadOnly):
             raise InputError(str(self.path), problems)
         if found.scene is None:
             raise refusal(
-                self.path, topics.SCENE.key, 0, "the recording must hold one scene"
+                self.path,
+                topics.SCENE_TOPIC.key,
+                0,
+                "the recording must hold one scene",
             )
         self.scene, self.idle_states = found.scene, found.idle_states
         self.foreign_states = found.foreign_states
         self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
-        runs = found.statuses_of("run", topics.SCENE.key)
+        runs = found.statuses_of("run", topics.SCENE_TOPIC.key)
         self.reports = tuple(
             (one.received_ns, one.values) for one in runs if "phase" in one.values
         )
@@ -406,9 +417,9 @@ class Recording(Explained, ReadOnly):
             for table in (
                 topics.JOINT_STATES,
                 topics.TRUE_JOINT_STATES,
-                topics.ORIENTATION,
+                topics.ORIENTATION_TABLE,
                 topics.EULER,
-                topics.TICKS,
+                topics.TICK_TABLE,
             )
         )
         if len(joints) < 2:
@@ -444,13 +455,13 @@ class Recording(Explained, ReadOnly):
             allowed = (
                 f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
             )
-            raise refusal(self.path, topics.TICKS.key, int(overlap[0]), allowed)
+            raise refusal(self.path, topics.TICK_TABLE.key, int(overlap[0]), allowed)
         moment = ticks.values[:, 4:]
         known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
         self.ticks = Ticks(begin_ns, end_ns, ticks.torque, moment if known else None)
         parts = [
             found.topic_series[one.key]
-            for one in (topics.COMMANDS, topics.STAMPED_COMMANDS)
+            for one in (topics.COMMAND_TABLE, topics.STAMPED_COMMANDS)
         ]
         order = np.argsort(
             np.concatenate([part.received_ns for part in parts]), kind="stable"
@@ -460,7 +471,7 @@ class Recording(Explained, ReadOnly):
             np.concatenate([getattr(part, name) for part in parts])[order]
             for name in names
         )
-        self.commands = Series(topics.COMMANDS.columns, *columns)
+        self.commands = Series(topics.COMMAND_TABLE.columns, *columns)
         self._freeze()
 
     time_ns: Integers
@@ -590,7 +601,7 @@ class Recording(Explained, ReadOnly):
         message are those that the simulator reported.
         """
         known, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
-        joints = np.hstack([getattr(self, name) for name in JOINTS])
+        joints = np.hstack([getattr(self, name) for name in JOINT_QUANTITIES])
         reported, error_estimate = self.diagnostics, np.nan
         with contextlib.suppress(ValueError):
             error_estimate = float(reported.get("error_estimate", "nan"))
@@ -641,7 +652,7 @@ class Recording(Explained, ReadOnly):
 def _finite_rows(found: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
     series = found.topic_series[table.key]
-    needed = series.values[:, : 4 if table is topics.TICKS else None]
+    needed = series.values[:, : 4 if table is topics.TICK_TABLE else None]
     finite = np.isfinite(needed)
     if finite.all():
         return series

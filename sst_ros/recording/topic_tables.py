@@ -26,18 +26,18 @@ from numpy.typing import NDArray
 
 from sst_ros.errors import InputError, Problem, refusal
 from sst_ros.recording.bag_reader import (
-    CONTROLLER,
+    CONTROLLER_NODE,
     EVERYBODY,
     NAMESPACE,
-    SIMULATOR,
+    SIMULATOR_NODE,
     Bag,
     Topic,
 )
 from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.state import Array, is_idle, nanoseconds
 
-ACTUATED = JOINTS[:3]
-KINDS = ("gamma", "mu", "beta")
+ACTUATED_JOINTS = JOINTS[:3]
+JOINT_KINDS = ("gamma", "mu", "beta")
 
 Integers: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = list[tuple[int, Sequence[float]]]
@@ -138,7 +138,10 @@ def sort_rows(
     if table in STAMPED:
         stamps, order = np.unique(at[:, 0], return_index=True)
         again = np.delete(np.arange(len(at)), order)
-        if table in (ORIENTATION, EULER):  # an idle state shows the last sample again
+        if table in (
+            ORIENTATION_TABLE,
+            EULER,
+        ):  # an idle state shows the last sample again
             first = order[np.searchsorted(stamps, at[again, 0])]
             again = again[~(values[again] == values[first]).all(axis=1)]
         if len(again):
@@ -148,7 +151,7 @@ def sort_rows(
             raise refusal(path, table.key, len(again), allowed)
     if not np.array_equal(order, np.arange(len(at))):  # most need no copy
         at, values = at[order], values[order]
-    if table is TICKS and np.isnan(values[:, -3:]).all():
+    if table is TICK_TABLE and np.isnan(values[:, -3:]).all():
         columns, values = columns[:-3], values[:, :-3]  # no moment was recorded
     stamps, received = at.T.copy()
     return Series(columns, stamps, received, values)
@@ -177,7 +180,7 @@ def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
         position, velocity, effort = (part[at].tolist() for part in parts)
     else:
         position, velocity, effort = (_take_known(part, at) for part in parts)
-    return [(stamp, position + velocity + effort[: len(ACTUATED)])]
+    return [(stamp, position + velocity + effort[: len(ACTUATED_JOINTS)])]
 
 
 def _take_known(part: Sequence[float], at: Sequence[int]) -> list[float]:
@@ -224,8 +227,8 @@ def _read_ticks(message: Any) -> Rows:
     start = nanoseconds(message.header.stamp)
     if not start:
         return []
-    names = tuple(message.joint_names) or ACTUATED
-    at = _places(ACTUATED, names)
+    names = tuple(message.joint_names) or ACTUATED_JOINTS
+    at = _places(ACTUATED_JOINTS, names)
     moments = _places(MOMENTS, names) if set(MOMENTS) <= set(names) else []
     rows, end = Rows(), start
     for point in message.points:
@@ -244,9 +247,9 @@ def _read_ticks(message: Any) -> Rows:
 
 
 def _read_stamped_commands(message: Any) -> Rows:
-    if sorted(message.name) != sorted(ACTUATED) or len(message.effort) != 3:
+    if sorted(message.name) != sorted(ACTUATED_JOINTS) or len(message.effort) != 3:
         return []
-    at = _places(ACTUATED, tuple(message.name))
+    at = _places(ACTUATED_JOINTS, tuple(message.name))
     return [(nanoseconds(message.header.stamp), message.effort[at].tolist())]
 
 
@@ -266,7 +269,7 @@ def _table(
     message_type: str,
     rows: Callable[[Any], Rows | None],
     *parts: tuple[Sequence[str], str, str],
-    owner: str = SIMULATOR,
+    owner: str = SIMULATOR_NODE,
 ) -> TopicTable:
     """Make the table of a topic by its key and owner.
 
@@ -280,14 +283,14 @@ def _table(
 
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _COMMANDED = (_legs("tau"), "N m", "commanded torque")
-_MOMENT = "external moment on the star in {B}"
+_MOMENT_LABEL = "external moment on the star in {B}"
 
 JOINT_STATES = _table(
     "joint_states",
     _JOINT_STATE,
     partial(_read_joints, JOINTS),
-    *((_legs(kind), "rad", f"joint angle {kind}") for kind in KINDS),
-    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in KINDS),
+    *((_legs(kind), "rad", f"joint angle {kind}") for kind in JOINT_KINDS),
+    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in JOINT_KINDS),
     (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
     owner=NAMESPACE,
 )
@@ -295,11 +298,17 @@ TRUE_JOINT_STATES = _table(
     "true_joint_states",
     _JOINT_STATE,
     partial(_read_joints, JOINTS),
-    *((_legs(f"true_{kind}"), "rad", f"true joint angle {kind}") for kind in KINDS),
-    *((_legs(f"true_{kind}_dot"), "rad/s", f"true rate of {kind}") for kind in KINDS),
+    *(
+        (_legs(f"true_{kind}"), "rad", f"true joint angle {kind}")
+        for kind in JOINT_KINDS
+    ),
+    *(
+        (_legs(f"true_{kind}_dot"), "rad/s", f"true rate of {kind}")
+        for kind in JOINT_KINDS
+    ),
     (_legs("true_tau"), "N m", "torque of the actuator over the step that ends here"),
 )
-ORIENTATION = _table(
+ORIENTATION_TABLE = _table(
     "orientation",
     "geometry_msgs/msg/QuaternionStamped",
     _parts("quaternion", "xyzw"),
@@ -311,33 +320,33 @@ EULER = _table(
     _parts("vector", "xyz"),
     (("theta", "phi", "psi"), "rad", "ZYZ angle of {E} in {B}"),
 )
-REFERENCE = _table(
+REFERENCE_TABLE = _table(
     "reference",
     _JOINT_STATE,
-    partial(_read_joints, ACTUATED),
+    partial(_read_joints, ACTUATED_JOINTS),
     (_legs("gamma_desired"), "rad", "desired angle of the actuator"),
     (_legs("gamma_dot_desired"), "rad/s", "desired rate of the actuator"),
     (_legs("tau_feedforward"), "N m", "torque of the model for the desired motion"),
-    owner=CONTROLLER,
+    owner=CONTROLLER_NODE,
 )
 TRACKING_ERROR = _table(
     "tracking_error",
     _JOINT_STATE,
-    partial(_read_joints, ACTUATED),
+    partial(_read_joints, ACTUATED_JOINTS),
     (_legs("gamma_error"), "rad", "desired less measured angle"),
     (_legs("gamma_dot_error"), "rad/s", "desired less measured rate"),
     (_legs("tau_feedback"), "N m", "torque of the feedback"),
-    owner=CONTROLLER,
+    owner=CONTROLLER_NODE,
 )
-TICKS = _table(
+TICK_TABLE = _table(
     "applied_torques",
     "trajectory_msgs/msg/JointTrajectory",
     _read_ticks,
     (("length",), "ns", "length of the tick, which begins at the stamp"),
     (_legs("tau"), "N m", "torque held over the tick"),
-    (MOMENTS, "N m", f"{_MOMENT} over the tick"),
+    (MOMENTS, "N m", f"{_MOMENT_LABEL} over the tick"),
 )
-COMMANDS = _table(
+COMMAND_TABLE = _table(
     "commands",
     "std_msgs/msg/Float64MultiArray",
     # Others are dropped by the simulator too.
@@ -347,34 +356,34 @@ COMMANDS = _table(
 STAMPED_COMMANDS = _table(
     "commands_stamped", _JOINT_STATE, _read_stamped_commands, _COMMANDED
 )
-MOMENT = _table(
+MOMENT_TABLE = _table(
     "external_moment",
     "geometry_msgs/msg/WrenchStamped",
     _parts("wrench.torque", "xyz", stamped=False),
-    (MOMENTS, "N m", _MOMENT),
+    (MOMENTS, "N m", _MOMENT_LABEL),
 )
 
-SCENE = Topic("scene", "std_msgs/msg/String")
+SCENE_TOPIC = Topic("scene", "std_msgs/msg/String")
 DIAGNOSTICS = Topic("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", EVERYBODY)
 
 TABLES: dict[str, tuple[TopicTable, ...]] = {
     "samples": (
         JOINT_STATES,
         TRUE_JOINT_STATES,
-        ORIENTATION,
+        ORIENTATION_TABLE,
         EULER,
-        REFERENCE,
+        REFERENCE_TABLE,
         TRACKING_ERROR,
     ),
-    "ticks": (TICKS,),
-    "commands": (COMMANDS,),
+    "ticks": (TICK_TABLE,),
+    "commands": (COMMAND_TABLE,),
     "commands_stamped": (STAMPED_COMMANDS,),
-    "external_moment": (MOMENT,),
+    "external_moment": (MOMENT_TABLE,),
 }
 """The tables of a run, and the topics in each: samples have a row at each stamp of their topics."""
 
 # topics whose rows are ordered by stamps, one at each
-STAMPED = (*TABLES["samples"], TICKS)
+STAMPED = (*TABLES["samples"], TICK_TABLE)
 TOPIC_TABLES = tuple(table for tables in TABLES.values() for table in tables)
 
 TIMES = (
@@ -390,7 +399,10 @@ TIMES = (
 )
 """The first columns of every table, whole numbers; all others are doubles."""
 
-PUBLISHED = {one.key for one in (SCENE, ORIENTATION, EULER, TICKS, TRUE_JOINT_STATES)}
+PUBLISHED = {
+    one.key
+    for one in (SCENE_TOPIC, ORIENTATION_TABLE, EULER, TICK_TABLE, TRUE_JOINT_STATES)
+}
 """Topics that a simulator publishes under its own name; others publish its commands."""
 
 
@@ -424,15 +436,15 @@ def select_topics(
         allowed = (
             "are of several simulators in one namespace; record one simulator a bag"
         )
-        raise refusal(bag.path, SCENE.key, ", ".join(here), allowed)
+        raise refusal(bag.path, SCENE_TOPIC.key, ", ".join(here), allowed)
     node = here[0] if here else None
     names = dict[str, str]()
     for name, topic in bag.candidates.items():
         own = {
             EVERYBODY: True,
-            SIMULATOR: _parent(name) == node,
+            SIMULATOR_NODE: _parent(name) == node,
             NAMESPACE: name == chosen.rstrip("/") + topic.ending,
-            CONTROLLER: False,
+            CONTROLLER_NODE: False,
         }
         if own[topic.owner]:
             names[topic.key] = name
@@ -453,7 +465,7 @@ def find_absent(
         if any(name in bag.candidates for name in others):
             typed, where = (
                 others,
-                run.node if topic.owner == SIMULATOR else run.namespace,
+                run.node if topic.owner == SIMULATOR_NODE else run.namespace,
             )
             allowed = f"no such topic is of {where}, whose scene is recorded; record it"
         found[topic.key] = Problem(topic.key, ", ".join(typed) or None, allowed)
@@ -486,12 +498,14 @@ def _find_simulators(candidates: Mapping[str, Topic]) -> list[str]:
     """
     topics: dict[str, set[str]] = {}
     for name, topic in candidates.items():
-        if topic.owner == SIMULATOR:
+        if topic.owner == SIMULATOR_NODE:
             topics.setdefault(_parent(name), set()).add(topic.key)
     publishing = {
         node: keys & PUBLISHED for node, keys in topics.items() if keys & PUBLISHED
     }
-    with_scene = {node: keys for node, keys in publishing.items() if SCENE.key in keys}
+    with_scene = {
+        node: keys for node, keys in publishing.items() if SCENE_TOPIC.key in keys
+    }
     # Another node may publish a text of the name `scene`, but nothing else of a
     # simulator.
     sure = [node for node, keys in with_scene.items() if len(keys) > 1]
@@ -504,7 +518,7 @@ def _find_namespaces(candidates: Mapping[str, Topic]) -> set[str]:
     below = {
         _parent(_parent(n))
         for n, topic in candidates.items()
-        if topic.owner == CONTROLLER
+        if topic.owner == CONTROLLER_NODE
     }
     return beside or below
 
@@ -518,7 +532,7 @@ def _find_controllers(
     """
     nodes: dict[str, dict[str, str]] = {}
     for name, topic in bag.candidates.items():
-        if topic.owner == CONTROLLER and name in heard:
+        if topic.owner == CONTROLLER_NODE and name in heard:
             nodes.setdefault(_parent(name), {})[topic.key] = name
     near = {node: found for node, found in nodes.items() if _parent(node) == namespace}
     chosen = near or (nodes if alone else {})

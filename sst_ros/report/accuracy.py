@@ -39,10 +39,10 @@ from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
 
-FIXED, TOLERANCE = "fixed steps", "tolerance"
+FIXED, TOLERANCE_KIND = "fixed steps", "tolerance"
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 _TOLERANCES = tuple(10.0**-n for n in range(4, 14))
-TARGET, TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
+TARGET, ERROR_TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
 """Orientation errors for which the fastest setting is named [rad].
 
 TARGET is in titles.
@@ -51,26 +51,26 @@ TARGET is in titles.
 # errors are reported if they are so many times the reference's own
 ABOVE_REFERENCE = 100.0
 USELESS = 0.1  # an orientation error above this [rad] is a failure
-ROUNDING = 2e-14  # finer steps are not expected to give less than this [rad]
+REFERENCE_ROUNDING = 2e-14  # finer steps are not expected to give less than this [rad]
 # no finer settings are tried after a run that took longer than this [s]
 LONGEST_RUN_S = 0.4
 # are tried even where they take longer: a busy machine must not empty the grid
 LEAST_SETTINGS = 3
 
-ERROR = "largest_orientation_rad"
-ERRORS = [
+ERROR_COLUMN = "largest_orientation_rad"
+ERROR_COLUMNS = [
     f"{when}_{quantity}"
     for when in ("final", "largest")
     for quantity in ("orientation_rad", "gamma_rad", "gamma_dot_rad_per_s")
 ]
-COLUMNS = (
+STUDY_COLUMNS = (
     "scene",
     "method",
     "kind",
     "setting",
     "evaluations",
     "wall_min_s",
-    *ERRORS,
+    *ERROR_COLUMNS,
     "failure",
 )
 """Columns of the solver grid. `setting` is the length of the steps [s] or the
@@ -87,7 +87,7 @@ class WorkPrecision:
     seconds: float  # time span [s]
     ends: str  # why it ends before the scene's duration; empty where it does not
     reference: ReferenceSolution
-    # the solver grid, columns as in COLUMNS; settings from coarse to fine
+    # the solver grid, columns as in STUDY_COLUMNS; settings from coarse to fine
     rows: DataFrame
     advice: StepAdvice  # as `scene show` prints it
     measured: float | None
@@ -106,7 +106,7 @@ class WorkPrecision:
         So it is with scenes that a controller drives along a reference motion.
         """
         states = self.reference.states[:, :7]
-        return bool(np.abs(states - states[0]).max() < ROUNDING)
+        return bool(np.abs(states - states[0]).max() < REFERENCE_ROUNDING)
 
     def best(self, target: float) -> Series[Any] | None:
         """Return the fastest setting with an orientation error of at most `target` [rad].
@@ -119,16 +119,20 @@ class WorkPrecision:
         if self.rests:
             return None
         for _, group in self.rows.groupby(["method", "kind"], sort=False):
-            bad = np.flatnonzero(~(group[ERROR].astype(float).to_numpy() <= target))
+            bad = np.flatnonzero(
+                ~(group[ERROR_COLUMN].astype(float).to_numpy() <= target)
+            )
             good += group.index[bad[-1] + 1 if len(bad) else 0 : -1].tolist()
         found = self.rows.loc[good].sort_values("wall_min_s", kind="stable")
         return None if found.empty else found.iloc[0]
 
     @cached_property
     def fastest(self) -> dict[float, Series[Any]]:
-        """The fastest setting for each of TARGETS that has one and is not below the floor."""
+        """The fastest setting for each of ERROR_TARGETS that has one and is not below the floor."""
         found = {
-            target: self.best(target) for target in TARGETS if target >= self.floor
+            target: self.best(target)
+            for target in ERROR_TARGETS
+            if target >= self.floor
         }
         return {target: row for target, row in found.items() if row is not None}
 
@@ -156,7 +160,7 @@ def study_scene(scene: Scene, *, shown: bool = False) -> WorkPrecision:
         seconds=problem.seconds,
         ends=problem.ends,
         reference=truth,
-        rows=data_frame(({"scene": scene.name, **row} for row in rows), COLUMNS),
+        rows=data_frame(({"scene": scene.name, **row} for row in rows), STUDY_COLUMNS),
         advice=step_advice(scene),
         measured=measured,
         proven=proven_error(scene, duration=problem.seconds, t_eval=problem.times),
@@ -189,7 +193,7 @@ class SolverSetting(NamedTuple):
     """One point of the grid."""
 
     method: str
-    kind: str  # FIXED or TOLERANCE
+    kind: str  # FIXED or TOLERANCE_KIND
     setting: float  # step [s] or tolerance
     solve: Callable[[], Run]  # raises SstError, ArithmeticError or ValueError
     timed: Callable[[], object]  # does the same work with the least overhead
@@ -220,7 +224,7 @@ def _list_tolerances(
 ) -> Iterator[SolverSetting]:
     for tolerance in _TOLERANCES:
         run = partial(problem.run_simulation, problem.simulation(method, tolerance))
-        yield SolverSetting(method, TOLERANCE, tolerance, run, run)
+        yield SolverSetting(method, TOLERANCE_KIND, tolerance, run, run)
 
 
 def _refine(
@@ -230,10 +234,10 @@ def _refine(
 ) -> list[dict[str, Any]]:
     """Go from coarse to fine until a run takes long or two errors lie below the floor."""
     rows, below = list[dict[str, Any]](), 0
-    floor = max(ABOVE_REFERENCE * truth.own.orientation, ROUNDING)
+    floor = max(ABOVE_REFERENCE * truth.own.orientation, REFERENCE_ROUNDING)
     for setting in settings:
         rows.append(row := _measure(setting, problem, truth))
-        below += row.get(ERROR, math.inf) < floor
+        below += row.get(ERROR_COLUMN, math.inf) < floor
         if (
             row["wall_min_s"] > LONGEST_RUN_S and len(rows) >= LEAST_SETTINGS
         ) or below > 1:
@@ -264,7 +268,7 @@ def _measure(
                 largest.gamma_dot
             ):
                 raise ArithmeticError(f"off by {largest.orientation:.1g} rad")
-            row |= dict(zip(ERRORS, (*final, *largest), strict=True))
+            row |= dict(zip(ERROR_COLUMNS, (*final, *largest), strict=True))
         except (SstError, ArithmeticError, ValueError) as error:
             row["failure"] = str(error).splitlines()[0] if str(error) else "not finite"
     return row
@@ -306,7 +310,7 @@ def name_fastest(study: WorkPrecision) -> str:
         )
     if best is not None:
         return f"{TARGET:.0e} rad over {study.seconds:g} s: {_setting(best)}."
-    least = study.rows[ERROR].astype(float).min()
+    least = study.rows[ERROR_COLUMN].astype(float).min()
     reached = (
         f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
     )
@@ -318,7 +322,7 @@ def name_fastest(study: WorkPrecision) -> str:
 
 def _setting(row: Series[Any]) -> str:
     fixed, wall_ms = f"{1e3 * row.setting:.4g} ms steps", 1e3 * row.wall_min_s
-    setting = f"tolerance {row.setting:.0e}" if row.kind == TOLERANCE else fixed
+    setting = f"tolerance {row.setting:.0e}" if row.kind == TOLERANCE_KIND else fixed
     return f"{row.method}, {setting}, {wall_ms:{'.2g' if wall_ms < 99.5 else '.0f'}} ms"
 
 
@@ -336,7 +340,7 @@ def accuracy_text(study: WorkPrecision) -> str:
 
 def accuracy_page(studies: Sequence[WorkPrecision], *, whole: bool = True) -> str:
     """Write studies as one Markdown page, or without its introduction and summary."""
-    given = {"targets": TARGETS, "fastest": name_fastest, "setting": _setting}
+    given = {"targets": ERROR_TARGETS, "fastest": name_fastest, "setting": _setting}
     return render("accuracy.md", whole=whole, studies=studies, **given)
 
 
@@ -344,7 +348,7 @@ def accuracy_page(studies: Sequence[WorkPrecision], *, whole: bool = True) -> st
 def draw_accuracy(study: WorkPrecision) -> Figure:
     """Draw the largest error of the orientation over wall time.
 
-    The fastest setting for each of TARGETS is marked.
+    The fastest setting for each of ERROR_TARGETS is marked.
     """
     rows, floor = study.rows, study.floor
     figure = Figure(figsize=(10.5, 6.2))
@@ -353,7 +357,7 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
         xscale="log", yscale="log", ylabel="largest error of the orientation [rad]"
     )
     axes.set_xlabel(f"wall time for {study.seconds:g} s of motion [ms]")
-    drawn = rows[(rows[ERROR] >= floor) & (rows[ERROR] > 0.0)]
+    drawn = rows[(rows[ERROR_COLUMN] >= floor) & (rows[ERROR_COLUMN] > 0.0)]
     for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
         colour, marker = MARKERS[name]
         hollow: Looks = (
@@ -361,9 +365,12 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
         )
         looks: Looks = {"color": colour, "marker": marker, "markersize": 6.5, **hollow}
         axes.plot(
-            1e3 * group.wall_min_s, group[ERROR], label=f"{name}, {kind}", **looks
+            1e3 * group.wall_min_s,
+            group[ERROR_COLUMN],
+            label=f"{name}, {kind}",
+            **looks,
         )
-    errors = drawn[ERROR].astype(float) if len(drawn) else np.array([1e-3, 1.0])
+    errors = drawn[ERROR_COLUMN].astype(float) if len(drawn) else np.array([1e-3, 1.0])
     low = 10.0 ** math.floor(math.log10(errors.min()) - 0.7)
     axes.set_ylim(low, 10.0 ** math.ceil(math.log10(errors.max()) + 0.01))
     if floor > low:
@@ -372,7 +379,7 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
     ring: Looks = {"markersize": 14, "markerfacecolor": "none", "markeredgewidth": 1.4}
     for target, row in study.fastest.items():
         axes.axhline(target, color=INK, linewidth=0.9, linestyle=":")
-        place = 1e3 * row.wall_min_s, max(row[ERROR], floor)
+        place = 1e3 * row.wall_min_s, max(row[ERROR_COLUMN], floor)
         label = "fastest for a dotted line" if target == min(study.fastest) else None
         axes.plot(*place, "o", color=INK, zorder=5, label=label, **ring)
     axes.yaxis.set_major_locator(LogLocator(numticks=12))

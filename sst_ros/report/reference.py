@@ -138,7 +138,7 @@ def _first_state(run: Recording) -> Array:
     return np.append(start, run.effort[0] if run.scene.lags else [])
 
 
-QUANTITIES = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
+COMPARED_UNITS = {"gamma": "rad", "gamma_dot": "rad_per_s", "orientation": "rad"}
 """What is compared, and its unit in names."""
 
 
@@ -268,7 +268,7 @@ def _compare(
         elif k < end:
             failed, k = failed + 1, k + 1
         bar.draw(k / count)
-    error, own = (pd.DataFrame(each, columns=[*QUANTITIES]) for each in distances)
+    error, own = (pd.DataFrame(each, columns=[*COMPARED_UNITS]) for each in distances)
     steps = -(-run.ticks.period_ns // LONGEST_TICK_NS)
     return Comparison(error, own, energy, tuple(begun), steps)
 
@@ -288,7 +288,7 @@ def _energy(model: kernel.Model, states: Array) -> Array:
 
 
 def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
-    """Distances of quaternions, gamma and gamma_dot, in the columns QUANTITIES, shape (n, 3)."""
+    """Distances of quaternions, gamma and gamma_dot, in the columns COMPARED_UNITS, shape (n, 3)."""
     # Recorded angles may count whole turns, computed ones do not.
     turn, difference = 2.0 * np.pi, one[1] - other[1]
     gamma = np.abs(difference - turn * np.round(difference / turn)).max(axis=1)

@@ -42,10 +42,10 @@ LongArray: TypeAlias = NDArray[np.longdouble]
 Run: TypeAlias = tuple[Array, int]
 """States at the instants of comparison, (count + 1, n), and evaluations of the right-hand side."""
 
-_MOST_STEPS = 25_000  # in extended precision: half a minute's work
+_MOST_REFERENCE_STEPS = 25_000  # in extended precision: half a minute's work
 INTERVALS = 20  # solutions are compared at this many instants or more
 
-EXACT = replace(
+EXACT_DOP853 = replace(
     DOP853,
     b=(*DOP853.b[:-1], float(1 - sum(map(Fraction, DOP853.b[:-1])))),
     error=(),
@@ -200,7 +200,7 @@ def _halve_steps(
     steps, change = 1, math.inf
     before = after = run_extended(problem, 1)
     # all of them together; halved at least once
-    most = max(_MOST_STEPS, 4 * problem.count)
+    most = max(_MOST_REFERENCE_STEPS, 4 * problem.count)
     while 4 * steps * problem.count <= most and not change < 1e-17:
         before, last, steps = after, change, 2 * steps
         after = run_extended(problem, steps)
@@ -222,7 +222,7 @@ def exact_derivative(problem: InitialValueProblem) -> Derivative:
 
 
 def run_extended(problem: InitialValueProblem, steps: int) -> LongArray:
-    """States at the instants, in long doubles, with `steps` steps of EXACT an interval.
+    """States at the instants, in long doubles, with `steps` steps of EXACT_DOP853 an interval.
 
     The quaternion is kept at length 1. A row of nan stands where there is no finite
     state.
@@ -231,10 +231,12 @@ def run_extended(problem: InitialValueProblem, steps: int) -> LongArray:
     result = np.full((problem.count + 1, len(problem.start)), np.nan, dtype=number)
     result[0] = problem.start
     y, h = result[0].copy(), number(problem.interval) / steps
-    stages = [None] * len(EXACT.a)
+    stages = [None] * len(EXACT_DOP853.a)
     with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
         for k in range(problem.count * steps):
-            y = np.array(explicit_step(derivative, EXACT, k * h, h, [*y], stages).state)
+            y = np.array(
+                explicit_step(derivative, EXACT_DOP853, k * h, h, [*y], stages).state
+            )
             y[:4] /= np.sqrt(y[:4] @ y[:4])
             if (k + 1) % steps == 0:
                 result[(k + 1) // steps] = y

@@ -31,7 +31,7 @@ from pandas import DataFrame, Series
 
 from sst_ros.recording.recording import Recording
 from sst_ros.report import reference, tracking
-from sst_ros.report.reference import QUANTITIES, Comparison
+from sst_ros.report.reference import COMPARED_UNITS, Comparison
 from sst_ros.report.results import (
     Finding,
     Severity,
@@ -160,7 +160,7 @@ def summarise(
         **{
             f"{name}_{key}_{unit}": largest(table[key])
             for name, table in compared.items()
-            for key, unit in QUANTITIES.items()
+            for key, unit in COMPARED_UNITS.items()
         },
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,

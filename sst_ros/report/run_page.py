@@ -21,7 +21,7 @@ from sst_ros.report.reference import Comparison
 from sst_ros.report.results import provenance, publish, render
 from sst_ros.report.run import RunEvaluation, evaluate_run, summary_table
 
-DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
+RUN_DRAWN = ("path_of_E", "position_of_E", "theta", "phi", "psi", "torques")
 """Pictures of `plot` that the report has, too."""
 
 PAGE, HTML = "page.png", "page.html"
@@ -42,7 +42,7 @@ def write_run_report(
     run = recording.read(bag, damaged=damaged, namespace=namespace)
     with write_into(out, "report"):
         found = evaluate_run(run)
-        drawn, _ = pictures.draw_run(run.signals, out, DRAWN, ["png"])
+        drawn, _ = pictures.draw_run(run.signals, out, RUN_DRAWN, ["png"])
         title = f"Error against run time, {run.scene.name}"
         drawn += pictures.save(draw_errors(run, found), title, out, "error", ["png"])
         figures.save_figure(draw_overview(run, found), out / PAGE)

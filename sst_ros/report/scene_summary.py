@@ -27,7 +27,7 @@ from sst_ros.errors import InputError, SstError
 from sst_ros.integration.methods import DORMAND_PRINCE, Method, Rosenbrock
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.report.results import WHOLE_RUN_S, render
-from sst_ros.scene.scene import TERMS, Scene, terms
+from sst_ros.scene.scene import SCENE_TERMS, Scene, terms
 from sst_ros.scene.schema import build, drop_idle
 from sst_ros.scene.yaml_document import replace_values
 from sst_ros.simulation.simulate import simulate
@@ -46,7 +46,7 @@ def summary(scene: Scene) -> str:
         dynamics=dynamics,
         operations=ODE(dynamics).program.operations,
         costs=costs(scene),
-        absent=[term for term in TERMS if term not in terms(scene)],
+        absent=[term for term in SCENE_TERMS if term not in terms(scene)],
         damping=damping_of(scene.stroke) if scene.stroke.at_end == "elastic" else 0.0,
         limits=len(list(limits_of(scene, geometry))),
         advice=step_advice(scene).text,
@@ -58,11 +58,11 @@ def summary(scene: Scene) -> str:
 
 
 def without(scene: Scene, term: str) -> Scene:
-    """Return a scene without one of TERMS.
+    """Return a scene without one of SCENE_TERMS.
 
     Gravity goes with the last links that it acts on.
     """
-    key, links = TERMS[term], term.endswith("links")
+    key, links = SCENE_TERMS[term], term.endswith("links")
     whole: dict[str, Any] = {key.partition(".")[0]: [{}] if links else None}
     for change in (whole if links else {key: None}, whole):
         # a kind of stops without its own, or gravity
@@ -94,9 +94,9 @@ def costs(scene: Scene) -> list[Cost]:
 
 LONGEST_S = 10.0  # the advice is for a run of the scene's duration, but not of more [s]
 # error of the orientation that it is for [rad]: the default of `simulate`
-TOLERANCE = 1e-9
+ADVICE_TOLERANCE = 1e-9
 # abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i
-GROWTH = 1e-6
+STABLE_GROWTH = 1e-6
 
 
 class StepAdvice(NamedTuple):
@@ -111,11 +111,13 @@ def step_advice(scene: Scene) -> StepAdvice:
     """Recommend a method and a step for a scene: those that `auto` takes."""
     seconds = min(scene.duration or WHOLE_RUN_S, LONGEST_S)
     try:
-        motion = simulate(scene, duration=seconds, tolerance=TOLERANCE)
+        motion = simulate(scene, duration=seconds, tolerance=ADVICE_TOLERANCE)
         rates = eigenvalues(scene)
     except SstError as error:
         return StepAdvice(f"none, the scene cannot start: {error}")
-    text = f"for an error of {TOLERANCE:g} rad over {seconds:g} s: {motion.method}"
+    text = (
+        f"for an error of {ADVICE_TOLERANCE:g} rad over {seconds:g} s: {motion.method}"
+    )
     text += f"; its steps have {motion.step:.2g} s on average"
     limit, fastest = (
         largest_stable_step(DORMAND_PRINCE, rates),
@@ -160,7 +162,7 @@ def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
     steps = np.geomspace(1e-2, 1e3, 5001) / np.abs(values).max()
     stable = (
         np.abs(stability_function(method, np.outer(steps, values))).max(axis=1)
-        < 1 + GROWTH
+        < 1 + STABLE_GROWTH
     )
     return (
         math.inf if stable.all() else float(steps[max(int(np.argmin(stable)) - 1, 0)])

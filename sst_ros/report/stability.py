@@ -51,10 +51,10 @@ from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
 
-INSTANTS = 50  # at which the motion is linearised
-FINER, FACTOR, ROUNDING = 1e-2, 10.0, 1e-13
+EIGENVALUE_INSTANTS = 50  # at which the motion is linearised
+FINER, FACTOR, PASSING_ROUNDING = 1e-2, 10.0, 1e-13
 """A run is checked by one for FINER times the tolerance. Its estimate holds if the true
-error is at most FACTOR times as large, or ROUNDING [rad].
+error is at most FACTOR times as large, or PASSING_ROUNDING [rad].
 """
 # of the star about each axis, up to pi: limits and singularities lie between them
 TURNS = 181
@@ -92,7 +92,7 @@ class StabilityReport(NamedTuple):
 def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
     """Examine a scene, print the report and write stability.csv, .json, .md and .png into `out`.
 
-    `only` names rows of ROWS; by default all. Returns whether no run failed. Raises
+    `only` names rows of CHANGED_RUNS; by default all. Returns whether no run failed. Raises
     InputError where a name is unknown or `out` cannot be written, SstError where the
     scene cannot start.
     """
@@ -120,15 +120,16 @@ def examine_stability(
     scene: Scene, only: Sequence[str] = (), *, shown: bool = False
 ) -> StabilityReport:
     """Find the stable steps along the motion of a scene, and run it with other numbers."""
-    known = f"must be one of {', '.join(ROWS)}"
+    known = f"must be one of {', '.join(CHANGED_RUNS)}"
     wrong = (
-        ("--only", name, name in ROWS, known + suggestion(name, ROWS)) for name in only
+        ("--only", name, name in CHANGED_RUNS, known + suggestion(name, CHANGED_RUNS))
+        for name in only
     )
     refuse_unless("report stability", *wrong)
-    chosen = [name for name in ROWS if name in only or not only]
+    chosen = [name for name in CHANGED_RUNS if name in only or not only]
     seconds = min(scene.duration or WHOLE_RUN_S, advised.LONGEST_S)
     began = time.perf_counter()
-    motion = simulate(scene, duration=seconds, tolerance=advised.TOLERANCE)
+    motion = simulate(scene, duration=seconds, tolerance=advised.ADVICE_TOLERANCE)
     if shown:
         about = max(1.0, 2.0 * (time.perf_counter() - began)) * len(chosen)
         print(
@@ -136,7 +137,7 @@ def examine_stability(
             f" {about:.0f} s"
         )
     steps = []
-    instants = motion.at(np.linspace(motion.t[0], motion.t[-1], INSTANTS))
+    instants = motion.at(np.linspace(motion.t[0], motion.t[-1], EIGENVALUE_INSTANTS))
     states = np.hstack([instants.quaternion, instants.body_rate, instants.torque])
     for t, state in zip(instants.t.tolist(), states.tolist(), strict=True):
         values = advised.eigenvalues(
@@ -153,7 +154,7 @@ def examine_stability(
         steps.append({"t_s": t, **fastest, **longest})
 
     def run(name: str) -> dict[str, Any]:
-        what, change = ROWS[name]
+        what, change = CHANGED_RUNS[name]
         return {"name": name, "change": what, **_run(change(scene, motion), seconds)}
 
     # One after another: computing times are those of a core that is free.
@@ -177,7 +178,10 @@ def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
             with np.errstate(all="ignore"):
                 run, fine = (
                     simulate(changed, duration=seconds, tolerance=tolerance)
-                    for tolerance in (advised.TOLERANCE, FINER * advised.TOLERANCE)
+                    for tolerance in (
+                        advised.ADVICE_TOLERANCE,
+                        FINER * advised.ADVICE_TOLERANCE,
+                    )
                 )
             at, estimate = min(float(run.t[-1]), float(fine.t[-1])), run.error_estimate
             error = float(
@@ -185,7 +189,7 @@ def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
             )
             # A run that ends where it starts has no estimate.
             holds = run.status < 0 or bool(
-                error <= np.fmax(FACTOR * estimate, ROUNDING)
+                error <= np.fmax(FACTOR * estimate, PASSING_ROUNDING)
             )
             same = run.status == fine.status
             result = run.message if same else f"{run.message}; finer: {fine.message}"
@@ -294,7 +298,7 @@ def _measure(scene: Scene, rotation: Array) -> workspace.Measures:
     )
 
 
-ROWS: dict[str, tuple[str, Change]] = {
+CHANGED_RUNS: dict[str, tuple[str, Change]] = {
     "as-it-is": ("nothing", lambda scene, _: scene),
     "torque": (
         "ten times the torque",
@@ -324,7 +328,7 @@ def stability_page(found: StabilityReport) -> str:
     """Write the report as Markdown."""
     given = {
         "factor": FACTOR,
-        "rounding": ROUNDING,
+        "rounding": PASSING_ROUNDING,
         "methods": METHODS,
         "inf": math.inf,
     }

@@ -23,12 +23,12 @@ from sst_ros.mechanism.geometry import (
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.topic_tables import REFERENCE, TRACKING_ERROR, places
+from sst_ros.recording.topic_tables import REFERENCE_TABLE, TRACKING_ERROR, places
 from sst_ros.report.results import largest, publish, render
 from sst_ros.state import NANOSECONDS, Array
 
-KEYS = (REFERENCE.key, TRACKING_ERROR.key)
-DRAWN = ("tracking", "tracking_error", "control_torques")
+TRACKING_TOPICS = (REFERENCE_TABLE.key, TRACKING_ERROR.key)
+TRACKING_DRAWN = ("tracking", "tracking_error", "control_torques")
 """Pictures of `plot` that the report has, too."""
 
 
@@ -49,7 +49,7 @@ class TrackedRun:
         counts = (
             status.values.get("samples_limited", "")
             for status in reversed(
-                self.recording.signals.statuses_of("control", REFERENCE.key)
+                self.recording.signals.statuses_of("control", REFERENCE_TABLE.key)
             )
         )
         limited = next((int(count) for count in counts if count.isdecimal()), None)
@@ -82,11 +82,13 @@ def read_tracking(path: Path) -> TrackedRun:
     """
     run = recording.read(path)
     missing = run.signals.absent
-    if absent := [missing[key] for key in KEYS if key in missing]:
+    if absent := [missing[key] for key in TRACKING_TOPICS if key in missing]:
         raise InputError(str(path), absent)
     found = of(run)
     if found is None:
-        raise refusal(path, KEYS[0], 0, "two samples or more must have a reference")
+        raise refusal(
+            path, TRACKING_TOPICS[0], 0, "two samples or more must have a reference"
+        )
     return found
 
 
@@ -95,7 +97,7 @@ def of(run: Recording) -> TrackedRun | None:
 
     None where fewer than two samples have one.
     """
-    series = [run.signals.topic_series[key] for key in KEYS]
+    series = [run.signals.topic_series[key] for key in TRACKING_TOPICS]
     at = [places(one.stamp_ns, run.time_ns + run.start_ns) for one in series]
     rows = np.flatnonzero(np.min(at, axis=0) >= 0)
     if len(rows) < 2:
@@ -127,5 +129,5 @@ def write_tracking_report(bag: Path, out: Path) -> str:
     given = {"found": tracked.metrics, "turned": largest(tracked.orientation_error)}
     text = render("tracking.txt", title=title, **given)
     publish(out, "report", {"tracking.txt": text})
-    pictures.draw_run(tracked.recording.signals, out, DRAWN, ["png"])
+    pictures.draw_run(tracked.recording.signals, out, TRACKING_DRAWN, ["png"])
     return text

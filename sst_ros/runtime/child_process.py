@@ -22,7 +22,7 @@ from sst_ros.errors import SstError
 
 # variable with the number of the process without which a node is to end
 PARENT = "SST_ROS_PARENT"
-_END_S = 10.0  # time that a node may take to end before it is killed
+_NODE_END_S = 10.0  # time that a node may take to end before it is killed
 _DOMAINS = 100  # ROS domains of this machine, 1 to 100: DDS allows 1 to 101 on Linux
 _PARTICIPANTS = 32  # ports of a domain that are probed: participants on one machine
 _next = itertools.count(os.getpid())  # what comes later leaves the last ones to end
@@ -49,7 +49,7 @@ def run_beside(
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
             try:
-                process.communicate(timeout=_END_S)
+                process.communicate(timeout=_NODE_END_S)
             except subprocess.TimeoutExpired:
                 process.kill()
 

@@ -32,7 +32,7 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3
 
 _POLL_S = 0.001
-_REPLY_S = 30.0
+_LONGEST_REPLY_S = 30.0
 
 
 class Phase(str, Enum):
@@ -78,7 +78,7 @@ class RunLoop(TickLoop):
         The wait ends early where the run has stopped.
         """
         pending = self.post(request)
-        deadline = time.monotonic() + _REPLY_S
+        deadline = time.monotonic() + _LONGEST_REPLY_S
         while not wait([pending], _POLL_S).done:
             ends = self.stopped.is_set() or time.monotonic() > deadline
             if ends and not pending.done():  # it may have been served just before

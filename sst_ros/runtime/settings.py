@@ -25,7 +25,7 @@ from sst_ros.errors import Check, refuse_errors, refuse_unless, suggestion
 from sst_ros.removed import REMOVED_ARGUMENTS
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
-from sst_ros.scene.schema import TURN, Rules, Section, Spec, accept, choice, entry
+from sst_ros.scene.schema import FULL_TURN, Rules, Section, Spec, accept, choice, entry
 from sst_ros.scene.yaml_document import read_file, read_values
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
 from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Vector3
@@ -194,8 +194,8 @@ class SimulatorParameters(NodeParameters):
         "angles of the actuators that ~/set_state puts the run at",
         "rad",
         default=ZERO,
-        least=-TURN,
-        most=TURN,
+        least=-FULL_TURN,
+        most=FULL_TURN,
     )
     state_gamma_dot: Vector3 = entry(
         "rates of the actuators that ~/set_state puts the run at",
@@ -430,7 +430,7 @@ USE_SIM_TIME = "use_sim_time"
 FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Parameters (or their beginning) that rclpy itself declares."""
 
-COMMANDS: dict[str, tuple[str, type[NodeParameters]]] = {
+NODE_COMMANDS: dict[str, tuple[str, type[NodeParameters]]] = {
     "simulator": ("Simulator", SimulatorParameters),
     "torque_player": ("TorquePlayer", PlayerParameters),
     "inverse_dynamics": ("InverseDynamicsController", ControllerNodeParameters),
@@ -455,7 +455,7 @@ def make_parser(command: str) -> argparse.ArgumentParser:
         allow_abbrev=False,
         argument_default=argparse.SUPPRESS,
     )
-    defaults = COMMANDS[command][1]()
+    defaults = NODE_COMMANDS[command][1]()
     for name, spec in _specs_of(command).items():
         value = getattr(defaults, name, False)
         shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
@@ -561,7 +561,10 @@ def _nodes_of(tree: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _specs_of(command: str) -> dict[str, Spec]:
-    return {**COMMANDS[command][1].SPECS, USE_SIM_TIME: Spec("flag", "follow /clock")}
+    return {
+        **NODE_COMMANDS[command][1].SPECS,
+        USE_SIM_TIME: Spec("flag", "follow /clock"),
+    }
 
 
 def _option(name: str) -> str:

@@ -22,8 +22,8 @@ from sst_ros.state import (
     nanoseconds,
 )
 
-ACTUATORS = JOINTS[:3]
-_SHOWN = 6  # entries of a list in the reason of a refusal
+ACTUATED_JOINTS = JOINTS[:3]
+_SHOWN_NAMES = 6  # entries of a list in the reason of a refusal
 
 MOST_WAITING = 50
 """Commands that wait for the next tick, which takes them all and uses the last: a
@@ -275,19 +275,19 @@ def torque_by_name(message: Any) -> Vector3:
 
 def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3:
     """Return one value for each actuator, gamma_1 to gamma_3, which may come in any order."""
-    if sorted(names) != list(ACTUATORS):
-        allowed = ", ".join(ACTUATORS)
+    if sorted(names) != list(ACTUATED_JOINTS):
+        allowed = ", ".join(ACTUATED_JOINTS)
         reason = f"names {_shorten(names)} must be {allowed}, each once"
         raise MessageRefused("wrong names", reason)
     if len(values) == 3:
         at = dict(zip(names, values, strict=True))
-        values = [at[name] for name in ACTUATORS]
+        values = [at[name] for name in ACTUATED_JOINTS]
     return three_numbers(values, what)
 
 
 def _shorten(values: Sequence[Any]) -> str:
     """Write a list as it is, or its beginning and its length."""
-    if len(values) <= _SHOWN:
+    if len(values) <= _SHOWN_NAMES:
         return str(list(values))
-    beginning = ", ".join(repr(value) for value in values[:_SHOWN])
+    beginning = ", ".join(repr(value) for value in values[:_SHOWN_NAMES])
     return f"[{beginning}, ...] ({len(values)} in all)"

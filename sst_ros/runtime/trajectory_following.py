@@ -41,7 +41,7 @@ Then twice the last.
 """
 _MOST_CHECKS = 5
 # numbers of samples, 19 each, that are added to the tracking metrics at once
-_NUMBERS = 256 * 19
+_NUMBERS_AT_ONCE = 256 * 19
 
 
 class Order:
@@ -350,7 +350,7 @@ class TrajectoryFollower:
             self._rows.extend(
                 ((stamp_ns - self._record_ns) / NANOSECONDS, *angles, *torques)
             )
-            if len(self._rows) >= _NUMBERS:
+            if len(self._rows) >= _NUMBERS_AT_ONCE:
                 self._add_rows()
         self.samples += 1
         self._last, self._last_ns = command, stamp_ns

@@ -24,7 +24,7 @@ from sst_ros.errors import Check, refuse_unless
 from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.runtime.settings import ControllerNodeParameters
-from sst_ros.runtime.torque_input import ACTUATORS
+from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
@@ -51,16 +51,16 @@ def read_points(message: Any, *, is_partial_allowed: bool = False) -> Points:
     faults; `plan` finds those of the numbers.
     """
     names = list(message.joint_names)
-    is_known = sorted(names) == list(ACTUATORS)
-    allowed = f"must be {', '.join(ACTUATORS)}, each once"
+    is_known = sorted(names) == list(ACTUATED_JOINTS)
+    allowed = f"must be {', '.join(ACTUATED_JOINTS)}, each once"
     if is_partial_allowed:
-        is_known = 0 < len(names) == len({*names} & {*ACTUATORS})
-        allowed = f"must be some of {', '.join(ACTUATORS)}, each once"
-    elif set(names) < set(ACTUATORS):
+        is_known = 0 < len(names) == len({*names} & {*ACTUATED_JOINTS})
+        allowed = f"must be some of {', '.join(ACTUATED_JOINTS)}, each once"
+    elif set(names) < set(ACTUATED_JOINTS):
         allowed += ", or allow_partial_joints_goal true"
     refuse_unless("joint_trajectory", ("joint_names", names, is_known, allowed))
-    legs = [leg for leg, name in enumerate(ACTUATORS) if name in names]
-    places = [names.index(ACTUATORS[leg]) for leg in legs]
+    legs = [leg for leg, name in enumerate(ACTUATED_JOINTS) if name in names]
+    places = [names.index(ACTUATED_JOINTS[leg]) for leg in legs]
     whole = f"must be {len(names)} finite numbers, one for each of joint_names"
     checks: list[Check] = []
 
@@ -232,13 +232,15 @@ class TrajectoryGoal:
         """
         own = {"position": position, "velocity": velocity}
         found = {
-            (quantity, joint): own[quantity] for quantity in own for joint in ACTUATORS
+            (quantity, joint): own[quantity]
+            for quantity in own
+            for joint in ACTUATED_JOINTS
         }
         for index, tolerance in enumerate(getattr(message, name)):
             place = f"{name}[{index}]"
             known, allowed = (
-                tolerance.name in ACTUATORS,
-                f"must be one of {', '.join(ACTUATORS)}",
+                tolerance.name in ACTUATED_JOINTS,
+                f"must be one of {', '.join(ACTUATED_JOINTS)}",
             )
             self._checks.append((f"{place}.name", tolerance.name, known, allowed))
             for quantity, default in own.items():

@@ -2,7 +2,7 @@
 """Loads of the user's own, written as formulas in the scene.
 
 A formula is arithmetic on names: no attribute, no index, no call but of a function in
-FUNCTIONS. So a scene from a stranger runs no code of its author, and the scene alone
+FORMULA_FUNCTIONS. So a scene from a stranger runs no code of its author, and the scene alone
 says what acts: in a file, in a bag, on each machine of a cluster.
 `dynamics.own_loads.own_load` writes a Python function as formulas.
 """
@@ -20,19 +20,21 @@ from sst_ros.scene.schema import Rules, Section, choice, entry
 ROTATION = tuple(f"R{i}{j}" for i in "123" for j in "123")
 """Entries of R, the orientation of {E} in {B}: R13, R23, R33 is the direction of E."""
 
-ANGLES = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
+ANGLE_NAMES = tuple(
+    f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3)
+)
 OMEGA = tuple(
     f"omega_{axis}" for axis in "xyz"
 )  # angular velocity of the star in {B} [rad/s]
 BODY_RATE = tuple(f"body_rate_{axis}" for axis in "xyz")  # the same in {E}
-RATES = tuple(name.replace("_", "_dot_") for name in ANGLES)
+RATE_NAMES = tuple(name.replace("_", "_dot_") for name in ANGLE_NAMES)
 
-POSE = (*ROTATION, *ANGLES)
+POSE_NAMES = (*ROTATION, *ANGLE_NAMES)
 """Names that a potential may use."""
-STATE = (*POSE, *OMEGA, *BODY_RATE, *RATES)
+STATE_NAMES = (*POSE_NAMES, *OMEGA, *BODY_RATE, *RATE_NAMES)
 """Names that a moment may use."""
 
-FUNCTIONS = {
+FORMULA_FUNCTIONS = {
     "sqrt": 1, "exp": 1, "sin": 1, "cos": 1, "tan": 1, "tanh": 1, "abs": 1, "positive": 1,
     "atan2": 2, "min": 2, "max": 2,
 }  # fmt: skip
@@ -41,16 +43,16 @@ FUNCTIONS = {
 positive(x) is x where x > 0 and zero elsewhere.
 """
 
-RESERVED = {"pi", *STATE, *FUNCTIONS}
-LONGEST = 4000  # characters of a formula: the parser of Python recurses
+RESERVED = {"pi", *STATE_NAMES, *FORMULA_FUNCTIONS}
+LONGEST_FORMULA = 4000  # characters of a formula: the parser of Python recurses
 # numbers, names and operations of a load: more is no formula, but a program
-MOST_PARTS = 4000
-DEEPEST = 200  # levels of a formula, whose evaluation recurses
+MOST_FORMULA_PARTS = 4000
+DEEPEST_FORMULA = 200  # levels of a formula, whose evaluation recurses
 LARGEST_POWER = 8  # a power is written as products
-OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
+FORMULA_OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
 SIGNS = (ast.USub, ast.UAdd)
 
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class LoadParameter(Section):
@@ -100,7 +102,7 @@ class FormulaLoad(Section):
         """Refuse what is no formula, and names that are not there."""
         count = len(self.moment)
         yield count not in (0, 3), "moment", self.moment, "must be three formulas"
-        known = set(STATE if self.moment else POSE)
+        known = set(STATE_NAMES if self.moment else POSE_NAMES)
         for parameter in self.parameters:
             twice = parameter.name in known
             yield twice, "parameters", parameter.name, "is given twice"
@@ -116,14 +118,19 @@ class FormulaLoad(Section):
                 strange = _is_strange(name) or name in known
                 yield strange, key, name, f"{_describe_name()}, and given once"
                 known.add(name)
-        yield parts > MOST_PARTS, "", parts, f"must have at most {MOST_PARTS} parts"
+        yield (
+            parts > MOST_FORMULA_PARTS,
+            "",
+            parts,
+            f"must have at most {MOST_FORMULA_PARTS} parts",
+        )
 
 
 @lru_cache(maxsize=256)
 def parse(text: str) -> ast.expr:
     """Parse a formula; raises ValueError where it is none."""
-    if len(text) > LONGEST:
-        raise ValueError(f"must have at most {LONGEST} characters")
+    if len(text) > LONGEST_FORMULA:
+        raise ValueError(f"must have at most {LONGEST_FORMULA} characters")
     try:
         return ast.parse(text, mode="eval").body
     except (SyntaxError, RecursionError, MemoryError):
@@ -140,8 +147,8 @@ def find_fault(text: str, known: frozenset[str]) -> str:
         tree = parse(text)
     except ValueError as error:
         return str(error)
-    if _measure_depth(tree) > DEEPEST:
-        return f"must have at most {DEEPEST} levels: write parts of it as terms"
+    if _measure_depth(tree) > DEEPEST_FORMULA:
+        return f"must have at most {DEEPEST_FORMULA} levels: write parts of it as terms"
     called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
     faults = (
         _fault_of(node, known) for node in ast.walk(tree) if id(node) not in called
@@ -160,9 +167,9 @@ def _measure_depth(tree: ast.AST) -> int:
 
 def _fault_of(node: ast.AST, known: frozenset[str]) -> str:
     """Say what is wrong with one part of a formula; "" for nothing."""
-    if isinstance(node, (*OPERATORS, *SIGNS, ast.Load)):
+    if isinstance(node, (*FORMULA_OPERATORS, *SIGNS, ast.Load)):
         return ""
-    if isinstance(node, ast.BinOp) and isinstance(node.op, OPERATORS):
+    if isinstance(node, ast.BinOp) and isinstance(node.op, FORMULA_OPERATORS):
         return _fault_of_operation(node)
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, SIGNS):
         return ""
@@ -171,9 +178,9 @@ def _fault_of(node: ast.AST, known: frozenset[str]) -> str:
     if isinstance(node, ast.Name):
         if node.id in known or node.id == "pi":
             return ""
-        if node.id in STATE:
+        if node.id in STATE_NAMES:
             return f"must be of the pose alone: {node.id} is a rate"
-        if node.id in FUNCTIONS:
+        if node.id in FORMULA_FUNCTIONS:
             return f"must give {node.id} its arguments in brackets"
         return (
             f"must have known names only: {node.id} is neither state, parameter nor"
@@ -196,9 +203,9 @@ def _fault_of_operation(node: ast.BinOp) -> str:
 
 def _fault_of_call(node: ast.Call) -> str:
     name = node.func.id if isinstance(node.func, ast.Name) else ""
-    if name not in FUNCTIONS:
-        return f"must call one of {', '.join(FUNCTIONS)}"
-    count = FUNCTIONS[name]
+    if name not in FORMULA_FUNCTIONS:
+        return f"must call one of {', '.join(FORMULA_FUNCTIONS)}"
+    count = FORMULA_FUNCTIONS[name]
     starred = any(isinstance(argument, ast.Starred) for argument in node.args)
     if node.keywords or starred or len(node.args) != count:
         return f"must give {name} {count} argument{'s' if count > 1 else ''}"
@@ -235,11 +242,13 @@ def names_in(texts: Iterator[str]) -> set[str]:
     """Names that formulas use, those of functions left out."""
     trees = [parse(text) for text in texts]
     found = (node for tree in trees for node in ast.walk(tree))
-    return {node.id for node in found if isinstance(node, ast.Name)} - FUNCTIONS.keys()
+    return {
+        node.id for node in found if isinstance(node, ast.Name)
+    } - FORMULA_FUNCTIONS.keys()
 
 
 def _is_strange(name: str) -> bool:
-    return name in RESERVED or not _NAME.fullmatch(name)
+    return name in RESERVED or not _NAME_PATTERN.fullmatch(name)
 
 
 def _describe_name() -> str:

@@ -34,7 +34,7 @@ from sst_ros.scene.yaml_document import (
 )
 from sst_ros.state import Array, Explained, LostMeaning, freeze, real_numbers
 
-LARGEST = 1e9
+LARGEST_NUMBER = 1e9
 """No number of a scene is larger: it is a slip of units, and its powers leave double precision."""
 
 
@@ -121,7 +121,7 @@ class Scene(Explained, Section):
             "name": self.name,
             "description": self.description,
             "has": present or "nothing but the star",
-            "has not": [term for term in TERMS if term not in present]
+            "has not": [term for term in SCENE_TERMS if term not in present]
             or "all terms are there",
             "gamma(0) [rad]": self.initial.gamma,
             "gamma_dot(0) [rad/s]": self.initial.gamma_dot,
@@ -135,9 +135,9 @@ class Scene(Explained, Section):
 
         And provenance of what no scene has.
         """
-        allowed = f"must not exceed {LARGEST:g} in size: use m, kg, s, rad, N"
+        allowed = f"must not exceed {LARGEST_NUMBER:g} in size: use m, kg, s, rad, N"
         for place, value in schema.leaves(self).items():
-            yield abs(value) > LARGEST, key_of(place), value, allowed
+            yield abs(value) > LARGEST_NUMBER, key_of(place), value, allowed
         reach = np.maximum(self.base.radius, self.star.radius)
         bodies = {"star": self.star}
         for name in LINKS:
@@ -158,7 +158,7 @@ class Scene(Explained, Section):
             yield strange, f"provenance.{key}", note, "is about a key that no scene has"
 
 
-TERMS = {
+SCENE_TERMS = {
     "actuated links": f"{LINKS[0]}.inertia",
     "intermediate links": f"{LINKS[1]}.inertia",
     "payload": "payload",
@@ -178,9 +178,11 @@ TERMS = {
 
 
 def terms(scene: Scene) -> list[str]:
-    """Return those of TERMS that a scene has."""
+    """Return those of SCENE_TERMS that a scene has."""
     return [
-        term for term, key in TERMS.items() if schema.has_effect(values_at(scene, key))
+        term
+        for term, key in SCENE_TERMS.items()
+        if schema.has_effect(values_at(scene, key))
     ]
 
 

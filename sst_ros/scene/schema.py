@@ -44,7 +44,7 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """What a terminal obeys, and halves of characters."""
 
 # no initial or desired angle of an actuator [rad] is larger: it is in degrees
-TURN = 2.0 * math.pi
+FULL_TURN = 2.0 * math.pi
 REQUIRED: Any = object()  # default of a field that must be given
 Place = tuple[str | int, ...]  # names and indices of a part of a tree from the root on
 
@@ -82,7 +82,7 @@ class Spec:
 
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
-        return self.describe() + ": in rad?" * (self.most == TURN)
+        return self.describe() + ": in rad?" * (self.most == FULL_TURN)
 
     def describe(self) -> str:
         """Describe the values that are allowed."""
@@ -127,7 +127,7 @@ def entry(doc: str, unit: str = "", default: Any = REQUIRED, **rules: Any) -> An
     )
 
 
-angles = partial(entry, unit="rad", least=-TURN, most=TURN)
+angles = partial(entry, unit="rad", least=-FULL_TURN, most=FULL_TURN)
 """Angles of the three actuators, at most a turn."""
 positive = partial(entry, above=0.0)
 amount = partial(entry, least=1e-12)
@@ -275,7 +275,7 @@ class Section:
 S = TypeVar("S", bound=Section)
 
 
-_KINDS = {
+_ENTRY_KINDS = {
     float: "number", int: "integer", bool: "flag", str: "text", tuple[str, ...]: "texts",
     tuple[tuple[str, str], ...]: "notes", Array: "samples",
 }  # fmt: skip
@@ -285,7 +285,7 @@ def _read_type(hint: Any) -> dict[str, Any]:
     """Return what the type of a field says of its `Spec`."""
     if typing.get_origin(hint) is UnionType:
         hint = typing.get_args(hint)[0]
-    if kind := _KINDS.get(hint):
+    if kind := _ENTRY_KINDS.get(hint):
         return {"kind": kind}
     if not (parts := typing.get_args(hint)):
         return {"kind": "section", "section": hint}

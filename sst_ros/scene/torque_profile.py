@@ -278,7 +278,7 @@ def count_arguments(function: Callable[..., Any]) -> int:
     raise refusal("simulate", "torque", function, allowed)
 
 
-_COLUMNS = ("time", "tau_1", "tau_2", "tau_3")
+_TORQUE_COLUMNS = ("time", "tau_1", "tau_2", "tau_3")
 
 
 def _read_numbers(row: Sequence[str], places: Sequence[int]) -> list[float] | None:
@@ -342,11 +342,11 @@ class TorqueTable(TorqueProfile):
             lines = [(reader.line_num, row) for row in reader]
         while lines and not any(map(str.strip, lines[-1][1])):
             lines.pop()
-        if any(names.count(column) != 1 for column in _COLUMNS):
-            allowed = "must be " + ", ".join(_COLUMNS)
+        if any(names.count(column) != 1 for column in _TORQUE_COLUMNS):
+            allowed = "must be " + ", ".join(_TORQUE_COLUMNS)
             raise InputError(origin, [Problem("header", names or None, allowed, 1)])
         problems = [] if lines else [Problem("rows", 0, "must be one or more")]
-        places = [names.index(column) for column in _COLUMNS]
+        places = [names.index(column) for column in _TORQUE_COLUMNS]
         last, rows = -math.inf, []
         for line, row in lines:
             numbers = _read_numbers(row, places) if len(row) == len(names) else None
@@ -405,7 +405,7 @@ def profile_of(torque: Any) -> TorqueProfile:
     return FunctionTorque(torque) if callable(torque) else ConstantTorque(torque)
 
 
-_KINDS = {
+_PROFILE_KINDS = {
     "constant": ConstantTorque, "sine": SineTorque, "table": TorqueTable,
     "polynomial": PolynomialTorque, "function": TorqueProfile,
 }  # fmt: skip
@@ -414,7 +414,9 @@ _KINDS = {
 def record_of(profile: TorqueProfile) -> dict[str, Any]:
     """Return kind and numbers of a profile, from which `profile_from` builds it again."""
     kind = next(
-        kind for kind, profiles in _KINDS.items() if isinstance(profile, profiles)
+        kind
+        for kind, profiles in _PROFILE_KINDS.items()
+        if isinstance(profile, profiles)
     )
     given = {} if kind == "function" else vars(profile)
     return {"kind": kind, **{name: np.asarray(x).tolist() for name, x in given.items()}}
@@ -425,4 +427,4 @@ def profile_from(record: dict[str, Any]) -> TorqueProfile:
     kind, *numbers = record.values()
     if kind == "sine":
         return SineTorque(**dict(zip(SineTorque.SPECS, numbers, strict=True)))
-    return LostTorque() if kind == "function" else _KINDS[kind](*numbers)
+    return LostTorque() if kind == "function" else _PROFILE_KINDS[kind](*numbers)

@@ -29,9 +29,9 @@ NO_NUMBER = "must name a number, as star.mass does"
 _WHOLE = re.compile("[-+]?[0-9]{1,18}")  # longer ones are doubles
 _INFINITE = re.compile(r"[-+]?\.inf")
 
-LONGEST, MOST_NODES, DEEPEST = 1_000_000, 20_000, 20
-LIMITS = (
-    f"no more than {LONGEST} characters, {MOST_NODES} values and {DEEPEST} levels are"
+LONGEST_DOCUMENT, MOST_NODES, DEEPEST_DOCUMENT = 1_000_000, 20_000, 20
+LIMITS_TEXT = (
+    f"no more than {LONGEST_DOCUMENT} characters, {MOST_NODES} values and {DEEPEST_DOCUMENT} levels are"
     " allowed, and no aliases"
 )
 """Of a document: PyYAML reads 20,000 values in 0.5 s, and its time grows with the
@@ -50,8 +50,10 @@ class _Loader(yaml.SafeLoader):
         self.depth -= isinstance(event, yaml.CollectionEndEvent)
         self.nodes += isinstance(event, yaml.NodeEvent)
         alias = f"*{event.anchor}" if isinstance(event, yaml.AliasEvent) else ""
-        if alias or self.depth > DEEPEST or self.nodes > MOST_NODES:
-            raise InputError("", [Problem("", alias or "more", LIMITS, _line(event))])
+        if alias or self.depth > DEEPEST_DOCUMENT or self.nodes > MOST_NODES:
+            raise InputError(
+                "", [Problem("", alias or "more", LIMITS_TEXT, _line(event))]
+            )
         return event
 
 
@@ -95,7 +97,7 @@ def read_file(path: Path) -> str:
     """
     check_regular(path)
     with path.open(encoding="utf-8") as file:
-        return file.read(LONGEST + 1)
+        return file.read(LONGEST_DOCUMENT + 1)
 
 
 def resolve_numbers(value: Any) -> Any:
@@ -119,8 +121,8 @@ def _parse(source: str, lines: dict[str, int], problems: list[Problem]) -> Any:
     InputError says what is wrong with it.
     """
     try:
-        if len(source) > LONGEST:
-            raise refusal("", "", "more", LIMITS)
+        if len(source) > LONGEST_DOCUMENT:
+            raise refusal("", "", "more", LIMITS_TEXT)
         return _values(yaml.compose(source, Loader=_Loader), "", lines, problems)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)

@@ -16,7 +16,7 @@ from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import Array
 
-_STATE = 7
+_STATE_NUMBERS = 7
 """Numbers of a sample's state: quaternion and body rate."""
 
 
@@ -96,9 +96,11 @@ class Samples:
             rows, known = zip(*self._states, strict=True)
             states[list(rows)] = known
         self._step_to(t, states)
-        joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE])
+        joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE_NUMBERS])
         torque = self._torque_at(t, states)
-        return SampleTable(t, states[:, :4], states[:, 4:_STATE], torque, joints)
+        return SampleTable(
+            t, states[:, :4], states[:, 4:_STATE_NUMBERS], torque, joints
+        )
 
     def _step_to(self, t: Array, states: Array) -> None:
         """Fill in the states inside of steps."""
@@ -117,8 +119,8 @@ class Samples:
     def _torque_at(self, t: Array, states: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""
         # the actuators lag: they are part of the state
-        if states.shape[1] > _STATE + 1:
-            return states[:, _STATE : _STATE + 3]
+        if states.shape[1] > _STATE_NUMBERS + 1:
+            return states[:, _STATE_NUMBERS : _STATE_NUMBERS + 3]
         torques = np.empty((len(t), 3))
         ends = [first for first, _ in self._torques[1:]]
         sines: list[int] = []

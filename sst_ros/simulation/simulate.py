@@ -38,10 +38,10 @@ from sst_ros.state import NANOSECONDS, Array, TimesLike
 _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
 """Control periods that the budget of a motion reaches: a step and its check are three steps."""
 
-_SAMPLES, _MOST_SAMPLES = 200, 10_000_000
+_DEFAULT_SAMPLES, _MOST_SAMPLES = 200, 10_000_000
 """Even intervals of a motion by default, and the most."""
 
-_ATTEMPTS = 4
+_RUN_ATTEMPTS = 4
 """Runs until the error estimate is at most the tolerance."""
 _FINEST = 1e-14
 """Least tolerance of a step: below it rounding decides."""
@@ -62,7 +62,7 @@ of 170 random runs one has an error of more than ten times the estimate without 
 answer.
 """
 
-_METHODS = "must be one of " + ", ".join(INTEGRATORS)
+_METHOD_WORDS = "must be one of " + ", ".join(INTEGRATORS)
 
 TorqueInput: TypeAlias = (
     Sequence[float]
@@ -195,7 +195,7 @@ def _integrate(task: Task, *, progress: bool) -> Trajectory:
     budget = EvaluationBudget(_budget_of(task), whole_run=True)
     remembers = task.period is not None and not task.memoryless
     local, kept, last = task.tolerance, None, math.inf
-    for _ in range(_ATTEMPTS):
+    for _ in range(_RUN_ATTEMPTS):
         attempt = task if local == task.tolerance else replace(task, tolerance=local)
         motion = SteppedMotion(
             attempt, start_of(task.scene), budget, progress=progress
@@ -272,7 +272,7 @@ def _refuse(name: str, value: object, allowed: str) -> NoReturn:
 def _allow_methods(method: object) -> str:
     """Say which methods there are, and what to use instead of one that has left."""
     advice = REMOVED_METHODS.get(str(method))
-    return _METHODS if advice is None else f"{advice}; {_METHODS}"
+    return _METHOD_WORDS if advice is None else f"{advice}; {_METHOD_WORDS}"
 
 
 def _nanoseconds(name: str, value: float) -> int:
@@ -311,7 +311,7 @@ def _times(
         if samples is None and period is not None:
             found = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
         else:
-            count = _SAMPLES if samples is None else samples
+            count = _DEFAULT_SAMPLES if samples is None else samples
             if not 1 <= count <= _MOST_SAMPLES:
                 _refuse(
                     "samples",

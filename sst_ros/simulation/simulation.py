@@ -50,12 +50,12 @@ INTEGRATORS = (AUTO, *METHODS)
 EQUATIONS = ("quaternion", "virtual_work")
 """Equations of motion: in the quaternion and the body rate, or the paper's Eqs. 1 to 92."""
 
-_MOST = 10**9
+_MOST_CALL_STEPS = 10**9
 """Steps of one call."""
 
-_COUNT = f"must be > 0 and <= {_MOST:g}, a whole number"
+_COUNT = f"must be > 0 and <= {_MOST_CALL_STEPS:g}, a whole number"
 _THREE = "must be three finite numbers [N m]"
-_TORQUE = f"{_THREE}, a SineTorque or a function of t [s]"
+_TORQUE_WORDS = f"{_THREE}, a SineTorque or a function of t [s]"
 
 _PLAIN_BUDGET = 3_000_000
 """Operations a step in plain Python may take: 0.12 s at 37 ns each, on a 3 GHz core."""
@@ -213,15 +213,15 @@ class Simulation(Explained):
         """
         length, number = _whole(dt_ns), _whole(count)
         numbers, field = finite_vector(torque), finite_vector(moment)
-        is_whole = 0 < number <= _MOST and length > 0
+        is_whole = 0 < number <= _MOST_CALL_STEPS and length > 0
         if not (is_whole and numbers and field):
             acts = callable(torque) or isinstance(torque, SineTorque) or numbers
             refuse_unless(
                 "step",
-                ("torque", torque, bool(acts), _TORQUE),
+                ("torque", torque, bool(acts), _TORQUE_WORDS),
                 ("moment", moment, field is not None, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
-                ("count", count, 0 < number <= _MOST, _COUNT),
+                ("count", count, 0 < number <= _MOST_CALL_STEPS, _COUNT),
             )
         if numbers:
             acting = self._stepper.torque.acting(numbers)
@@ -250,14 +250,15 @@ class Simulation(Explained):
         try:
             if callable(torque) and not getattr(torque, "feedback", False):
                 refuse_unless(
-                    "step", ("torque", torque, count_arguments(torque) == 1, _TORQUE)
+                    "step",
+                    ("torque", torque, count_arguments(torque) == 1, _TORQUE_WORDS),
                 )
             acts = callable(torque) or isinstance(torque, SineTorque)
             if not acts and finite_vector(torque) is None:
                 raise ValueError
             return self._stepper.torque.acting(torque)
         except (TypeError, ValueError, OverflowError):
-            raise refusal("step", "torque", torque, _TORQUE) from None
+            raise refusal("step", "torque", torque, _TORQUE_WORDS) from None
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.motion_table import JOINTS, MotionTable
+from sst_ros.dynamics.motion_table import JOINT_QUANTITIES, MotionTable
 from sst_ros.dynamics.reactions import REACTION_UNITS, Reactions, reactions_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.variational import Sensitivities, Sensitivity
@@ -52,7 +52,7 @@ from sst_ros.scene.torque_profile import (
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.tables import SUFFIXES, load_table, write_table
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Array, TimesLike, freeze
+from sst_ros.state import DIMENSIONS, MOTION_UNITS, QUANTITIES, Array, TimesLike, freeze
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,7 +88,7 @@ def check_error(
     return status or _UNMET, f"{message}; {unmet}"
 
 
-_UNIT = 1e-6
+_UNIT_DEVIATION = 1e-6
 """Largest deviation of the length of a quaternion from 1 in a file."""
 _CLOSURE = 0.02
 """Largest abs(r_k . t_k) in a file. A simulated motion has 1e-15; a recorded one has
@@ -268,7 +268,7 @@ class Trajectory(MotionTable):
         return freeze(np.stack(columns, axis=1))
 
     def _joint(self, name: str) -> Array:
-        first = 3 * JOINTS.index(name)
+        first = 3 * JOINT_QUANTITIES.index(name)
         return self._joints[:, first : first + 3]
 
     @cached_property
@@ -458,7 +458,7 @@ class Trajectory(MotionTable):
             "torque": self.law and record_of(self.law),
             "gaps": self.gaps.tolist(),
         }
-        units = {name: {"unit": unit} for name, unit in UNITS.items()}
+        units = {name: {"unit": unit} for name, unit in MOTION_UNITS.items()}
         columns = self.columns()
         if reactions:
             columns |= self.reactions.columns()
@@ -479,7 +479,7 @@ class Trajectory(MotionTable):
             "must be a trajectory that `Trajectory.save` has written as Parquet or NPZ"
         )
         try:
-            columns, texts = load_table(Path(path), list(UNITS), [_KEY])
+            columns, texts = load_table(Path(path), list(MOTION_UNITS), [_KEY])
             about = json.loads(texts[_KEY])
         except (KeyError, ValueError, RecursionError) as error:
             reason = "" if isinstance(error, KeyError) else f" ({error})"
@@ -499,7 +499,7 @@ class Trajectory(MotionTable):
                 read(Scene, about["scene"], str(path)),
                 columns["t"],
                 *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
-                joints=np.hstack([arrays[name] for name in JOINTS]),
+                joints=np.hstack([arrays[name] for name in JOINT_QUANTITIES]),
                 law=about["torque"] and profile_from(about["torque"]),
                 gaps=about.get("gaps", ()),
                 **{name: about[name] for name in _FIGURES if name in about},
@@ -511,7 +511,12 @@ class Trajectory(MotionTable):
         off = float(np.abs(lengths - 1.0).max(initial=0.0))
         refuse_unless(
             "load",
-            ("quaternion", off, off <= _UNIT, f"must be of length 1 to {_UNIT:g}"),
+            (
+                "quaternion",
+                off,
+                off <= _UNIT_DEVIATION,
+                f"must be of length 1 to {_UNIT_DEVIATION:g}",
+            ),
             (
                 "quaternion",
                 found.closure_error,

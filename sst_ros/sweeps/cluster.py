@@ -27,7 +27,7 @@ GATHER = 60.0
 LOOK = 0.1  # time between two looks for jobs that are done, and for workers [s]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-_LOCK = threading.Lock()
+_UNPICKLE_LOCK = threading.Lock()
 
 
 class SweepFailed(SstError):
@@ -158,7 +158,7 @@ def _on_worker(number: int, work: bytes, versions: str) -> Any:
     try:
         if (here := describe_versions()) != versions:
             raise OSError(f"it has {here} in place of {versions}")
-        with _LOCK:  # prepared once, not by each thread
+        with _UNPICKLE_LOCK:  # prepared once, not by each thread
             function, jobs = _unpickle(work)
         return function(jobs[number])
     except (OSError, ImportError) as error:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
-from sst_ros.control.controller import BAND, Controller
+from sst_ros.control.controller import SETTLING_BAND, Controller
 from sst_ros.dynamics import kernel
 from sst_ros.errors import refuse_unless
 from sst_ros.integration.batch import Batch, BatchResult, block_width
@@ -33,7 +33,7 @@ from sst_ros.programs.columns import ColumnFunction, compile_columns
 from sst_ros.programs.expression import Expression, trace
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
-NEWTON_STEPS = 5
+CONTROL_NEWTON_STEPS = 5
 """Of the observer at a sample. They square the error.
 
 From one sample to the next it is small.
@@ -72,13 +72,13 @@ def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
 # each number; a pair of them becomes a normal number by the method of Box and Muller
 # (1958).
 
-_STEP = np.uint64(0x9E3779B97F4A7C15)
+_SPLITMIX_STEP = np.uint64(0x9E3779B97F4A7C15)
 
 
 def streams(seed: int, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
     """Return where the random bits of rows begin, shape (N,)."""
-    first = _mix(np.array([seed], dtype=np.uint64) + _STEP)
-    return _mix(first + rows.astype(np.uint64) * _STEP)
+    first = _mix(np.array([seed], dtype=np.uint64) + _SPLITMIX_STEP)
+    return _mix(first + rows.astype(np.uint64) * _SPLITMIX_STEP)
 
 
 def uniform_numbers(
@@ -91,7 +91,7 @@ def uniform_numbers(
     numbers = np.arange(1, 2 * normal + 1, dtype=np.uint64) + np.uint64(
         2 * normal * sample
     )
-    bits = _mix(starts + (numbers * _STEP)[:, None])
+    bits = _mix(starts + (numbers * _SPLITMIX_STEP)[:, None])
     uniform: Array = ((bits >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
     return uniform
 
@@ -264,7 +264,7 @@ class ControlledBatch:
         )
         if observed := memory["observed"]:  # in the last assembly mode
             carriages = space.carriages(gamma)
-            for _ in range(NEWTON_STEPS):
+            for _ in range(CONTROL_NEWTON_STEPS):
                 observed = space.newton_step(*observed, *carriages)[:4]
         desired = Reference(**{name: given[name] for name in _DESIRED})
         limit = gains["limit"][0] if self._limited else None
@@ -381,7 +381,7 @@ class ControlledBatch:
     def _band(self) -> float:
         """Settling band [rad]: a share of the largest range of a desired angle."""
         desired = [divide(REFERENCES, row)["gamma"] for row in self._references]
-        return BAND * float(np.ptp(desired, axis=0).max())
+        return SETTLING_BAND * float(np.ptp(desired, axis=0).max())
 
     @cached_property
     def _references(self) -> Array:

@@ -36,7 +36,7 @@ from sst_ros.progress import Bar
 from sst_ros.report.results import render
 from sst_ros.scene.scene import Scenarios
 from sst_ros.simulation.tables import compute_checksum
-from sst_ros.state import DIMENSIONS, QUANTITIES, UNITS, Joints
+from sst_ros.state import DIMENSIONS, MOTION_UNITS, QUANTITIES, Joints
 from sst_ros.sweeps.cluster import SweepFailed, run_on_cluster
 from sst_ros.sweeps.controlled_batch import ControlledBatch
 from sst_ros.sweeps.sweep_study import SweepStudy
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 Table: TypeAlias = "pd.DataFrame"  # evaluated with the annotations of `sweep`
 # extremes are those of the states at the ends of at most so many equal parts of a run
-PARTS = 64
+EXTREME_PARTS = 64
 # runs whose reactions are computed at once: their arrays fit the cache
 REACTION_ROWS = 256
 
@@ -58,7 +58,7 @@ PILOT = 256
 Drawn apart, so that no number of rows matters.
 """
 
-MOST_STEPS = 1_000_000
+MOST_RUN_STEPS = 1_000_000
 
 EXTREMES = tuple(itertools.product(Joints._fields, ("min", "max")))
 REACTIONS = tuple(itertools.product(SIZES, LINK_JOINTS, ("peak", "rms")))
@@ -329,11 +329,9 @@ class PreparedSweep:
                 else 4.0
             )
             count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
-            if count > MOST_STEPS:
+            if count > MOST_RUN_STEPS:
                 break
-        allowed = (
-            f"is not reached by {MOST_STEPS} steps; give `steps`, or a larger tolerance"
-        )
+        allowed = f"is not reached by {MOST_RUN_STEPS} steps; give `steps`, or a larger tolerance"
         raise refusal("sweep", "tolerance", tolerance, allowed)
 
     def check(self, values: dict[str, Array]) -> None:
@@ -343,7 +341,7 @@ class PreparedSweep:
     @cached_property
     def about(self) -> dict[str, Any]:
         """Metadata of the files: study, its digest, version, units."""
-        units = UNITS | {"fault_time": "s", "local_error": "1"}
+        units = MOTION_UNITS | {"fault_time": "s", "local_error": "1"}
         for k in DIMENSIONS["leg"]:
             joints = {
                 f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES
@@ -436,7 +434,9 @@ class PreparedSweep:
         batch = self.batch.with_parameters(scenarios)
         outputs = self.study.outputs
         every = (
-            -(-steps // PARTS) if "extremes" in outputs or "reactions" in outputs else 0
+            -(-steps // EXTREME_PARTS)
+            if "extremes" in outputs or "reactions" in outputs
+            else 0
         )
         if self.controlled is not None:
             result, more = self.controlled.run(batch, starts, rows, steps, every)

@@ -16,7 +16,7 @@ from sst_ros.figures import BLUE, GREY, VERMILION, styled
 from sst_ros.report.results import publish
 from sst_ros.sweeps.sweep import correlate, list_outputs
 
-COLUMNS, MOST_INPUTS, MOST_RUNS = 4, 6, 200
+PANEL_COLUMNS, MOST_INPUTS, MOST_RUNS = 4, 6, 200
 MOST_POINTS = 2000  # of all runs in a scatter plot; the worst are drawn over them
 
 
@@ -53,10 +53,10 @@ def _score(table: pd.DataFrame) -> tuple[pd.Series, str]:
 @styled
 def draw_distributions(outputs: pd.DataFrame, units: Mapping[str, str]) -> Figure:
     """Histograms of the outputs of the runs that reached the end."""
-    rows = max(1, math.ceil(len(outputs.columns) / COLUMNS))
-    figure = Figure(figsize=(3.0 * COLUMNS, 2.2 * rows))
+    rows = max(1, math.ceil(len(outputs.columns) / PANEL_COLUMNS))
+    figure = Figure(figsize=(3.0 * PANEL_COLUMNS, 2.2 * rows))
     for i, (name, values) in enumerate(outputs.items()):
-        axes = figure.add_subplot(rows, COLUMNS, i + 1)
+        axes = figure.add_subplot(rows, PANEL_COLUMNS, i + 1)
         axes.hist(values[np.isfinite(values)], 60, color=BLUE)
         axes.set(title=f"{name} [{units.get(str(name), '1')}]", yticks=[])
     return figure

@@ -49,10 +49,10 @@ from sst_ros.sweeps.variations import (
 
 DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
 
-CHUNK = 32_768
+CHUNK_ROWS = 32_768
 """Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
 
-OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
+SWEEP_OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
 """What `outputs` may name: of the final state.
 
 Extremes of joints and reactions over a run.
@@ -115,7 +115,7 @@ class SweepStudy(Section):
         " `reactions`, at the ends of the steps",
         default=DEFAULT_OUTPUTS,
     )
-    chunk: int = _count("rows of a task and of a file", default=CHUNK)
+    chunk: int = _count("rows of a task and of a file", default=CHUNK_ROWS)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "scene", scene_of(self.scene))
@@ -131,10 +131,10 @@ class SweepStudy(Section):
         yield not mapping, "vary", self.vary, allowed
         for name in self.outputs:
             yield (
-                name not in OUTPUTS,
+                name not in SWEEP_OUTPUTS,
                 "outputs",
                 name,
-                f"must be of {', '.join(OUTPUTS)}",
+                f"must be of {', '.join(SWEEP_OUTPUTS)}",
             )
         yield (
             torque is not None and self.control is not None,

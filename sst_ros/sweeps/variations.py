@@ -31,7 +31,7 @@ from sst_ros.scene.schema import Place, Section, Spec, key_of
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
 from sst_ros.state import freeze, real_numbers
 
-KINDS = ("uniform", "normal", "grid", "linspace")
+VARIATION_KINDS = ("uniform", "normal", "grid", "linspace")
 EXPECTED = {"uniform": "low, high", "normal": "mean, standard deviation[, low, high]"}
 
 SAMPLINGS = ("random", "sobol")
@@ -169,9 +169,9 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
         )
         numbers = given[1 : len(given) - relative]
     listed = np.iterable(numbers) and not isinstance(numbers, (str, bytes, bytearray))
-    if kind not in KINDS or not isinstance(relative, bool) or not listed:
+    if kind not in VARIATION_KINDS or not isinstance(relative, bool) or not listed:
         raise ValueError(
-            f"must be a list of values, or one of {', '.join(KINDS)} with its numbers"
+            f"must be a list of values, or one of {', '.join(VARIATION_KINDS)} with its numbers"
         )
     factor = _scales_tensor(key, targets)
     if factor and not relative:

@@ -37,7 +37,7 @@ _LARGEST_TORQUE = 5.0  # range of the torque sliders where the scene has no limi
 _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
 _REFUSAL_S = 4.0
 _WINDOW_S = 10.0
-_POINTS = 500
+_CURVE_POINTS = 500
 _COLOURS = tuple(
     "#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in robot.LEG_COLOURS
 )
@@ -130,7 +130,7 @@ class Page:
             self._plots = gamma, _plot(server, "τ [N m]", (-1.0, 1.0))
         with gui.add_folder("status of the run", order=6.0):
             self._status = gui.add_html("")
-        self._rows: deque[tuple[float, ...]] = deque(maxlen=_POINTS)
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=_CURVE_POINTS)
         middle = Geometry.of(scene).v.sum(axis=0)
         middle /= np.linalg.norm(middle)
         size = max(scene.base.radius, scene.star.radius)
@@ -163,7 +163,10 @@ class Page:
             return
         if self._rows and state.time < self._rows[-1][0]:
             self._rows.clear()
-        if not self._rows or state.time - self._rows[-1][0] >= _WINDOW_S / _POINTS:
+        if (
+            not self._rows
+            or state.time - self._rows[-1][0] >= _WINDOW_S / _CURVE_POINTS
+        ):
             self._rows.append((state.time, *np.degrees(state.gamma), *state.torque))
 
     def _show_numbers(self) -> None:
@@ -343,7 +346,7 @@ class SceneDrawing:
         )
         outward = scene.star.radius * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.28]])
         self._add_arrow(
-            f"{robot.STAR}/s", outward, robot.STAR_COLOUR, (0.010, 0.028, 0.075)
+            f"{robot.STAR_LINK}/s", outward, robot.STAR_COLOUR, (0.010, 0.028, 0.075)
         )
         self._torques = [
             self._add_arrow(
@@ -365,7 +368,7 @@ class SceneDrawing:
             self._last = -np.inf
         if time is not None and time - self._last >= _POINT_PERIOD_S:
             self._last = time
-            star = robot.rotations(self._joints[:3], angles)[robot.STAR]
+            star = robot.rotations(self._joints[:3], angles)[robot.STAR_LINK]
             self._points.append((time, self._scene.star.radius * star[:, 2]))
             while self._points[0][0] < time - _PATH_S:
                 self._points.popleft()
@@ -375,7 +378,7 @@ class SceneDrawing:
         found = robot.rotations(self._joints, angles)
         for link, frame in self._frames.items():
             frame.wxyz = wxyz(found[link])
-        end = self._scene.star.radius * found[robot.STAR][:, 2]
+        end = self._scene.star.radius * found[robot.STAR_LINK][:, 2]
         points = np.array([*(point for _, point in self._points), end])[-PATH_POINTS:]
         points = np.concatenate(
             [np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points]
@@ -428,7 +431,7 @@ class SceneDrawing:
             (f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at)
             for k, at in enumerate(points, 1)
         ]
-        for name, text, at in (*places, (f"{robot.STAR}/E", "E", end)):
+        for name, text, at in (*places, (f"{robot.STAR_LINK}/E", "E", end)):
             self._server.scene.add_label(
                 f"{ROOT}/{name}",
                 text,

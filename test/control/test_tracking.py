@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sst_ros.control.controller import BAND, TRACK, TrackingMetrics, track_of
+from sst_ros.control.controller import SETTLING_BAND, TRACK, TrackingMetrics, track_of
 from sst_ros.report.results import render
 
 TIME = np.linspace(0.0, 2.0, 2001)
@@ -37,8 +37,8 @@ def test_errors_of_a_sine():
 def test_settling_time_of_a_decay_after_the_motion():
     error = 0.5 * np.exp(-np.maximum(TIME - 1.0, 0.0) / 0.1)
     found = TrackingMetrics(track(error))
-    assert found.band == pytest.approx(BAND)  # the way is 1 rad
-    assert found.settling == pytest.approx(0.1 * np.log(0.5 / BAND), abs=2e-3)
+    assert found.band == pytest.approx(SETTLING_BAND)  # the way is 1 rad
+    assert found.settling == pytest.approx(0.1 * np.log(0.5 / SETTLING_BAND), abs=2e-3)
 
 
 def test_settling_time_is_unknown_where_it_is_not_seen():

@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from sst_ros.__main__ import main
 from sst_ros.description.robot import (
-    ACTUATED,
+    ACTUATED_LINKS,
     BASE,
     INTERMEDIATE,
-    LEAST,
+    LEAST_MASS,
     LEGS,
     PLUGIN,
-    STAR,
+    STAR_LINK,
     STARS,
     Arc,
     Ball,
@@ -49,7 +49,7 @@ CONTROLLERS = Path(__file__).parents[2] / "config" / "controllers.yaml"
 HARDWARE = ET.parse(Path(__file__).parents[2] / "hardware" / "plugins.xml").getroot()
 EXACT = 2e-14  # a product of nine rotations, each rounded
 GEARED = Actuators(rotor_inertia=1e-4, gear_ratio=10.0)
-LINKS = {STAR, *ACTUATED, *INTERMEDIATE}
+LINKS = {STAR_LINK, *ACTUATED_LINKS, *INTERMEDIATE}
 
 
 class Read:
@@ -98,7 +98,7 @@ def test_poses_of_all_links(isotropic):
         expected = dict.fromkeys(STARS, sample.rotation)
         for k in range(3):
             r, t, w = at.r[k], at.t[k], at.w[k]
-            expected[ACTUATED[k]] = np.stack([r, np.cross(w, r), w], axis=1)
+            expected[ACTUATED_LINKS[k]] = np.stack([r, np.cross(w, r), w], axis=1)
             expected[INTERMEDIATE[k]] = np.stack([r, np.cross(t, r), t], axis=1)
         for link, rotation in expected.items():
             assert np.abs(read.rotation(angles, link) - rotation).max() < EXACT
@@ -138,7 +138,7 @@ def test_masses_are_those_of_the_scene_or_said_to_be_assumed():
         for name in ET.fromstring(urdf(weighed)).iter("link")
         if name.find("inertial") is not None
     }
-    assert masses[STAR] == 2.6 and masses["payload"] == 0.8
+    assert masses[STAR_LINK] == 2.6 and masses["payload"] == 0.8
     assert "has no masses" not in urdf(weighed)
     assert "has no masses" in urdf(bare)
     # Thin arcs on the sphere: the printed masses come back.
@@ -270,7 +270,7 @@ def test_mujoco_loads_every_scene(name):
     model = mujoco.MjModel.from_xml_string(urdf(load(name)))
     assert {model.joint(i).name for i in range(model.njnt)} == set(JOINTS)
     # of the frames, which MuJoCo wants to weigh
-    assert model.body_inertia[1:].min() == LEAST
+    assert model.body_inertia[1:].min() == LEAST_MASS
 
 
 def test_mujoco_reads_it():
@@ -399,7 +399,7 @@ class Collisions:
         return found
 
 
-ON_THE_ARMS = {frozenset((STAR, carriage)) for carriage in INTERMEDIATE}
+ON_THE_ARMS = {frozenset((STAR_LINK, carriage)) for carriage in INTERMEDIATE}
 """Links that touch in each pose: one is the joint of leg 1, which URDF has; loops close
 by the others."""
 
@@ -559,7 +559,9 @@ def test_every_scene_is_drawn(name):
 def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name):
     scene = load(name)
     geometry = Geometry.of(scene)
-    arcs = [shape.points() for shape in shapes(scene)[STAR] if isinstance(shape, Arc)]
+    arcs = [
+        shape.points() for shape in shapes(scene)[STAR_LINK] if isinstance(shape, Arc)
+    ]
     for points, e in zip(arcs, geometry.e, strict=True):
         assert points[0] == pytest.approx([0.0, 0.0, scene.star.radius])
         assert points @ e == pytest.approx(0.0, abs=1e-15)

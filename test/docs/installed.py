@@ -13,7 +13,7 @@ from docs.blocks import ROOT
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.nodes.topics import EXECUTES, PUBLISHES, SERVES, SUBSCRIBES
-from sst_ros.runtime.settings import COMMANDS, ros_arguments
+from sst_ros.runtime.settings import NODE_COMMANDS, ros_arguments
 from tools.reference_pages import NODES
 
 ENDPOINTS = {
@@ -85,7 +85,7 @@ def run(words):
     """
     command, *rest = words
     assert (ROOT / "executables" / command).is_file(), command
-    known = COMMANDS[command][1].SPECS
+    known = NODE_COMMANDS[command][1].SPECS
     for name, assigned, text in (
         w.partition(":=") for w in ros_arguments(command, rest)
     ):

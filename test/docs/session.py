@@ -14,7 +14,7 @@ from pathlib import Path
 from docs.blocks import ROOT, commands
 
 from docs import installed
-from sst_ros.cli.commands import NODES
+from sst_ros.cli.commands import NODE_HELP
 from sst_ros.errors import InputError
 
 PYTHONS = (".venv/bin/python", "python", "python3")
@@ -170,7 +170,7 @@ class Session:
     def _stays(self, words):
         """Tell whether a command runs until it is stopped, as nodes do."""
         if words[1] == "-m":
-            return words[2] == "sst_ros" and words[3] in (*NODES, "view")
+            return words[2] == "sst_ros" and words[3] in (*NODE_HELP, "view")
         return "rclpy.spin" in (self.folder / words[1]).read_text(encoding="utf-8")
 
     def _start(self, line, words):

@@ -11,7 +11,7 @@ import pytest
 from docs.blocks import ROOT, blocks, links, pages, prose
 from programs import own_domain
 
-from sst_ros.cli.commands import NODES, parser
+from sst_ros.cli.commands import NODE_HELP, parser
 
 PAGES = pages()
 LONG = (
@@ -86,7 +86,7 @@ def test_commands_in_the_text_are_commands(page):
     """`sst-ros ...` in running text names commands, options and nodes that exist."""
     for text in re.findall(r"`(?:sst-ros|python -m sst_ros) ([^`\n]+)`", prose(page)):
         words = shlex.split(text.replace("...", ""))
-        if words[0] in NODES or words[0].isupper():
+        if words[0] in NODE_HELP or words[0].isupper():
             continue
         of = parser()
         while (choices := _choices(of)) and words and not words[0].isupper():

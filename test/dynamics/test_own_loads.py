@@ -27,7 +27,7 @@ from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import model_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.scene.own_loads import ANGLES, ROTATION, FormulaLoad, LoadParameter
+from sst_ros.scene.own_loads import ANGLE_NAMES, ROTATION, FormulaLoad, LoadParameter
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump, read
 
@@ -57,7 +57,7 @@ def mpmath_energy(truth, text, gamma, k=1.3):
     """
     here = truth.at(gamma)
     names = dict(zip(ROTATION, here.rotation.ravel(), strict=True))
-    names |= dict(zip(ANGLES, here.angles.ravel(), strict=True))
+    names |= dict(zip(ANGLE_NAMES, here.angles.ravel(), strict=True))
     functions = {
         name: getattr(mp, name) for name in ("sqrt", "exp", "sin", "cos", "tanh")
     }

@@ -9,7 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sst_ros.errors import InputError
-from sst_ros.runtime.settings import COMMANDS, make_parser, ros_arguments, unused_files
+from sst_ros.runtime.settings import (
+    NODE_COMMANDS,
+    make_parser,
+    ros_arguments,
+    unused_files,
+)
 
 
 def values(command, *words):
@@ -97,10 +102,10 @@ def test_a_parameter_file_for_another_node_is_reported(tmp_path, nodes, node, ma
     assert (not [*unused_files(ros, node)]) == matches
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", NODE_COMMANDS)
 def test_help_has_every_parameter_with_default_and_bounds(command):
     text = " ".join(make_parser(command).format_help().split())
-    for name, spec in COMMANDS[command][1].SPECS.items():
+    for name, spec in NODE_COMMANDS[command][1].SPECS.items():
         assert f"--{name.replace('_', '-')} " in text
         assert spec.describe() in text
 

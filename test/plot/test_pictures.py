@@ -23,7 +23,7 @@ from sst_ros import figures
 from sst_ros.errors import InputError
 from sst_ros.plot import compare, pictures
 from sst_ros.plot.compare import differences, draw_comparison
-from sst_ros.plot.pictures import PICTURES, draw_run
+from sst_ros.plot.pictures import RUN_PICTURES, draw_run
 from sst_ros.recording import recording
 from sst_ros.recording.recording import read_signals
 from sst_ros.report import reference
@@ -60,7 +60,7 @@ def drawn(run, tmp_path_factory):
         patch.setattr(pictures, "save", keep)
         paths, missing = draw_run(run, out)
     assert missing == {}
-    assert {path.stem for path in paths} == set(kept) and len(kept) == len(PICTURES)
+    assert {path.stem for path in paths} == set(kept) and len(kept) == len(RUN_PICTURES)
     return kept, out
 
 
@@ -195,7 +195,7 @@ def test_one_picture_may_be_asked_for(run, tmp_path, capsys, undrawn):
 def test_the_list_names_all(capsys):
     assert cli.main(["plot", "--list"]) == 0
     said = capsys.readouterr().out
-    assert [line.split()[0] for line in said.splitlines()][:-1] == list(PICTURES)
+    assert [line.split()[0] for line in said.splitlines()][:-1] == list(RUN_PICTURES)
 
 
 def test_a_spike_of_one_sample_is_seen_and_a_gap_stays_a_gap(tmp_path):
@@ -318,7 +318,7 @@ def test_the_panel_of_differences_says_which_runs_do_not_differ_and_which_share_
         ["first", "same", "changed", "late"],
     )
     drawn = list(zip(runs, names, figures.LINES, strict=False))
-    panel = compare.PICTURES["gamma"].make(drawn).axes[-1]
+    panel = compare.COMPARISON_PICTURES["gamma"].make(drawn).axes[-1]
     said = [line.get_label() for line in panel.lines]
     assert said == ["same: no difference", "changed", "late: no samples in common"]
     assert np.nanmax(panel.lines[1].get_ydata()) == pytest.approx(np.degrees(1e-3))
@@ -342,7 +342,7 @@ def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
     written = pd.read_csv(table, index_col=["run", "joint"])
     pd.testing.assert_frame_equal(written, differences(pair), check_exact=True)
     drawn = {path.name for path in (tmp_path / "out").iterdir()}
-    names = [name for name in compare.PICTURES if name != "tracking_error"]
+    names = [name for name in compare.COMPARISON_PICTURES if name != "tracking_error"]
     assert drawn == {
         f"compare_{name}.{form}" for name in names for form in ("pdf", "png")
     }
@@ -403,7 +403,7 @@ def crosses(line):
     "name", ["joint_angles", "position_of_E", "psi", "torques", "energy", "margins"]
 )
 def test_no_line_is_drawn_across_a_gap(twice, name):
-    figure = pictures.PICTURES[name].make(twice, twice.scene)
+    figure = pictures.RUN_PICTURES[name].make(twice, twice.scene)
     lines = [
         line
         for axes in figure.axes

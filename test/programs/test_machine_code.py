@@ -13,7 +13,7 @@ import pytest
 
 from sst_ros.mechanism.generic_math import absolute, larger, select
 from sst_ros.programs.expression import (
-    FUNCTIONS,
+    MATH_FUNCTIONS,
     Routine,
     compile_program,
     number_constants,
@@ -115,7 +115,7 @@ def test_a_program_calls_another_by_its_name_scalar_and_in_lanes():
     programs = {"inner": inner, "f": trace(twice, ("t", "x"))}
     fast = write_module(programs).function("f")
     plain = compile_program(
-        programs["f"], {**FUNCTIONS, "inner": compile_program(inner)}
+        programs["f"], {**MATH_FUNCTIONS, "inner": compile_program(inner)}
     )
     assert tuple(fast(0.3, 0.7)) == plain(0.3, 0.7) == written_out(0.3, 0.7)
     x = np.linspace(0.1, 2.0, 2 * LANES + 3)

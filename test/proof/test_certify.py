@@ -19,7 +19,7 @@ from sst_ros import (
     simulate,
 )
 from sst_ros.__main__ import main
-from sst_ros.dynamics.motion_table import JOINTS
+from sst_ros.dynamics.motion_table import JOINT_QUANTITIES
 from sst_ros.mechanism.geometry import angle_between
 from sst_ros.proof import balls, enclosure, scene_balls
 from sst_ros.proof import certify as certify_module
@@ -53,7 +53,7 @@ CASES = {
         None,
     ),
 }
-NAMES = [f"{joint}_{leg}" for joint in JOINTS for leg in (1, 2, 3)]
+NAMES = [f"{joint}_{leg}" for joint in JOINT_QUANTITIES for leg in (1, 2, 3)]
 
 
 def worst(columns, motion, row, time):

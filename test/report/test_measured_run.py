@@ -151,7 +151,7 @@ def test_pictures_show_the_truth_and_what_was_measured(
 ):
     path = written(measure(bags, exact, ("noise",), monkeypatch, truth=True))
     run = read_bag(path).signals
-    figure = pictures.PICTURES["joint_angles"].make(run, run.scene)
+    figure = pictures.RUN_PICTURES["joint_angles"].make(run, run.scene)
     dots, lines = figure.axes[0].lines[:3], figure.axes[0].lines[3:]
     for leg in range(3):
         measured, true = run.legs("gamma")[:, leg], run.legs("true_gamma")[:, leg]
@@ -170,9 +170,9 @@ def test_pictures_of_each_combination_show_truth_and_measurement(
     path = written(measure(bags, exact, kinds, monkeypatch, truth=True))
     run = read_bag(path).signals
     for name in ("joint_angles", "joint_rates", "power", "margins"):
-        figure = pictures.PICTURES[name].make(run, run.scene)
+        figure = pictures.RUN_PICTURES[name].make(run, run.scene)
         assert figure.axes[0].get_lines()
-    dots = pictures.PICTURES["joint_angles"].make(run, run.scene).axes[0].lines[:3]
+    dots = pictures.RUN_PICTURES["joint_angles"].make(run, run.scene).axes[0].lines[:3]
     true = DEGREES * run.true_legs("gamma")
     apart = [
         np.nanmax(np.abs(dot.get_ydata() - column))

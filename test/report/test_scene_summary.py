@@ -35,7 +35,7 @@ from sst_ros.report.scene_summary import (
 )
 from sst_ros.scene.loads import Actuators, Friction, Initial, JointFriction, Moment
 from sst_ros.scene.own_loads import FormulaLoad
-from sst_ros.scene.scene import TERMS, load, names, terms
+from sst_ros.scene.scene import SCENE_TERMS, load, names, terms
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulate import simulate
 
@@ -75,7 +75,7 @@ def with_everything():
 
 def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operation():
     scene = with_everything()
-    for term in TERMS:
+    for term in SCENE_TERMS:
         if term not in ("actuated links", "intermediate links"):
             assert term in terms(scene), term
             scene = without(scene, term)
@@ -109,7 +109,7 @@ def test_a_summary_has_all_parts_and_every_term_adds_operations_or_folds(name):
         row = rf"^  {cost.name} +{cost.adds} +{cost.without}$"
         assert cost.adds >= 0 and re.search(row, said, re.MULTILINE)
     listed = " ".join(said[said.index("terms absent") : said.index("\nends")].split())
-    assert all((term in listed) != (term in terms(scene)) for term in TERMS)
+    assert all((term in listed) != (term in terms(scene)) for term in SCENE_TERMS)
     for key, reason in scene.provenance:
         assert re.search(rf"^  {key} +{re.escape(reason[:20])}", said, re.MULTILINE)
     assert step_advice(scene).text in " ".join(said.split())

@@ -16,7 +16,7 @@ from sst_ros.mechanism import kinematics, workspace
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.report import stability
 from sst_ros.report.stability import (
-    ROWS,
+    CHANGED_RUNS,
     draw_stability,
     examine_stability,
     stability_page,
@@ -34,7 +34,7 @@ def found():
 
 
 def changed(name, scene=EXAMPLE2):
-    return ROWS[name][1](scene, simulate(scene, duration=0.02))
+    return CHANGED_RUNS[name][1](scene, simulate(scene, duration=0.02))
 
 
 def test_every_run_ends_with_a_value_within_its_estimate_or_with_a_named_fault(found):
@@ -144,7 +144,7 @@ def test_the_steps_are_those_of_the_eigenvalues(found):
 def test_the_figure_and_the_page_show_every_method_and_run(found):
     said = stability_page(found)
     assert all(f"- {name}: " in said for name in METHODS)
-    assert all(f"| {name} | {ROWS[name][0]} | yes |" in said for name in FEW)
+    assert all(f"| {name} | {CHANGED_RUNS[name][0]} | yes |" in said for name in FEW)
     lines = {
         line.get_label() for axes in draw_stability(found).axes for line in axes.lines
     }

@@ -19,11 +19,11 @@ from sst_ros.programs.expression import compile_program
 from sst_ros.report import accuracy
 from sst_ros.report.accuracy import (
     ABOVE_REFERENCE,
-    COLUMNS,
-    ERROR,
+    ERROR_COLUMN,
+    ERROR_TARGETS,
     FIXED,
-    TARGETS,
-    TOLERANCE,
+    STUDY_COLUMNS,
+    TOLERANCE_KIND,
     accuracy_page,
     accuracy_text,
     draw_accuracy,
@@ -32,7 +32,7 @@ from sst_ros.report.accuracy import (
     write_accuracy_report,
 )
 from sst_ros.report.reference_solution import (
-    EXACT as EXACT_STEP,
+    EXACT_DOP853 as EXACT_STEP,
 )
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
@@ -115,12 +115,14 @@ def test_methods_show_their_order(short):
 
 def test_every_row_is_whole(short):
     rows = short.rows
-    assert set(rows.kind) == {FIXED, TOLERANCE} and not _rows(short, "rk4", TOLERANCE)
+    assert set(rows.kind) == {FIXED, TOLERANCE_KIND} and not _rows(
+        short, "rk4", TOLERANCE_KIND
+    )
     assert set(rows.method) == set(METHODS) - {"auto"}
     assert (rows.failure == "").all()
     assert (rows.wall_min_s > 0.0).all() and rows.evaluations.min() > 0
-    assert (rows.final_orientation_rad <= rows[ERROR]).all()
-    assert short.best(1e-9)[ERROR] <= 1e-9
+    assert (rows.final_orientation_rad <= rows[ERROR_COLUMN]).all()
+    assert short.best(1e-9)[ERROR_COLUMN] <= 1e-9
 
 
 def test_what_it_writes_can_be_read(short, tmp_path, monkeypatch, capsys):
@@ -130,7 +132,7 @@ def test_what_it_writes_can_be_read(short, tmp_path, monkeypatch, capsys):
     assert words in said and words.startswith("1e-09 rad over 0.2 s: ")
     assert all(len(line) < 200 for line in said.splitlines())
     rows = list(csv.DictReader(io.StringIO((tmp_path / "accuracy.csv").read_text())))
-    assert len(rows) == len(short.rows) and tuple(rows[0]) == COLUMNS
+    assert len(rows) == len(short.rows) and tuple(rows[0]) == STUDY_COLUMNS
     assert [float(row["wall_min_s"]) for row in rows] == short.rows.wall_min_s.tolist()
     read = json.loads((tmp_path / "accuracy.json").read_text())
     assert read["rows"][0]["method"] == "rk4" and "date" in read["report"]
@@ -141,7 +143,7 @@ def test_what_it_writes_can_be_read(short, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_every_target_has_a_fastest_setting(short):
-    assert tuple(short.fastest) == TARGETS == (1e-3, 1e-6, 1e-9, 1e-12)
+    assert tuple(short.fastest) == ERROR_TARGETS == (1e-3, 1e-6, 1e-9, 1e-12)
 
 
 @pytest.mark.slow
@@ -174,10 +176,10 @@ def graded(study, *errors):
             "setting": 0.5**k,
             "wall_min_s": 1e-3 * (k + 1),
         }
-        | {ERROR: error}
+        | {ERROR_COLUMN: error}
         for k, error in enumerate(errors)
     ]
-    return dataclasses.replace(study, rows=data_frame(rows, COLUMNS))
+    return dataclasses.replace(study, rows=data_frame(rows, STUDY_COLUMNS))
 
 
 @pytest.mark.parametrize(
@@ -206,7 +208,7 @@ def test_another_inertia_in_the_runs_is_seen(monkeypatch):
     target = InitialValueProblem(dataclasses.replace(BRIEF, star=star))
     monkeypatch.setattr(accuracy, "solve_reference", lambda _: solve_reference(target))
     found = study_quickly(BRIEF, 0.005)
-    assert 1e-10 < found.rows[ERROR].min() < 1e-6
+    assert 1e-10 < found.rows[ERROR_COLUMN].min() < 1e-6
 
 
 @pytest.mark.slow
@@ -215,7 +217,7 @@ def test_failures_stay_in_sight(tmp_path):
     found = study_quickly(stiff, 0.005)
     assert not any(row.failure for row in _rows(found, "rodas5p"))
     failed = found.rows[found.rows.failure != ""]
-    assert len(failed) and failed[ERROR].isna().all()
+    assert len(failed) and failed[ERROR_COLUMN].isna().all()
     assert accuracy_text(found).count("FAILED") == len(failed)
     assert found.rows.failure.str.contains("not finite|off by").sum() >= len(failed)
     save_figure(draw_accuracy(found), tmp_path / "picture.png")

@@ -152,7 +152,9 @@ def run_here(domain, capfd):
     """
 
     def run(command, *words, **given):
-        handlers = {number: signal.getsignal(number) for number in signals._NUMBERS}
+        handlers = {
+            number: signal.getsignal(number) for number in signals._SIGNAL_NUMBERS
+        }
         try:
             options = ["--ros-args", *child_process.words(given)] if given else []
             status = main([command, *words, *options])

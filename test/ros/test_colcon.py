@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from programs import python
 
-from sst_ros.runtime.settings import COMMANDS
+from sst_ros.runtime.settings import NODE_COMMANDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 SOURCE = Path(__file__).parents[2]
@@ -56,7 +56,7 @@ def test_all_is_installed_where_ros_looks_for_it(prefix):
                 assert (
                     share / path.relative_to(SOURCE)
                 ).read_bytes() == path.read_bytes()
-    for name in COMMANDS:  # as `ros2 run` finds it
+    for name in NODE_COMMANDS:  # as `ros2 run` finds it
         assert os.access(prefix / "lib" / "sst_ros" / name, os.X_OK)
 
 

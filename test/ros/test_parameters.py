@@ -16,7 +16,7 @@ from missing_packages import needs
 from rcl_interfaces.msg import ParameterType
 
 from sst_ros.nodes.process import Worker
-from sst_ros.runtime.settings import COMMANDS, SimulatorParameters
+from sst_ros.runtime.settings import NODE_COMMANDS, SimulatorParameters
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[2]
@@ -127,11 +127,11 @@ TYPES = {
 }
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", NODE_COMMANDS)
 @pytest.mark.parametrize("texts", ["", "[]", "[joint_states]"])
 def test_descriptors_carry_type_words_bounds_and_read_only(domain, command, texts):
     """As `ros2 param describe` and `ros2 param get` read them; an empty list, too."""
-    settings = COMMANDS[command][1]
+    settings = NODE_COMMANDS[command][1]
     lists = [name for name, spec in settings.SPECS.items() if spec.kind == "texts"]
     if command == "recorder" and texts == "[]":
         pytest.skip("a recorder of no topic ends at once")
@@ -245,7 +245,7 @@ def test_the_file_of_parameters_holds_the_defaults(nodes, observer):
     assert nodes.stop(process)[0] == 0
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", NODE_COMMANDS)
 def test_a_dump_of_the_parameters_loads_again(domain, tmp_path, command):
     """As `ros2 param dump` writes it: parameters with dots in trees, an empty list as
     [].
@@ -254,7 +254,7 @@ def test_a_dump_of_the_parameters_loads_again(domain, tmp_path, command):
     for options in ([], ["--params-file", str(path)]):
         rclpy.init(args=[command, "--ros-args", *options])
         try:
-            worker = Worker(f"sst_{command}", COMMANDS[command][1])
+            worker = Worker(f"sst_{command}", NODE_COMMANDS[command][1])
             loaded.append(worker.parameters)
             tree = {}
             for name, one in worker.node._parameters.items():

@@ -15,7 +15,7 @@ from ros.conftest import COMMANDS, NODE
 from std_msgs.msg import Float64MultiArray, String
 
 import sst_ros
-from sst_ros.runtime.settings import COMMANDS as NODES
+from sst_ros.runtime.settings import NODE_COMMANDS as NODES
 
 pytestmark = pytest.mark.ros
 

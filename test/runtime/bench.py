@@ -13,7 +13,7 @@ from sst_ros import load_scene
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime
-from sst_ros.runtime.torque_input import ACTUATORS, MOST_WAITING, TorqueInput
+from sst_ros.runtime.torque_input import ACTUATED_JOINTS, MOST_WAITING, TorqueInput
 from sst_ros.simulation.simulation import Simulation
 
 
@@ -26,7 +26,7 @@ def plain(torque):
     return Message(data=torque)
 
 
-def stamped(stamp_ns, effort=(0.0, 0.0, 0.0), names=ACTUATORS):
+def stamped(stamp_ns, effort=(0.0, 0.0, 0.0), names=ACTUATED_JOINTS):
     header = Message(stamp=duration(stamp_ns))
     return Message(header=header, name=list(names), effort=list(effort))
 

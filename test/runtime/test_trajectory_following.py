@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from runtime.bench import Message, duration
 
-from sst_ros.control.controller import BAND, ControlStopped, Measurement
+from sst_ros.control.controller import SETTLING_BAND, ControlStopped, Measurement
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import InputError, SstError
 from sst_ros.runtime import assistant as assistant_process
@@ -78,7 +78,10 @@ def test_it_follows_holds_and_ends_with_zero_torque():
     assert stages == (Stage.FOLLOWING,) * 25 + (Stage.HOLDING,) * 5 + (Stage.ENDED,)
     assert commands[-1].torque == REST and follower.samples == 31
     judged = follower.tracking()
-    assert judged.samples == 31 and judged.largest.max() < 0.01 * judged.band / BAND
+    assert (
+        judged.samples == 31
+        and judged.largest.max() < 0.01 * judged.band / SETTLING_BAND
+    )
     rms, largest = follower.errors
     assert largest == judged.largest.max()
     assert rms == pytest.approx(np.sqrt(np.mean(judged.rms**2)))

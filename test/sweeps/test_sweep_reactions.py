@@ -6,7 +6,7 @@ import pytest
 
 from sst_ros import load_scene, simulate, sweep
 from sst_ros.dynamics.reactions import LINK_JOINTS, SIZES
-from sst_ros.sweeps.sweep import PARTS
+from sst_ros.sweeps.sweep import EXTREME_PARTS
 
 
 def test_peaks_and_rms_of_runs_are_those_of_each_alone():
@@ -20,7 +20,7 @@ def test_peaks_and_rms_of_runs_are_those_of_each_alone():
     }
     given = {
         "duration": 0.3,
-        "steps": PARTS,
+        "steps": EXTREME_PARTS,
         "outputs": ("reactions",),
         "progress": False,
     }
@@ -32,7 +32,7 @@ def test_peaks_and_rms_of_runs_are_those_of_each_alone():
         own = scene.with_values(
             {name: chosen[name] for name in vary if name != "base.v"} | {"base.v": v}
         )
-        figures = simulate(own, duration=0.3, samples=PARTS).reactions.figures
+        figures = simulate(own, duration=0.3, samples=EXTREME_PARTS).reactions.figures
         for name in LINK_JOINTS:
             for size, unit in SIZES.items():
                 expected = figures[name][size]

@@ -8,7 +8,7 @@ pytest.importorskip("viser", reason="needs viser: pip install .[view]")
 
 import trimesh
 
-from sst_ros.description.robot import BASE, STAR, Arc, Ball, Box, Rod, shapes
+from sst_ros.description.robot import BASE, STAR_LINK, Arc, Ball, Box, Rod, shapes
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
@@ -78,7 +78,7 @@ def test_links_are_where_the_simulation_has_them(server, name):
     at = state.joints
     shown = ViewState(0.005, at.gamma, at.mu, at.beta, at.gamma_dot, state.torque)
     drawing.show(shown.angles, shown.torque)
-    star = node(server, f"/manipulator/{STAR}")
+    star = node(server, f"/manipulator/{STAR_LINK}")
     assert turned(star) == pytest.approx(rotation_matrix(state.quaternion), abs=1e-12)
     for link, drawn in shapes(scene).items():
         for index in range(len(drawn)):
