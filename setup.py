@@ -67,7 +67,7 @@ EXTRAS |= {
         "sphinx-gallery>=0.16",
     ],
     "engines": ["mujoco>=4", "pin>=4"],
-    "peers": ["mpmath", "mujoco>=4", "pin>=4"],
+    "peers": ["casadi>=3.6.5", "cmeel-eigen", "mpmath", "mujoco>=4", "pin>=4"],
     "test": [
         "argcomplete",
         "build",

@@ -25,6 +25,7 @@ MODULES = {
     "ours": "llvmlite",
     "mujoco_peer": "mujoco",
     "pinocchio_peer": "pinocchio",
+    "casadi_peer": "casadi",
     "scipy_peer": "scipy",
 }
 """Who brings series, and the module without which it has none."""

@@ -131,7 +131,7 @@ def _tanh_function() -> Iterator[str]:
 
 
 def _body(named: NamedProgram) -> Iterator[str]:
-    """Write the statements: arguments are read, then computed with, then results stored."""
+    """Write the statements: read arguments, compute, store results."""
     program = named.program
     used = {
         operand

@@ -116,9 +116,9 @@ def equations(
 
     Args:
         scene: name or path of a scene, its document as a dict, or a `Scene`.
-        target: "c" (C99 with its header), "numpy", "jax", "casadi", "mpmath" or "sympy" (a
-            module of Python, whose functions the result has too), "fmu" (FMI 3.0, Model
-            Exchange and Co-Simulation) or "mjcf" (the mechanism for MuJoCo).
+        target: "c" (C99 with its header), "numpy", "jax", "casadi", "mpmath" or "sympy"
+            (a module of Python, whose functions the result has too), "fmu" (FMI 3.0,
+            Model Exchange and Co-Simulation) or "mjcf" (the mechanism for MuJoCo).
         parameters: keys of numbers of the scene that stay open, as "star.inertia.zz",
             "payload.mass" or "friction.gamma.viscous", but not of its geometry; the
             functions take their values as the last argument. A vector means each of its

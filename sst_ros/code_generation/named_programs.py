@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The equations of a scene as programs with named arguments, for writers of other languages.
+"""The equations of a scene as programs with named arguments, for other languages.
 
 Each is a straight-line program of the state, of what acts, and of the numbers of the
 scene that are left open, its parameters. Without parameters they are the programs that
@@ -154,7 +154,7 @@ class SceneEquations:
 
     @property
     def acting(self) -> tuple[Argument, ...]:
-        """What acts from outside: the torques, and a moment if it comes from a topic."""
+        """What acts from outside: torques, and a moment if it comes from a topic."""
         legs = (1, 2, 3)
         word = "command to" if self.scene.lags else "torque of"
         torques = tuple(f"{word} actuator {leg} [N m]" for leg in legs)
@@ -272,7 +272,7 @@ def _by_parameters(equations: SceneEquations) -> NamedProgram:
 
 
 def _jacobian(equations: SceneEquations, by: Argument) -> NamedProgram:
-    """Trace the derivatives of the derivative by an argument: a row a number of the state."""
+    """Trace the Jacobian of the derivative by an argument: a row a number of the state."""
     arguments = (equations.state, *equations.acting, *equations.open)
     whole = trace(equations.derivative, _symbols(arguments), by.symbols)
     rows = equations.state.size

@@ -173,7 +173,7 @@ def _function(named: NamedProgram, library: Library) -> Iterator[str]:
 def _write_operations(
     named: NamedProgram, library: Library
 ) -> tuple[list[str], list[str]]:
-    """Return a line for each step, v0 = .., v1 = .., and what the outputs are called."""
+    """Return a line for each step, v0 = .., v1 = .., and the names of the outputs."""
     program = named.program
     words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
 

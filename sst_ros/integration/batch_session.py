@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many robots step by step: torques go in, states come out, in arrays that stay in place.
+"""Many robots step by step: torques in, states out, in arrays that stay in place.
 
 The robots are divided into as many blocks as threads take them, and a step of a block
 is one call of the compiled program of `batch_step`.
@@ -185,7 +185,7 @@ class BatchSession:
         return index.astype(np.intp)
 
     def result(self) -> Any:
-        """Return a copy of all robots' states with every quantity of a `BatchResult`."""
+        """Return a copy of all states, with every quantity of a `BatchResult`."""
         time = (self._done - np.maximum(self._begun, 0)) * self._substeps * self._h
         batch, code, fault = self._batch, self.state.code.copy(), self.fault_time.copy()
         torque = self._given[:3].T.copy()

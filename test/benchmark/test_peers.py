@@ -20,6 +20,13 @@ def peer(name):
     return importlib.import_module(f"benchmark.peers.{name}")
 
 
+@pytest.fixture(autouse=True)
+def without_loop_in_cpp(request, monkeypatch):
+    """It takes minutes to compile."""
+    if request.node.get_closest_marker("slow") is None:
+        monkeypatch.setattr(peer("pinocchio_peer"), "compile_loop", lambda: None)
+
+
 @pytest.fixture(scope="module")
 def task():
     return Task()
@@ -31,7 +38,27 @@ def test_kernel_and_paper_agree_where_engines_are_gated(task):
         assert find_relative(task.kernel_answer(at.y, at.torque), at.answer) < 1e-12
 
 
-@pytest.mark.parametrize("module", ["mujoco", "pinocchio", "scipy"])
+def test_reference_and_lagrange_solve_the_same_equations(task):
+    from benchmark.peers.independent import check_reference
+
+    assert check_reference(task, 5).acceleration < 1e-13
+
+
+@pytest.mark.slow
+def test_gate_of_the_loop_in_cpp(task):
+    pytest.importorskip("pinocchio")
+    if peer("pinocchio_peer").compile_loop() is None:
+        pytest.skip("no g++ or headers of Eigen")
+    compiled = peer("pinocchio_peer").series(task, quick=True)[2:]
+    assert [series.name for series in compiled] == [
+        "RK4 in a C++ loop",
+        "DOP853 in a C++ loop",
+    ]
+    for series in compiled:
+        assert series.gate(task) <= series.tolerance, series.name
+
+
+@pytest.mark.parametrize("module", ["casadi", "mujoco", "pinocchio", "scipy"])
 def test_gate(task, module):
     pytest.importorskip(module)
     for series in peer(f"{module}_peer").series(task, quick=True):
