@@ -198,8 +198,9 @@ class PolynomialTorque(TorqueProfile):
         """See `TorqueProfile`."""
         from scipy.interpolate import PPoly
 
-        # SciPy before 1.13 finds no roots where the coefficients are read-only.
-        legs = [PPoly(c.copy(), self.x) for c in np.moveaxis(self.c, 2, 0)]
+        # SciPy 1.11 finds no roots where the arrays are read-only.
+        breaks = self.x.copy()
+        legs = [PPoly(c.copy(), breaks) for c in np.moveaxis(self.c, 2, 0)]
         bounds = () if limit is None else (limit, -limit)
         roots = [
             leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds
