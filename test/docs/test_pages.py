@@ -15,7 +15,7 @@ from sst_ros.cli.commands import NODE_HELP, parser
 
 PAGES = pages()
 LONG = (
-    "README batch collocation controller evaluate fast faults follow geometry identify"
+    "README batch collocation controller designers evaluate fast faults follow geometry identify"
     " index lockstep look many own_loads plot reactions record rodas5p simulate sweep"
     " torque twelve_tasks"
 )
