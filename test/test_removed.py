@@ -32,7 +32,9 @@ def test_prepare_says_what_to_call():
 
 def test_arguments_say_what_to_do_instead():
     line = refuse(Simulation, "example2", compiled=True)
-    assert line == f"simulation: compiled = True: {removed.REMOVED_ARGUMENTS['compiled']}"
+    assert (
+        line == f"simulation: compiled = True: {removed.REMOVED_ARGUMENTS['compiled']}"
+    )
     with pytest.raises(TypeError, match="unexpected keyword argument 'compile'"):
         Simulation("example2", compile=True)
 
@@ -48,7 +50,9 @@ def test_methods_say_which_are_as_good(name):
     [["--compiled"], ["--ros-args", "-p", "compiled:=true"]],
 )
 def test_parameters_of_nodes_say_what_to_do_instead(words):
-    assert removed.REMOVED_ARGUMENTS["compiled"] in refuse(ros_arguments, "simulator", words)
+    assert removed.REMOVED_ARGUMENTS["compiled"] in refuse(
+        ros_arguments, "simulator", words
+    )
 
 
 def test_commands_say_what_to_do_instead(capsys):
