@@ -185,12 +185,33 @@ class Row(NamedTuple):
         """The call without what is allowed besides, over its compiled steps."""
         return (self.later - ALLOWED_MS - 2.0 * self.functions) / self.steps
 
+    @property
+    def short(self) -> str:
+        """The row in README.md, "" where it has none."""
+        if self.name not in SHORT:
+            return ""
+        mujoco = "-" if self.mujoco is None else f"{self.mujoco:.1f} ms"
+        return f"| {self.name} | {self.later:.1f} ms | {mujoco} |"
+
     def __str__(self) -> str:
         functions = f"{self.functions:.3f}" if self.functions else "-"
         mujoco = "-" if self.mujoco is None else f"{self.mujoco:.2f}"
         times = f"{self.first:.0f} | {self.later:.2f} | {self.steps:.3f}"
         return f"| {self.name} | {times} | {functions} | {self.ratio:.1f} | {mujoco} |"
 
+
+SHORT = (
+    "Example 2 to 1e-6 rad",
+    "Example 2 to 1e-9 rad",
+    "torque as a function of time, 1e-6 rad",
+    "elastic stops, auto",
+    "friction, auto",
+)
+"""Rows that README.md has."""
+
+SHORT_HEAD = """\
+| one second, 200 samples read | `simulate` | MuJoCo, best setting, without samples |
+| --- | ---: | ---: |"""
 
 HEAD = """\
 | one second, 200 samples read [ms] | first call | later | its steps alone \
@@ -211,17 +232,19 @@ def main(arguments: list[str] | None = None) -> int:
     if options.first is not None:
         print(time_first(CALLS[options.first]))
         return 0
-    lines = [HEAD]
     print(HEAD)
+    rows = []
     for number, call in enumerate(CALLS):
-        lines.append(str(measure(number, call, options.rounds)))
-        print(lines[-1], flush=True)
-    lines += ["", *measure_steps(options.rounds), ""]
-    lines.append(join_line(describe_machine("numpy", "llvmlite", "mujoco")))
-    print("\n".join(lines[-4:]))
+        rows.append(measure(number, call, options.rounds))
+        print(rows[-1], flush=True)
+    machine = join_line(describe_machine("numpy", "llvmlite", "mujoco"))
+    end = f"\n{measure_steps(options.rounds)}\n\nMeasured: {machine}."
+    print(end)
     if options.write:
-        for page in (DOCS / "peers.md", DOCS.parent / "README.md"):
-            fill_page(page, {"calls": "\n".join(lines)})
+        table = "\n".join([HEAD, *map(str, rows), end])
+        fill_page(DOCS / "peers.md", {"calls": table})
+        short = [row.short for row in rows if row.short]
+        fill_page(DOCS.parent / "README.md", {"calls": "\n".join([SHORT_HEAD, *short])})
     return 0
 
 
@@ -268,14 +291,14 @@ def _prepare_mujoco(setting: MuJoCo) -> Callable[[], Any]:
     return kind(*arguments).run
 
 
-def measure_steps(rounds: int) -> Sequence[str]:
-    """Return lines on single steps of a `Simulation`."""
+def measure_steps(rounds: int) -> str:
+    """Return a line on single steps of a `Simulation`."""
     run = Simulation(HEAVY)
     run.load_code()
     taken = time_in_turn(
         {"step": partial(_ticks, run, 100)}, rounds, clock=time.process_time
     )
-    return [f"`Simulation.step`, 1 ms: {1e6 * median(taken['step']) / 100:.1f} us"]
+    return f"`Simulation.step`, 1 ms: {1e6 * median(taken['step']) / 100:.1f} us."
 
 
 def _ticks(run: Simulation, count: int) -> None:

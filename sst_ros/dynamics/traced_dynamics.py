@@ -220,16 +220,6 @@ class ODE:
         """The derivative, and its derivatives by t and by each number of the state."""
         return trace(self._of_numbers, self._inputs, ("t", *self.state))
 
-    @cached_property
-    def directional(self) -> Program:
-        """The derivative, and its own along the direction d_x, .. of further inputs.
-
-        They are of the state but the work, and of the time under a torque.
-        """
-        state = self.state[:-1] if self._work else self.state
-        along = state if self._torque is None else (*state, "t")
-        return trace(self._of_numbers, self._inputs, (), along)
-
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
         """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
 

@@ -269,6 +269,9 @@ RODAS5P = Rosenbrock(
 
 Method = Tableau | Rosenbrock
 
+AUTO = "auto"
+"""Changes between methods as the motion asks for."""
+
 METHODS: dict[str, Method] = {
     method.name: method for method in (RK4, DORMAND_PRINCE, DOP853, RODAS5P)
 }

@@ -11,7 +11,6 @@ interpreter or for a compiler.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
@@ -379,42 +378,29 @@ class Program:
     def source(
         self,
         name: str,
-        slots: Slots | None = None,
         templates: Mapping[str, str] = _TEMPLATES,
     ) -> str:
-        """Source of a flat function of all inputs that returns the tuple of outputs.
-
-        With `slots` its last argument is the vector p, which it takes its numbers from.
-        """
-        lines, _, results = self.split((), slots, templates=templates)
-        given = self.inputs
-        if slots is not None:
-            given, lines = (*given, "p"), [*slots.reads([*lines, *results]), *lines]
-        lines = [f"def {name}({', '.join(given)}):", *(f"    {line}" for line in lines)]
+        """Source of a flat function of all inputs that returns the tuple of outputs."""
+        steps, _, results = self.split((), templates=templates)
+        head = f"def {name}({', '.join(self.inputs)}):"
+        lines = [head, *(f"    {line}" for line in steps)]
         return "\n".join([*lines, f"    return ({', '.join(results)},)\n"])
 
     def split(
         self,
         late: Container[int],
-        slots: Slots | None = None,
-        names: Sequence[str] = (),
         templates: Mapping[str, str] = _TEMPLATES,
     ) -> tuple[list[str], list[str], list[str]]:
-        """Lines v0 = .., v1 = .., a step each, that depend on no `late` input.
+        """Write lines v0 = .., v1 = .., a step each.
 
-        The others; outputs.
-
-        With `slots` numbers have the names of their slots; inputs may have other
-        `names`.
+        Returns those that depend on no `late` input, the others, and the outputs.
         """
-        words = [*(names or self.inputs), *(f"v{i}" for i in range(len(self.steps)))]
+        words = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
         is_late = [number in late for number in range(len(self.inputs))]
 
         def word(operand: float | int) -> str:
             if isinstance(operand, int):
                 return words[operand]
-            if slots is not None and isinstance(operand, Number):
-                return slots.name(operand)
             return repr(operand) if operand >= 0.0 else f"({operand!r})"
 
         before, after = list[str](), list[str]()
@@ -448,39 +434,23 @@ class Slots:
             self.values.append(float(number))
         return slot
 
-    def name(self, number: Number) -> str:
-        """Return the name of a number in a text."""
-        return f"c{self.slot(number)}"
-
-    def reads(self, lines: Sequence[str]) -> list[str]:
-        """Lines that read what other lines name."""
-        used = {
-            int(found) for line in lines for found in re.findall(r"\bc(\d+)\b", line)
-        }
-        return [f"c{slot} = p[{slot}]" for slot in sorted(used)]
-
 
 def trace(
     function: Callable[..., Sequence[Value]],
     inputs: Sequence[str],
     by: Sequence[str] = (),
-    along: Sequence[str] = (),
 ) -> Program:
-    """Run `function` on one expression per input and return what it does, then df/dx for x in `by`.
+    """Run a function on one expression per input and return what it does.
 
-    With `along` the last outputs are the derivative along one direction, which is given
-    by further inputs, d_x for each x in `along`. Derivatives are exact.
+    The outputs are those of the function, then their derivatives by each input in `by`,
+    which are exact.
     """
     graph = Graph()
-    names = (*inputs, *(f"d_{name}" for name in along))
-    symbols = {name: graph.node("input", name) for name in names}
-    outputs = tuple(function(*[symbols[name] for name in inputs]))
-    directions: list[dict[str, Value]] = [{name: 1.0} for name in by]
-    if along:
-        directions.append({name: symbols[f"d_{name}"] for name in along})
+    names = tuple(inputs)
+    outputs = tuple(function(*[graph.node("input", name) for name in names]))
     results, nodes = list(outputs), graph.nodes[:]
     # forward mode: what a node makes of the slopes of its arguments
-    for direction in directions:
+    for variable in by:
         slopes: list[Value] = []
         for index, (op, args) in enumerate(nodes):
             d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
@@ -490,7 +460,7 @@ def trace(
                     f"the program {op.name} is called: it has no derivative here"
                 )
             if op == "input":
-                slopes.append(direction.get(args[0], 0.0))
+                slopes.append(1.0 if args[0] == variable else 0.0)
             elif len(args) > 1:
                 slopes.append(_SLOPE_RULES[op](here, *args, *d))
             else:

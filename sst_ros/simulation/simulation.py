@@ -20,7 +20,7 @@ from sst_ros.errors import (
     refusal,
     refuse_unless,
 )
-from sst_ros.integration.methods import METHODS, RK4, Rosenbrock
+from sst_ros.integration.methods import AUTO, METHODS, RK4, Rosenbrock
 from sst_ros.integration.point import MethodChange, Point
 from sst_ros.integration.stepper import (
     BudgetSpent,
@@ -44,7 +44,6 @@ from sst_ros.state import (
     finite_vector,
 )
 
-AUTO = "auto"
 INTEGRATORS = (AUTO, *METHODS)
 
 EQUATIONS = ("quaternion", "virtual_work")

@@ -14,7 +14,7 @@ import numpy as np
 
 from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
-from sst_ros.integration.methods import DOP853, Method
+from sst_ros.integration.methods import AUTO, DOP853, Method
 from sst_ros.integration.point import Point, Step, state_distance
 from sst_ros.integration.stepper import (
     ACCURATE,
@@ -28,8 +28,6 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import Torque, TorqueProfile, torque_at
 from sst_ros.simulation.samples import Samples
 from sst_ros.state import NANOSECONDS, Array, State, Vector3, clamp
-
-AUTO = "auto"
 
 _WARN_AFTER = 100_000
 """Evaluations, a second of work where a function gives the torques, after which a
