@@ -59,10 +59,7 @@ __all__ = ["Leg", "Model", "model_of"]
 
 
 class LegMotion(NamedTuple):
-    """One leg at one instant, vectors in {E} but for `outward`.
-
-    For the letters see above.
-    """
+    """One leg at one instant, vectors in {E} but for `outward`; for letters see above."""
 
     leg: Leg
     axis: Triple  # w_k
@@ -89,16 +86,16 @@ def derivative(
     Where the actuators lag, the torques [N m] that they give follow, and `torque` has
     the commanded ones. `moment` acts on the star, in {B} [N m].
     """
-    x, y, z, w, wx, wy, wz, *given = state
-    more: tuple[Scalar, ...] = ()
-    if (lag := model.time_constant) is not None:
-        more = tuple(
-            (asked - has) / lag for asked, has in zip(torque, given, strict=True)
-        )
-        torque = triple(given)
+    x, y, z, w, wx, wy, wz, *lagged = state
+    lag_rates: tuple[Scalar, ...] = ()
+    lag = model.time_constant
+    if lag is not None:
+        pairs = zip(torque, lagged, strict=True)
+        lag_rates = tuple((command - acting) / lag for command, acting in pairs)
+        torque = triple(lagged)
     inertia, force, _ = balance(model, (x, y, z, w), (wx, wy, wz), torque, moment)
     acceleration = solve_symmetric(inertia, force)
-    return (*quaternion_rate((x, y, z, w), (wx, wy, wz)), *acceleration, *more)
+    return (*quaternion_rate((x, y, z, w), (wx, wy, wz)), *acceleration, *lag_rates)
 
 
 def actuator_torque(
@@ -335,30 +332,27 @@ def power(
 def joint_torques(at: LegMotion, field: Triple) -> Triple:
     """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
     leg = at.leg
-    friction = triple(
-        0.0 if one is None else -friction_torque(one, joint_rate(at, kind))
-        for kind, one in enumerate(leg.friction)
-    )
-    springs = triple(
-        0.0
-        if spring is None
-        else -spring.stiffness * (joint_angle(at, kind) - spring.rest)
-        for kind, spring in enumerate(leg.springs)
-    )
+    torques = []
+    for kind in range(3):
+        rubbing, restoring = 0.0, 0.0
+        friction, spring = leg.friction[kind], leg.springs[kind]
+        if friction is not None:
+            rubbing = -friction_torque(friction, joint_rate(at, kind))
+        if spring is not None:
+            restoring = -spring.stiffness * (joint_angle(at, kind) - spring.rest)
+        torques.append(rubbing + restoring)
     at_gamma, at_mu = 0.0, 0.0
     if any(leg.drive) or any(leg.link):  # weight: moments about w_k and -r_k
         of_drive, of_link = _directions(at)
         on_link = cross3(_combine(leg.link, *of_link), field)
         on_drive = cross3(_combine(leg.drive, *of_drive), field)
-        at_gamma, at_mu = (
-            dot3(add(on_link, on_drive), at.axis),
-            -dot3(on_link, of_drive[0]),
-        )
+        r = of_drive[0]
+        at_gamma = dot3(add(on_link, on_drive), at.axis)
+        at_mu = -dot3(on_link, r)
     if leg.stops is not None:
         at_gamma = at_gamma + stop_torque(leg.stops, joint_angle(at, 0), at.gamma_dot)
-    rubbing = zip(friction, springs, strict=True)
-    first, second, third = (rub + spring for rub, spring in rubbing)
-    return first + at_gamma, second + at_mu, third
+    of_gamma, of_mu, of_beta = torques
+    return of_gamma + at_gamma, of_mu + at_mu, of_beta
 
 
 class OwnTorques(NamedTuple):
@@ -435,10 +429,7 @@ def friction_torque(friction: Friction, v: Scalar) -> Scalar:
 
 
 def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
-    """Torque of elastic stops.
-
-    The damping grows from zero with the depth (Hunt-Crossley).
-    """
+    """Torque of elastic stops; its damping grows with the depth (Hunt-Crossley)."""
     low, high = positive(-gamma), positive(gamma - stops.arc)
     if not stops.damping:
         return stops.stiffness * (low - high)
@@ -461,10 +452,7 @@ def joint_angle(at: LegMotion, kind: int) -> Scalar:
 
 
 def direction_of(at: LegMotion, kind: int) -> tuple[Scalar, Scalar]:
-    """Sine and cosine of gamma (0), mu (1) or beta (2).
-
-    Of gamma and beta times sqrt(u).
-    """
+    """Sine and cosine of gamma (0), mu (1) or beta (2); times sqrt(u) but those of mu."""
     if kind == 0:
         return dot3(at.outward, at.leg.across), dot3(at.outward, at.leg.v)
     if kind == 1:

@@ -61,17 +61,18 @@ from sst_ros.scene.torque_profile import (
 from sst_ros.scene.yaml_document import find_fields, find_number, plain, replace_values
 from sst_ros.state import Array, clamp, freeze
 
-# of a step, relative and absolute; the latter over the size of a parameter
 SENSITIVITY_TOLERANCE = 1e-12
-# of it where stops are elastic: a step across a jump of derivatives loses its order
-AT_STOPS = 0.1
-MOST_MOTION_EVALUATIONS = 4_000_000
-"""Evaluations of a motion: minutes, where a stiff motion needs hours by an explicit method."""
-GEOMETRY = ("base.v", "star.alpha_deg")
-"""Keys of the geometry that the equations of motion have.
+"""Error of a step, relative and absolute; the latter over the size of a parameter."""
 
-The third alpha is what is left.
-"""
+AT_STOPS = 0.1
+"""Share of it where stops are elastic: a step across a jump of derivatives loses order."""
+
+MOST_MOTION_EVALUATIONS = 4_000_000
+"""Evaluations of a motion: minutes, where a stiff one needs hours by explicit steps."""
+
+GEOMETRY = ("base.v", "star.alpha_deg")
+"""Keys of the geometry in the equations of motion; the third alpha is what is left."""
+
 ACTUATOR_PARAMETERS = (
     "actuators.torque_limit",
     "actuators.idle_damping",
@@ -114,7 +115,7 @@ class VariationalEquations:
         refuse_other_numbers(scene, self.names, caller)
 
     def run(self, values: Array, t: Array) -> tuple[Array, Array]:
-        """Integrate the motion and its sensitivities with values of the parameters, shape (p,).
+        """Integrate motion and sensitivities with values of the parameters, shape (p,).
 
         Returns states (q, W and lagged torques) at times t [s], shape (n,), ascending
         from 0 on, of shape (n, m), and their derivatives, (n, m, p), with those by the
@@ -149,7 +150,7 @@ class VariationalEquations:
         scene: Scene | None = None,
         most: int = MOST_MOTION_EVALUATIONS,
     ) -> tuple[Array, Array] | None:
-        """Integrate from a state, shape (m,), and its derivatives, shape (m, k), to times t [s].
+        """Integrate from a state, (m,), and its derivatives, (m, k), to times t [s].
 
         The last of the k numbers are the parameters, with these values, and those of
         the torques; of others the motion depends by its state alone. Returns as `run`,
@@ -157,73 +158,88 @@ class VariationalEquations:
         """
         from scipy.integrate import solve_ivp  # takes 0.3 s, which few runs need
 
-        scene, values = scene or self.scene, np.empty(0) if values is None else values
-        given, factor = values.tolist(), np.ones(len(values))
-        rebound = [i for i, name in enumerate(self.names) if name in REBOUND]
-        if rebound:
-            by = dict(zip(REBOUND, differentiate_damping(scene), strict=True))
-            for i in rebound:
-                factor[i], given[i] = by[self.names[i]], 0.0
-            given[rebound[0]] = damping_of(scene.stroke)
-        own = np.append(values, _numbers(self._torque) if self._by_torque else [])
-        size, y = len(state), np.concatenate([state, slopes.ravel()])
-        limit, left, free = (
-            scene.torque_limit,
-            iter(range(most)),
-            slopes.shape[1] - len(own),
-        )
+        if scene is None:
+            scene = self.scene
+        if values is None:
+            values = np.empty(0)
+        parameters, factor = self._parameters(scene, values)
+        numbers = np.append(values, _numbers(self._torque) if self._by_torque else [])
+        size = len(state)
+        y = np.concatenate([state, slopes.ravel()])
+        first = slopes.shape[1] - len(numbers)  # column of the first parameter
+        limit = scene.torque_limit
+        evaluations = iter(range(most))
         derivatives = trace_derivatives(self.scene, self.names, self._by_torque)
-        parts = np.cumsum([1, size, 3 * self._by_torque])
+        blocks = np.cumsum([1, size, 3 * self._by_torque])
 
         def rates(
             time: float, y: Array, acting: Any, forcing: Callable[[float], Array]
         ) -> Array:
-            if next(left, None) is None:
+            if next(evaluations, None) is None:
                 raise ArithmeticError
             torque = clamp(torque_at(acting, time), limit)
-            found = np.array(derivatives(*y[:size].tolist(), *torque, *given)).reshape(
-                -1, size
-            )
-            rate, by_state, by_torque, by_parameter = np.split(found, parts)
+            flat = derivatives(*y[:size].tolist(), *torque, *parameters)
+            rows = np.array(flat).reshape(-1, size)
+            rate, by_state, by_torque, by_parameter = np.split(rows, blocks)
             flow = by_state.T @ y[size:].reshape(size, -1)
-            flow[:, free:] += np.hstack(
-                [by_parameter.T * factor, by_torque.T @ forcing(time)]
-            )
+            own = [by_parameter.T * factor, by_torque.T @ forcing(time)]
+            flow[:, first:] += np.hstack(own)
             return np.concatenate([rate[0], flow.ravel()])
 
-        tolerance = SENSITIVITY_TOLERANCE * (
-            AT_STOPS if scene.stroke.at_end == "elastic" else 1.0
-        )
-        sizes = np.append(np.ones(free), np.abs(own))
-        least = np.append(np.ones(size), np.tile(1.0 / (sizes + (sizes == 0.0)), size))
+        tolerance = SENSITIVITY_TOLERANCE
+        if scene.stroke.at_end == "elastic":
+            tolerance = SENSITIVITY_TOLERANCE * AT_STOPS
+        sizes = np.append(np.ones(first), np.abs(numbers))
+        sizes = sizes + (sizes == 0.0)
+        least = np.append(np.ones(size), np.tile(1.0 / sizes, size))
         end = max(float(t[-1]), 1e-9)
         breaks = self._torque.kinks(limit, end)
         inside = breaks[(breaks > 0.0) & (breaks < end)]
-        rows, begin = np.empty((len(t), len(y))), 0.0
+        rows = np.empty((len(t), len(y)))
         rows[t <= 0.0] = y
+        begin = 0.0
         for stop in np.append(np.unique(inside), end).tolist():
-            here = (t > begin) & (t <= stop)
+            reached = (t > begin) & (t <= stop)
             law = self._torque.acting(begin, stop), self._forcing(begin, stop, limit)
             try:
                 run = solve_ivp(
-                    rates, (begin, stop), y, "DOP853", np.union1d(t[here], stop),
+                    rates, (begin, stop), y, "DOP853", np.union1d(t[reached], stop),
                     rtol=tolerance, atol=tolerance * least, args=law,
                 )  # fmt: skip
             except (ArithmeticError, ValueError):
                 return None
             if run.status != 0:
                 return None
-            rows[here], y, begin = run.y.T[: int(here.sum())], run.y[:, -1], stop
+            rows[reached] = run.y.T[: int(reached.sum())]
+            y = run.y[:, -1]
+            begin = stop
         return rows[:, :size], rows[:, size:].reshape(len(t), size, -1)
+
+    def _parameters(self, scene: Scene, values: Array) -> tuple[list[float], Array]:
+        """Return the parameters as the equations take them, and factors of derivatives.
+
+        Restitution and impact rate act as one damping: the first of them has it.
+        """
+        parameters = values.tolist()
+        factor = np.ones(len(values))
+        rebound = [i for i, name in enumerate(self.names) if name in REBOUND]
+        if rebound:
+            slopes = dict(zip(REBOUND, differentiate_damping(scene), strict=True))
+            for i in rebound:
+                factor[i] = slopes[self.names[i]]
+                parameters[i] = 0.0
+            parameters[rebound[0]] = damping_of(scene.stroke)
+        return parameters, factor
 
     def differentiate_joints(self, motion: Array) -> Array:
         """Differentiate gamma and gamma_dot by quaternion and W, (7, n): shape (7, 6, n)."""
         return self._joint_slopes(motion, ())
 
     def differentiate_joints_by_geometry(self, motion: Array) -> Array:
-        """Differentiate gamma and gamma_dot at a fixed state, (7, n), by the parameters, (p, 6, n).
+        """Differentiate gamma and gamma_dot at a fixed state by the parameters.
 
-        By what is no number of the geometry the derivative is zero.
+        The state has the shape (7, n), the derivatives (p, 6, n); by what is no number
+        of the geometry they are zero.
         """
         names = tuple(name for name in self.names if name.startswith(GEOMETRY))
         slopes = np.zeros((len(self.names), 6, motion.shape[1]))
@@ -232,14 +248,14 @@ class VariationalEquations:
         return slopes
 
     def _joint_slopes(self, motion: Array, names: tuple[str, ...]) -> Array:
-        """Differentiate gamma and gamma_dot by quaternion, W and numbers of the geometry."""
+        """Differentiate gamma and gamma_dot by quaternion, W and numbers of geometry."""
         numbers = [find_number(self.scene, name) for name in names]
-        found = _trace_joints(self.scene, names)(*motion, *numbers)
-        rows = np.stack([np.broadcast_to(row, motion.shape[1]) for row in found])
+        columns = _trace_joints(self.scene, names)(*motion, *numbers)
+        rows = np.stack([np.broadcast_to(row, motion.shape[1]) for row in columns])
         return rows.reshape(-1, 6, motion.shape[1])[1:]
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:
-        """Return the initial state, and its derivatives by parameters and torques, (m, p + q)."""
+        """Return the initial state, and derivatives by parameters and torques."""
         more = len(_numbers(self._torque)) if self._by_torque else 0
         state = np.zeros(len(Dynamics.of(scene).state))
         state[:7] = initial_state(scene, self._geometry)
@@ -268,35 +284,29 @@ class VariationalEquations:
             ]
             slopes[:7, shaped] = -by_joints @ by_geometry.T
         for i in own:
-            name, first = (
-                self.names[i],
-                3 * self.names[i].startswith("initial.gamma_dot"),
-            )
-            legs = (
-                [first + int(name[-2])]
-                if name.endswith("]")
-                else [first, first + 1, first + 2]
-            )
-            slopes[:7, i] = by_joints[:, legs].sum(axis=1)
+            name = self.names[i]
+            first = 3 if name.startswith("initial.gamma_dot") else 0
+            rows = [first, first + 1, first + 2]
+            if name.endswith("]"):
+                rows = [first + int(name[-2])]
+            slopes[:7, i] = by_joints[:, rows].sum(axis=1)
         return state, slopes
 
     def _forcing(
         self, begin: float, end: float, limit: float | None
     ) -> Callable[[float], Array]:
-        """Return the function of derivatives of the torques between two kinks by their numbers."""
+        """Return the function of derivatives of torques by their numbers between kinks."""
         if not self._by_torque:
             return lambda time: np.empty((0, 0))
-        slopes, middle = (
-            _differentiate_torque(self._torque, begin, end),
-            0.5 * (begin + end),
-        )
+        slopes = _differentiate_torque(self._torque, begin, end)
+        middle = 0.5 * (begin + end)
         acting = np.abs(torque_at(self._torque.acting(begin, end), middle))
         free = (acting <= (np.inf if limit is None else limit))[:, None]
         return lambda time: slopes(time) * free
 
 
 def refuse_other_numbers(scene: Scene, names: Sequence[str], caller: str) -> None:
-    """Raise InputError of a caller for a name that is no number of the equations of motion.
+    """Raise InputError of a caller for a name of no number of the equations of motion.
 
     Only `simulate` differentiates by the geometry.
     """
@@ -327,23 +337,20 @@ class _TracedAxes(NamedTuple):
 
     @classmethod
     def of(cls, scene: Any) -> _TracedAxes:
-        """Derive them from a scene whose base and star may have symbols, as `Geometry.build`."""
+        """Derive them as `Geometry.build`; base and star of the scene may have symbols."""
         v = [_unit(triple(row)) for row in scene.base.v]
-        pairs = [(v[k], v[(k + 1) % 3]) for k in range(3)]
-        normals = [cross3(*pair) for pair in pairs]
-        sines = [sqrt(dot3(normal, normal)) for normal in normals]
-        w = [
-            triple(part / sine for part in n)
-            for n, sine in zip(normals, sines, strict=True)
-        ]
+        w, arcs = [], []
+        for k in range(3):
+            begin, end = v[k], v[(k + 1) % 3]
+            normal = cross3(begin, end)
+            sine = sqrt(dot3(normal, normal))
+            w.append(triple(x / sine for x in normal))
+            arcs.append(atan2(sine, dot3(begin, end)))
         degree = float(np.radians(1.0))
-        first, second, _ = (degree * angle for angle in scene.star.alpha_deg)
-        turns = 0.0, first, first + second
+        alpha_12, alpha_23, _ = (degree * angle for angle in scene.star.alpha_deg)
+        turns = 0.0, alpha_12, alpha_12 + alpha_23
         e = [(-sin(turn), cos(turn), 0.0) for turn in turns]
-        arc = [
-            atan2(sine, dot3(*pair)) for sine, pair in zip(sines, pairs, strict=True)
-        ]
-        return cls(v, w, e, arc)
+        return cls(v, w, e, arcs)
 
     def of_leg(self, name: str, k: int) -> Any:
         """Return what an array has for leg k."""
@@ -367,7 +374,7 @@ def _open_model(scene: Scene, symbols: dict[str, Any]) -> Any:
 def trace_derivatives(
     scene: Scene, names: tuple[str, ...], by_torque: bool
 ) -> Callable[..., list[float]]:
-    """Return y', then its derivatives by each component of y, torque if needed, and parameter."""
+    """Return y', then its derivatives by y, by torques if needed, and by parameters."""
     state = Dynamics.of(scene).state
     size, varied = len(state), tuple(f"p{i}" for i in range(len(names)))
 
@@ -389,16 +396,16 @@ def trace_derivatives(
 def _trace_joints(
     scene: Scene, names: tuple[str, ...]
 ) -> Callable[..., tuple[Any, ...]]:
-    """Return gamma and gamma_dot, then their derivatives by quaternion, W and named numbers."""
+    """Return gamma and gamma_dot, then derivatives by quaternion, W and named numbers."""
     inputs = (*MOTION, *(f"p{i}" for i in range(len(names))))
 
-    def joints(*given: Any) -> tuple[Any, ...]:
-        symbols = dict(zip(names, map(mark_present, given[7:]), strict=True))
+    def angles_and_rates(*values: Any) -> tuple[Any, ...]:
+        symbols = dict(zip(names, map(mark_present, values[7:]), strict=True))
         model = _open_model(scene, symbols) if names else Dynamics.of(scene).model
-        found = kernel.joints(model, given[:7])
-        return (*found.gamma, *found.gamma_dot)
+        joints = kernel.joints(model, values[:7])
+        return (*joints.gamma, *joints.gamma_dot)
 
-    return compile_for_arrays(trace(joints, inputs, inputs))
+    return compile_for_arrays(trace(angles_and_rates, inputs, inputs))
 
 
 def _numbers(torque: TorqueProfile) -> Array:
@@ -415,7 +422,7 @@ def _numbers(torque: TorqueProfile) -> Array:
 def _differentiate_torque(
     torque: TorqueProfile, begin: float, end: float
 ) -> Callable[[float], Array]:
-    """Return the derivatives of the torques by `_numbers`, (3, q), between two kinks [s]."""
+    """Return derivatives of the torques by `_numbers`, (3, q), between two kinks [s]."""
     unit = np.eye(3)
     if isinstance(torque, SineTorque):
         size, f, phase = map(
@@ -447,9 +454,9 @@ def _differentiate_torque(
 
 
 def differentiate_damping(scene: Scene) -> tuple[float, float]:
-    """Return the derivatives of the damping by restitution [s/rad] and impact rate [s^2/rad^2].
+    """Return derivatives of the damping by restitution and impact rate.
 
-    By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de
+    Their units are s/rad and s^2/rad^2. By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de
     = d / (1 - e - e d), which is -3 where e = 1. The damping is d / v.
     """
     e, v = scene.stroke.restitution, scene.stroke.impact_rate
@@ -480,7 +487,7 @@ class Sensitivity(NamedTuple):
 
 
 class Sensitivities:
-    """Derivatives of a motion by parameters as `simulate` takes them: each may be several numbers.
+    """Derivatives of a motion by parameters, each of which may be several numbers.
 
     A vector means each of its components, a list each of its entries, in their order,
     and "torque" the numbers of the profile: the three torques, `torques` of a
@@ -518,7 +525,7 @@ class Sensitivities:
         self._given = np.array([find_number(scene, name) for name in flat], dtype=float)
 
     def at(self, t: Array) -> dict[str, Sensitivity]:
-        """Sensitivities by the name of their parameter at times [s] >= 0, ascending, shape (n,)."""
+        """Sensitivities by the name of their parameter at ascending times [s] >= 0, (n,)."""
         states, slopes = self._equations.run(self._given, t)
         motion, slopes = states[:, :7].T, slopes[:, :7]
         turn = np.array(

@@ -341,7 +341,7 @@ def test_more_boxes_prove_more_and_shares_are_one():
     assert small.proven < large.proven and small.open > large.open
     for zone in (small, large):
         assert zone.proven + zone.refuted + zone.open == 1.0
-        assert zone.columns["share"].sum() == 1.0 and zone.judged <= 20_000
+        assert zone.columns["share"].sum() == 1.0 and zone.examined <= 20_000
         assert sum(zone.refuted_by.values()) == zone.refuted
 
 
