@@ -49,8 +49,8 @@ from sst_ros.proof.enclosure import (
 from sst_ros.proof.root import krawczyk
 from sst_ros.proof.scene_balls import Parts, SceneBalls
 
-MOST_DIRECTIONS = 900  # of a region, beyond which the smallest are put into a box
-KEPT_DIRECTIONS = 700  # of them behind that
+MOST_DIRECTIONS = 600  # of a region, beyond which the smallest are put into a box
+KEPT_DIRECTIONS = 450  # of them behind that
 ATAN_TERMS = 40  # of the series of atan(t) / t
 SMALL_TANGENT = 0.25  # largest square of the tangent of half an error on SO(3)
 LOST = "the orientation at the measured angles is not proven to be the only one near"
