@@ -34,6 +34,7 @@ from sst_ros.report.results import render
 from sst_ros.report.scene_summary import summary
 from sst_ros.runtime import child_process
 from sst_ros.scene.scene import Scene, load, text_of
+from sst_ros.scene.schema import NUMBER
 from sst_ros.scene.yaml_document import line_of, read
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
@@ -160,17 +161,42 @@ def run_simulation(options: argparse.Namespace) -> int:
 
 
 def certify_scene(options: argparse.Namespace) -> int:
-    """Print what is proven of the motion of a scene."""
-    if options.out is not None:
-        free_out(options, options.out)
+    """Print what is proven of the motion of a scene, or of a loop that tracks a motion."""
+    for path in (options.out, options.tracking):
+        if path is not None:
+            require_free(path, "certify", force=options.force)
     given = {name: getattr(options, name) for name in ("duration", "bound")}
-    digits = dict.fromkeys(options.digits, "digits")
-    certify = function("proof.certify:certify")
-    proven = certify(options.scene, ranges=digits, progress=True, **given)
+    ranges: dict[str, object] = dict.fromkeys(options.digits, "digits")
+    for text in options.range:
+        key, width = read_range(text)
+        refuse_unless("certify", ("--range", text, key not in ranges, "names it twice"))
+        ranges[key] = width
+    given |= {"ranges": ranges, "split": options.split or 1, "progress": True}
+    scene, torque = load(options.scene), None
+    loop_options = (
+        options.gain,
+        options.noise,
+        options.control_period,
+        options.tracking,
+    )
+    if options.control is not None:
+        period = 1e-3 if options.control_period is None else options.control_period
+        torque = _controller(scene, options, period)
+        given |= {"control_period": period, "noise": tuple(options.noise or (0.0, 0.0))}
+    else:
+        allowed = "are given with --control"
+        is_free = not any(loop_options)
+        names = "--gain, --noise, --control-period, --tracking"
+        refuse_unless("certify", (names, loop_options, is_free, allowed))
+    proven = function("proof.certify:certify")(scene, torque, **given)
     print(proven)
     if options.out is not None:
         proven.to_pandas().to_csv(options.out, index=False)
         print(options.out)
+    if options.tracking is not None:
+        table = require("pandas").DataFrame(proven.tracking)
+        table.to_csv(options.tracking, index=False)
+        print(options.tracking)
     return 0 if proven.success else 1
 
 
@@ -227,6 +253,36 @@ def _read_ranges(words: Sequence[str]) -> dict[str, float | str]:
         with refuse_errors("zone", "--ranges", word, allowed, ValueError):
             ranges[key] = width if width == "digits" else float(width)
     return ranges
+
+
+def read_range(text: str) -> tuple[str, object]:
+    """Read KEY=HALF_WIDTH, KEY=LOW..HIGH or KEY=digits."""
+    key, _, width = text.partition("=")
+    low, dots, high = width.partition("..")
+    if key and width == "digits":
+        return key, width
+    numbers = [low, high] if dots else [width]
+    is_read = bool(key) and all(NUMBER.fullmatch(number) for number in numbers)
+    allowed = "must be KEY=HALF_WIDTH, KEY=LOW..HIGH or KEY=digits"
+    refuse_unless("certify", ("--range", text, is_read, allowed))
+    floats = tuple(map(float, numbers))
+    return key, floats if dots else floats[0]
+
+
+def _controller(scene: Scene, options: argparse.Namespace, period: float) -> object:
+    """Return the controller of the options, which tracks the motion of a scene."""
+    settings = function("control.law:ControllerSettings")
+    gains = {}
+    for text in options.gain:
+        name, _, number = text.partition("=")
+        is_known = name in settings.SPECS and name != "mode"
+        is_read = is_known and NUMBER.fullmatch(number) is not None
+        allowed = "must be a setting of a controller and a number, as bandwidth=40"
+        refuse_unless("certify", ("--gain", text, is_read, allowed))
+        gains[name] = float(number)
+    motion = function("control.reference_motions:reference_motion")(scene)
+    controller = function("control.controller:Controller")
+    return controller(scene, motion, settings(mode=options.control, **gains), period)
 
 
 def view(options: argparse.Namespace) -> int:
