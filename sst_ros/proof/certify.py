@@ -51,7 +51,7 @@ from sst_ros.proof.balls import (
     write_down,
     write_up,
 )
-from sst_ros.proof.closed_loop import SampledControl, SampledLoop, TrackingRow
+from sst_ros.proof.closed_loop import CertifiedControl, SampledLoop, TrackingRow
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
 from sst_ros.proof.root import krawczyk
 from sst_ros.proof.scene_balls import (
@@ -102,7 +102,7 @@ class BallEquations:
         scene: Scene,
         profile: TorqueProfile | None,
         ranges: Mapping[Place, Any],
-        control: SampledControl | None = None,
+        control: CertifiedControl | None = None,
     ) -> None:
         self.scene, self._profile = scene, profile
         self.state = Dynamics.of(scene).state
@@ -681,7 +681,7 @@ class ProofTask(NamedTuple):
     bound: float
     max_steps: int
     progress: bool
-    control: SampledControl | None = None
+    control: CertifiedControl | None = None
 
     def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
         """Prove the motion for all numbers of ranges."""
@@ -836,7 +836,7 @@ def certify(
 
 def _read_control(
     controller: Controller, noise: tuple[float, float], period: float | None
-) -> SampledControl:
+) -> CertifiedControl:
     """Return a copy of a controller as it begins, and how it is sampled."""
     allowed = "must be two half-widths >= 0, of angles [rad] and of rates [rad/s]"
     refuse_unless(
@@ -852,7 +852,7 @@ def _read_control(
     assert period is not None
     begun = copy.deepcopy(controller)
     begun.reset()
-    return SampledControl(begun, period, noise)
+    return CertifiedControl(begun, period, noise)
 
 
 def _ticks(period: float, end: float) -> Array:

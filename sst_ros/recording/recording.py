@@ -60,7 +60,7 @@ LEAST_GAP = 10.0  # usual periods without a row over which no picture draws a li
 MEASURED_SHARE = 0.1  # of the samples that must be, as single ones are faults
 
 
-class Status(NamedTuple):
+class RecordedStatus(NamedTuple):
     """One diagnostic status: when it was received [ns], its name, its values by key."""
 
     received_ns: int
@@ -79,7 +79,7 @@ class Signals:
     topic_series: dict[str, Series]
     idle_states: int  #: number of joint states that are no samples of the run
     foreign_states: int  #: number of joint states of other robots on the same topic
-    statuses: tuple[Status, ...]  #: diagnostics, in order of reception
+    statuses: tuple[RecordedStatus, ...]  #: diagnostics, in order of reception
     absent: dict[str, Problem]  #: why a topic of the run is missing, by its key
     namespace: str = "/"  #: of the simulator
 
@@ -115,7 +115,7 @@ class Signals:
         missing = [key for key, series in self.topic_series.items() if not len(series)]
         return (*missing, *([] if self.scene else [topics.SCENE_TOPIC.key]))
 
-    def statuses_of(self, part: str, key: str) -> list[Status]:
+    def statuses_of(self, part: str, key: str) -> list[RecordedStatus]:
         """Diagnostics of a part of the node that publishes a topic: other nodes send theirs, too.
 
         All of that part where none has the name of the node, as in a bag that was
@@ -195,7 +195,7 @@ class _Heard:
     times: array[int] = field(default_factory=lambda: array("q"))
     numbers: array[float] = field(default_factory=lambda: array("d"))
     scenes: set[str] = field(default_factory=set)
-    statuses: list[Status] = field(default_factory=list)
+    statuses: list[RecordedStatus] = field(default_factory=list)
     messages: int = 0
     idle: int = 0  # messages that are no samples of a run
     foreign: int = 0  # messages of other robots
@@ -210,7 +210,9 @@ class _Heard:
         elif self.table is None:
             for status in content.status:
                 texts = {pair.key: pair.value for pair in status.values}
-                self.statuses.append(Status(message.received_ns, status.name, texts))
+                self.statuses.append(
+                    RecordedStatus(message.received_ns, status.name, texts)
+                )
         elif self.fault is None:
             self._take_rows(self.table, message)
 
