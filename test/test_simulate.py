@@ -392,6 +392,6 @@ def test_a_motion_that_its_budget_will_not_finish_is_said_early():
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         with pytest.raises(
-            RuntimeWarning, match=r"swing: 100,.* % of the motion; it stops at 10,0"
+            RuntimeWarning, match=r"swing: 100,.* % of the motion; it stops at 50,0"
         ):
             simulate("swing", duration=1e5, t_eval=[1e5])

@@ -51,6 +51,8 @@ _FUNCTION_BUDGET = 1_000_000
 """Evaluations where each calls a function of the state: half a minute."""
 _BUDGET_PER_SECOND = 5_000
 """Evaluations a second of motion that a long motion may take beyond that."""
+_LONGEST_BUDGET = 50_000_000
+"""Evaluations of any motion: a minute."""
 _ADVICE = (
     "; if the torque function switches with the state, give control_period, as a"
     " controller has it, or smooth the switch"
@@ -220,7 +222,8 @@ def _budget_of(task: Task) -> int:
     if task.period is None and task.torque.feedback:
         return _FUNCTION_BUDGET
     begin, end = task.span
-    return max(WHOLE_MOTION_BUDGET, round(_BUDGET_PER_SECOND * (end - begin)))
+    by_duration = min(_BUDGET_PER_SECOND * (end - begin), _LONGEST_BUDGET)
+    return max(WHOLE_MOTION_BUDGET, round(by_duration))
 
 
 def _trajectory(
