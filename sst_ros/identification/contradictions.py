@@ -34,7 +34,7 @@ RATE_SHARE = 0.25
 LEAST_TRAVEL = 1e-3  # range of an angle [rad] below which its rate is not checked
 CERTAIN = 5.0  # standard deviations
 LEAST_ENERGY = 0.1  # share of the scene's kinetic energy that is more than none
-STRANGE = 100.0  # ratio of energies from which the units are worth a look
+STRANGE = 30.0  # ratio of energies from which the units are worth a look
 IMPOSSIBLE = 1e5  # ratio of energies that another unit makes: milliseconds make 1e6
 OPPOSED = -0.8  # correlation of measured torques and those of the scene
 
