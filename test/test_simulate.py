@@ -394,4 +394,4 @@ def test_a_motion_that_its_budget_will_not_finish_is_said_early():
         with pytest.raises(
             RuntimeWarning, match=r"swing: 100,.* % of the motion; it stops at 50,0"
         ):
-            simulate("swing", duration=1e5, t_eval=[1e5])
+            simulate("swing", duration=1e6, t_eval=[1e6])
