@@ -51,12 +51,12 @@ from sst_ros.proof.balls import (
     write_down,
     write_up,
 )
-from sst_ros.proof.closed_loop import SampledControl, SampledLoop, TrackingRow
+from sst_ros.proof.closed_loop import ProvenControl, SampledLoop, TrackingRow
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
 from sst_ros.proof.root import krawczyk
 from sst_ros.proof.scene_balls import (
     Parts,
-    Reading,
+    NumberReading,
     SceneBalls,
     WrittenDocument,
     range_balls,
@@ -102,7 +102,7 @@ class BallEquations:
         scene: Scene,
         profile: TorqueProfile | None,
         ranges: Mapping[Place, Any],
-        control: SampledControl | None = None,
+        control: ProvenControl | None = None,
     ) -> None:
         self.scene, self._profile = scene, profile
         self.state = Dynamics.of(scene).state
@@ -149,7 +149,7 @@ class BallEquations:
             *self.balls.initial("gamma"),
             *self.balls.initial("gamma_dot"),
         ]
-        given = [x.ball if isinstance(x, Reading) else x for x in initial_numbers]
+        given = [x.ball if isinstance(x, NumberReading) else x for x in initial_numbers]
         given += self.balls.varied_balls
         root = krawczyk(run, [0.0, 0.0, 0.0, *rate], given, AT_START)
         size = len(self.state)
@@ -162,7 +162,9 @@ class BallEquations:
         for j, ball in enumerate(given):
             place = j if j < len(initial) else size + j - len(initial)
             factor, radius = arb(1), ball.rad()
-            if j < len(initial) and isinstance(reading := initial_numbers[j], Reading):
+            if j < len(initial) and isinstance(
+                reading := initial_numbers[j], NumberReading
+            ):
                 place, factor, radius = n - 1, reading.half, arb(0)
                 missing = abs(reading.middle - ball.mid())
                 for i in range(len(unknown)):
@@ -681,7 +683,7 @@ class ProofTask(NamedTuple):
     bound: float
     max_steps: int
     progress: bool
-    control: SampledControl | None = None
+    control: ProvenControl | None = None
 
     def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
         """Prove the motion for all numbers of ranges."""
@@ -836,7 +838,7 @@ def certify(
 
 def _read_control(
     controller: Controller, noise: tuple[float, float], period: float | None
-) -> SampledControl:
+) -> ProvenControl:
     """Return a copy of a controller as it begins, and how it is sampled."""
     allowed = "must be two half-widths >= 0, of angles [rad] and of rates [rad/s]"
     refuse_unless(
@@ -852,7 +854,7 @@ def _read_control(
     assert period is not None
     begun = copy.deepcopy(controller)
     begun.reset()
-    return SampledControl(begun, period, noise)
+    return ProvenControl(begun, period, noise)
 
 
 def _ticks(period: float, end: float) -> Array:

@@ -111,7 +111,7 @@ class _Response(NamedTuple):
     rest: list[Any]  # by what the observer leaves open, bounds
 
 
-class SampledControl(NamedTuple):
+class ProvenControl(NamedTuple):
     """A controller, and what lies between it and the plant."""
 
     controller: Controller
@@ -130,7 +130,7 @@ class SampledLoop:
     """
 
     def __init__(
-        self, control: SampledControl, balls: SceneBalls, state: Sequence[str]
+        self, control: ProvenControl, balls: SceneBalls, state: Sequence[str]
     ) -> None:
         controller, noise = control.controller, control.noise
         self._controller, self._settings = controller, controller.settings
