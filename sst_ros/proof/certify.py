@@ -55,8 +55,8 @@ from sst_ros.proof.closed_loop import ProvenControl, SampledLoop, TrackingRow
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
 from sst_ros.proof.root import krawczyk
 from sst_ros.proof.scene_balls import (
-    Parts,
     NumberReading,
+    Parts,
     SceneBalls,
     WrittenDocument,
     range_balls,
