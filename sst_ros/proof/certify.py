@@ -55,8 +55,8 @@ from sst_ros.proof.closed_loop import CertifiedControl, SampledLoop, TrackingRow
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
 from sst_ros.proof.root import krawczyk
 from sst_ros.proof.scene_balls import (
+    NumberReading,
     Parts,
-    Reading,
     SceneBalls,
     WrittenDocument,
     range_balls,
@@ -149,7 +149,7 @@ class BallEquations:
             *self.balls.initial("gamma"),
             *self.balls.initial("gamma_dot"),
         ]
-        given = [x.ball if isinstance(x, Reading) else x for x in initial_numbers]
+        given = [x.ball if isinstance(x, NumberReading) else x for x in initial_numbers]
         given += self.balls.varied_balls
         root = krawczyk(run, [0.0, 0.0, 0.0, *rate], given, AT_START)
         size = len(self.state)
@@ -162,7 +162,9 @@ class BallEquations:
         for j, ball in enumerate(given):
             place = j if j < len(initial) else size + j - len(initial)
             factor, radius = arb(1), ball.rad()
-            if j < len(initial) and isinstance(reading := initial_numbers[j], Reading):
+            if j < len(initial) and isinstance(
+                reading := initial_numbers[j], NumberReading
+            ):
                 place, factor, radius = n - 1, reading.half, arb(0)
                 missing = abs(reading.middle - ball.mid())
                 for i in range(len(unknown)):

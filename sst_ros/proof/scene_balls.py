@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of a scene in balls, from the document on, and functions of them as programs.
 
-Reading a scene converts some of it in floats: arcs to directions, an inertia about the
+NumberReading a scene converts some of it in floats: arcs to directions, an inertia about the
 centre of mass to one about O, a restitution to a damping. Here these conversions are
 made again, in balls, from what the document says. What no range touches is computed
 once; what a range touches becomes part of the programs, so that one number of the
@@ -303,7 +303,7 @@ def _balls_of(
         yield place, number_ball(numbers[place], digits) + arb(0, float(width))
 
 
-class Reading(NamedTuple):
+class NumberReading(NamedTuple):
     """A number as the program reads it and as the document writes it, as balls.
 
     What stands between them is middle + half r, with r from -1 (read) to 1 (written).
@@ -313,7 +313,7 @@ class Reading(NamedTuple):
     written: Any
 
     @classmethod
-    def of(cls, number: float, text: str | None) -> Reading:
+    def of(cls, number: float, text: str | None) -> NumberReading:
         """Return the double and the decimal number of a text, or its shortest one."""
         written = Fraction(text or repr(number))
         if written == Fraction(number):
@@ -344,7 +344,7 @@ class Reading(NamedTuple):
 class _Constants:
     """Numbers of a program that no range touches, by place: balls, one for r = 0 and a slope."""
 
-    def __init__(self, letter: str, readings: Mapping[Place, Reading]) -> None:
+    def __init__(self, letter: str, readings: Mapping[Place, NumberReading]) -> None:
         self.balls: list[Any] = []
         self._slopes: dict[Place, bool] = {}
         for place, reading in readings.items():
@@ -393,9 +393,9 @@ class SceneBalls:
         if isinstance(profile, SineTorque) and profile != scene.torque:
             written = rebuild(written, {("torque",): profile})
             texts = {place: x for place, x in texts.items() if place[0] != "torque"}
-        readings: dict[Place, Reading] = {}
+        readings: dict[Place, NumberReading] = {}
         for place, number in leaves(written).items():
-            readings[place] = Reading.of(number, texts.get(place))
+            readings[place] = NumberReading.of(number, texts.get(place))
         varied = [place for place in ranges if place[0] != "initial"]
         ranges = dict(ranges)
         if written.stroke.restitution is not None:
@@ -408,7 +408,7 @@ class SceneBalls:
                 )
             else:
                 as_read, as_written = zip(*impact, strict=True)
-                readings[DAMPING] = Reading(
+                readings[DAMPING] = NumberReading(
                     damping_ball(*as_read), damping_ball(*as_written)
                 )
             written = rebuild(written, dict.fromkeys(RESTITUTION))
@@ -425,12 +425,12 @@ class SceneBalls:
         settled = {
             p: x for p, x in settled.items() if not (x.read.is_zero() and not x.differs)
         }
-        settled[DEGREE] = Reading(arb.pi() / 180, arb.pi() / 180)
+        settled[DEGREE] = NumberReading(arb.pi() / 180, arb.pi() / 180)
         self._symbols = settled
         self._settled = self._convert_in_balls()
         two = any(x.differs for x in settled.values())
         two = two or any(
-            isinstance(x, Reading) and x.differs for x in self._initial.values()
+            isinstance(x, NumberReading) and x.differs for x in self._initial.values()
         )
         names = [f"p{i}" for i in range(len(varied))]
         self.inputs = (*names, READING) if two else tuple(names)
@@ -442,10 +442,10 @@ class SceneBalls:
         return [*balls, arb(0, 1)] if READING in self.inputs else balls
 
     def initial(self, name: str) -> list[Any]:
-        """Return gamma or gamma_dot at the start: a ball of a range, or a `Reading`."""
+        """Return gamma or gamma_dot at the start: a ball of a range, or a `NumberReading`."""
         return [self._initial["initial", name, k] for k in range(3)]
 
-    def _convert_in_balls(self) -> dict[Place, Reading | float]:
+    def _convert_in_balls(self) -> dict[Place, NumberReading | float]:
         """Convert in balls; return what no range touches, floats where exactly 0, +-1."""
         places: list[Place] = []
         varied = [f"p{i}" for i in range(len(self._varied))]
@@ -467,9 +467,9 @@ class SceneBalls:
         as_written = enclosure.compile_on_balls(
             program, [x.written for x in self._symbols.values()]
         )
-        pairs = map(Reading, as_read(*ranges), as_written(*ranges))
+        pairs = map(NumberReading, as_read(*ranges), as_written(*ranges))
         touched = _depend_on_first(program, len(varied))
-        settled: dict[Place, Reading | float] = {}
+        settled: dict[Place, NumberReading | float] = {}
         for place, reading, is_touched in zip(places, pairs, touched, strict=True):
             if is_touched:
                 continue
@@ -495,7 +495,7 @@ class SceneBalls:
         derivatives by these inputs, too.
         """
         derived_readings = {
-            p: x for p, x in self._settled.items() if isinstance(x, Reading)
+            p: x for p, x in self._settled.items() if isinstance(x, NumberReading)
         }
         folded = {p: x for p, x in self._settled.items() if isinstance(x, float)}
         symbols, derived = (
