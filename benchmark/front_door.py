@@ -3,10 +3,11 @@
 
 python -m benchmark.front_door [--rounds 9] [--write]
 
-One second of each class of scene, its 200 samples read. For each call: its first in a new
-process, imports not counted; a later one; the calls of its compiled steps alone; the calls
-of a user's function alone; and MuJoCo's best setting for the same second. All in time of
-the processor. With --write the table becomes the first of docs/peers.md and README.md.
+One second of each class of scene, its 200 samples read. For each call: its first in a
+new process, imports not counted; a later one; the calls of its compiled steps alone;
+the calls of a user's function alone; and MuJoCo's best setting for the same second. All
+in time of the processor. With --write the table becomes the first of docs/peers.md and
+README.md.
 """
 
 from __future__ import annotations

@@ -120,7 +120,8 @@ def write(path: Path, seconds: float, *, shown: bool = False) -> Path:
 
 
 def _of_rosbags(value: Any) -> Any:
-    """Turn a message of rclpy into one of rosbags, which writes no bytes behind its end.
+    """Turn a message of rclpy into one of rosbags, which writes no bytes behind its
+    end.
 
     `rclpy.serialization` does, for sequences of messages; `publish` does not.
     """

@@ -5,8 +5,8 @@ python -m benchmark.vector_env [--rounds 5] [--no-page]
 
 A vector step advances all robots by a period of 2 ms under torques of their own. MuJoCo
 has the MJCF of `equations`, in gymnasium's vector environment and by its own `rollout`.
-The error is the largest of actuator angles after 0.2 s, against `simulate`. Times are of
-the processor, those of all threads together, so that other load counts less.
+The error is the largest of actuator angles after 0.2 s, against `simulate`. Times are
+of the processor, those of all threads together, so that other load counts less.
 """
 
 from __future__ import annotations

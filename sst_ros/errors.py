@@ -188,7 +188,10 @@ _ARGUMENT_KINDS = {
 
 
 def _kind_of(hint: Any) -> Kind | None:
-    """Return the kind that an annotation asks for; None if the function itself checks."""
+    """Return the kind that an annotation asks for.
+
+    None if the function itself checks.
+    """
     kind = _ARGUMENT_KINDS.get(_key(hint))
     if kind is not None:
         return kind
@@ -216,8 +219,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 def check_kinds(function: F, *, late: bool = False) -> F:
     """Refuse arguments of another kind than the annotations of a function say, by InputError.
 
-    Annotations are those of `_ARGUMENT_KINDS`, and classes, with or without `| None`. What else
-    an argument must be is checked by the function itself.
+    Annotations are those of `_ARGUMENT_KINDS`, and classes, with or without `| None`.
+    What else an argument must be is checked by the function itself.
     """
     names = list(inspect.signature(function).parameters)
     origin = function.__qualname__.removesuffix(".__init__").rpartition(".")[2].lower()

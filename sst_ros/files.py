@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders and files that a command writes, and the templates of their texts.
 
-Nothing is written over unasked. A file that others may read gets its name when it is whole.
+Nothing is written over unasked. A file that others may read gets its name when it is
+whole.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 """Arguments, nodes, recorders and RViz for the launch files, and when a launch ends.
 
 Only launch files import this module: it needs `launch` and `launch_ros` of a ROS
-installation. A launch file names its arguments, each an `LaunchArgument`, and a function that
-makes its actions from their values; `description` does the rest. The actions of one
-launch file end together: when one that `ends` has exited, or when any has failed.
+installation. A launch file names its arguments, each an `LaunchArgument`, and a
+function that makes its actions from their values; `description` does the rest. The
+actions of one launch file end together: when one that `ends` has exited, or when any
+has failed.
 """
 
 from __future__ import annotations
@@ -52,7 +53,10 @@ from sst_ros.state import BASE_FRAME
 
 
 class LaunchArgument(NamedTuple):
-    """A launch argument; an empty default leaves the value to params_file or the node."""
+    """A launch argument.
+
+    An empty default leaves the value to params_file or the node.
+    """
 
     default: str
     description: str

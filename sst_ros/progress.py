@@ -43,7 +43,10 @@ def slices(total: int, size: int, label: str, shown: bool) -> Iterator[slice]:
 
 
 def follow(results: Iterable[Result], total: int, label: str) -> Iterator[Result]:
-    """Yield results as they arrive; with a label, draw how many of `total` are there."""
+    """Yield results as they arrive.
+
+    With a label, draw how many of `total` are there.
+    """
     bar = Bar(label, bool(label))
     for done, result in enumerate(results, start=1):
         yield result

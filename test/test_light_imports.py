@@ -24,8 +24,9 @@ DOCUMENTS = {
     "runtime",
     "scene",
 }
-"""Rooms that a command needs which prints documents; of `nodes` and `runtime` only how signals and
-child processes are handled."""
+"""Rooms that a command needs which prints documents; of `nodes` and `runtime` only how
+signals and child processes are handled.
+"""
 COMMAND = "from sst_ros.__main__ import main; main({!r})"
 RUN = "import sst_ros; sst_ros.Simulation('example2').step((1.0, 0.0, 0.0), 10_000_000)"
 

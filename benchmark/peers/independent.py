@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference held against equations that our code did not make.
 
-test/lagrange.py has the mechanism by loop closure and Lagrange's equations alone, with 80
-digits. At Gauss's nodes of the reference motion it gives gamma_ddot; two quadratures give
-gamma_dot and gamma at the end. If both solve the same equations they agree: a difference
-of the accelerations anywhere would show there.
+test/lagrange.py has the mechanism by loop closure and Lagrange's equations alone, with
+80 digits. At Gauss's nodes of the reference motion it gives gamma_ddot; two quadratures
+give gamma_dot and gamma at the end. If both solve the same equations they agree: a
+difference of the accelerations anywhere would show there.
 """
 
 from __future__ import annotations

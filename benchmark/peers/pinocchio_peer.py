@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pinocchio: constrained forward dynamics in C++, Runge-Kutta loops in Python and in C++.
+"""Pinocchio: constrained forward dynamics in C++, Runge-Kutta loops in Python and in
+C++.
 
 The loop in C++ is pinocchio_loop.cpp, compiled against the headers that come with `pin`
 and those of Eigen (cmeel-eigen from PyPI, or Debian's libeigen3-dev).

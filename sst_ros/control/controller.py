@@ -338,8 +338,8 @@ class Controller:
     ) -> law.ControlLaw:
         """Return the law with functions of the model that take numbers of another kind.
 
-        See `law.ControlLaw`. Its settings are by default those of the controller. Raises
-        InputError where the integral action would be unstable.
+        See `law.ControlLaw`. Its settings are by default those of the controller.
+        Raises InputError where the integral action would be unstable.
         """
         settings = settings or self._settings
         column, rate = np.array(self.inertia)[:, None], settings.integral_rate

@@ -507,7 +507,10 @@ def solids_of_links(
 
 
 def solids(shape: Shape, step: float = ARC_STEP) -> Iterator[Solid]:
-    """Yield the primitives that a shape is in URDF; an arc is chords of `step` [rad]."""
+    """Yield the primitives that a shape is in URDF.
+
+    An arc is chords of `step` [rad].
+    """
     colour = (*shape.colour, getattr(shape, "opacity", 1.0))
     upright = np.zeros(3)
     if isinstance(shape, Ball):

@@ -113,7 +113,10 @@ def _body_rates(geometry: Geometry, rotation: Array, gamma_dot: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def start_of(scene: Scene) -> tuple[float, ...]:
-    """Return `initial_state` of a scene; InputError where gamma is outside the stroke."""
+    """Return `initial_state` of a scene.
+
+    InputError where gamma is outside the stroke.
+    """
     geometry = Geometry.of(scene)
     gamma = np.array(scene.initial.gamma)
     in_stroke = bool(np.all((gamma >= 0) & (gamma <= geometry.arc)))

@@ -59,7 +59,10 @@ __all__ = ["Leg", "Model", "model_of"]
 
 
 class LegMotion(NamedTuple):
-    """One leg at one instant, vectors in {E} but for `outward`; for letters see above."""
+    """One leg at one instant, vectors in {E} but for `outward`.
+
+    For letters see above.
+    """
 
     leg: Leg
     axis: Triple  # w_k
@@ -452,7 +455,10 @@ def joint_angle(at: LegMotion, kind: int) -> Scalar:
 
 
 def direction_of(at: LegMotion, kind: int) -> tuple[Scalar, Scalar]:
-    """Sine and cosine of gamma (0), mu (1) or beta (2); times sqrt(u) but those of mu."""
+    """Sine and cosine of gamma (0), mu (1) or beta (2).
+
+    Times sqrt(u) but those of mu.
+    """
     if kind == 0:
         return dot3(at.outward, at.leg.across), dot3(at.outward, at.leg.v)
     if kind == 1:

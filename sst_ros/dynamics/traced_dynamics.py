@@ -469,7 +469,10 @@ class ParametricModel:
     def _constants_of(
         self, scenarios: Scenarios
     ) -> tuple[Constants, Geometry, NDArray[np.intp]]:
-        """Return constants of scenarios, as columns; geometries, and that of each row."""
+        """Return constants of scenarios, as columns.
+
+        Geometries, and that of each row.
+        """
         geometries, which = Geometry.of_scenarios(scenarios)
         geometry = geometries.of_rows(which)
         columns = scenarios.columns()

@@ -337,7 +337,10 @@ class _TracedAxes(NamedTuple):
 
     @classmethod
     def of(cls, scene: Any) -> _TracedAxes:
-        """Derive them as `Geometry.build`; base and star of the scene may have symbols."""
+        """Derive them as `Geometry.build`.
+
+        Base and star of the scene may have symbols.
+        """
         v = [_unit(triple(row)) for row in scene.base.v]
         w, arcs = [], []
         for k in range(3):
@@ -456,8 +459,9 @@ def _differentiate_torque(
 def differentiate_damping(scene: Scene) -> tuple[float, float]:
     """Return derivatives of the damping by restitution and impact rate.
 
-    Their units are s/rad and s^2/rad^2. By d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`, with s = d (1 + e): ds/de
-    = d / (1 - e - e d), which is -3 where e = 1. The damping is d / v.
+    Their units are s/rad and s^2/rad^2. By d (1 + e) = ln((1 + d) / (1 - d e)), see
+    `damping_of`, with s = d (1 + e): ds/de = d / (1 - e - e d), which is -3 where e =
+    1. The damping is d / v.
     """
     e, v = scene.stroke.restitution, scene.stroke.impact_rate
     assert e is not None and v is not None

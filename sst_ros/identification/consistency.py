@@ -72,9 +72,9 @@ def fit_weighted(
     """Fit torque = columns estimate, with b independent columns, shape (m, 3, b).
 
     Torques are measured less known ones [N m], shape (m, 3), and the noise their
-    standard deviations, three, by default estimated: at least LEAST_NOISE of the torques, and
-    of the RMS of the `terms` that sum up to them [N m], which cancel in a free motion.
-    Returns the estimates, shape (b,), R of the weighted regressor, R^T R =
+    standard deviations, three, by default estimated: at least LEAST_NOISE of the
+    torques, and of the RMS of the `terms` that sum up to them [N m], which cancel in a
+    free motion. Returns the estimates, shape (b,), R of the weighted regressor, R^T R =
     covariance^-1, shape (b, b), and the noise, (3,).
     """
     if noise is not None:

@@ -456,7 +456,10 @@ class RegressionEquations:
         )
 
     def find_bodies(self, fitted: WeightedFit) -> tuple[Array, float]:
-        """Return values of bodies that can exist, and chi^2 of them; see `consistency`."""
+        """Return values of bodies that can exist, and chi^2 of them.
+
+        See `consistency`.
+        """
         scene, names = self.regressor.scene, self.regressor.names
         return find_consistent_values(
             names,

@@ -406,8 +406,8 @@ class BatchResult(MotionTable):
         body_rate: angular velocities of the star in {E} [rad/s], shape (N, 3).
         status: 0 where a scenario reached its end, 1 where a limit ended it, -1 where
             it has no start or its numbers ceased to be finite, shape (N,).
-        code: 0 at the end, 1 + the index of a limit, NOT_FINITE_CODE, < 0 without a start,
-            shape (N,).
+        code: 0 at the end, 1 + the index of a limit, NOT_FINITE_CODE, < 0 without a
+            start, shape (N,).
         fault_time: when a scenario passed a limit [s], the end of the step in which its
             numbers ceased to be finite, 0 without a start, nan where it reached its
             end, shape (N,).

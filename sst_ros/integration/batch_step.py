@@ -238,8 +238,8 @@ class Block:
         """Advance the columns that were taken over by `count` steps.
 
         Step `number` begins at `number` times h [s]. Codes and times of columns that
-        end change: to 1 + the index of a limit, or NOT_FINITE_CODE, and to when that was
-        [s].
+        end change: to 1 + the index of a limit, or NOT_FINITE_CODE, and to when that
+        was [s].
         """
         _, _, code, time, _ = columns
         for number in range(first, first + count):

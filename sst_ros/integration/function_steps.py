@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps under torques that are a function.
 
-1. A function of the time is evaluated at the times of all stages, and its torques go into
-   the compiled step: `TimeSteps`. Inside a step they are interpolated where a polynomial
-   through some of them meets all others, so samples need no further calls.
-2. A function of the state is called in each stage, between two compiled parts of the step:
-   `FeedbackSteps`.
-3. Rosenbrock methods, and derivatives in plain Python, take the steps as they are read in
-   `steps.py`: `FunctionSteps`.
+1. A function of the time is evaluated at the times of all stages, and its torques go
+   into the compiled step: `TimeSteps`. Inside a step they are interpolated where a
+   polynomial through some of them meets all others, so samples need no further calls.
+2. A function of the state is called in each stage, between two compiled parts of the
+   step: `FeedbackSteps`.
+3. Rosenbrock methods, and derivatives in plain Python, take the steps as they are read
+   in `steps.py`: `FunctionSteps`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ _SHARE_FITTED = 0.4
 """Of the torques of a step a polynomial goes through so many; the others check it."""
 _SAME_TORQUE = 1e-13
 """Relative difference of interpolated torques from the function's, at most. In a step,
-which turns no joint by more than about a radian, it moves no joint by more in radians."""
+which turns no joint by more than about a radian, it moves no joint by more in radians.
+"""
 
 
 class FunctionSteps:
@@ -209,7 +210,10 @@ class TimeSteps(FunctionSteps):
     def pair(
         self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
     ) -> Outcome:
-        """See `MethodSteps.pair`; `stages` are the torques in the stages of its steps."""
+        """See `MethodSteps.pair`.
+
+        `stages` are the torques in the stages of its steps.
+        """
         if other is not None:
             raise ValueError("a function of the time is the same for both solutions")
         half = 0.5 * h
@@ -256,7 +260,10 @@ class TimeSteps(FunctionSteps):
         return [t + node * h if node else t for node in self.method.c]
 
     def _torques_at(self, times: Sequence[float], drive: Drive) -> list[Any]:
-        """Return the torques at times of the steps [s]; equal ones are asked for once."""
+        """Return the torques at times of the steps [s].
+
+        Equal ones are asked for once.
+        """
         evaluate = self._torque.of_time(drive)
         known = {time: evaluate(time) for time in dict.fromkeys(times)}
         return [known[time] for time in times]
@@ -376,7 +383,10 @@ class FeedbackSteps(FunctionSteps):
     def pair(
         self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
     ) -> Outcome:
-        """See `MethodSteps.pair`; `stages` are the slopes in the stages of the first."""
+        """See `MethodSteps.pair`.
+
+        `stages` are the slopes in the stages of the first.
+        """
         second = drive if other is None else other
         joints, half, z = self._functions["joints"], 0.5 * h, at.z
         slopes, y_end = self._go(t, h, at.y, at.joints, drive)

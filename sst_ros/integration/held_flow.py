@@ -5,8 +5,9 @@ With the motion y' = f(y, u) the sensitivities S = dy/dy(0) and dy/du obey
 
     S' = (df/dy) S + df/du
 
-(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14). All
-numbers are one array, and the steps are those of DOP853 with Hairer's error estimate.
+(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14).
+All numbers are one array, and the steps are those of DOP853 with Hairer's error
+estimate.
 """
 
 from __future__ import annotations

@@ -24,12 +24,15 @@ def run_many(
     workers: int = 1,
     label: str = "",
 ) -> Iterator[tuple[int, Result]]:
-    """Call a function for each job; yield the number of the job and the result when it is done.
+    """Call a function for each job.
+
+    Yield the number of the job and the result when it is done.
 
     Args:
         function: what is called; an exception that it raises ends all jobs.
         jobs: its arguments.
-        workers: threads of this process, 0 for one a core; 1 for none, in the order of the jobs.
+        workers: threads of this process, 0 for one a core; 1 for none, in the order of
+            the jobs.
         label: of a bar that is drawn on a terminal; none is drawn without it.
 
     """

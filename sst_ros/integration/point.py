@@ -119,6 +119,9 @@ class Step(NamedTuple):
         return (3 if self.other is None else 6) * cost
 
     def inside(self, x: float) -> list[float]:
-        """Return the state x [s] after its begin, by a shorter step; nan if not finite."""
+        """Return the state x [s] after its begin, by a shorter step.
+
+        Nan if not finite.
+        """
         state: list[float] = self.steps.single(self.t, x, self.begin.y, self.drive)
         return state

@@ -387,7 +387,8 @@ class Stepper:
             jacobian = steps.jacobian(t, at.y, drive)
         except ArithmeticError:
             return at  # no finite Jacobian here; the step size has to do
-        # Nothing depends on the work, the last number, which adds an eigenvalue of zero.
+        # Nothing depends on the work, the last number, which adds an eigenvalue of
+        # zero.
         only_stiff = early or at.method is DOP853 or self._tolerance >= ACCURATE
         if (
             only_stiff

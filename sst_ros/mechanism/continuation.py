@@ -99,8 +99,9 @@ def advance(
 ) -> Array:
     """Return R, shape (3, 3), at the end of a segment in gamma [rad], from its start.
 
-    The branch is that of the assembly `rotation` at the start. The steps are proved not to leave the branch. Where a parallel singularity lies on
-    the path, BranchEnds is raised; it says that the end is point `row` of a motion.
+    The branch is that of the assembly `rotation` at the start. The steps are proved not
+    to leave the branch. Where a parallel singularity lies on the path, BranchEnds is
+    raised; it says that the end is point `row` of a motion.
     """
     begin = np.array(start, dtype=float)
     goal = np.array(end, dtype=float)

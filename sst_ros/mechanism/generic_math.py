@@ -31,7 +31,10 @@ sqrt, exp, log, sin, cos = map(_function, ("sqrt", "exp", "log", "sin", "cos"))
 
 
 def positive(x: Any) -> Any:
-    """Return x where x > 0 and 0 elsewhere; of a complex number the real part decides."""
+    """Return x where x > 0 and 0 elsewhere.
+
+    Of a complex number the real part decides.
+    """
     if type(x) is float:
         return x if x > 0.0 else 0.0
     if hasattr(x, "apply"):
@@ -80,15 +83,17 @@ def atan2(y: Any, x: Any) -> Any:
 
 
 LN_2 = (float.fromhex("0x1.62e42fefa2p-1"), float.fromhex("0x1.9ef35793c7673p-41"))
-"""ln 2 as a sum. The first part has 13 zeros at its end: its product with a whole number
-below 2^13 is exact."""
+"""ln 2 as a sum. The first part has 13 zeros at its end: its product with a whole
+number below 2^13 is exact.
+"""
 
 TO_WHOLE = 1.5 * 2.0**52
 """A double as large has no fraction: to add and subtract it rounds to a whole number."""
 
 _EXPM1_SERIES = tuple(1.0 / math.factorial(n) for n in range(2, 14))
-"""Coefficients of the exponential series from r^2 on. For abs(r) <= ln(2) / 2 the rest is
-less than 2e-17 of the sum."""
+"""Coefficients of the exponential series from r^2 on. For abs(r) <= ln(2) / 2 the rest
+is less than 2e-17 of the sum.
+"""
 
 _TANH_IS_ONE = 22.0
 """From here on tanh is 1 to all digits of a double."""

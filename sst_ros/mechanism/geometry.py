@@ -135,7 +135,10 @@ class Geometry(Explained):
         return distinct, index.ravel()
 
     def of_rows(self, rows: Any) -> Geometry:
-        """Return the geometries of rows, or of a row; this one where it is a single one."""
+        """Return the geometries of rows, or of a row.
+
+        This one where it is a single one.
+        """
         if self.v.ndim == 2:
             return self
         return Geometry(*(array[rows] for array in vars(self).values()))
@@ -176,8 +179,9 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
 def quaternion_of(rotation: ArrayLike) -> Array:
     """Quaternions (x, y, z, w) with w >= 0, shape (..., 4), of rotation matrices.
 
-    The matrices have the shape (..., 3, 3). The largest component comes from the diagonal (Markley, J. Guid. Control Dyn. 31
-    (2008) 440-442). Where w is zero, the first other component that is not is positive.
+    The matrices have the shape (..., 3, 3). The largest component comes from the
+    diagonal (Markley, J. Guid. Control Dyn. 31 (2008) 440-442). Where w is zero, the
+    first other component that is not is positive.
     """
     m = np.asarray(rotation, dtype=float)
     trace = np.trace(m, axis1=-2, axis2=-1)
@@ -205,8 +209,9 @@ def quaternion_of(rotation: ArrayLike) -> Array:
 def zyz_angles(rotation: ArrayLike) -> Array:
     """ZYZ angles [rad], shape (..., 3), of rotations (..., 3, 3), Eqs. 3 and 6 to 8.
 
-    R = Rz(theta) Ry(phi) Rz(psi). theta and psi are in (-pi, pi], phi in [0, pi]. Where sin(phi) = 0 only theta + psi
-    (phi = 0) or theta - psi (phi = pi) exists; there theta is 0 and psi carries it all.
+    R = Rz(theta) Ry(phi) Rz(psi). theta and psi are in (-pi, pi], phi in [0, pi]. Where
+    sin(phi) = 0 only theta + psi (phi = 0) or theta - psi (phi = pi) exists; there
+    theta is 0 and psi carries it all.
     """
     r = np.asarray(rotation, dtype=float)
     sine = np.hypot(r[..., 0, 2], r[..., 1, 2])

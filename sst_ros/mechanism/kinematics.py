@@ -5,8 +5,8 @@ A leg holds t_k at a right angle to r_k; that is all there is to the position pr
 r_k(gamma_k) . R e_k = 0 for k = 1, 2, 3. Its roots R are those of one quartic, for many
 r at once:
 
-t_1 = cos(x) n + sin(x) m spans the plane across r_1, and
-s = cos(y) r_1 + sin(y) t_1 x r_1. Legs 2 and 3 then read a cos(y) + b sin(y) + c = 0, so (cos y, sin y, 1) is the
+t_1 = cos(x) n + sin(x) m spans the plane across r_1, and s = cos(y) r_1 + sin(y) t_1 x
+r_1. Legs 2 and 3 then read a cos(y) + b sin(y) + c = 0, so (cos y, sin y, 1) is the
 cross product of the two rows (a, b, c), and cos^2 + sin^2 = 1 is a form of degree four
 in (cos x, sin x). Its roots come from a companion matrix; each is polished on the
 rotation itself. t_1 and -t_1 give two assemblies, R and R Rot(z, pi), that share s: up
@@ -197,8 +197,8 @@ def admissible(
 ) -> Assembly:
     """Return the one assembly in which the manipulator can be built, section 4.1.
 
-    The actuator angles gamma [rad] have the shape (3,). Where several are admissible, the rotation `near` selects the only one within NEAR
-    of it.
+    The actuator angles gamma [rad] have the shape (3,). Where several are admissible,
+    the rotation `near` selects the only one within NEAR of it.
 
     Raises:
         NoAdmissibleAssembly: no assembly has E on the base triangle and 0 < beta_k <=

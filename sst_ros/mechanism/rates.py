@@ -71,9 +71,9 @@ def of_star(
 ) -> BodyRates:
     """Everything from omega [rad/s] and omega_dot [rad/s^2] of the star in {B}.
 
-    Both have the shape (3,). The rotation R of {E} in {B} has the shape (3, 3); the actuator angles gamma [rad]
-    choose the branch of each leg, by default mu_k in (0, pi). SingularConfiguration is
-    raised where some c_k = 0 (serial).
+    Both have the shape (3,). The rotation R of {E} in {B} has the shape (3, 3); the
+    actuator angles gamma [rad] choose the branch of each leg, by default mu_k in (0,
+    pi). SingularConfiguration is raised where some c_k = 0 (serial).
     """
     matrix = np.asarray(rotation, dtype=float)
     if gamma is None:

@@ -161,9 +161,9 @@ def equation_of_motion(
 ) -> tuple[Array, Array]:
     """T1 and T2 of the equation of motion T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
 
-    T1 has the shape (3, 3) [kg m^2], T2 (3,) [N m]. M = -T1 is the mass matrix, positive definite; -T2 without a moment has the velocity
-    products. gamma_dot is in rad/s, the moment n_ext on the star in {B} in N m. Inertia
-    tensors may be full.
+    T1 has the shape (3, 3) [kg m^2], T2 (3,) [N m]. M = -T1 is the mass matrix,
+    positive definite; -T2 without a moment has the velocity products. gamma_dot is in
+    rad/s, the moment n_ext on the star in {B} in N m. Inertia tensors may be full.
     """
     rate = np.asarray(gamma_dot, dtype=float)
     products = bias(at, rate)

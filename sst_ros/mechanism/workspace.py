@@ -5,8 +5,8 @@ A pose is admissible when E lies on the base triangle (Eq. 4), 0 < beta_k <= bet
 and gamma_k lies in its stroke. The map is over orientations (direction of s, turn psi
 about it), where the inverse kinematics has one answer.
 
-Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means
-t_k = +-w_k, so w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever
+Singular poses are of two kinds. Serial (det J1 = 0): c_k = sin(mu_k) = 0 means t_k =
++-w_k, so w_k.s = 0: E lies on the base arc P_k P_k+1. By Eq. 4 such poses are only ever
 at the edge of what is admissible, never inside. Parallel (det J2 = 0): may lie inside
 when some alpha_k > 180 deg; none for all alpha_k < 180 deg and beta_k < 90 deg.
 """
@@ -112,7 +112,10 @@ class OrientationMap:
 
     @property
     def best_margin(self) -> Array:
-        """Largest distance to all limits over psi [rad], shape (m,); NaN without any."""
+        """Largest distance to all limits over psi [rad], shape (m,).
+
+        NaN without any.
+        """
         values = np.where(self.measures.admissible, self.measures.margin, np.nan)
         return np.asarray(np.fmax.reduce(values, axis=1))
 
@@ -210,7 +213,8 @@ def over_orientations(
 def orientations(s: Array, psi: ArrayLike) -> Array:
     """R of directions s, shape (..., 3), and third ZYZ angles psi [rad], shape (...).
 
-    theta and phi are those of s; where s = +-z, theta is 0. R has the shape (..., 3, 3).
+    theta and phi are those of s; where s = +-z, theta is 0. R has the shape (..., 3,
+    3).
     """
     s_x, s_y, s_z = s[..., 0], s[..., 1], s[..., 2]
     sine_phi = np.hypot(s_x, s_y)

@@ -399,8 +399,8 @@ def run(words: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker
-    close. Words are a key of `settings.NODE_COMMANDS` and the arguments behind it. The exit
-    status is 0, 1 for a failure, 2 for arguments that are refused.
+    close. Words are a key of `settings.NODE_COMMANDS` and the arguments behind it. The
+    exit status is 0, 1 for a failure, 2 for arguments that are refused.
     """
     signals.handle()
     command, *given = words

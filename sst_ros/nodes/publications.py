@@ -72,7 +72,10 @@ def time_of(nanoseconds: int) -> Time:
 
 
 class JointStateMessage(_Stateless):
-    """joint_states: all nine joints; the effort is the torque over the step that ended."""
+    """joint_states: all nine joints.
+
+    The effort is the torque over the step that ended.
+    """
 
     def __init__(self, frame_id: str = "") -> None:
         self._message = JointState(name=list(JOINTS))

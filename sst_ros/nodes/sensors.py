@@ -182,7 +182,10 @@ class ImuMessage:
         )
 
     def _transmit(self, reading: ImuReading) -> ImuReading:
-        """Return the reading that arrives; until the first one does, it is there already."""
+        """Return the reading that arrives.
+
+        Until the first one does, it is there already.
+        """
         self._late.append(reading)
         if len(self._late) > self._delay:
             return self._late.popleft()

@@ -50,7 +50,8 @@ UNNAMED = "a node whose name is not known yet"
 class Endpoint(NamedTuple):
     """One topic, service or action of a node."""
 
-    use: str  # PUBLISHES, SUBSCRIBES, SERVES, CALLED_SERVICES or EXECUTES, the last of an action
+    # PUBLISHES, SUBSCRIBES, SERVES, CALLED_SERVICES or EXECUTES, the last of an action
+    use: str
     name: str
     type_name: str
     doc: str
@@ -85,8 +86,8 @@ class Endpoint(NamedTuple):
         return QoSProfile(depth=self.depth or depth, durability=durability)
 
 
-# In names ~ stands for the name of the node, {simulator} for the parameter. The keys are
-# the last parts of the names, but for a topic and a service of one name.
+# In names ~ stands for the name of the node, {simulator} for the parameter. The keys
+# are the last parts of the names, but for a topic and a service of one name.
 
 SIMULATOR: dict[str, Endpoint] = {
     "joint_states": Endpoint(

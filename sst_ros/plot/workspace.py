@@ -100,8 +100,8 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
 def plot_zone(zone: ProvenZone) -> Figure:
     """Draw what is proven of a zone on the workspace triangle.
 
-    Of a cap the torsion at each direction of E: how much of it is proven, and how much is
-    neither proven nor refuted; of a box of actuator angles the directions of E.
+    Of a cap the torsion at each direction of E: how much of it is proven, and how much
+    is neither proven nor refuted; of a box of actuator angles the directions of E.
     """
     is_zone = hasattr(zone, "turns_at")
     refuse_unless("plot_zone", ("zone", zone, is_zone, "must be of `certify_zone`"))

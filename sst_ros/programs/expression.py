@@ -302,10 +302,9 @@ class Program:
     """A straight-line program."""
 
     inputs: tuple[str, ...]  #: names of the inputs
-    # : (op, operands) in order; an operand is a float, or an int: the number of an
-    # input or, from
-    # : len(inputs) on, of a step; "part" takes a call and the place of one of its
-    # results
+    #: (op, operands) in order; an operand is a float, or an int: the number of an
+    #: input or, from len(inputs) on, of a step; "part" takes a call and the place of
+    #: one of its results
     steps: tuple[tuple[Operation, tuple[float | int, ...]], ...]
     outputs: tuple[float | int, ...]  #: operands that are the results
 

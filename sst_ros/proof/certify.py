@@ -154,8 +154,9 @@ class BallEquations:
         root = krawczyk(run, [0.0, 0.0, 0.0, *rate], given, AT_START)
         size = len(self.state)
         n = size + len(self.balls.inputs)
-        # Columns of the set: a range of an initial number has one, in place of a number of the
-        # state; how numbers are read, and all other ranges, have that of their own input.
+        # Columns of the set: a range of an initial number has one, in place of a number
+        # of the state; how numbers are read, and all other ranges, have that of their
+        # own input.
         by_column = [[arb(0)] * n for _ in unknown]
         off = [arb(0)] * len(unknown)
         radii = [arb(0)] * n
@@ -386,7 +387,10 @@ class Follower:
             self.reason = enclosure.UNBOUNDED
 
     def _sample(self, loop: SampledLoop, here: Region) -> Region:
-        """Return the region behind a tick of the controller; keep the tracking error."""
+        """Return the region behind a tick of the controller.
+
+        Keep the tracking error.
+        """
         here, row = loop.sample(here)
         self.tracking.append(row)
         return here
@@ -753,15 +757,15 @@ def certify(
     proven: `until` and `reason` say so. One proof runs at a time, whatever the threads.
 
     Under a `Controller` the motion is that of the sampled loop: torques are held over
-    `control_period`, and its law acts at the ticks as it does in `simulate`, but without
-    rounding. `tracking` is then the proven tube of the tracking error.
+    `control_period`, and its law acts at the ticks as it does in `simulate`, but
+    without rounding. `tracking` is then the proven tube of the tracking error.
 
     Args:
         scene: as `simulate` takes it.
         torque: as `simulate` takes it; of functions a `Controller` alone.
         duration: as `simulate` takes it.
-        bound: angle [rad] within which the orientation is to be proven; steps are chosen
-            for it.
+        bound: angle [rad] within which the orientation is to be proven; steps are
+            chosen for it.
         ranges: how far numbers of the document may be from those given, by key, as in
             {"star.inertia.zz": 5e-4, "star.alpha_deg": (119.0, 121.0), "star.mass":
             "digits"}: a half-width, an interval, or half a unit of the last digit that
@@ -769,7 +773,8 @@ def certify(
             its geometry, limits and torques included; others are refused.
         split: number of parts that the box of ranges is split into; what holds for all
             of them is returned.
-        max_steps: number of steps after which the proof of a part ends, some 20 ms each.
+        max_steps: number of steps after which the proof of a part ends, some 20 ms
+            each.
         noise: most that a controller may measure angles [rad] and rates [rad/s] wrong,
             by any amount at any tick.
         progress: draw a bar on a terminal.

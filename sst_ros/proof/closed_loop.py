@@ -362,7 +362,10 @@ class SampledLoop:
     def _alike(
         self, guess: Sequence[float], turn: Sequence[Any], desired: Sequence[float]
     ) -> Sequence[float]:
-        """Return a desired quaternion with the sign of the observed one; Refused: far."""
+        """Return a desired quaternion with the sign of the observed one.
+
+        Refused: far.
+        """
         x, y, z, w = quaternion_product(tuple(map(arb, guess)), (*turn, arb(1)))
         signed = desired
         if sum(a * float(b) for a, b in zip(desired, (x, y, z, w), strict=True)) < 0.0:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of a scene in balls, from the document on, and functions of them as programs.
 
-NumberReading a scene converts some of it in floats: arcs to directions, an inertia about the
-centre of mass to one about O, a restitution to a damping. Here these conversions are
-made again, in balls, from what the document says. What no range touches is computed
-once; what a range touches becomes part of the programs, so that one number of the
-document is the same number wherever it acts.
+NumberReading a scene converts some of it in floats: arcs to directions, an inertia
+about the centre of mass to one about O, a restitution to a damping. Here these
+conversions are made again, in balls, from what the document says. What no range touches
+is computed once; what a range touches becomes part of the programs, so that one number
+of the document is the same number wherever it acts.
 """
 
 from __future__ import annotations
@@ -332,7 +332,10 @@ class NumberReading(NamedTuple):
 
     @property
     def half(self) -> Any:
-        """Return half of what the written number has more; exactly 0 if it is the other."""
+        """Return half of what the written number has more.
+
+        Exactly 0 if it is the other.
+        """
         return (self.written - self.read) / 2
 
     @property
@@ -370,9 +373,10 @@ class _Constants:
 class SceneBalls:
     """A scene in balls, and functions of it as programs.
 
-    The numbers that are ranges, `varied`, are inputs of the programs; those of the start are not.
-    One more input, READING, says how all other numbers are taken: from -1, as the doubles that the
-    document is read as, to 1, as the decimal numbers that it has.
+    The numbers that are ranges, `varied`, are inputs of the programs; those of the
+    start are not. One more input, READING, says how all other numbers are taken: from
+    -1, as the doubles that the document is read as, to 1, as the decimal numbers that
+    it has.
 
     Args:
         scene: what moves.
@@ -446,7 +450,10 @@ class SceneBalls:
         return [self._initial["initial", name, k] for k in range(3)]
 
     def _convert_in_balls(self) -> dict[Place, NumberReading | float]:
-        """Convert in balls; return what no range touches, floats where exactly 0, +-1."""
+        """Convert in balls.
+
+        Return what no range touches, floats where exactly 0, +-1.
+        """
         places: list[Place] = []
         varied = [f"p{i}" for i in range(len(self._varied))]
         names = [*varied, *(f"c{i}" for i in range(len(self._symbols)))]
@@ -491,8 +498,8 @@ class SceneBalls:
     ) -> enclosure.Function:
         """Compile function(parts, *inputs), whose `Parts` depend on the inputs `self.inputs`.
 
-        The compiled function has the inputs, then `self.inputs`; with `by` it returns the
-        derivatives by these inputs, too.
+        The compiled function has the inputs, then `self.inputs`; with `by` it returns
+        the derivatives by these inputs, too.
         """
         derived_readings = {
             p: x for p, x in self._settled.items() if isinstance(x, NumberReading)

@@ -9,17 +9,17 @@ for k = 1, 2, 3
     w_k . R g_k > 0                     beta_k < beta_max,
 
 with g_k = sin(beta_max) z x e_k - cos(beta_max) z: by r_k = t_k x w_k / sin(mu_k) these
-numbers are sin(mu_k) times the sine of gamma_k, arc_k - gamma_k, beta_k and
-beta_max - beta_k. Each is the product of two unit vectors, and a turn by an angle moves
-a unit vector by no more than that angle. So the sine of an angle, compared with the
-product at one pose, decides for all poses within the angle, and for all geometries whose
-vectors lie within a tolerance. With N_k = w_k - (w_k . t_k) t_k,
+numbers are sin(mu_k) times the sine of gamma_k, arc_k - gamma_k, beta_k and beta_max -
+beta_k. Each is the product of two unit vectors, and a turn by an angle moves a unit
+vector by no more than that angle. So the sine of an angle, compared with the product at
+one pose, decides for all poses within the angle, and for all geometries whose vectors
+lie within a tolerance. With N_k = w_k - (w_k . t_k) t_k,
 
     det J2 = -D / (sin mu_1 sin mu_2 sin mu_3),    D = N_1 . (N_2 x N_3),
 
 where abs(N_k) <= 1; along a turn at unit rate the first derivative of N_k is at most 1
-and the second at most 2, so that the second of D is at most 12. Cells of poses are halved
-until they are decided, or the budget is used up.
+and the second at most 2, so that the second of D is at most 12. Cells of poses are
+halved until they are decided, or the budget is used up.
 """
 
 from __future__ import annotations
@@ -121,7 +121,8 @@ class PoseBalls(NamedTuple):
 
     rotation: Array  # R in the middle, shape (n, 3, 3)
     radius: Array  # angle [rad], shape (n,)
-    #: what is known without looking at the poses, shape (n,): REFUTED, OPEN, and the limit
+    #: what is known without looking at the poses, shape (n,): REFUTED, OPEN, and the
+    #: limit
     status: NDArray[np.int8]
     limit: NDArray[np.int8]
     in_stroke: NDArray[np.bool_]  # whether all gamma_k are known to be, shape (n,)
@@ -311,9 +312,9 @@ def join_cells(parts: Sequence[Cells]) -> Cells:
 class OrientationCap:
     """Orientations by azimuth and tilt of E and torsion about it, from a reference pose.
 
-    R = R_0 Rz(azimuth) Ry(tilt) Rz(torsion - azimuth): the tilt moves E, the torsion turns
-    the star about it (Bonev, Zlatanov & Gosselin, Parallel Kinematic Machines, 2002).
-    Equal volumes of the coordinates are equal shares of all orientations.
+    R = R_0 Rz(azimuth) Ry(tilt) Rz(torsion - azimuth): the tilt moves E, the torsion
+    turns the star about it (Bonev, Zlatanov & Gosselin, Parallel Kinematic Machines,
+    2002). Equal volumes of the coordinates are equal shares of all orientations.
     """
 
     NAMES = "azimuth", "tilt", "torsion"
@@ -323,7 +324,10 @@ class OrientationCap:
         self._most = math.sin(0.5 * tilt)
 
     def coordinates(self, rotation: ArrayLike) -> Array:
-        """Coordinates of rotations (..., 3, 3), shape (..., 3); beyond 0 to 1 outside."""
+        """Coordinates of rotations (..., 3, 3), shape (..., 3).
+
+        Beyond 0 to 1 outside.
+        """
         relative = self.reference.T @ np.asarray(rotation, dtype=float)
         azimuth, tilt, psi = np.moveaxis(zyz_angles(relative), -1, 0)
         torsion = np.remainder(psi + azimuth + np.pi, 2.0 * np.pi) - np.pi
@@ -346,9 +350,10 @@ class OrientationCap:
     def poses(self, cells: Cells) -> PoseBalls:
         """Return balls that hold all poses of cells.
 
-        Along a straight line in the angles the star turns about three axes: at the rate of
-        the tilt, about an axis across the others; at that of the torsion, about E; and at
-        2 sin(tilt / 2) times that of the azimuth, about an axis at (pi + tilt) / 2 to E.
+        Along a straight line in the angles the star turns about three axes: at the rate
+        of the tilt, about an axis across the others; at that of the torsion, about E;
+        and at 2 sin(tilt / 2) times that of the azimuth, about an axis at (pi + tilt) /
+        2 to E.
         """
         low, high = self._tilts(cells)
         azimuth, _, torsion = self.angles(cells.middle).T
@@ -474,7 +479,10 @@ class GammaBox:
         )
 
     def _follow(self, cells: Cells) -> tuple[Array, NDArray[np.bool_]]:
-        """Follow the known assemblies to the middles of cells; return where that succeeded."""
+        """Follow the known assemblies to the middles of cells.
+
+        Return where that succeeded.
+        """
         begin, end = self.angles(cells.known_at), self.angles(cells.middle)
         segment = end - begin
         length = np.linalg.norm(segment, axis=1)
@@ -616,9 +624,9 @@ class ProvenZone(Explained):
         names: names of the three coordinates: azimuth, tilt and torsion, or gamma_1 to
             gamma_3.
         columns: by name, shape (n,): the boxes that cover the zone, from NAME_low to
-            NAME_high [rad] in each coordinate; status, 1 where a box is proven, -1 where
-            it is refuted, 0 where it is open; limit, the index in `limits` of what
-            refutes it, or -1; share of the zone.
+            NAME_high [rad] in each coordinate; status, 1 where a box is proven, -1
+            where it is refuted, 0 where it is open; limit, the index in `limits` of
+            what refutes it, or -1; share of the zone.
         proven: share of the zone that is proven, not rounded up.
         refuted: share of it that is beyond a limit at the geometry in the middle of the
             ranges, not rounded up.
@@ -626,8 +634,8 @@ class ProvenZone(Explained):
         refuted_by: share that each limit refutes; the first one, where several do.
         least_det_j2: abs(det J2) is larger in all that is proven; nan where nothing is.
         least_sine_mu: so is sin(mu_k), of which det J1 is the product up to its sign.
-        nearest: a pose that is refuted, of those found the nearest to the reference; None
-            where there is none.
+        nearest: a pose that is refuted, of those found the nearest to the reference;
+            None where there is none.
         examined: number of boxes that were looked at.
 
     """
@@ -711,7 +719,8 @@ class ProvenZone(Explained):
     def status_of(self, poses: ArrayLike) -> NDArray[np.int8]:
         """Return the status of poses, shape (m,): 1 proven, -1 refuted, 0 anything else.
 
-        Poses are rotations R, shape (m, 3, 3); of a box of actuator angles these, (m, 3).
+        Poses are rotations R, shape (m, 3, 3); of a box of actuator angles these, (m,
+        3).
         """
         low, high = self._cells.low, self._cells.low + self._cells.size
         status = np.zeros(len(np.asarray(poses)), dtype=np.int8)
@@ -724,8 +733,8 @@ class ProvenZone(Explained):
     def turns_at(self, directions: ArrayLike) -> Array:
         """Torsion [rad] that is refuted, open and proven at directions of E in {B}.
 
-        Shapes (m, 3) of both; all zero outside of the cap. A box of actuator angles has no
-        torsion: InputError.
+        Shapes (m, 3) of both; all zero outside of the cap. A box of actuator angles has
+        no torsion: InputError.
         """
         zone = self._zone
         is_cap = isinstance(zone, OrientationCap)
@@ -742,7 +751,10 @@ class ProvenZone(Explained):
         return turns
 
     def middles(self) -> Array:
-        """R in the middle of each box, shape (n, 3, 3); nan where no assembly is known."""
+        """R in the middle of each box, shape (n, 3, 3).
+
+        Nan where no assembly is known.
+        """
         poses = self._zone.poses(self._cells)
         is_known = poses.status != OPEN
         return np.asarray(np.where(is_known[:, None, None], poses.rotation, np.nan))
@@ -796,16 +808,17 @@ def certify_zone(
     """Prove where the manipulator is regular and inside all limits, for given tolerances.
 
     A pose is inside where 0 < gamma_k < arc P_k P_k+1, E lies on the base triangle and
-    0 < beta_k < beta_max; it is regular where neither det J1 nor det J2 is zero. What is
-    proven is so for every geometry of the ranges, with one sign of det J2: that of the
-    reference pose. Rounding is outward. What the scene does at an end or an edge (`at_end`,
-    `at_edge`) has no part in it.
+    0 < beta_k < beta_max; it is regular where neither det J1 nor det J2 is zero. What
+    is proven is so for every geometry of the ranges, with one sign of det J2: that of
+    the reference pose. Rounding is outward. What the scene does at an end or an edge
+    (`at_end`, `at_edge`) has no part in it.
 
-    Without `gamma_box` the zone is all orientations whose E is within the angle `tilt` of
-    that of the reference pose, and which are turned about E by no more than `torsion`
-    (tilt and torsion angles); shares are those of all orientations of the zone. With it, the
-    zone is all actuator angles of a box, in the assembly that is followed from its middle
-    without meeting a singularity; shares are those of its volume.
+    Without `gamma_box` the zone is all orientations whose E is within the angle `tilt`
+    of that of the reference pose, and which are turned about E by no more than
+    `torsion` (tilt and torsion angles); shares are those of all orientations of the
+    zone. With it, the zone is all actuator angles of a box, in the assembly that is
+    followed from its middle without meeting a singularity; shares are those of its
+    volume.
 
     Args:
         scene: as `simulate` takes it.
@@ -813,9 +826,9 @@ def certify_zone(
         tilt: half of the opening of the cap [rad], at most 3; by default as far as the
             farthest corner of the base triangle.
         torsion: largest turn about E [rad], at most pi.
-        orientation: quaternion (x, y, z, w) of the reference pose; by default that at the
-            start of the scene. With a box it selects the assembly in the middle, within
-            0.1 rad, where several are admissible.
+        orientation: quaternion (x, y, z, w) of the reference pose; by default that at
+            the start of the scene. With a box it selects the assembly in the middle,
+            within 0.1 rad, where several are admissible.
         ranges: tolerances of the geometry, as `certify` takes them: of base.v or
             base.arcs_deg, star.alpha_deg and workspace.beta_max_deg.
         max_boxes: number of boxes after which the rest is left open, some 5 us each.
@@ -823,8 +836,8 @@ def certify_zone(
 
     Raises:
         InputError: an argument is not allowed; names it and the allowed values.
-        AssemblyError: the scene does not start, or the middle of the box is, in a unique
-            admissible assembly.
+        AssemblyError: the scene does not start, or the middle of the box is, in a
+            unique admissible assembly.
         SingularConfiguration: the reference pose is singular.
         MissingDependency: python-flint is not installed.
 

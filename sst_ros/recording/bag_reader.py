@@ -66,9 +66,9 @@ RawMessage: TypeAlias = tuple[str, str, int, bytes]
 class Topic:
     """A topic of a run: the last part of its name, its message type, and whose it is.
 
-    The owner is SIMULATOR_NODE for a topic of the simulator's node, NAMESPACE for one that
-    lies beside the node, CONTROLLER_NODE for one of another node there, EVERYBODY for one
-    whose name is the same for all.
+    The owner is SIMULATOR_NODE for a topic of the simulator's node, NAMESPACE for one
+    that lies beside the node, CONTROLLER_NODE for one of another node there, EVERYBODY
+    for one whose name is the same for all.
     """
 
     key: str

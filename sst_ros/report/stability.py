@@ -92,9 +92,9 @@ class StabilityReport(NamedTuple):
 def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
     """Examine a scene, print the report and write stability.csv, .json, .md and .png into `out`.
 
-    `only` names rows of CHANGED_RUNS; by default all. Returns whether no run failed. Raises
-    InputError where a name is unknown or `out` cannot be written, SstError where the
-    scene cannot start.
+    `only` names rows of CHANGED_RUNS; by default all. Returns whether no run failed.
+    Raises InputError where a name is unknown or `out` cannot be written, SstError where
+    the scene cannot start.
     """
     found = examine_stability(scene, only, shown=True)
     said = stability_page(found)

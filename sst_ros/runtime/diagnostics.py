@@ -117,7 +117,10 @@ class RunDiagnostics:
         self._rows: dict[float, _TableRow] = {}  # by simulated time [s]
 
     def values(self, publishers: int) -> dict[str, Any]:
-        """Return the value of each key that has one; publishers are those of commands."""
+        """Return the value of each key that has one.
+
+        Publishers are those of commands.
+        """
         counters = self._loop.counters
         run, commands, pacer, _ = self._loop.parts
         period = run.period_ns / NANOSECONDS
@@ -166,7 +169,10 @@ class RunDiagnostics:
         return values
 
     def _note_row(self, values: dict[str, Any]) -> None:
-        """Add a row to the table; of a long run half of the rows stay, and the newest."""
+        """Add a row to the table.
+
+        Of a long run half of the rows stay, and the newest.
+        """
         self._rows[values["simulated_time_s"]] = _TableRow(
             orientation=values.get("error_estimate"),
             energy=values.get("energy_residual_J"),

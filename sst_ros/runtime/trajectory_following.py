@@ -163,8 +163,8 @@ class TrajectoryFollower:
     def tune(self, settings: ControllerNodeParameters) -> None:
         """Take other gains from the next sample on.
 
-        Raises InputError, and changes nothing, where the controller refuses them; before
-        the first motion they are checked when it is taken.
+        Raises InputError, and changes nothing, where the controller refuses them;
+        before the first motion they are checked when it is taken.
         """
         if self.stage is not Stage.WAITING:
             self._controller.tune(settings)

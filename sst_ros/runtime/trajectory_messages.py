@@ -160,7 +160,10 @@ def _points_ahead(points: Points, passed: float) -> Points:
 
 
 def _fill_in(row: list[float], legs: list[int], others: Vector3) -> list[float]:
-    """Return a row of all legs, with the numbers of those that are not in it; open if empty."""
+    """Return a row of all legs, with the numbers of those that are not in it.
+
+    Open if empty.
+    """
     if not row:
         return row
     whole = list(others)

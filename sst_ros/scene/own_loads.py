@@ -2,8 +2,8 @@
 """Loads of the user's own, written as formulas in the scene.
 
 A formula is arithmetic on names: no attribute, no index, no call but of a function in
-FORMULA_FUNCTIONS. So a scene from a stranger runs no code of its author, and the scene alone
-says what acts: in a file, in a bag, on each machine of a cluster.
+FORMULA_FUNCTIONS. So a scene from a stranger runs no code of its author, and the scene
+alone says what acts: in a file, in a bag, on each machine of a cluster.
 `dynamics.own_loads.own_load` writes a Python function as formulas.
 """
 

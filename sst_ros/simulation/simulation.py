@@ -350,7 +350,8 @@ class Simulation(Explained):
     def body_acceleration(self) -> Vector3:
         """Angular acceleration of the star in {E} [rad/s^2].
 
-        That under the torques and the moment of the last step; the next one may have others.
+        That under the torques and the moment of the last step; the next one may have
+        others.
         """
         now = self._now
         moment = (now.moment or ZERO) if self.dynamics.has_moment_topic else ()

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of numbers in files: Parquet, NPZ or CSV.
 
-Parquet and NPZ hold every bit, texts about the table, and a checksum of both. Parquet also has the
-checksums of its pages, for other readers. CSV has the columns alone, for other programs.
+Parquet and NPZ hold every bit, texts about the table, and a checksum of both. Parquet
+also has the checksums of its pages, for other readers. CSV has the columns alone, for
+other programs.
 """
 
 from __future__ import annotations

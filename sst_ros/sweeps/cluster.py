@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many runs of one function on the workers of a Dask cluster.
 
-A result depends on its job alone. So a job may be computed again, which changes no bit: Dask does
-it where a worker dies or, by its `worker-ttl`, gives no sign of life. A worker that does not fit
-(another version, no space left) is retired.
+A result depends on its job alone. So a job may be computed again, which changes no bit:
+Dask does it where a worker dies or, by its `worker-ttl`, gives no sign of life. A
+worker that does not fit (another version, no space left) is retired.
 """
 
 from __future__ import annotations
@@ -63,7 +63,9 @@ def run_on_cluster(
     *,
     name: str = "run",
 ) -> Iterator[tuple[int, Result]]:
-    """Call a function for each job; yield the number of the job and the result when it is done.
+    """Call a function for each job.
+
+    Yield the number of the job and the result when it is done.
 
     Workers that are retired are printed, with the reason.
 
@@ -74,8 +76,8 @@ def run_on_cluster(
         name: what a job is called in messages.
 
     Raises:
-        SweepFailed: an SstError of a job, no worker, or no scheduler; or, when all other jobs are
-            done, a job that ended its workers.
+        SweepFailed: an SstError of a job, no worker, or no scheduler; or, when all
+            other jobs are done, a job that ended its workers.
 
     """
     dask, sent, faults = require("distributed"), dict[Any, int](), dict[str, str]()

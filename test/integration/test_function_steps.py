@@ -111,7 +111,9 @@ def test_a_polynomial_of_torques_goes_through_them(method):
 
 
 def dense_error(h):
-    """Largest error inside a step of the pendulum's linear equation, whose truth is known."""
+    """Largest error inside a step of the pendulum's linear equation, whose truth is
+    known.
+    """
     method, dense = DOP853, DOP853.dense
 
     def slope(y):

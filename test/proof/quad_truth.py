@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An independent truth of proofs: Lagrange's equations in 33 digits, by truth/lagrange.cpp.
+"""An independent truth of proofs: Lagrange's equations in 33 digits, by
+truth/lagrange.cpp.
 
 What a document says is converted here, in mpmath, from its text: arcs to directions,
 inertias about other points, payload, rotors, a restitution to a damping. Nothing of it
@@ -28,7 +29,10 @@ PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @cache
 def program():
-    """The compiled integrator; the test is skipped where there is no compiler for it."""
+    """The compiled integrator.
+
+    The test is skipped where there is no compiler for it.
+    """
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no C compiler")
@@ -205,7 +209,10 @@ class TrueState(NamedTuple):
 
 
 def motion(document, near, times, local_error="1e-31"):
-    """States at times of a document with mpf numbers; the number of events; 30 digits."""
+    """States at times of a document with mpf numbers; the number of events.
+
+    30 digits.
+    """
     with mp.workdps(DIGITS):
         text = inputs(document, near, times)
     done = subprocess.run(

@@ -213,7 +213,10 @@ def find(document, key):
 
 
 def change(document, ranges, draw):
-    """A document with mpf numbers in which each range has a value; draw gives -1 to 1."""
+    """A document with mpf numbers in which each range has a value.
+
+    Draw gives -1 to 1.
+    """
     texts = yaml.load(yaml.dump(document), yaml.BaseLoader)
     changed = truth.numbers(texts)
     for key, width in ranges.items():

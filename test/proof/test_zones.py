@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Proven zones against the paper's kinematics in plain NumPy, at random geometries.
 
-`Manipulator` has the arcs as arcs and joint angles as angles between them; the loops are
-closed by Newton's method on r_k . R e_k = 0. Nothing of it is taken from the package.
+`Manipulator` has the arcs as arcs and joint angles as angles between them; the loops
+are closed by Newton's method on r_k . R e_k = 0. Nothing of it is taken from the
+package.
 """
 
 import math
@@ -54,10 +55,12 @@ class Manipulator:
         return math.cos(gamma) * begin + math.sin(gamma) * across
 
     def describe(self, rotation):
-        """Least distance to a limit [rad], det J2, sines of mu, least singular value of J2.
+        """Least distance to a limit [rad], det J2, sines of mu, least singular value of
+        J2.
 
         The carriage is where the plane of the star's arc meets that of the base arc, on
-        the side of the arc where E is: r.s = cos(beta) and r is no farther than beta_max.
+        the side of the arc where E is: r.s = cos(beta) and r is no farther than
+        beta_max.
         """
         s, margins, rows, sines = rotation[:, 2], [], [], []
         for k in range(3):

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of states against what rclpy and rosbags read; what is shown without a run."""
+"""Messages of states against what rclpy and rosbags read.
+
+What is shown without a run.
+"""
 
 from types import SimpleNamespace
 
