@@ -96,7 +96,7 @@ class Outcome(NamedTuple):
 
     point: Point
     size: float  # of the local error, in units of the tolerance; infinite if not finite
-    stages: Sequence[Any] = ()  # what was evaluated on the way, for states inside
+    stages: Sequence[Any] = ()  # evaluated in it, for states inside
 
 
 class Step(NamedTuple):

@@ -58,9 +58,9 @@ class Measures(Explained):
     def _facts(self) -> dict[str, object]:
         finite = self.cond_j[np.isfinite(self.cond_j)]
         smallest = {
-            "least way to an end of the stroke [rad]": self.stroke,
-            "least beta, way to the edge [rad]": self.edge,
-            "least way to the largest beta [rad]": self.reach,
+            "least distance to an end of the stroke [rad]": self.stroke,
+            "least beta, distance to the edge [rad]": self.edge,
+            "least distance to the largest beta [rad]": self.reach,
             "least |det J1|, 0 is serially singular": np.abs(self.det_j1),
             "least |det J2|, 0 is parallelly singular": np.abs(self.det_j2),
         }

@@ -53,7 +53,7 @@ def compile_functions(
 
 
 def _refuse_variables() -> None:
-    """Refuse variables by which earlier versions were told how to compile."""
+    """Refuse variables that set how earlier versions compiled."""
     for name, advice in REMOVED_VARIABLES.items():
         if name in os.environ:
             raise refusal("environment", name, os.environ[name], advice)
@@ -82,7 +82,7 @@ def compile_rows(programs: Mapping[str, Program], name: str) -> RowsFunction:
         width = -(-count // LANES) * LANES
         inputs = np.empty((columns.rows, width))
         inputs[:, :count] = rows.T
-        inputs[:, count:] = inputs[:, :1]  # any numbers do: nobody reads their results
+        inputs[:, count:] = inputs[:, :1]  # any numbers do: their results are not read
         results = np.empty((columns.outputs, width))
         columns.compute_table(inputs, results)
         by_row: Array = results[:, :count].T
