@@ -490,7 +490,7 @@ def trace_stages(
 ) -> dict[str, Program]:
     """Trace the parts of an explicit step between calls of a function of the state.
 
-    Inputs of `stage0`, `stage1`, .. are t, h, the state y, the slopes in all stages
+    Inputs of the program of a stage are t, h, the state y, the slopes in all stages
     before, and the point and the drive of this stage; outputs its slope, and the point
     of the next stage with its joints; in the last stage the new state and, of a method
     with an estimate, its error. Inputs of `end` are h, both states before a step, and
