@@ -101,7 +101,7 @@ def _mathml(node: Element, display: str) -> str:
 
 
 def _plain(_app, what: str, _name, _object, _options, lines: list[str]) -> None:
-    """Keep Napoleon from taking what stands before a colon for the type of a property."""
+    """Keep Napoleon from taking what precedes a colon for the type of a property."""
     if what == "property" and lines:
         lines[0] = lines[0].replace(": ", " - ")
 

@@ -18,7 +18,10 @@ inverse = InverseDynamics(scene)
 
 
 def gravity_pd(t: float, state: State) -> np.ndarray:
-    """PD control with gravity compensation (Takegaki and Arimoto 1981): torques [N m]."""
+    """Return PD torques [N m] with gravity compensation.
+
+    The control law is that of Takegaki and Arimoto (1981).
+    """
     error = GOAL - state.joints.gamma
     weight = np.array(inverse.gravity_torque(state))
     return STIFFNESS * error - DAMPING * np.array(state.joints.gamma_dot) + weight

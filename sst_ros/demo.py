@@ -20,7 +20,7 @@ from sst_ros.scene.scene import load
 EXAMPLES = ("example1", "example2")
 FOLLOWED = "reach"
 DEMO_MODES = ("feedforward", "feedforward_pd")
-"""The first is the paper's double check: nothing but the torques of the inverse dynamics."""
+"""The first is the paper's double check: only the torques of the inverse dynamics."""
 
 _HOLD_S = 0.3
 _DEMO_RATE = 500
@@ -29,11 +29,11 @@ _DEMO_END_S = 30.0
 
 
 def record(name: str, folder: Path) -> Path:
-    """Play a scene's torques to its simulator, in processes of their own, and record the run.
+    """Play a scene's torques to its simulator, and record the run.
 
-    It goes by the clock, and in lockstep: to the same bits however busy the machine is.
-    The bag in `folder` takes the place of an earlier one. An SstError names a node that
-    failed or did not end in time.
+    The nodes are processes of their own. The run goes by the clock, and in lockstep: to
+    the same bits however busy the machine is. The bag in `folder` takes the place of an
+    earlier one. An SstError names a node that failed or did not end in time.
     """
     seconds = load(name).duration or 1.0
     run = {"scene": name, "duration": seconds}
@@ -106,7 +106,10 @@ def _record(
 def _node(
     command: str, end_s: float, **given: object
 ) -> Iterator[subprocess.Popen[str]]:
-    """Have a node beside a block, after which it ends within a time [s], or raise an SstError."""
+    """Run a node beside a block.
+
+    After the block the node ends within a time [s], or an SstError is raised.
+    """
     with child_process.run_beside(command, given, stdout=subprocess.PIPE) as process:
         yield process
         try:

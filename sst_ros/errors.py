@@ -39,7 +39,7 @@ class SstError(Exception):
     """Base of all errors that this package raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Go to another process as it is: `__init__` takes other arguments than its text."""
+        """Support pickling: `__init__` takes other arguments than the error's text."""
         return Exception.__new__, (type(self), *self.args), vars(self)
 
 
@@ -217,7 +217,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def check_kinds(function: F, *, late: bool = False) -> F:
-    """Refuse arguments of another kind than the annotations of a function say, by InputError.
+    """Raise InputError for arguments of another kind than a function's annotations.
 
     Annotations are those of `_ARGUMENT_KINDS`, and classes, with or without `| None`.
     What else an argument must be is checked by the function itself.
@@ -263,7 +263,7 @@ def check_kinds(function: F, *, late: bool = False) -> F:
 
 
 def check_kinds_late(function: F) -> F:
-    """Refuse as `check_kinds`, but only where the function fails: that takes microseconds."""
+    """Apply `check_kinds` only where the function fails: it takes microseconds."""
     return check_kinds(function, late=True)
 
 
@@ -276,7 +276,10 @@ def refusal(origin: object, key: str, value: object, allowed: str) -> InputError
 def refuse_errors(
     origin: str, key: str, value: object, allowed: str, *errors: type[Exception]
 ) -> Iterator[None]:
-    """Raise InputError where a block raises one of the errors, with its words as the reason."""
+    """Raise InputError where a block raises one of the errors.
+
+    The words of that error are given as the reason.
+    """
     try:
         yield
     except errors as error:
@@ -284,7 +287,10 @@ def refuse_errors(
 
 
 def check_regular(path: Path) -> None:
-    """Raise OSError where a path is a pipe or a device, which may never end, or is not there."""
+    """Raise OSError where a path is missing, or is a pipe or a device.
+
+    Reading from a pipe or a device may never end.
+    """
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "it is no regular file")
@@ -363,27 +369,33 @@ class RunStopped(SstError):
 
 
 class StrokeExceeded(RunStopped):
-    """An actuator reached an end of its stroke, gamma_k = 0 or gamma_k = arc P_k P_k+1."""
+    """An actuator reached an end of its stroke: gamma_k = 0 or arc P_k P_k+1."""
 
 
 class WorkspaceLeft(RunStopped):
-    """beta_k left (0, beta_max]: E reached an edge of the base triangle or of the star's arcs."""
+    """beta_k left (0, beta_max].
+
+    E reached an edge of the base triangle or of the star's arcs.
+    """
 
 
 class SingularityReached(RunStopped):
-    """mu_k reached 0 or pi: the arc of the star lies along the base arc, gamma_k has no value."""
+    """mu_k reached 0 or pi, where gamma_k has no value.
+
+    The arc of the star lies along the base arc.
+    """
 
 
 class Diverged(RunStopped):
-    """No step, however small, resolves the motion to the tolerance with finite numbers."""
+    """No step size resolves the motion to the tolerance with finite numbers."""
 
 
 class StepBudgetExceeded(Diverged):
-    """A step takes more evaluations of the right-hand side than `step_budget` allows."""
+    """A step takes more right-hand side evaluations than `step_budget` allows."""
 
 
 def printable(text: str) -> str:
-    """Return one line of text with all that a terminal would act on written as an escape."""
+    """Return one line of text with all that a terminal would act on escaped."""
     return "".join(
         (
             letter
@@ -395,7 +407,10 @@ def printable(text: str) -> str:
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """Return "; did you mean NAME?" for the known name nearest to `word`, "" if none is near."""
+    """Return "; did you mean NAME?" for the known name nearest to `word`.
+
+    Where none is near, return "".
+    """
     near = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
@@ -430,7 +445,10 @@ _NO_WHEEL = ("launch", "launch_ros")  # only a ROS installation has them
 _BUILT = {
     "sst_ros_hardware": "colcon build --base-paths src/sst_ros/hardware",
 }
-"""Packages of ROS that no distribution has, with the command that builds them in a workspace."""
+"""ROS packages that no distribution has, by the command that builds them.
+
+The command runs in a workspace.
+"""
 
 
 class MissingDependency(SstError, ImportError):
@@ -476,7 +494,7 @@ def explanation(error: ModuleNotFoundError) -> str | None:
 
 
 def explain_missing_ros(packages: Sequence[str]) -> str:
-    """Return how to install packages of ROS, or to build those that cannot be installed."""
+    """Return how to install ROS packages or build those that cannot be installed."""
     distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
     names = [name.replace("_", "-") for name in packages if name not in _BUILT]
     apt = " ".join(f"ros-{distribution}-{name}" for name in names)

@@ -47,7 +47,10 @@ LINES: tuple[Looks, ...] = (
     {"color": ORANGE, "linestyle": (0, (5, 1)), "linewidth": 1.2},
     {"color": "#000000", "linestyle": "-", "linewidth": 0.8},
 )
-"""Curves that may coincide: each is thinner than the one below it, so that all can be seen."""
+"""Looks of curves that may coincide.
+
+Each is thinner than the one below it, so that all can be seen.
+"""
 
 DEGREES = float(np.degrees(1.0))
 
@@ -87,7 +90,10 @@ def leg_names(letter: str) -> list[str]:
 
 
 def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes]]:
-    """Make panels one above the other with a common time axis, which shows the run and no more."""
+    """Make panels one above the other with a common time axis.
+
+    The axis shows the run and no more.
+    """
     figure = Figure(figsize=(7.0, 1.0 + height * len(labels)))
     grid = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, label in zip(grid, labels, strict=True):
@@ -98,9 +104,10 @@ def stack(labels: Sequence[str], height: float = 2.2) -> tuple[Figure, list[Axes
 
 
 def break_lines(seconds: Array, values: Array, gaps: Array) -> tuple[Array, Array]:
-    """Return times [s] and values with a row of nan in each gap, where no line is drawn.
+    """Return times [s] and values with a row of nan in each gap.
 
-    Values have the shape (n,) or (n, k), gaps begin and end [s], (g, 2).
+    No line is drawn in a gap. Values have the shape (n,) or (n, k), gaps begin and end
+    [s], (g, 2).
     """
     places = np.searchsorted(seconds, gaps[:, 0], side="right")
     broken = np.insert(values, places, np.nan, axis=0)

@@ -17,13 +17,16 @@ from typing import Any
 from sst_ros.errors import refuse_errors, refuse_unless
 
 TEMPORARY = ".part-"
-"""How the name of a file begins that is not whole yet, or that a killed process has left."""
+"""How the name of a file begins that is not whole yet.
+
+A killed process may have left it.
+"""
 
 
 def require_free(
     out: Path, origin: str, *, force: bool = False, option: str = "--out"
 ) -> Path:
-    """Return `out`, a file or a folder to be written, if nothing there would be overwritten.
+    """Return `out`, a file or a folder to be written, if nothing would be overwritten.
 
     An InputError names `origin`, the command that writes, and `option`, which gave
     `out`: that is a file, or a folder that is not empty, and `force` is not set; or it
@@ -40,7 +43,10 @@ def require_free(
 
 @contextmanager
 def write_into(out: Path, origin: str) -> Iterator[None]:
-    """Make the folder `out` for a block that writes into it, or raise an InputError of `origin`."""
+    """Make the folder `out` for a block that writes into it.
+
+    An InputError of `origin` is raised where it cannot be written.
+    """
     with refuse_errors(
         origin, "--out", str(out), "must be a folder that can be written", OSError
     ):

@@ -81,7 +81,7 @@ class Values(dict[str, str]):
 
     @property
     def node_time(self) -> dict[str, bool]:
-        """Parameters of a node that reads the simulated time where that is asked for."""
+        """Parameters of a node that reads the simulated time where requested."""
         return {USE_SIM_TIME: True} if self.is_true(USE_SIM_TIME) else {}
 
 
@@ -314,7 +314,7 @@ def _temporary_file(text: str) -> str:
 
 
 def rviz(values: Values, scene_name: str) -> list[Action]:
-    """Describe robot_state_publisher with the URDF of a scene, and RViz with our layout.
+    """Describe robot_state_publisher with a scene's URDF, and RViz with our layout.
 
     In a namespace its frames have that as a prefix.
     """
@@ -339,7 +339,7 @@ def rviz(values: Values, scene_name: str) -> list[Action]:
 
 
 def ros2_control(values: Values, controller: str, controllers: str) -> list[Action]:
-    """Describe a controller manager whose hardware is the simulator, and its controllers.
+    """Describe a controller manager with the simulator as hardware, and controllers.
 
     Beside joint_state_broadcaster it starts the controller of this name, with the
     parameters of the file `controllers`, by default config/controllers.yaml. In

@@ -12,7 +12,7 @@ _DEFAULT_PARTS = 50
 
 
 class Bar:
-    """A bar that shows how much of something is done, where `shown` and stderr is a terminal."""
+    """A bar that shows how much is done, where `shown` and stderr is a terminal."""
 
     def __init__(self, label: str, shown: bool) -> None:
         self._label, self._percent = label, -1

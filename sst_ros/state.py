@@ -43,11 +43,17 @@ SI_UNITS = frozenset(
         "kg m^2",
     )
 )
-"""Units that an array may carry, as those of `to_xarray` do: its numbers are taken as they are."""
+"""Units that an array may carry, as those of `to_xarray` do.
+
+The numbers of such an array are taken as they are.
+"""
 
 _DOUBLE = np.dtype(float)
 _DEEPEST_LIST = 32
-"""Levels of lists that are looked into: NumPy allows 64 dimensions, a list in itself has more."""
+"""Levels of lists that are read.
+
+NumPy allows 64 dimensions, a list in itself has more.
+"""
 
 
 class NotNumbers(ValueError):
@@ -116,7 +122,10 @@ class ReadOnly:
 
 
 def _read_objects(objects: NDArray[Any], seconds: bool) -> Array:
-    """Return Python objects (fractions, decimals, durations) as doubles, in their shape."""
+    """Return Python objects (fractions, decimals, durations) as doubles.
+
+    The shape remains.
+    """
     numbers = []
     for each in objects.flat:
         if isinstance(each, (str, bytes, bytearray, bool, np.bool_)):
@@ -219,10 +228,13 @@ def finite_vector(value: Any) -> Vector3 | None:
 
 
 class Explained:
-    """An object that says what it is in at most ten lines, and as a table in a notebook."""
+    """An object that describes itself in at most ten lines, and as a notebook table."""
 
     def _facts(self) -> dict[str, object]:
-        """Return what to say of the object: at most nine names, with units, and their values."""
+        """Return what describes the object.
+
+        There are at most nine names, with units, and their values.
+        """
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -241,7 +253,10 @@ class Explained:
 
 
 def _say(value: object) -> str:
-    """Write a value on one line: numbers with six digits, several in brackets, "none" for none."""
+    """Write a value on one line.
+
+    Numbers have six digits, several are in brackets, and "none" stands for none.
+    """
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, (tuple, list, np.ndarray)):
@@ -287,7 +302,10 @@ class State(Explained):
     def of(
         cls, time_ns: int, y: Sequence[float], joints: Sequence[float], torque: Vector3
     ) -> State:
-        """Collect a state: quaternion and body rate begin y, 18 angles and rates are the joints."""
+        """Collect a state.
+
+        Quaternion and body rate begin y, 18 angles and rates are the joints.
+        """
         j: Any = joints if type(joints) is tuple else tuple(joints)
         by_kind = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])
         return cls(

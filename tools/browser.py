@@ -19,7 +19,10 @@ _FLAGS = (
     " --no-first-run --hide-scrollbars"
 )
 _TIMEOUT_S = 120.0
-"""Bound of every wait: without a graphics card a busy machine draws a frame in seconds."""
+"""Bound of every wait.
+
+Without a graphics card a busy machine needs seconds to draw a frame.
+"""
 
 
 def chromium() -> tuple[str, str] | None:
@@ -35,7 +38,10 @@ class Browser:
         self._driver = driver
 
     def open(self, url: str, size: tuple[int, int]) -> None:
-        """Open a page, of a size in pixels, in place of the last one, whose errors are dropped."""
+        """Open a page, of a size in pixels, in place of the last one.
+
+        Errors of the last page are dropped.
+        """
         self._driver.get("about:blank")
         self._driver.set_window_size(*size)
         # The window has borders; what counts is the page.

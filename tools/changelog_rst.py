@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write CHANGELOG.rst, which bloom reads (REP 132), from the released sections of CHANGELOG.md.
+"""Write CHANGELOG.rst from the released sections of CHANGELOG.md.
+
+bloom reads CHANGELOG.rst (REP 132).
 
 python -m tools.changelog_rst
 """

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a repository of the package in hardware/, which bloom does not find inside another one.
+"""Make a repository of the package in hardware/.
+
+bloom does not find a package inside another one.
 
     python -m tools.hardware_repository ../sst_ros_hardware
 

@@ -33,7 +33,10 @@ HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
 def great_circle(
     start: Array, end: Array, share: float = 1.0, points: int = 60
 ) -> Array:
-    """Points of the great circle from one unit vector towards another, shape (points, 3)."""
+    """Return points of the great circle from one unit vector towards another.
+
+    The shape is (points, 3).
+    """
     angle = np.arccos(np.clip(start @ end, -1.0, 1.0))
     across = end - (start @ end) * start
     across = across / np.linalg.norm(across)
@@ -84,8 +87,8 @@ class SphereDrawing:
              size: float = 13) -> None:  # fmt: skip
         """Write a name beside a point, on a white ground so that no line crosses it."""
         x, y = self.flat(at) + np.asarray(shift)
-        self.axes.text(x, y, label, color=colour, fontsize=size, ha="center", va="center",
-                       bbox=HALO, zorder=5)  # fmt: skip
+        self.axes.text(x, y, label, color=colour, fontsize=size, ha="center",
+                       va="center", bbox=HALO, zorder=5)  # fmt: skip
 
     def legend(self, *entries: tuple[str, float, str, str]) -> None:
         """Explain lines below the drawing: colour, width, style, text of each."""
@@ -96,7 +99,7 @@ class SphereDrawing:
         )
 
     def outward(self, at: Array, length: float) -> Array:
-        """Return the projected direction from the centre to a point, scaled to a length."""
+        """Return the projected direction from the centre to a point, of this length."""
         flat = self.flat(at)
         return np.asarray(length * flat / np.linalg.norm(flat))
 
@@ -176,7 +179,7 @@ def geometry_picture() -> Figure:
 
 
 def frames_picture() -> Figure:
-    """Fig. 4: the base frame {B} and the star's frame {E}, both with their origin in O."""
+    """Fig. 4: base frame {B} and frame {E} of the star, both with their origin in O."""
     geometry, rotation, _, _ = _pose()
     figure = Figure(figsize=(7.0, 6.4), layout="constrained")
     sheet = SphereDrawing(figure.subplots(), VIEW)
@@ -212,8 +215,8 @@ def leg_frames_picture() -> Figure:
          ("$v_k$", "$w_k \\times v_k$", "$w_k$")),
         ("{1k}, actuated link: {0k} turned by $\\gamma_k$ about z", first[0], BLUE,
          ("$r_k$", "$w_k \\times r_k$", "$w_k$")),
-        ("{2k}, intermediate link: {1k} turned by $-\\mu_k$ about x", second[0], VERMILION,
-         ("$r_k$", "$t_k \\times r_k$", "$t_k$")),
+        ("{2k}, intermediate link: {1k} turned by $-\\mu_k$ about x", second[0],
+         VERMILION, ("$r_k$", "$t_k \\times r_k$", "$t_k$")),
     )  # fmt: skip
     for axes, (title, frame, colour, names) in zip(
         figure.subplots(1, 3), frames, strict=True
@@ -237,7 +240,7 @@ def leg_frames_picture() -> Figure:
 
 
 def planes_picture() -> Figure:
-    """Fig. 6: E lies on the base triangle where it is above all three planes O P_k P_k+1."""
+    """Fig. 6: E is on the base triangle if above all three planes O P_k P_k+1."""
     geometry, rotation, _, _ = _pose()
     s = rotation[:, 2]
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
@@ -299,7 +302,8 @@ def flow_chart() -> Figure:
     for row, (step, function, equations) in enumerate(STEPS):
         y = -row
         axes.add_patch(
-            FancyBboxPatch((0.0, y - 0.3), 3.6, 0.6, boxstyle="round,pad=0.02,rounding_size=0.08",
+            FancyBboxPatch((0.0, y - 0.3), 3.6, 0.6,
+                           boxstyle="round,pad=0.02,rounding_size=0.08",
                            facecolor="#eaf2f8", edgecolor=BLUE)
         )  # fmt: skip
         axes.text(1.8, y, step, ha="center", va="center", fontsize=11)

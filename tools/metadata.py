@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the version and the metadata of package.xml into the other files that need them.
+"""Write version and metadata of package.xml into the other files that need them.
 
     python -m tools.metadata           # write
-    python -m tools.metadata --filled  # fail while a person has not filled in what is marked
+    python -m tools.metadata --filled  # fail while a marked element is not filled in
 
 setup.py reads package.xml itself.
 """

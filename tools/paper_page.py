@@ -23,7 +23,7 @@ ROW = re.compile(r"^(\| (\d+) \| \$.*\$ \| .* \| )`[\w.]+` \|$", re.MULTILINE)
 
 
 def numbers(text: str) -> Iterator[tuple[int, int]]:
-    """Yield each equation number in a text with the length of the range it was named in."""
+    """Yield each equation number in a text, and the length of the range it is in."""
     for tag in TAG.finditer(text):
         for first, last in re.findall(r"(\d+)(?: to (\d+))?", tag[1]):
             span = range(int(first), int(last or first) + 1)
@@ -31,7 +31,10 @@ def numbers(text: str) -> Iterator[tuple[int, int]]:
 
 
 def places() -> dict[int, str]:
-    """Return for each equation the function whose comment or docstring names it most narrowly."""
+    """Return for each equation the function that names it most narrowly.
+
+    Comments and docstrings are read.
+    """
     found: dict[int, tuple[int, str]] = {}
     for path in sorted((ROOT / "sst_ros" / "mechanism").glob("*.py")):
         source = path.read_text(encoding="utf-8")

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw docs/readings.png: what readings of the paper's figures could tell of its lost inertias.
+"""Draw docs/readings.png: how well readings determine lost inertias.
 
+Readings are of the paper's figures, the inertias those it does not give.
 Run `python -m tools.reading_figure`.
 """
 
@@ -57,7 +58,7 @@ LEAST, MOST = 1e-3, 1e2
 
 
 def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str], Array]:
-    """Return the combinations of an example's lost numbers, and their relative deviations.
+    """Return combinations of an example's lost numbers, and their relative deviations.
 
     Readings are of ZYZ angles, or of coordinates of E, whose error is that of an angle
     by the radius.
@@ -95,10 +96,11 @@ def determined(name: str, read: tuple[str, ...], rate: bool) -> tuple[list[str],
 
 @styled
 def draw_determined(panels: Sequence[tuple[str, Sequence[str], Array]]) -> Figure:
-    """Draw how well readings determine combinations of parameters, a panel for each figure read.
+    """Draw how well readings determine combinations of parameters.
 
-    A panel has a title, labels of the combinations and their relative standard
-    deviations, rising; those beyond MOST are counted below the others.
+    There is a panel for each figure read. It has a title, labels of the combinations
+    and their relative standard deviations, rising; those beyond MOST are counted below
+    the others.
     """
     known = [int(np.sum(deviations < MOST)) for _, _, deviations in panels]
     both = zip(known, panels, strict=True)

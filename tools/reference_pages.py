@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of reference pages and the SROS2 policies, from the declarations that the program runs by.
+"""Tables of reference pages and SROS2 policies from the program's declarations.
 
 `python -m tools.reference_pages` writes them, the tables between the marks of each
 page, as in
@@ -84,7 +84,10 @@ def commands_tables() -> Iterator[tuple[str, str]]:
             arguments_of = (
                 _table(("argument", "what"), rows) if rows else "No arguments.\n"
             )
-            text += f"## {name}\n\n{entry.what[:1].upper()}{entry.what[1:]}.\n\n{arguments_of}\n"
+            text += (
+                f"## {name}\n\n{entry.what[:1].upper()}{entry.what[1:]}.\n\n"
+                f"{arguments_of}\n"
+            )
     yield "commands", text
 
 
@@ -197,7 +200,7 @@ def fill(name: str, text: str) -> str:
 
 
 def policy(node: Described) -> str:
-    """Write the SROS2 policy of a node: what it needs by its declarations, and nothing else."""
+    """Write the SROS2 policy of a node: what its declarations need, nothing else."""
     publish = {*LOG_AND_EVENTS, *_names(node, PUBLISHES)}
     subscribe = {"/clock", *_names(node, SUBSCRIBES)}  # the clock with use_sim_time
     reply = {f"/{node.name}/{name}" for name in PARAMETER_SERVICES.split()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write test/rosdep_keys.yaml: what each key of package.xml is, by a copy of ros/rosdistro.
+"""Write test/rosdep_keys.yaml: each key of package.xml by a copy of ros/rosdistro.
 
     git clone https://github.com/ros/rosdistro
     python -m tools.rosdep_keys rosdistro
@@ -26,8 +26,10 @@ DISTRIBUTIONS = ("jazzy", "kilted", "lyrical")
 RULES = ("base", "python")
 HEAD = """\
 # SPDX-License-Identifier: Apache-2.0
-# Written by `python -m tools.rosdep_keys`: each key of package.xml and hardware/package.xml, by
-# distribution its version there, or the platforms on which the system has a package for it.
+# Written by `python -m tools.rosdep_keys`: each key of package.xml and \
+hardware/package.xml, by
+# distribution its version there, or the platforms on which the system has a \
+package for it.
 """
 
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the page: `python -m tools.view_pictures`, then docs/mechanism.png or docs/view.webp.
+"""Draw the pictures of the page.
 
-The picture shows the mechanism as built. The frames of the paper have their origins at
-O; {1k}, {2k} and {E} are drawn on their links, where they can be distinguished; axes
-are x red, y green, z blue. The film shows what `make view` does, of a run in slow
-motion, so that it is as smooth as the motion is, however slowly a machine without
-graphics draws.
+Run `python -m tools.view_pictures`, then docs/mechanism.png or docs/view.webp. The
+picture shows the mechanism as built. The frames of the paper have their origins at O;
+{1k}, {2k} and {E} are drawn on their links, where they can be distinguished; axes are x
+red, y green, z blue. The film shows what `make view` does, of a run in slow motion, so
+that it is as smooth as the motion is, however slowly a machine without graphics draws.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _shrink(taken: Image.Image, width: int) -> Image.Image:
 
 
 def _build(server: PageServer, scene: Scene) -> None:
-    """Draw the scene in its initial pose, without the globe that hides O, and the frames."""
+    """Draw frames and scene in its initial pose, without the globe that hides O."""
     server.scene.configure_default_lights(cast_shadow=False)
     server.scene.configure_environment_map(None)
     server.scene.set_up_direction("+z")
@@ -122,8 +122,8 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
     for link, (name, position, length) in places.items():
         node = f"/manipulator/{link}/axes"
         server.scene.add_frame(
-            node, axes_length=length * size, axes_radius=0.010 * size, position=position,
-            origin_radius=0.018 * size,
+            node, axes_length=length * size, axes_radius=0.010 * size,
+            position=position, origin_radius=0.018 * size,
         )  # fmt: skip
         beside = np.array(LABELS.get(link, (0.5, 0.5, 0.5)))
         server.scene.add_label(

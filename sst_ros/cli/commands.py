@@ -37,7 +37,7 @@ _BAG_SUFFIXES = (".mcap", ".db3")
 
 
 class Arg:
-    """An argument as argparse takes it, and `module:function` of what completes it in a shell."""
+    """An argument for argparse, and `module:function` that completes it in a shell."""
 
     def __init__(
         self, name: str, what: str = "", *, completer: str = "", **options: Any
@@ -50,7 +50,7 @@ class Arg:
 
 
 class Subcommand:
-    """A command: its line of help, what runs it as `module:function`, and its arguments.
+    """A command: its line of help, `module:function` that runs it, its arguments.
 
     Optional modules that it `needs` are looked for before the module that runs it is
     imported; its page of help says `more`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands on motions: a plan of one, a sweep of many, a scene from one that was recorded."""
+"""Commands on motions: plan one, sweep many, identify a scene from a recorded one."""
 
 from __future__ import annotations
 
@@ -94,7 +94,10 @@ def run_sweep(options: argparse.Namespace) -> None:
 
 
 def run_identification(options: argparse.Namespace) -> None:
-    """Identify a scene from a recorded run, or design a motion that determines its parameters."""
+    """Identify a scene from a recorded run, or design a motion for that.
+
+    The designed motion determines the parameters of the scene.
+    """
     designing, later = (
         options.bag == DESIGN,
         "must be given after design, and only there",

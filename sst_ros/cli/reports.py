@@ -80,7 +80,10 @@ def compare_runs(options: argparse.Namespace) -> int:
 
 
 def _pair(bags: list[Path], namespaces: list[str]) -> list[tuple[Path, str | None]]:
-    """Return each run that is compared, by its bag and its namespace, None for the only one."""
+    """Return each compared run by its bag and its namespace.
+
+    The namespace is None for the only run of a bag.
+    """
     if not namespaces:
         return [(bag, None) for bag in bags]
     if len(bags) == 1:

@@ -161,7 +161,7 @@ def run_simulation(options: argparse.Namespace) -> int:
 
 
 def certify_scene(options: argparse.Namespace) -> int:
-    """Print what is proven of the motion of a scene, or of a loop that tracks a motion."""
+    """Print what is proven of a scene's motion, or of a loop that tracks a motion."""
     for path in (options.out, options.tracking):
         if path is not None:
             require_free(path, "certify", force=options.force)
@@ -286,7 +286,7 @@ def _controller(scene: Scene, options: argparse.Namespace, period: float) -> obj
 
 
 def view(options: argparse.Namespace) -> int:
-    """Serve the page of a bag, of a running simulator, or of one that is started for it."""
+    """Serve the page of a bag, of a running simulator, or of one started for it."""
     if options.bag is not None:
         one = options.scene is None
         refuse_unless(

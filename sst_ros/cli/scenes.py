@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that print a scene as text: they need the documents, and none of the equations."""
+"""Commands that print a scene as text: they need the documents, not the equations."""
 
 from __future__ import annotations
 

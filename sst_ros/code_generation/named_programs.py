@@ -272,7 +272,10 @@ def _by_parameters(equations: SceneEquations) -> NamedProgram:
 
 
 def _jacobian(equations: SceneEquations, by: Argument) -> NamedProgram:
-    """Trace the Jacobian of the derivative by an argument: a row a number of the state."""
+    """Trace the Jacobian of the derivative by an argument.
+
+    It has a row for each number of the state.
+    """
     arguments = (equations.state, *equations.acting, *equations.open)
     whole = trace(equations.derivative, _symbols(arguments), by.symbols)
     rows = equations.state.size

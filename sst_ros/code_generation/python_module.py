@@ -117,7 +117,8 @@ LIBRARIES = {
         ),
         Library(
             name="mpmath",
-            imports="import mpmath\nfrom mpmath import atan2, cos, exp, sin, sqrt, tanh",
+            imports="import mpmath\n"
+            "from mpmath import atan2, cos, exp, sin, sqrt, tanh",
             about=MPMATH,
             collect=MPMATH_TAIL,
             unpack="map(mpmath.mpf, {})",

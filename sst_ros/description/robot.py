@@ -82,10 +82,10 @@ TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
 """Of commands and states, by which ros2_control drives a simulator."""
 
 NEGLIGIBLE_MASS, NEGLIGIBLE_INERTIA = 1e-12, 2e-14
-"""Of a moving link that has none in the scene [kg, kg m^2]: MuJoCo refuses less than 1e-14.
+"""Mass and inertia of a moving link that has none in the scene [kg, kg m^2].
 
-Beside the star's inertia, some 1e-2 kg m^2, they are lost in the rounding of a few
-operations.
+MuJoCo refuses less than 1e-14. Beside the star's inertia, some 1e-2 kg m^2, they are
+lost in the rounding of a few operations.
 """
 
 _INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -134,7 +134,7 @@ def joints_of(geometry: Geometry) -> list[Joint]:
 
 
 def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str, Array]:
-    """Rotation of every link in {B}, each shape (3, 3), by the angles of the joints [rad]."""
+    """Return each link's rotation in {B}, shape (3, 3), by the joint angles [rad]."""
     found: dict[str, Array] = {BASE: np.eye(3)}
     for joint in joints:
         angle, across = angles[joint.name], np.cross(np.eye(3), np.array(joint.axis))
@@ -400,7 +400,10 @@ def short(values: Iterable[float]) -> str:
 
 
 class Body(NamedTuple):
-    """A rigid body that is fixed to a link of the tree, and has its name where it is the link."""
+    """A rigid body that is fixed to a link of the tree.
+
+    It has the link's name where it is the link.
+    """
 
     name: str
     link: str  # whose frame all vectors are in

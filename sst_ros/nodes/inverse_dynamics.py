@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inverse-dynamics controller: answers every sample with the torque that follows a motion.
+"""The inverse-dynamics controller: torques that follow a motion.
 
-The motion is that of the scene, of ~/joint_trajectory, or of a goal of
-~/follow_joint_trajectory, of which there is one at a time.
+It answers every sample with such a torque. The motion is that of the scene, of
+~/joint_trajectory, or of a goal of ~/follow_joint_trajectory, of which there is one at
+a time.
 """
 
 from __future__ import annotations
@@ -57,7 +58,10 @@ _SPIN_S = 0.01
 
 
 class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
-    """Worker of the process `inverse_dynamics`: messages and time of a `TrajectoryFollower`."""
+    """Worker of the process `inverse_dynamics`.
+
+    It handles messages and time of a `TrajectoryFollower`.
+    """
 
     def __init__(self) -> None:
         super().__init__("sst_inverse_dynamics", ControllerNodeParameters)
@@ -96,7 +100,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             every(self.node, _FEEDBACK_PERIOD_S, self._report_goal)
 
     def close(self) -> None:
-        """Abort a goal, leave the actuators without torque, and print the tracking errors."""
+        """Abort a goal, set zero torque, and print the tracking errors."""
         executor = self.node.executor
         if self._active is not None and executor is not None:
             reason = f": {self.failure}" if self.failure is not None else ""
@@ -111,7 +115,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         _print(self.follower.tracking())
 
     def change(self, changed: ControllerNodeParameters) -> None:
-        """Take over gains, from the next sample on: callbacks come one after the other."""
+        """Apply gains from the next sample on: callbacks run one after the other."""
         self.follower.tune(changed)
         super().change(changed)
 
@@ -141,7 +145,10 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self.follower.proceed()
 
     def missing_subscribers(self) -> list[str]:
-        """Return the topics that wait for subscribers, with wait_for_recorder its own, too."""
+        """Return the topics that wait for subscribers.
+
+        With wait_for_recorder its own topics are among them.
+        """
         missing = super().missing_subscribers()
         if self.parameters.wait_for_recorder:
             recorded = (self._reference, self._error)
@@ -151,7 +158,10 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         return missing
 
     def preview(self) -> Vector3 | None:
-        """Return what answers the last state before the run [N m], if there is a motion."""
+        """Return the answer to the last state before the run [N m].
+
+        Without a motion it is None.
+        """
         command = self.follower.preview(self._seen) if self._seen else None
         return None if command is None else command.torque
 
@@ -264,7 +274,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
     def _judge(
         self, state: JointState, measured: Measurement, command: Command
     ) -> None:
-        """Test the tolerances of the active goal at a sample of the run that was answered."""
+        """Test the tolerances of the active goal at an answered sample of the run."""
         if self._goal is None or not self._is_active():
             return
         goal, order = self._goal
@@ -308,7 +318,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             self._interrupt("replaced by a newer trajectory")
 
     def _cancel(self, handle: Any) -> CancelResponse:
-        """Stop; the goal ends after this call, when its handle has changed to canceling."""
+        """Stop; the goal ends after this call, when its handle is canceling."""
         if self._active is not None and self._active.handle == handle:
             self.follower.stop()
         return CancelResponse.ACCEPT

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One process, one node: its parameters, its start, its callbacks, and an end in order."""
+"""One process, one node: its parameters, start, callbacks, and an orderly end."""
 
 from __future__ import annotations
 
@@ -46,15 +46,21 @@ _PROFILES = {
     "FASTRTPS_DEFAULT_PROFILES_FILE": "fast_dds_2.xml",
     "FASTDDS_DEFAULT_PROFILES_FILE": "fast_dds_3.xml",
 }
-"""Our profile, by the variable that names it: for Fast DDS 2, libfastrtps, and 3, libfastdds."""
+"""Our profile, by the variable that names it.
+
+The first is for Fast DDS 2, libfastrtps, the second for Fast DDS 3, libfastdds.
+"""
 # longest delay of a signal. The executor would take half a millisecond for each look
 _ORPHAN_POLL_S = 0.1
 _CALLBACK_S = 1.0
-"""Wait for a callback in progress: a service that waits for the run ends once that is closed."""
+"""Wait for a callback in progress.
+
+A service that waits for the run ends once that is closed.
+"""
 _ACKNOWLEDGE_AT_END_S = 6.0
 """Longest wait for subscribers of a node whose work is done, within _CLEAN_UP_S."""
 _ACKNOWLEDGE_S = 1.2
-"""A subscriber that was killed never acknowledges: a node ends within 2 s of a signal."""
+"""A killed subscriber never acknowledges: a node ends within 2 s of a signal."""
 _CLEAN_UP_S = 10.0  # longer than any clean-up of the middleware, also on a busy machine
 _WATCH_S = 0.25
 _LOG_PERIOD_S = 5.0  # of what a node waits for
@@ -234,7 +240,10 @@ class AnsweringWorker(Worker[A]):
     def connect(
         self, own: dict[str, topics.Endpoint], **more: Callable[[Any], None]
     ) -> None:
-        """Publish commands, and listen to topics of its own table, as soon as it can answer."""
+        """Publish commands, and listen to topics of its own table.
+
+        Call this as soon as the node can answer.
+        """
         given, self._own = self.parameters, own
         self.begun = self.commanded = False
         self.phase = ""
@@ -278,7 +287,10 @@ class AnsweringWorker(Worker[A]):
         return not self.missing_subscribers()
 
     def missing_subscribers(self) -> list[str]:
-        """Return the topics without as many subscribers as the parameters ask for, with counts."""
+        """Return the topics with too few subscribers, with counts.
+
+        The parameters say how many are needed.
+        """
         count, least = (
             self._commands.get_subscription_count(),
             self.parameters.min_subscribers,
@@ -385,8 +397,9 @@ class AnsweringWorker(Worker[A]):
         """Count a message of another robot; say so the first time."""
         if self.foreign_states == 0:
             self.node.get_logger().warning(
-                f"joint_states without {', '.join(ACTUATED_JOINTS)} are ignored: another"
-                f" robot publishes there, too (its names are {list(state.name)})"
+                f"joint_states without {', '.join(ACTUATED_JOINTS)} are ignored:"
+                " another robot publishes there, too"
+                f" (its names are {list(state.name)})"
             )
         self.foreign_states += 1
 
@@ -443,11 +456,12 @@ def run(words: Sequence[str]) -> int:
 
 @contextlib.contextmanager
 def _bound_time() -> Iterator[None]:
-    """End the process, with a traceback and status 1, where the middleware hangs for ten seconds.
+    """End the process where the middleware hangs for ten seconds.
 
-    Fast DDS 3.2 deadlocks now and then when another node leaves (eProsima/Fast-DDS
-    issue 6502), and rclpy holds the interpreter's lock while it gives up a node:
-    neither another thread nor a signal could end it from Python.
+    It ends with a traceback and status 1. Fast DDS 3.2 deadlocks now and then when
+    another node leaves (eProsima/Fast-DDS issue 6502), and rclpy holds the
+    interpreter's lock while it gives up a node: neither another thread nor a signal
+    could end it from Python.
     """
     faulthandler.dump_traceback_later(_CLEAN_UP_S, exit=True, file=_STDERR)
     try:
@@ -515,7 +529,8 @@ def _wait_for_subscribers(node: Node) -> None:
     if unheard:
         topics_named = ", ".join(unheard)
         node.get_logger().warning(
-            f"subscribers have not received all of {topics_named} within {longest_s:g} s"
+            f"subscribers have not received all of {topics_named}"
+            f" within {longest_s:g} s"
         )
 
 
@@ -545,7 +560,7 @@ def configure_middleware() -> None:
 
 
 def _has_library(name: str) -> bool:
-    """Look for a shared library where that of the middleware is found when it is loaded."""
+    """Look for a shared library where the loader finds that of the middleware."""
     folders = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
     return any(next(Path(one).glob(f"lib{name}.so*"), None) for one in folders if one)
 

@@ -122,9 +122,10 @@ class EulerMessage(_Stateless):
 
 
 def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
-    """ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w), as `geometry.zyz_angles`.
+    """Return ZYZ angles theta, phi, psi [rad] of a quaternion (x, y, z, w).
 
-    z / w is tan((theta + psi) / 2), -x / y is tan((theta - psi) / 2).
+    They are those of `geometry.zyz_angles`: z / w is tan((theta + psi) / 2), -x / y is
+    tan((theta - psi) / 2).
     """
     x, y, z, w = quaternion
     sine, cosine = math.hypot(x, y), math.hypot(z, w)

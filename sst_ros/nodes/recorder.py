@@ -68,7 +68,10 @@ def own_topics(
 
 
 def _is_of_simulator(message: Any) -> bool:
-    """Whether a message of a topic that others publish on, too, can be that of a simulator."""
+    """Whether a message can be that of a simulator.
+
+    Others publish on its topic, too.
+    """
     if isinstance(message, JointState):
         return set(JOINTS) <= set(message.name)
     if isinstance(message, DiagnosticArray):

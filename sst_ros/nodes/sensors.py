@@ -77,7 +77,7 @@ class MeasuredJointStateMessage:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew at the first sample of a run: the same seed gives the same noise."""
+        """Restart at the first sample of a run: the same seed gives the same noise."""
         self._random = np.random.default_rng(self._seed)
         kinds = range(_KIND_COUNT)
         self._angles = [
@@ -103,7 +103,7 @@ class MeasuredJointStateMessage:
 
 
 class ImuReading(NamedTuple):
-    """What an inertial measurement unit reads, in its own axes, which are those of {E}."""
+    """Readings of an inertial measurement unit in its own axes, those of {E}."""
 
     quaternion: Quaternion  # (x, y, z, w) of them in {B}
     angular_velocity: Vector3  # [rad/s]
@@ -145,7 +145,7 @@ class ImuMessage:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew at the first sample of a run: the same seed gives the same noise."""
+        """Restart at the first sample of a run: the same seed gives the same noise."""
         self._random = np.random.default_rng((self._seed, _IMU_SEED))
         self._late: deque[ImuReading] = deque()
 

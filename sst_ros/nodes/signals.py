@@ -26,7 +26,7 @@ def handle() -> None:
 
 
 def interrupt(*, at_once: bool) -> None:
-    """Have a SIGINT without a handler end the process at once, or raise KeyboardInterrupt."""
+    """Have an unhandled SIGINT end the process at once, or raise KeyboardInterrupt."""
     usual = signal.SIG_DFL, signal.default_int_handler
     if signal.getsignal(signal.SIGINT) in usual:  # not ignored, as behind a shell's `&`
         signal.signal(signal.SIGINT, usual[not at_once])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services and the action of simulation_interfaces 2.x, where that package is installed.
+"""Services and action of simulation_interfaces 2.x, where that is installed.
 
 The same state machine as that of ~/pause, ~/step and ~/reset answers. STOPPED is a run
 at its initial state that is paused. The numbers are those of the package's messages.
@@ -236,7 +236,7 @@ class SimulationInterfaces:
         return self._ask(response, partial(self._loop.set_state, *joints))
 
     def begin_steps(self, handle: Any) -> None:
-        """Begin a goal of ~/simulate_steps: steps of a paused run, with feedback after each.
+        """Begin a goal of ~/simulate_steps: steps of a paused run, each with feedback.
 
         A thread asks for the steps, so that the node answers meanwhile.
         """
@@ -261,9 +261,10 @@ class SimulationInterfaces:
     def _actuators(
         self, quaternion: Quaternion, rate: Vector3
     ) -> tuple[Vector3, Vector3]:
-        """Angles [rad] and rates [rad/s] of an orientation and an angular velocity in base_link.
+        """Return angles [rad] and rates [rad/s] of the actuators.
 
-        At a serial singularity an ArithmeticError is raised.
+        They are those of an orientation and an angular velocity in base_link. At a
+        serial singularity an ArithmeticError is raised.
         """
         x, y, z = (rotation_matrix(quaternion).T @ rate).tolist()
         at = self._space.of_star(quaternion, (x, y, z), ZERO)
@@ -299,7 +300,7 @@ def answer(response: Any, code: int, text: str = "") -> Any:
 
 
 def answer_with(response: Any, reply: Reply) -> Any:
-    """Fill the result of a response from a reply of the run, and return the response."""
+    """Fill the result of a response from a reply of the run, and return it."""
     return (
         answer(response, RESULT_OK)
         if reply.success
@@ -308,7 +309,7 @@ def answer_with(response: Any, reply: Reply) -> Any:
 
 
 def _refuse_other(request: Any, response: Any) -> Any:
-    """Return the filled response where another entity than the star is meant, else None."""
+    """Return the filled response for another entity than the star, else None."""
     text = f"there is no entity {request.entity!r}, only {ENTITY_NAME!r}"
     return None if request.entity == ENTITY_NAME else answer(response, NOT_FOUND, text)
 

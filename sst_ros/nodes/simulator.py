@@ -146,7 +146,7 @@ class Simulator(Worker[SimulatorParameters]):
         self._diagnostics.gauges = read_gauges(self._loop.simulation, self._loop.held)
 
     def _report(self) -> None:
-        """Publish the diagnostics, log what is new, request gauges for the next time."""
+        """Publish diagnostics, log what is new, request gauges for the next time."""
         self._schedule()  # the threads that have begun since: of callbacks and of DDS
         named = self.node.resolve_topic_name
         commands = [

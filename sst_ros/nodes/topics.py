@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics, services and actions of the nodes: one table that they, the docs and the policies follow.
+"""Topics, services and actions of the nodes in one table.
 
-Who is at the other end of a topic, subscriptions whose owner takes the messages when he
-needs them, and goals of actions that end later than they are accepted.
+The nodes, the docs and the policies follow that table. The module also has who is at
+the other end of a topic, subscriptions whose owner takes the messages when he needs
+them, and goals of actions that end later than they are accepted.
 """
 
 from __future__ import annotations
@@ -458,14 +459,17 @@ def subscribe(
     simulator: str = "",
     **callbacks: Callable[[Any], None],
 ) -> None:
-    """Create the subscriptions of a node to topics of its own table, by the names there."""
+    """Create a node's subscriptions to topics of its own table, by the names there."""
     for name, callback in callbacks.items():
         one, topic = own[name], own[name].name.format(simulator=simulator)
         node.create_subscription(one.kind, topic, callback, one.qos())
 
 
 def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str]:
-    """Full names of the nodes that publish a topic, one for each (best-effort) publisher."""
+    """Return full names of the nodes that publish a topic.
+
+    There is one for each publisher, or for each best-effort publisher.
+    """
     return [
         _name_of(info)
         for info in node.get_publishers_info_by_topic(topic)
@@ -482,7 +486,10 @@ def _name_of(info: TopicEndpointInfo) -> str:
 
 
 def other_types(node: Node, topic: Endpoint, *, simulator: str = "") -> list[str]:
-    """Say who publishes a topic of ours with another type, whose messages never arrive."""
+    """Return who publishes a topic of ours with another type.
+
+    Such messages never arrive.
+    """
     name = node.resolve_topic_name(topic.name.format(simulator=simulator))
     return [
         f"{name} of {_name_of(info)} is {info.topic_type} and not received: must be "
@@ -589,7 +596,10 @@ class Reader:
 
 
 class ActionGoal:
-    """An accepted goal of an action, by its handle: it runs until `end`, in any thread."""
+    """An accepted goal of an action, by its handle.
+
+    It runs until `end`, in any thread.
+    """
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle
@@ -613,7 +623,10 @@ class ActionGoal:
         return await self._result
 
     def end(self, result: Any, *, success: bool) -> None:
-        """End the goal with a result: canceled where that was requested, else as `success` is."""
+        """End the goal with a result.
+
+        It is canceled where that was requested, else it ends as `success` is.
+        """
         if self.handle.is_cancel_requested:
             self.handle.canceled()
         elif success:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The torque player: answers every joint state with the torque of the hold that begins there.
+"""The torque player: answers every joint state with the torque of a hold.
 
-A torque is held until the next sample. That of the hold's middle makes the motion
-second order in the period, that of its start first order only.
+The hold begins at that state. A torque is held until the next sample. That of the
+hold's middle makes the motion second order in the period, that of its start first order
+only.
 """
 
 from __future__ import annotations
@@ -48,7 +49,10 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
             self.done.set()
 
     def _hold(self, elapsed_ns: int) -> Vector3:
-        """Torques [N m] from this time of the profile [ns] until the next sample or its end."""
+        """Return torques [N m] from this time of the profile [ns].
+
+        They are held until the next sample or the end of the profile.
+        """
         given = self.parameters
         end_ns = round(self._duration * NANOSECONDS)
         hold_ns = min(given.period_ns, max(0, end_ns - elapsed_ns))

@@ -73,7 +73,7 @@ class Viewer(Worker[ViewerParameters]):
             self._commands.publish(Float64MultiArray(data=array("d", ZERO)))
 
     def states(self) -> Sequence[ViewState]:
-        """Return the joint states that came since the last call, the last _QUEUE of them."""
+        """Return the joint states since the last call, the last _QUEUE of them."""
         return [self._states.popleft() for _ in range(len(self._states))]
 
     def status(self) -> RunStatus:

@@ -47,7 +47,10 @@ Drawn: TypeAlias = "Sequence[tuple[Signals, str, dict[str, Any]]]"
 def _overlay(
     quantity: str, label: str, scale: float = 1.0
 ) -> Callable[[Drawn], Figure]:
-    """Return what draws a quantity of the legs of all runs, and below how far they are apart."""
+    """Return what draws a quantity of the legs of all runs.
+
+    Below it draws how far the runs are apart.
+    """
 
     def draw(runs: Drawn) -> Figure:
         legs = [
@@ -120,7 +123,7 @@ COMPARISON_PICTURES = {
 def draw_comparison(
     runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of several runs into `out`, as `pictures.draw_run` does of one.
+    """Write pictures of several runs into `out`, as `pictures.draw_run` does of one.
 
     Raises InputError where there are too many runs, too.
     """
@@ -192,7 +195,7 @@ def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def labels(runs: Sequence[Signals]) -> list[str]:
-    """Name each run by its folder, or by number and path where two folders have one name.
+    """Name each run by its folder, or by number and path where folders share a name.
 
     Runs of one bag have the names of their namespaces.
     """

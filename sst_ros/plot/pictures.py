@@ -59,9 +59,10 @@ POSITION, ZYZ = "position of E in {B} [m]", "θφψ"
 
 
 class Picture(NamedTuple):
-    """A picture: what it shows, keys of the topics without which it cannot be drawn, what draws it.
+    """A picture: what it shows, the topics it needs, what draws it.
 
-    That of one run takes the run and its scene, which is there if it is needed.
+    It cannot be drawn without the topics of the keys `needs`. What draws that of one
+    run takes the run and its scene, which is there if it is needed.
     """
 
     title: str
@@ -70,7 +71,10 @@ class Picture(NamedTuple):
 
 
 Curves: TypeAlias = "tuple[str, Sequence[str], Callable[[Signals], Array]]"
-"""Curves over time in one panel: label of the axis, names, and a column (n,) each of a run."""
+"""Curves over time in one panel.
+
+The parts are the label of the axis, names, and a column (n,) each of a run.
+"""
 
 
 def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], Figure]:
@@ -169,7 +173,7 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
 
 
 def zyz_degrees(quaternion: Array, which: int) -> Array:
-    """One of the ZYZ angles (0 theta, 1 phi, 2 psi) without jumps [deg], shape (n, 1)."""
+    """Return a ZYZ angle (0 theta, 1 phi, 2 psi) without jumps [deg], shape (n, 1)."""
     angle = zyz_angles(rotation_matrix(quaternion))[:, which : which + 1]
     known = np.isfinite(angle)
     angle[known] = np.unwrap(angle[known])  # over lost samples too
@@ -193,9 +197,9 @@ def _angle(run: Signals, _: Scene | None, which: int) -> Figure:
 
 
 def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
-    """Draw E over the base triangle, both at their own radius, and the triangle's image at E's.
+    """Draw E over the base triangle, and the triangle's image at the radius of E.
 
-    Paths are quaternions (n, 4) by name.
+    E and the triangle are at their own radius. Paths are quaternions (n, 4) by name.
     """
     figure = Figure(figsize=(6.4, 6.4))
     axes = figure.add_subplot(projection="3d")
@@ -401,7 +405,7 @@ def directions(run: Signals) -> Array:
 
 
 def _sphere(run: Signals, scene: Scene) -> Figure:
-    """Draw the path of E over how far the best turn of the star keeps from every limit."""
+    """Draw the path of E over how far the star's best turn keeps from every limit."""
     looks = {"color": BLUE, "linewidth": 1.8}
     return workspace.draw_paths(scene, [("path of E", directions(run), looks)])
 
@@ -473,7 +477,7 @@ RUN_PICTURES = {
 def draw_run(
     run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of a run, those that `only` names or all, into the folder `out`.
+    """Write the pictures of a run, all or those `only` names, into the folder `out`.
 
     Returns the paths written, and for each picture that could not be drawn what is
     missing. Raises InputError where a name is none of RUN_PICTURES, or `out` cannot be

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The workspace on the sphere: maps, a row of three for each manipulator, and paths of E.
+"""The workspace on the sphere: a row of three maps per manipulator, and paths of E.
 
 The sphere is seen from outside along the middle of the base triangle, in the equal-area
 projection of Lambert, so that equal patches are equal solid angles.
@@ -47,7 +47,7 @@ ZONE_DIVISIONS = 50  # of an edge of the triangle on which a zone is drawn
 
 @styled
 def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figure:
-    """Draw maps of `workspace`: free turn, condition of J and distance to the nearest limit.
+    """Draw maps of `workspace`: free turn, condition of J, distance to nearest limit.
 
     Each map is a row of pictures, with a title if there are any.
     """
@@ -161,7 +161,10 @@ def _panel(
     *,
     condition: bool,
 ) -> None:
-    """Draw values (n,): angles [deg], or cond J: logarithmic, from 1, and the least is the best."""
+    """Draw values (n,): angles [deg], or cond J.
+
+    The scale of cond J is logarithmic, from 1, and the least is the best.
+    """
     x, y = project(chart.geometry, chart.s)
     axes.tripcolor(Triangulation(x, y, faces), 0.0 * x, cmap="Greys", vmin=-0.5, vmax=5)
     known = np.isfinite(values)
@@ -204,7 +207,10 @@ def _panel(
 
 
 def sides(geometry: Geometry, points: int) -> Array:
-    """Points on the three sides of the base triangle on the unit sphere, shape (3, points, 3)."""
+    """Return points on the sides of the base triangle, shape (3, points, 3).
+
+    They lie on the unit sphere.
+    """
     angle = np.multiply.outer(geometry.arc, np.linspace(0.0, 1.0, points))[:, :, None]
     across = np.cross(geometry.w, geometry.v)
     return np.asarray(
@@ -232,7 +238,7 @@ def draw_triangle(axes: Axes, geometry: Geometry) -> None:
 
 
 def project(geometry: Geometry, s: Array) -> tuple[Array, Array]:
-    """Project unit vectors (..., 3) about the middle of the base triangle, P_1 upward."""
+    """Project unit vectors (..., 3) about the base triangle's middle, P_1 upward."""
     middle = geometry.v.sum(axis=0)
     out = middle / np.linalg.norm(middle)
     up = geometry.v[0] - out * (out @ geometry.v[0])
@@ -247,9 +253,9 @@ def _map(scene: Scene) -> OrientationMap:
 
 
 def draw_paths(scene: Scene, paths: Sequence[tuple[str, Array, Looks]]) -> Figure:
-    """Draw paths of E, directions (n, 3) each, over the map of the distance to the nearest limit.
+    """Draw paths of E over the map of the distance to the nearest limit.
 
-    One path has its ends.
+    Paths are directions (n, 3) each. One path has its ends.
     """
     figure, chart = Figure(figsize=(7.2, 5.6)), _map(scene)
     axes = figure.subplots()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process beside this one that computes what would take longer than a control period."""
+"""A process beside this one that computes what takes longer than a control period."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Assistant:
 
 
 def assist(number: int) -> None:
-    """Be the process of an `Assistant` at the other end of the connection of this descriptor."""
+    """Run the process of an `Assistant` on the connection of this descriptor."""
     with contextlib.suppress(EOFError, OSError), Connection(number) as connection:
         # with all that it imports: nothing is checked before
         function = connection.recv()

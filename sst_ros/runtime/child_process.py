@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes as child processes of this one, in a ROS domain that nothing else on this machine has."""
+"""Nodes as child processes, in a ROS domain that nothing else on this machine has."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def run_beside(
 
 
 def keep_domain() -> None:
-    """Use the ROS domain that the environment names, or else one that this process then keeps."""
+    """Use the ROS domain of the environment, or else one that this process keeps."""
     if "ROS_DOMAIN_ID" not in os.environ:
         os.environ["ROS_DOMAIN_ID"] = str(lock_domain()[0])
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 def lock_domain() -> tuple[int, int]:
-    """Return the number of a domain, and the descriptor that keeps it until it is closed.
+    """Return the number of a domain, and the descriptor that keeps it until closed.
 
     No node is in it, neither one whose parent has just ended nor one that a user has
     started.
@@ -85,7 +85,10 @@ def lock_domain() -> tuple[int, int]:
 
 
 def _refuse_nodes(domain: int) -> None:
-    """Raise OSError where a port of a participant of this domain is taken (RTPS 2.5, 9.6.2.3)."""
+    """Raise OSError where a port of a participant of this domain is taken.
+
+    The ports are those of RTPS 2.5, 9.6.2.3.
+    """
     for port in range(7410 + 250 * domain, 7410 + 250 * domain + 2 * _PARTICIPANTS, 2):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("", port))
@@ -100,6 +103,9 @@ def words(given: dict[str, object]) -> list[str]:
 
 
 def is_orphan() -> bool:
-    """Return whether the process that started this one, and without which it ends, has ended."""
+    """Return whether the process that started this one has ended.
+
+    Without that process this one ends.
+    """
     parent = os.environ.get(PARENT)
     return parent is not None and os.getppid() != int(parent)

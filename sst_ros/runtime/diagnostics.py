@@ -272,7 +272,7 @@ def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
 
 
 def _margins_of(simulation: Simulation) -> dict[str, float]:
-    """Return the least distance from a limit by kind of joint, where it has limits [rad]."""
+    """Return the least distance from a limit [rad] by kind of joint with limits."""
     joints = simulation.state.joints
     angles = (*joints.gamma, *joints.mu, *joints.beta)
     margins: dict[str, float] = {}

@@ -157,7 +157,7 @@ class RunLoop(TickLoop):
         return Reply(True, self.phase.value)
 
     def step(self, samples: int = 1) -> Reply:
-        """Advance a paused run by some samples, with the torques of the last command."""
+        """Advance a paused run by some samples with the torques of the last command."""
         if self.phase is not Phase.PAUSED:
             return Reply(
                 False,

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the operating system schedules a node: priority, idle states of the cores, no pauses."""
+"""Scheduling of a node by the operating system.
+
+The module sets priority and idle states of the cores, and avoids pauses.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,7 @@ def _schedule_all(policy: int, thread: int, priority: int, others: int) -> None:
 
 
 class CpuDmaLatency:
-    """Request that no core uses an idle state with a longer exit latency (Linux PM QoS).
+    """Request that no core uses idle states of longer exit latency (Linux PM QoS).
 
     A core that leaves a deep idle state does so late and with cold caches. The kernel
     keeps the request as long as the file is open: it ends with the process, however

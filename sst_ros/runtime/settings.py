@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes: source of descriptors, checks, --help and the tables of the docs.
+"""Parameters of the nodes: source of descriptors, checks, --help, tables of docs.
 
 On the command line every parameter is a plain option, beside ROS arguments. What is
 wrong with those other than the name of a parameter, `rclpy.init` says: --help and a
@@ -437,7 +437,7 @@ NODE_COMMANDS: dict[str, tuple[str, type[NodeParameters]]] = {
     "recorder": ("Recorder", RecorderParameters),
     "viewer": ("Viewer", ViewerParameters),
 }
-"""Class of `nodes.COMMAND` that does the work of each node sst_COMMAND, and its parameters."""
+"""Class in `nodes.COMMAND` that does the work of sst_COMMAND, and its parameters."""
 
 
 def make_parser(command: str) -> argparse.ArgumentParser:
@@ -530,9 +530,10 @@ def unknown_name(name: str, known: Iterable[str]) -> Check:
 
 
 def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:
-    """Yield a line for each parameter file without parameters for the node of this full name.
+    """Yield a line for each parameter file without parameters for this node.
 
-    The files are those that rcl has read from the ROS arguments.
+    The node is given by its full name. The files are those that rcl has read from the
+    ROS arguments.
     """
     for path in (path for flag, path in pairwise(ros) if flag == "--params-file"):
         allowed = "must be a readable file"
@@ -584,7 +585,10 @@ def _as_yaml(spec: Spec, word: str) -> str:
 
 
 def _read_list(word: str) -> list[str]:
-    """Read a list with or without brackets, whose entries may be quoted as in JSON or YAML."""
+    """Read a list with or without brackets.
+
+    Its entries may be quoted as in JSON or YAML.
+    """
     inner = word.strip()
     if inner.startswith("[") and inner.endswith("]"):
         inner = inner[1:-1]

@@ -28,14 +28,20 @@ IDLE_PERIOD_S = 0.1
 """Period in which the state of a run that does not advance is shown."""
 _LOAD_S = 0.02  # loading what has been loaded takes less; then nothing is shown
 _STEP_ANSWER_S = 0.4
-"""Longest wait for the answer in a step of a paused run: services are answered within 0.5 s."""
+"""Longest wait for the answer in a step of a paused run.
+
+Services are answered within 0.5 s.
+"""
 _TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
 """Bounds of one call of `Simulation.advance`, after which requests are served."""
 _LONGEST_WAIT_S = 0.1
-"""Requests wait for the next sample this long: deadlines may be far, and a followed clock stand."""
+"""Longest time that requests wait for the next sample.
+
+Deadlines may be far, and a followed clock may stand.
+"""
 
 RunOutput: TypeAlias = Any
-"""Where a run publishes: what has the methods of `nodes.publications.SimulatorTopics`."""
+"""Where a run publishes: has the methods of `nodes.publications.SimulatorTopics`."""
 
 
 class SteadyTime:
@@ -95,7 +101,7 @@ class Pacer:
         self.together = max(1, int(_TOGETHER_NS // self._interval)) if several else 1
 
     def excuse(self, ticks: int) -> None:
-        """Put the deadlines off if the last of the next ticks is past: that is no overrun."""
+        """Put the deadlines off if the last of the next ticks is past: no overrun."""
         if self.speed > 0.0:
             self._anchor += max(0, self._source.now_ns() - self._due(ticks))
 
@@ -164,7 +170,7 @@ class Counters:
             self._resumed = None
 
     def count(self, took_s: float, late_ns: int, ticks: int = 1) -> None:
-        """Count steps of one call: their time [s] and the lateness of their start [ns]."""
+        """Count steps of one call: their time [s] and how late they start [ns]."""
         self.ticks += ticks
         self._step_total_s += took_s
         if took_s > self.step_max_s * ticks:
@@ -200,7 +206,7 @@ class Counters:
 
 
 class HeldTorques:
-    """Error of the orientation that comes from holding torques, estimated from how they change.
+    """Error of the orientation from holding torques, estimated from their change.
 
     A torque tau(t_k) held over a period T acts, on average, T / 2 late: the angular
     acceleration lacks A tau' T / 2, where A turns torques into body accelerations.
@@ -232,9 +238,10 @@ class HeldTorques:
         self._impulse = p[0] + seconds * x, p[1] + seconds * y, p[2] + seconds * z
 
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
-        """Estimated errors of the orientation [rad]: torques of the start, and of the middle.
+        """Return estimated errors of the orientation [rad].
 
-        None where fewer than two torques were held, or where the torques of the
+        The first is of torques of the start, the second of torques of the middle. None
+        is returned where fewer than two torques were held, or where the torques of the
         actuators lag.
         """
         if len(self._torques) < 2 or len(simulation.dynamics.state) > 7:

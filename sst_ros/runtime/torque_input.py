@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torque commands: validated, limited, held (zero-order hold) and dropped when they are too old."""
+"""Torque commands: validated, limited, held (zero-order hold), dropped if too old."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class TorqueInput:
         self._forget()
 
     def clear(self) -> None:
-        """Forget the command and what has arrived: zero torque until the next command."""
+        """Forget the command and all arrivals: zero torque until the next command."""
         for arrivals in filter(None, (self._commands, self._stamped, self._moments)):
             arrivals.read(math.inf)
         self._forget()
@@ -114,7 +114,10 @@ class TorqueInput:
         return (time.monotonic_ns() - self._since) / NANOSECONDS if self.begun else None
 
     def constant(self, until_ns: int) -> bool:
-        """Whether the torque and moment of the last tick act until this monotonic time [ns]."""
+        """Whether torque and moment of the last tick act until this time.
+
+        The time is monotonic [ns].
+        """
         if self.stale and self._damping > 0.0:  # the torque depends on the state
             return False
         moments = self._moments
@@ -129,7 +132,10 @@ class TorqueInput:
         return self.moment == ZERO or not self._is_old(self._moment_since, until_ns)
 
     def accept_idle(self, stamp_ns: int, *, alone: bool = False) -> None:
-        """Accept answers to a state shown with this stamp before the run, `alone` to no other."""
+        """Accept answers to a state shown with this stamp before the run.
+
+        With `alone`, answers to no other state are accepted.
+        """
         self._idle_ns = [(not alone and self._idle_ns[0]) or stamp_ns, stamp_ns]
 
     def starts_run(self) -> bool:
@@ -144,7 +150,7 @@ class TorqueInput:
         return self.begun
 
     def torque(self, simulation: Simulation, now_ns: int) -> Vector3:
-        """Return the torques of the tick that begins at this monotonic time [ns], in N m."""
+        """Return torques [N m] of the tick that begins at this monotonic time [ns]."""
         self._take(now_ns)
         old = self.begun and self._is_old(self._since, now_ns)
         self.timeouts += old and not self.stale
@@ -158,11 +164,11 @@ class TorqueInput:
         return clamp((damping * first, damping * second, damping * third), self._limit)
 
     def answer(self, stamp_ns: int | None) -> Vector3 | None:
-        """Return the torques that answer the sample of this stamp [N m], None without an answer.
+        """Return the torques [N m] that answer the sample of this stamp.
 
-        With None an answer to a state shown before the run is looked for. In a run such
-        answers are ignored, because they may arrive late. In a pause the state of the
-        sample is shown again.
+        Without an answer None is returned. With the stamp None an answer to a state
+        shown before the run is looked for. In a run such answers are ignored, because
+        they may arrive late. In a pause the state of the sample is shown again.
         """
         found: Vector3 | None = None
         for _ in self._commands.read(math.inf):
@@ -274,7 +280,7 @@ def torque_by_name(message: Any) -> Vector3:
 
 
 def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3:
-    """Return one value for each actuator, gamma_1 to gamma_3, which may come in any order."""
+    """Return a value for each actuator, gamma_1 to gamma_3, given in any order."""
     if sorted(names) != list(ACTUATED_JOINTS):
         allowed = ", ".join(ACTUATED_JOINTS)
         reason = f"names {_shorten(names)} must be {allowed}, each once"

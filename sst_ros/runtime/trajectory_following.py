@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Following trajectories of messages: when each is planned and begins, its stages, its end."""
+"""Following trajectories of messages: planning, beginning, stages, end of each."""
 
 from __future__ import annotations
 
@@ -263,7 +263,7 @@ class TrajectoryFollower:
         return not self._upcoming and self.time >= self._motion.duration
 
     def _motion_at(self, stamp_ns: int) -> tuple[ReferenceMotion, float]:
-        """Return what is followed at a stamp that has not come yet, and its time then [s]."""
+        """Return what is followed at a stamp to come, and its time then [s]."""
         motion, start_ns = self._motion, self._start_ns or self._last_ns
         for begin_ns, upcoming, _ in self._upcoming:
             if begin_ns <= stamp_ns:
@@ -369,7 +369,7 @@ class TrajectoryFollower:
 
     @property
     def errors(self) -> tuple[float, float]:
-        """Root of the mean square and largest of all errors of the motion up to now [rad]."""
+        """Root mean square and largest of all errors of the motion up to now [rad]."""
         self._add_rows()
         rms, largest = self._metrics.rms, self._metrics.largest
         return float(np.sqrt(np.mean(rms**2))), float(largest.max())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories and goals as messages have them: points, a motion through them, tolerances.
+"""Trajectories and goals of messages: points, a motion through them, tolerances.
 
 The rules of goals are those of ros2_controllers' joint_trajectory_controller:
 tolerances of the path hold until the time of the last point, those of the goal from
@@ -143,7 +143,7 @@ def plan(
 
 
 def _points_ahead(points: Points, passed: float) -> Points:
-    """Return the points behind a time of the trajectory [s], with times from there on."""
+    """Return the points after a time of the trajectory [s], with times from there."""
     ahead = [index for index, time in enumerate(points.times) if time > passed]
     latest = max(points.times, default=0.0)
     late = f"must lie less than {latest:g} s back: all points have passed"
@@ -261,7 +261,7 @@ class TrajectoryGoal:
         return 0.0 if none else value or default
 
     def index(self, time: float) -> int:
-        """Return the index of the point that is approached at a time of the motion [s]."""
+        """Return the index of the point approached at a time of the motion [s]."""
         return min(bisect_right(self._times, time), len(self._times) - 1)
 
     def outcome(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: a picture by viser, numbers, plots and controls, some thirty times a second.
+"""The page: picture by viser, numbers, plots, controls, some thirty times a second.
 
 The picture has seven links that rotate about O, the path of E, s, and torques.
 """
@@ -112,7 +112,7 @@ class Page:
         scene.set_up_direction("+z")
 
     def _build(self, scene: Scene) -> None:
-        """Show another scene in place of the last: picture, numbers, plots and controls."""
+        """Replace the scene that is shown: picture, numbers, plots and controls."""
         self._clear()
         server, gui, source = self._server, self._server.gui, self._source
         self._scene, self._state = scene, None
@@ -170,7 +170,7 @@ class Page:
             self._rows.append((state.time, *np.degrees(state.gamma), *state.torque))
 
     def _show_numbers(self) -> None:
-        """Show name, phase and time, the numbers of the state, and what is possible now."""
+        """Show name, phase, time, numbers of the state, and what is possible now."""
         state, status = self._state, self._source.status()
         phase, at = (
             status.phase or "no simulator",

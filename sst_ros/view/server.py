@@ -114,9 +114,10 @@ class AccessCheck:
 
 
 class PageServer(ViserServer):
-    """viser's server at `url` with the check, a bounded search for a port, and no public share.
+    """viser's server at `url` with the check and without a public share.
 
-    Raises InputError where the host is no address of this machine, or no port is free.
+    The search for a port is bounded. Raises InputError where the host is no address of
+    this machine, or no port is free.
     """
 
     def __init__(self, host: str = LOCAL, port: int = PORT) -> None:
@@ -138,13 +139,13 @@ class PageServer(ViserServer):
             super().stop()
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse to publish the page through a server elsewhere: it drives a machine."""
+        """Refuse to publish the page by a server elsewhere: it drives a machine."""
         return None
 
 
 @contextlib.contextmanager
 def _swap_serve(check: AccessCheck) -> Iterator[None]:
-    """Put the check before viser's own handler in the call by which it starts its web server.
+    """Put the check before viser's own handler in the call that starts its web server.
 
     viser 1.1 neither takes a handler of requests nor hands on the server that it
     starts, and hears of a client only when its websocket is open; so `websockets` gets

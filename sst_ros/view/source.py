@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows and what its controls act on: a running simulator, or a recording."""
+"""What the page shows and its controls act on: a running simulator or a recording."""
 
 from __future__ import annotations
 
