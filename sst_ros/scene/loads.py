@@ -142,7 +142,7 @@ class Initial(Section):
 class ToAngles(Section):
     """The actuators go straight from their initial angles to others.
 
-    They go with minimum jerk.
+    The motion has minimum jerk.
     """
 
     gamma: Vector3 = angles("actuator angles at the end")
@@ -152,7 +152,7 @@ class ToAngles(Section):
 class ToOrientation(Section):
     """The star turns about one axis from its initial orientation to another.
 
-    It turns with minimum jerk.
+    The motion has minimum jerk.
     """
 
     orientation: Quaternion = entry(
