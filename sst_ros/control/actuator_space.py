@@ -108,7 +108,10 @@ class ReferenceMotion(Explained):
         return Reference(found.quaternion, ZERO, ZERO, found.gamma, ZERO, ZERO)
 
     def effort_at(self, time: float) -> Vector3 | None:
-        """Return the torques to add at a time [s], those of the ends beyond them [N m]."""
+        """Return the torques [N m] to add at a time [s].
+
+        Beyond the ends of the motion they are those of the ends.
+        """
         if self.effort is None:
             return None
         return self.effort(min(max(time, 0.0), self.duration))
@@ -133,11 +136,12 @@ def equal_pieces(duration: float, count: int) -> tuple[float, ...]:
 def slow_down(
     motion: ReferenceMotion, begin: float, duration: float
 ) -> ReferenceMotion:
-    """Return a motion from its time `begin` [s] on, slowed down to rest over a duration > 0 [s].
+    """Return a motion slowed down to rest from its time `begin` [s] on.
 
-    Its time s has ds/dt = 1 - 3 u^2 + 2 u^3 with u = t / duration: 1 at first and 0 at
-    the end, with d^2s/dt^2 = 0 at both. It stays on the path of the given motion, which
-    is inside all limits of position, for half of `duration` more at most.
+    The duration of the slowdown is > 0 [s]. Its time s has ds/dt = 1 - 3 u^2 + 2 u^3
+    with u = t / duration: 1 at first and 0 at the end, with d^2s/dt^2 = 0 at both. It
+    stays on the path of the given motion, which is inside all limits of position, for
+    half of `duration` more at most.
     """
     inside = partial(_slowed_down, motion, begin, duration)
     effort = None
@@ -232,14 +236,14 @@ class ActuatorSpaceMap:
         gamma: Vector3,
         sigma: float | None = None,
     ) -> Quaternion:
-        """Quaternion at gamma of the assembly mode that is known at other angles, however far.
+        """Find the quaternion at gamma of the assembly mode known at other angles.
 
-        It is found in the steps that `continuation` proves to stay in the mode. The
-        proof needs sigma, the least singular value of J2. The rows of J2 are unit
-        vectors, so its squared singular values sum to 3, the product of the larger two
-        is at most 3/2, and sigma >= 2/3 abs(det J2): enough for most steps, and cheap.
-        Raises BranchEnds where a parallel singularity lies between, or no assembly has
-        these angles.
+        The other angles may be far from gamma. The quaternion is found in the steps
+        that `continuation` proves to stay in the mode. The proof needs sigma, the least
+        singular value of J2. The rows of J2 are unit vectors, so its squared singular
+        values sum to 3, the product of the larger two is at most 3/2, and sigma >= 2/3
+        abs(det J2): enough for most steps, and cheap. Raises BranchEnds where a
+        parallel singularity lies between, or no assembly has these angles.
         """
         step = math.dist(gamma, here)
         with contextlib.suppress(ArithmeticError):
@@ -257,7 +261,7 @@ class ActuatorSpaceMap:
         return follow_assembly(self.geometry, known, here, gamma)
 
     def _find_orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
-        """Quaternion, of length 1, of the assembly at gamma that is closest to `near`."""
+        """Return the unit quaternion of the assembly at gamma closest to `near`."""
         carriages = self.carriages(gamma)
         best, least, q = near, math.inf, near
         for _ in range(_INVERSION_STEPS):
@@ -273,7 +277,10 @@ class ActuatorSpaceMap:
         return best
 
     def carriages(self, gamma: Any) -> list[Any]:
-        """Return the unit vectors r_k of the carriages at angles of any kind, nine numbers."""
+        """Return the unit vectors r_k of the carriages, nine numbers.
+
+        The angles may be numbers of any kind.
+        """
         found: list[Any] = []
         for angle, leg in zip(gamma, self._legs, strict=True):
             c, s = gm.cos(angle), gm.sin(angle)
@@ -283,7 +290,10 @@ class ActuatorSpaceMap:
     def orientations(
         self, near: Array, gamma: Array, steps: int = _INVERSION_STEPS
     ) -> Array:
-        """Quaternions (n, 4) at gamma (n, 3) by steps of Newton's method from `near` (n, 4)."""
+        """Find quaternions (n, 4) at gamma (n, 3) by steps of Newton's method.
+
+        The steps begin at `near`, shape (n, 4).
+        """
         carriages, q = self.carriages(gamma.T), list(near.T)
         for _ in range(steps):
             *q, first, second, third = self.newton_step(*q, *carriages)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse dynamics, controllers that track a reference motion by them, and how well they do.
+"""Inverse dynamics, controllers that track a reference motion, and how well they do.
 
-The control laws are in `law`: by the model, by feedback, or by both.
+The controllers use the inverse dynamics. The control laws are in `law`: by the model,
+by feedback, or by both.
 """
 
 from __future__ import annotations
@@ -111,11 +112,12 @@ class InverseDynamics(Explained):
         )
 
     def gravity_torque(self, at: State | Sequence[float]) -> Vector3:
-        """Torques [N m] that hold the manipulator at rest against gravity, springs and the like.
+        """Return the torques [N m] that hold the manipulator at rest.
 
-        It is in a state of a simulation; or in the admissible assembly at gamma [rad],
-        shape (3,); or at the quaternion (x, y, z, w) of {E} in {B}, shape (4,). Raises
-        as `torque`, and AssemblyError where gamma has no unique admissible assembly.
+        They hold it against gravity, springs and the like. The manipulator is in a
+        state of a simulation; or in the admissible assembly at gamma [rad], shape (3,);
+        or at the quaternion (x, y, z, w) of {E} in {B}, shape (4,). Raises as `torque`,
+        and AssemblyError where gamma has no unique admissible assembly.
         """
         return self.torque(self._orientation(at), ZERO, ZERO)
 
@@ -133,9 +135,9 @@ class InverseDynamics(Explained):
 
     @check_kinds
     def bias(self, state: State, moment: Vector3 = ZERO) -> Vector3:
-        """Torques h of tau = M gamma_ddot + h [N m]: those that keep gamma_dot in a state.
+        """Return the torques h of tau = M gamma_ddot + h [N m] in a state.
 
-        The moment and what is raised are as in `torque`.
+        They keep gamma_dot as it is. The moment and what is raised are as in `torque`.
         """
         three = finite_vector(moment) is not None
         refuse_unless(
@@ -150,10 +152,11 @@ class InverseDynamics(Explained):
     def torque_of_moment(
         self, at: State | Sequence[float], moment: ArrayLike
     ) -> Vector3:
-        """Torques [N m] at the actuators that do the work of a moment on the star in {B} [N m].
+        """Return torques [N m] at the actuators that do the work of a moment.
 
-        `at` and what is raised are as in `gravity_torque`. They stand for loads that a
-        scene has not, in a function for `simulate`.
+        The moment acts on the star, in {B} [N m]. `at` and what is raised are as in
+        `gravity_torque`. The torques stand for loads that a scene has not, in a
+        function for `simulate`.
         """
         three = finite_vector(moment) is not None
         refuse_unless(
@@ -260,7 +263,10 @@ class ChannelState:
         self._first = 1.0
 
     def measure(self, gamma: Vector3, gamma_dot: Vector3) -> Measurement:
-        """Return what the controller receives of gamma [rad] and gamma_dot [rad/s] at a sample."""
+        """Return what the controller receives at a sample.
+
+        It receives gamma [rad] and gamma_dot [rad/s], as they are measured.
+        """
         channel, noise = self._channel, []
         if channel.counts and self._before is None:
             earlier = axpy(1.0, gamma, -channel.period, gamma_dot)
@@ -271,19 +277,23 @@ class ChannelState:
         return Measurement(*measured)
 
     def transmit(self, command: Vector3) -> Vector3:
-        """Return what arrives when this was sent: torques [N m] that act, or what is measured."""
+        """Return what arrives when this command was sent.
+
+        These are torques [N m] that act, or what is measured.
+        """
         torque, self._queue = self._channel.transmit(command, self._queue, self._first)
         self._first = 0.0
         return torque
 
 
 class Controller:
-    """A controller that tracks one reference motion by one of the five schemes of the law.
+    """A controller that tracks one reference motion by a scheme of the law.
 
-    It has a model of the manipulator, which may differ from the plant, and holds a
-    command over a control period [s]. Its `inertia` is M_kk at the start of the motion
-    [kg m^2], by which gains are made. Raises InputError where the integral action would
-    be unstable, SingularConfiguration where the motion begins in a singularity.
+    The law has five schemes. The controller has a model of the manipulator, which may
+    differ from the plant, and holds a command over a control period [s]. Its `inertia`
+    is M_kk at the start of the motion [kg m^2], by which gains are made. Raises
+    InputError where the integral action would be unstable, SingularConfiguration where
+    the motion begins in a singularity.
     """
 
     @check_kinds
@@ -404,9 +414,10 @@ class Controller:
         self._motion = motion
 
     def desire(self, time: float) -> tuple[Reference, Vector3, Vector3]:
-        """Return the reference at a time [s], its torques [N m], and those that a period holds.
+        """Return the reference at a time [s], its torques, and those held.
 
-        The torques are zeros where the mode does not feed them forward.
+        The torques [N m] are those of this time, and those that a period holds. They
+        are zeros where the mode does not feed them forward.
         """
         desired = self._motion.at(time)
         if not self._settings.feeds:
@@ -419,7 +430,10 @@ class Controller:
         return desired, now, held
 
     def _hold_time(self, time: float) -> float:
-        """Return the time whose feedforward is held over the period from `time` on [s]."""
+        """Return the time of the feedforward held over a period.
+
+        The period is from `time` on [s].
+        """
         is_middle = self._settings.feedforward_at == "middle"
         return time + 0.5 * self._period_s if is_middle else time
 
@@ -465,7 +479,10 @@ class Controller:
         return command
 
     def __call__(self, time: float, state: State) -> Vector3:
-        """Torques [N m] for the angles and rates of a state: a function for `simulate`."""
+        """Return torques [N m] for the angles and rates of a state.
+
+        This makes the controller a function for `simulate`.
+        """
         joints = state.joints
         return self.command(time, Measurement(joints.gamma, joints.gamma_dot)).torque
 
@@ -484,7 +501,10 @@ Track: TypeAlias = "np.recarray[Any, Any]"
 
 
 def track_of(rows: ArrayLike) -> Track:
-    """Return a tracking record, shape (n,) of TRACK, of numbers in its order, (n, 19) or flat."""
+    """Return a tracking record, shape (n,) of TRACK, of numbers in its order.
+
+    The numbers have the shape (n, 19), or are flat.
+    """
     return np.array(rows, dtype=float).reshape(-1).view(TRACK).view(np.recarray)
 
 

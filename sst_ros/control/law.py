@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control law, and the channel between plant and controller, on numbers of any kind.
+"""The control law, and the channel of plant and controller, on numbers of any kind.
 
 The five schemes, with e = desired - measured in gamma:
 
     feedforward         tau = ID(desired)
     pd                  tau = K e + D e_dot
-    gravity_pd          tau = K e + D e_dot + G(measured)           Takegaki and Arimoto 1981
+    gravity_pd          tau = K e + D e_dot + G(measured)      Takegaki and Arimoto 1981
     feedforward_pd      tau = ID(desired) + K e + D e_dot
     computed_torque     tau = ID(measured state, gamma_ddot + kd e_dot + kp e)
 
@@ -153,10 +153,11 @@ class ControlChannel(Section):
     def measure(
         self, gamma: Triple, gamma_dot: Triple, before: Any, noise: Any
     ) -> tuple[Triple, Triple, Any]:
-        """Return the angles and rates that the controller receives, and angles to remember.
+        """Return the angles and rates that the controller receives.
 
-        `before` are those of the last sample, none without encoders; `noise` are six
-        numbers that are added to gamma [rad] and gamma_dot [rad/s], or none.
+        Also angles to remember: `before` are those of the last sample, none without
+        encoders; `noise` are six numbers that are added to gamma [rad] and gamma_dot
+        [rad/s], or none.
         """
         if self.counts:
             gamma = triple(map(self.count, gamma))
@@ -239,12 +240,13 @@ class ControlLaw(NamedTuple):
         integral: Any,
         effort: Triple | None = None,
     ) -> Command:
-        """Return the torques at a sample, of angles [rad] and rates [rad/s] as measured.
+        """Return the torques at a sample, of the measured angles and rates.
 
-        `torques` are those of the desired motion [N m], now and at the instant whose
-        torque is held; `observed` is the orientation at the measured angles, where the
-        law needs it, and `integral` the sum of errors [rad s], none without integral
-        action. An `effort` is added to the feedforward [N m].
+        Angles are in rad, rates in rad/s. `torques` [N m] are those of the desired
+        motion, now and at the instant whose torque is held; `observed` is the
+        orientation at the measured angles, where the law needs it, and `integral` the
+        sum of errors [rad s], none without integral action. An `effort` [N m] is added
+        to the feedforward.
         """
         mode, feedback, summed = self.settings.mode, ZERO, ZERO
         feedforward = torques[1] if self.settings.feeds else ZERO
@@ -321,7 +323,10 @@ def feedback_gains(
 
 
 def command_limit(limit: Any, model: Scene) -> Array:
-    """Return the limit of commands [N m]: the settings', 0 for none, or less by the actuators."""
+    """Return the limit of commands [N m].
+
+    It is that of the settings, 0 for none, or less by the actuators.
+    """
     own = model.torque_limit or np.inf
     return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own)
 

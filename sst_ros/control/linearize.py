@@ -109,7 +109,9 @@ class LinearModel(Explained, ReadOnly):
 
 
 def equilibrium(scene: SceneInput, gamma: Any) -> State:
-    """Return the state at rest at gamma [rad], whose `torque` holds the manipulator there.
+    """Return the state at rest at gamma [rad].
+
+    Its `torque` holds the manipulator there.
 
     Raises:
         InputError: gamma is not three angles in the stroke.
@@ -132,7 +134,9 @@ def linearize(
     dt: float | None = None,
     coordinates: str = "gamma",
 ) -> LinearModel:
-    """Linearize the dynamics of a scene, all its terms included, near a state and its torques.
+    """Linearize the dynamics of a scene near a state and its torques.
+
+    All terms of the scene are included.
 
     Args:
         scene: name or path of a scene, its document as a dict, or a `Scene`.

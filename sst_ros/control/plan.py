@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feasibility of a reference motion before it is run: demands, distances from limits, top speed.
+"""Feasibility of a reference motion: demands, distances from limits, top speed.
 
-At `factor` times the speed rates grow by the factor and accelerations by its square.
-Torques of inertia follow the square too, but weight and springs stay, and friction has
-its own dependence: the limits are tested on the dynamics themselves, not scaled.
+All this is known before the motion is run. At `factor` times the speed rates grow by
+the factor and accelerations by its square. Torques of inertia follow the square too,
+but weight and springs stay, and friction has its own dependence: the limits are tested
+on the dynamics themselves, not scaled.
 """
 
 from __future__ import annotations
@@ -116,9 +117,10 @@ def check_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
 def examine_motion(
     motion: ReferenceMotion, scene: Scene, *, exact: bool = True
 ) -> MotionPlan:
-    """Compute demands of a motion and its distances from all limits, between samples too.
+    """Compute demands of a motion and its distances from all limits.
 
-    Those that lie inside all limits are not `exact` where that is not asked for.
+    Also between samples. Distances that lie inside all limits are not `exact` where
+    that is not asked for.
 
     An external moment from a topic counts as zero; the lag of actuators is not
     included. Raises SingularConfiguration where the motion meets a singularity: no
@@ -184,10 +186,11 @@ def _sample(
     times: Array,
     desired: Sequence[Reference],
 ) -> tuple[Array, Callable[[int, float, float], Peak]]:
-    """Return m numbers that are measured at n references, (n, m), and what finds their extremes.
+    """Return m numbers at n references, (n, m), and what finds their extremes.
 
-    That takes the index of a number, a sign, +1 for its highest value or -1 for its
-    lowest, and the floor of `maximum` for the number times the sign.
+    `measure` gives the numbers. What finds an extreme takes the index of a number, a
+    sign, +1 for its highest value or -1 for its lowest, and the floor of `maximum` for
+    the number times the sign.
     """
     samples = np.array(list(map(measure, desired)))
 
@@ -322,12 +325,12 @@ def _faults(
 
 @dataclass(frozen=True)
 class TimeScaling:
-    """Factors of speed at which the actuators can do a motion, from `lowest` to `highest`.
+    """Factors of speed at which the actuators can do a motion.
 
-    The lowest is 0 where the actuators can hold the manipulator all along the path; the
-    highest is infinite where no limit is ever met, None where no factor is feasible.
-    `binding` is the limit that ends the range: torque, velocity or acceleration; empty
-    if none does.
+    They range from `lowest` to `highest`. The lowest is 0 where the actuators can hold
+    the manipulator all along the path; the highest is infinite where no limit is ever
+    met, None where no factor is feasible. `binding` is the limit that ends the range:
+    torque, velocity or acceleration; empty if none does.
     """
 
     highest: float | None
@@ -405,10 +408,10 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
 
 
 def examine_reactions(plan: MotionPlan) -> dict[str, dict[str, LoadFigures]]:
-    """Return peak and RMS of the reactions of a plan, by kind of joint and `reactions.SIZES`.
+    """Return peak and RMS of the reactions of a plan.
 
-    The motion is sampled again, finely, beside each largest sample: a peak is off by
-    some 1e-5 of itself.
+    They are ordered by kind of joint and `reactions.SIZES`. The motion is sampled
+    again, finely, beside each largest sample: a peak is off by some 1e-5 of itself.
     """
     t = plan.trajectory.t
     windows = [t]
@@ -453,9 +456,10 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
 
 
 def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
-    """Write the torques for `torque_player`: each row, held for a period [s], is its middle's.
+    """Write the torques for `torque_player`.
 
-    The last row holds the manipulator where the motion ends.
+    Each row is held for a period [s], and has the torques of its middle. The last row
+    holds the manipulator where the motion ends.
     """
     inverse, motion = InverseDynamics(plan.trajectory.scene), plan.motion
     count = math.ceil(motion.duration / period - 1e-9)

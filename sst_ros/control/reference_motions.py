@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference motion of a scene: of the star, or of the actuators, which the star follows.
+"""The reference motion of a scene: of the star, or of the actuators.
 
-Through waypoints, and through the samples of a recording, goes one quintic a segment:
-position, velocity and acceleration at both ends make it. Where a velocity or an
-acceleration is left open, all open ones together minimise the integral of the jerk
-squared: with positions alone that is the quintic spline with four continuous
-derivatives.
+The star follows a motion of the actuators. Through waypoints, and through the samples
+of a recording, goes one quintic a segment: position, velocity and acceleration at both
+ends make it. Where a velocity or an acceleration is left open, all open ones together
+minimise the integral of the jerk squared: with positions alone that is the quintic
+spline with four continuous derivatives.
 """
 
 from __future__ import annotations
@@ -130,13 +130,19 @@ def reference_motion(
 def _on_line(
     gamma: Vector3, span: Vector3, duration: float, time: float
 ) -> tuple[Vector3, Vector3, Vector3]:
-    """Return gamma and its derivatives at a time [s], straight from gamma over a span [rad]."""
+    """Return gamma and its derivatives at a time [s] of a straight motion.
+
+    The motion goes from gamma over a span [rad].
+    """
     s, rate, acceleration = minimum_jerk(time, duration)
     return axpy(1.0, gamma, s, span), multiply(rate, span), multiply(acceleration, span)
 
 
 def minimum_jerk(time: float, duration: float = 1.0) -> tuple[float, float, float]:
-    """From 0 to 1 over a duration, at rest at both ends, with its two derivatives by time."""
+    """Return the minimum-jerk course from 0 to 1 over a duration.
+
+    It is at rest at both ends. Its two derivatives by time are returned with it.
+    """
     u = time / duration
     rest, square = 1.0 - u, u * u
     return (
@@ -177,9 +183,10 @@ def _on_star_path(
 def geodesic_motion(
     geometry: Geometry, start: Quaternion, end: Quaternion, duration: float
 ) -> ReferenceMotion:
-    """From one orientation to another about one axis (the geodesic of SO(3)), minimum jerk.
+    """Turn from one orientation to another about one axis, with minimum jerk.
 
-    Quaternions (x, y, z, w) may have any length > 0; the shorter rotation is taken.
+    This is the geodesic of SO(3). Quaternions (x, y, z, w) may have any length > 0; the
+    shorter rotation is taken.
     """
     # The axis is the same in {B} and in {E}.
     turn = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()
@@ -201,10 +208,11 @@ def _on_geodesic(
 def spiral_motion(
     geometry: Geometry, start: Quaternion, spiral: Spiral
 ) -> ReferenceMotion:
-    """R(0) Rz(theta) Ry(phi) Rz(psi - theta), the three angles [rad] grown by minimum jerk.
+    """Return the motion R(0) Rz(theta) Ry(phi) Rz(psi - theta).
 
-    Tilt, its direction and torsion: at phi = 0 the star only turns by psi about E, so
-    the motion is smooth where ZYZ angles are not.
+    The three angles [rad] grow by minimum jerk. They are tilt, its direction and
+    torsion: at phi = 0 the star only turns by psi about E, so the motion is smooth
+    where ZYZ angles are not.
     """
     theta, phi, psi = spiral.theta, spiral.phi, spiral.psi
     path, turn = partial(_on_spiral, theta, phi, psi), abs(theta) + abs(phi) + abs(psi)
@@ -239,14 +247,15 @@ def _on_spiral(
 def move_actuators(
     geometry: Geometry, path: ActuatorPath, pieces: tuple[float, ...], start: Quaternion
 ) -> ReferenceMotion:
-    """Return a motion of the actuators, with the orientation of one assembly mode along it.
+    """Return a motion of the actuators, with the orientation along it.
 
-    Orientations are computed once along the path, by `continuation` in steps that
-    cannot leave the assembly mode; any other orientation is computed from the nearest
-    of these. The motion therefore does not depend on what was asked before. It starts
-    from an orientation (x, y, z, w). Raises SingularConfiguration, with the time, where
-    the path meets a parallel singularity, InputError where a piece is longer than
-    LONGEST_PIECE, AssemblyError where it does not begin at that orientation.
+    The orientation is that of one assembly mode. Orientations are computed once along
+    the path, by `continuation` in steps that cannot leave the assembly mode; any other
+    orientation is computed from the nearest of these. The motion therefore does not
+    depend on what was asked before. It starts from an orientation (x, y, z, w). Raises
+    SingularConfiguration, with the time, where the path meets a parallel singularity,
+    InputError where a piece is longer than LONGEST_PIECE, AssemblyError where it does
+    not begin at that orientation.
     """
     space, times = ActuatorSpaceMap(geometry), _space(path, pieces)
     gammas = [path(time)[0] for time in times]
@@ -286,14 +295,20 @@ def _on_path(
 
 
 def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
-    """Return times from the first to the last between which gamma moves by no more than KEPT_STEP."""
+    """Return times between which gamma moves by no more than KEPT_STEP.
+
+    The first and the last time are among them.
+    """
     times = [np.zeros(1)]
     for begin, end in pairwise(pieces):
         rough = [
             path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()
         ]
         length = sum(math.dist(a, b) for a, b in pairwise(rough))
-        allowed = f"must be less than {LONGEST_PIECE:g} rad between {begin:.9g} s and {end:.9g} s"
+        allowed = (
+            f"must be less than {LONGEST_PIECE:g} rad"
+            f" between {begin:.9g} s and {end:.9g} s"
+        )
         refuse_unless(
             "motion", ("path length of gamma", length, length < LONGEST_PIECE, allowed)
         )
@@ -493,7 +508,10 @@ def quintic(
 
 
 def _complete(nodes: Array, lengths: Array) -> None:
-    """Fill in what is open in nodes, shape (n, 3, m), in place: the least integral of jerk^2."""
+    """Fill in what is open in nodes, shape (n, 3, m), in place.
+
+    What is filled in has the least integral of jerk^2.
+    """
     usual = float(np.median(lengths))
     # A velocity times the usual length has the size of a position: the system stays
     # well scaled.

@@ -91,7 +91,10 @@ def fit_weighted(
 
 
 def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, Array]:
-    """Estimate, R of the weighted regressor, and the unknowns that each actuator determines."""
+    """Return the estimate, R of the weighted regressor, and the leverage.
+
+    The leverage of an actuator is how many unknowns it determines.
+    """
     matrix = (columns / noise[:, None]).reshape(-1, columns.shape[-1])
     right = (torque / noise).ravel()
     lengths = np.linalg.norm(matrix, axis=0)
@@ -113,13 +116,13 @@ def find_consistent_values(
     root: Array,
     reach: float,
 ) -> tuple[Array, float]:
-    """Values of all parameters that fit the base parameters, those of bodies that can exist.
+    """Find values of all parameters that fit the base parameters.
 
-    Of p parameters with values given in the scene, b combinations (transform, shape (b,
-    p)) were estimated, with the covariance (R^T R)^-1 of the root R. Centres of mass
-    lie within the reach of O [m]. Returns the values, shape (p,), and chi^2 of the base
-    parameters there: how much worse the torques are fitted than without the
-    constraints.
+    The values are those of bodies that can exist. Of p parameters with values given in
+    the scene, b combinations (transform, shape (b, p)) were estimated, with the
+    covariance (R^T R)^-1 of the root R. Centres of mass lie within the reach of O [m].
+    Returns the values, shape (p,), and chi^2 of the base parameters there: how much
+    worse the torques are fitted than without the constraints.
     """
     sizes, (constant, basis) = scales(names, given), make_cones(names, reach)
     rows = np.vstack([root @ transform, np.diag(1.0 / sizes)])
@@ -217,7 +220,10 @@ def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
 
 
 def scales(names: Sequence[str], given: Array) -> Array:
-    """Size that a parameter may have: of bodies by their mass and inertia, shape (p,)."""
+    """Return the sizes that parameters may have, shape (p,).
+
+    Those of bodies are by their mass and inertia.
+    """
     values = dict(zip(names, given.tolist(), strict=True))
     sizes = []
     for name in names:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exciting motions: Fourier series of the actuators that make parameters well determined.
+"""Exciting motions of the actuators, which make parameters well determined.
 
 The motion is a Fourier series that begins and ends at rest,
 
@@ -90,7 +90,9 @@ def design(
     iterations: int = 60,
     seed: int = 0,
 ) -> ExcitingMotion:
-    """Design a motion about the initial pose of a scene that determines parameters well.
+    """Design a motion that determines the parameters of a scene well.
+
+    The motion is about the initial pose of the scene.
 
     Args:
         scene: the manipulator, with values as good as they are known.
@@ -140,10 +142,11 @@ def design(
 
 
 class _Trial:
-    """Fourier series of free numbers about `centre`, at `times`, and how far they determine `base`.
+    """Fourier series of free numbers, and how far they determine `base`.
 
-    `base` are the parameters that some motion of the scene determines; samples are
-    POINTS_A_PERIOD in a period of the highest harmonic, n of them.
+    The series are about `centre`, at `times`. `base` are the parameters that some
+    motion of the scene determines; samples are POINTS_A_PERIOD in a period of the
+    highest harmonic, n of them.
     """
 
     def __init__(
@@ -187,7 +190,10 @@ class _Trial:
         return float(np.log(_condition(columns))) + log_deviation + penalty
 
     def evaluate(self, free: Array) -> tuple[Array, Array]:
-        """Return the regressor of b base parameters, shape (3 n, b), and excesses over limits."""
+        """Return the regressor of the base parameters, and excesses over limits.
+
+        The regressor of b base parameters has the shape (3 n, b).
+        """
         gamma, rate, acceleration = self.series(free)
         space, chosen = self._space, self.base.chosen
         with np.errstate(all="ignore"):

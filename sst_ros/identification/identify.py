@@ -151,7 +151,10 @@ class TorqueFit(Identification):
 
     @property
     def consistent(self) -> bool:
-        """Whether bodies that can exist explain the estimates within their uncertainty."""
+        """Whether bodies that can exist explain the estimates.
+
+        They have to explain them within their uncertainty.
+        """
         return self.excess < SIGNIFICANT
 
     @property
@@ -331,7 +334,9 @@ class WeightedFit(NamedTuple):
 
 
 class RegressionEquations:
-    """The equation of motion along measured segments, as a function of the delay of the angles.
+    """The equation of motion along measured segments.
+
+    It is a function of the delay of the angles.
 
     Attributes:
         regressor: known torques, and columns of the parameters.
@@ -359,10 +364,11 @@ class RegressionEquations:
         self._period = max(path.period for path in paths)
 
     def fit(self, noise: Sequence[float] | None, delay: float | None) -> WeightedFit:
-        """Fit the base parameters, and the delay [s] where none is given and angles are filtered.
+        """Fit the base parameters, and the delay [s] where none is given.
 
-        The noise is that of the torques [N m], three, by default estimated. InputError
-        is raised where the motion determines nothing.
+        The delay is fitted only where angles are filtered. The noise is that of the
+        torques [N m], three, by default estimated. InputError is raised where the
+        motion determines nothing.
         """
         if delay is not None or self.band is None:
             given = delay or 0.0
@@ -584,10 +590,10 @@ class EnergySums(NamedTuple):
 
 
 class _Path(NamedTuple):
-    """Angles, rates and accelerations along one segment, and where the equation is taken.
+    """Angles, rates and accelerations along one segment.
 
-    Without a `cutoff` [Hz] angles are filtered only where no rates were measured, at
-    CUTOFF_MARGIN times the bandwidth of the motion.
+    Also where the equation is taken. Without a `cutoff` [Hz] angles are filtered only
+    where no rates were measured, at CUTOFF_MARGIN times the bandwidth of the motion.
     """
 
     measured: MeasuredMotion
@@ -647,11 +653,12 @@ class _Path(NamedTuple):
     def evaluate(
         self, regressor: Regressor, delay: float, longest: float
     ) -> tuple[Array, Array, Array]:
-        """Evaluate the equation of motion at the samples, or its means where torques are held.
+        """Evaluate the equation of motion at the samples.
 
-        Returns known and measured torques [N m], each shape (m, 3), between them the
-        regressor of p parameters, shape (m, 3, p). Angles were measured a delay [s]
-        late. Angles that no assembly has are refused.
+        Where torques are held, its means are evaluated. Returns known and measured
+        torques [N m], each shape (m, 3), between them the regressor of p parameters,
+        shape (m, 3, p). Angles were measured a delay [s] late. Angles that no assembly
+        has are refused.
         """
         cut = self.unsettled + int(np.ceil(longest / self.period * (1.0 - 1e-9)))
         rows = slice(cut, max(len(self.times) - cut, cut))
@@ -755,9 +762,10 @@ def _follow_orientations(
 
 
 def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, int]:
-    """Angles after a zero-phase filter, and the samples at both ends that it has not settled for.
+    """Return angles after a zero-phase filter, and how many samples to leave out.
 
-    Samples must be evenly spaced, and the cut-off be below half their rate.
+    Those are the samples at both ends that the filter has not settled for. Samples must
+    be evenly spaced, and the cut-off be below half their rate.
     """
     spacing = np.diff(t)
     period = float(np.median(spacing))
@@ -785,7 +793,10 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
 
 
 def find_bandwidth(period: float, gamma: Array) -> float:
-    """Frequency [Hz] below which the angles have all but 1e-4 of the power of their changes."""
+    """Return the frequency [Hz] below which the angles have their power.
+
+    That is all but 1e-4 of the power of their changes.
+    """
     spread = (gamma - gamma.mean(axis=0)) * np.hanning(len(gamma))[:, None]
     power = np.sum(np.abs(np.fft.rfft(spread, axis=0)) ** 2, axis=1)
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
@@ -849,7 +860,10 @@ def fit_simulation(
 
     @lru_cache(maxsize=1)  # SciPy asks for residuals and slopes one after the other
     def compare(*x: float) -> tuple[Array, Array]:
-        """Return computed less measured angles [rad], (3 n,), and derivatives, (3 n, p)."""
+        """Return computed less measured angles [rad], and derivatives.
+
+        The angles have the shape (3 n,), the derivatives (3 n, p).
+        """
         states, slopes = motion.run(np.array(x) * size, t)
         rows = states[:, :7].T
         turned = np.exp(

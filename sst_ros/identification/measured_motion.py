@@ -107,7 +107,10 @@ class Segments(NamedTuple):
 
 
 def read_motion(data: Measured) -> MeasuredMotion:
-    """Read a motion from a recording, a trajectory, or arrays, see `identify`, or refuse it."""
+    """Read a motion from a recording, a trajectory, or arrays, or refuse it.
+
+    What is allowed is described in `identify`.
+    """
     return _read(data)[0]
 
 
@@ -205,11 +208,11 @@ def _cut(motion: MeasuredMotion, first: int, end: int) -> MeasuredMotion:
 
 
 def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Known]:
-    """Take a simulated motion, or what was measured in a recorded run while it has torques.
+    """Take a simulated motion, or what was measured in a recorded run.
 
-    Also whether the torque of each interval is known. Rates of a run count only where
-    they are those of its motion: what was measured has noise, and its rates more than
-    its angles.
+    Of a run, samples count while it has torques. Returned is also whether the torque of
+    each interval is known. Rates of a run count only where they are those of its
+    motion: what was measured has noise, and its rates more than its angles.
     """
     if not isinstance(data, Trajectory) and hasattr(data, "measured"):
         return _take_measured(data)
@@ -286,7 +289,10 @@ def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
 
 
 def _average(law: torques.TorqueProfile, t: Array) -> Array:
-    """Means over the intervals of t of a torque that is constant between its breaks, (n - 1, 3)."""
+    """Return means of a torque over the intervals of t, (n - 1, 3).
+
+    The torque is constant between its breaks.
+    """
     if len(t) < 2:
         return np.empty((0, 3))
     breaks = law.kinks()
@@ -300,7 +306,10 @@ def _average(law: torques.TorqueProfile, t: Array) -> Array:
 def take_angles(
     data: Measured, scene: Scene
 ) -> tuple[torques.TorqueProfile, Array, Array]:
-    """Take the torques that move a scene, times from 0 on [s] (n,), and measured gamma (n, 3)."""
+    """Take the torques that move a scene, times, and measured gamma.
+
+    Times are from 0 on [s], shape (n,), gamma has the shape (n, 3).
+    """
     measured = read_motion(data)
     t = measured.t - measured.t[0]
     # a recording: torques before the lag, which the model has

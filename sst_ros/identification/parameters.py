@@ -63,10 +63,10 @@ STANDARD = (
 
 
 def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ...]:
-    """Names of parameters: all that the scene has, or those that begin as one of `requested`.
+    """Return names of parameters of a scene: all, or the `requested` ones.
 
-    Names begin as in ("star", "friction.gamma", "offset"); a beginning of none is
-    refused.
+    A name counts that begins as in ("star", "friction.gamma", "offset"); a beginning of
+    none is refused.
     """
     own, others = _list_names(scene)
     if requested is None:
@@ -94,7 +94,10 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
 
 
 def values(scene: Scene, names: Sequence[str]) -> Array:
-    """Values of parameters in a scene, zero for what it does not have, shape (len(names),)."""
+    """Return the values of parameters in a scene, shape (len(names),).
+
+    A value is zero for what the scene does not have.
+    """
     found = []
     for name in names:
         body, moment, _ = name.partition(".moment.")
@@ -111,7 +114,10 @@ def _of_centre(name: str) -> str:
 def with_parameters(
     scene: Scene, names: Sequence[str], numbers: Array, note: str
 ) -> Scene:
-    """Return the scene with identified values and a note of their provenance, or refuse them."""
+    """Return the scene with identified values, or refuse them.
+
+    A note of their provenance is added.
+    """
     found = dict(zip(names, (float(number) for number in numbers), strict=True))
     changed: dict[str, Any] = {}
     for name, number in found.items():
@@ -136,9 +142,10 @@ def with_parameters(
 
 
 def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
-    """Names of what the scene has, of equal links alike, and of what may be asked for besides.
+    """List names of what the scene has, and of what may be asked for besides.
 
-    That are links alone or alike, friction that is not yet known, and offsets.
+    Equal links are named alike. What may be asked for besides are links alone or alike,
+    friction that is not yet known, and offsets.
     """
     parts = STANDARD if scene.gravity is not None else STANDARD[4:]
 
@@ -213,13 +220,19 @@ class Identification(ReadOnly):
         return np.asarray(self.covariance / np.outer(self.deviation, self.deviation))
 
     def table(self) -> str:
-        """Return estimates, standard deviations, and what the motion leaves open, as text."""
+        """Return the estimates as text.
+
+        It has standard deviations, and what the motion leaves open.
+        """
         rows = zip(self.before, self.estimate, self.deviation, self.labels, strict=True)
         return render("identification.txt", found=self, rows=rows)
 
 
 class Regressor:
-    """Y and the known part of the torques of a scene: what is not among the parameters is known."""
+    """Y and the known part of the torques of a scene.
+
+    What is not among the parameters is known.
+    """
 
     def __init__(self, scene: Scene, names: Sequence[str]) -> None:
         self.scene, self.names = scene, tuple(names)
@@ -257,7 +270,7 @@ class Regressor:
     def __call__(
         self, quaternion: Array, rate: Array, acceleration: Array
     ) -> tuple[Array, Array]:
-        """Return the known torques [N m], shape (n, 3), and Y, shape (n, 3, len(names)).
+        """Return the known torques [N m], (n, 3), and Y, (n, 3, len(names)).
 
         States are quaternions (x, y, z, w) of {E} in {B}, W [rad/s] and W_dot [rad/s^2]
         in {E}.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Balls of Arb: numbers of documents, outward rounding to floats and to text, and a lock.
+"""Balls of Arb: numbers of documents, outward rounding to floats and text, a lock.
 
 A number of a document stands for the decimal number that is written and for the double
 that it is read as: its ball holds both. A number that Python code gives stands for the

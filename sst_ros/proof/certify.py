@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""certify(): how far the motion of a scene can be from the one that `simulate` gives, proven.
+"""certify(): how far a motion can be from the one that `simulate` gives, proven.
 
 A number of a scene stands for what is written and for the double that is read, or for
 anything in a range that is given. What is made from them (unit vectors, shifted
@@ -234,16 +234,25 @@ class BallEquations:
         return value, self.balls.compile(derivative, inputs, self.inputs)
 
     def between(self, begin: float, end: float) -> tuple[Function, Function]:
-        """Return the derivative, and it with the Jacobian, of time and state between two kinks."""
+        """Return the derivative, and the derivative with the Jacobian.
+
+        Both are functions of time and state between two kinks.
+        """
         value, jacobian = self.derivatives
         return self._commanded(value, begin, end), self._commanded(jacobian, begin, end)
 
     def limits_between(self, begin: float, end: float) -> Function:
-        """Return the numbers whose signs are named by `limit_names`, of time and state."""
+        """Return the numbers whose signs are named by `limit_names`.
+
+        They are functions of time and state.
+        """
         return self._commanded(self._limits, begin, end)
 
     def _commanded(self, function: Function, begin: float, end: float) -> Function:
-        """Return a function of time and state, of one that has commands after the state."""
+        """Return a function of time and state, without commands.
+
+        The given one has commands after the state.
+        """
         if self.loop is not None:
             return function
         size = len(self.state)
@@ -259,7 +268,10 @@ class BallEquations:
 
     @cached_property
     def joints(self) -> Function:
-        """Angles and rates of the joints, and their derivatives by quaternion, W and varied."""
+        """Compile the angles and rates of the joints, and their derivatives.
+
+        The derivatives are by quaternion, W and varied.
+        """
 
         def angles_and_rates(parts: Parts, *y: Any) -> list[Any]:
             return [x for row in kernel.joints(parts.model, y) for x in row]
@@ -298,7 +310,10 @@ class BallEquations:
 
     @cached_property
     def _limits(self) -> Function:
-        """Numbers of time, state, commands and varied: zero at a limit, positive inside."""
+        """Compile numbers that are zero at a limit and positive inside.
+
+        They are functions of time, state, commands and varied.
+        """
         size, elastic = len(self.state), self.scene.stroke.at_end == "elastic"
 
         def distances(parts: Parts, time: Any, *given: Any) -> list[Any]:
@@ -338,7 +353,10 @@ class Row(NamedTuple):
 
 
 class Follower:
-    """A proof of one motion, step by step, for all numbers in the balls of its equations."""
+    """A proof of one motion, step by step.
+
+    It holds for all numbers in the balls of the equations.
+    """
 
     def __init__(self, equations: BallEquations, trajectory: Trajectory) -> None:
         self._equations, self._trajectory = equations, trajectory
@@ -350,7 +368,10 @@ class Follower:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the motion is proven to its end: the duration, or a limit that stops it."""
+        """Whether the motion is proven to its end.
+
+        That is the duration, or a limit that stops it.
+        """
         return not self.reason or self.reason in self._equations.stop_names
 
     @property
@@ -361,7 +382,10 @@ class Follower:
     def follow(
         self, breaks: Sequence[float], tolerance: float, max_steps: int, bar: Bar
     ) -> None:
-        """Prove step by step from one break in time to the next, as far as that goes."""
+        """Prove step by step from one break in time to the next.
+
+        This goes on as long as steps can be proven.
+        """
         order = max(14, math.ceil(ORDER * math.log10(tolerance)))
         try:
             loop = self._equations.loop
@@ -442,7 +466,10 @@ class Follower:
 
 
 def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
-    """Return the rows that hold for all motions of some proofs, and the spans of all of them."""
+    """Return the rows that hold for all motions of some proofs.
+
+    The spans of all of them are returned, too.
+    """
     first, until = parts[0], min(part.until for part in parts)
     rows = []
     for rows_at in zip(*(part.rows for part in parts), strict=False):
@@ -645,7 +672,10 @@ def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
 def _signs(
     step: Advance, run: Function, count: int
 ) -> Iterator[tuple[float, float, Sequence[int]]]:
-    """Split a step into spans of time in which numbers are > 0 (1), < 0 (-1), or unknown (0)."""
+    """Split a step into spans of time by the signs of numbers.
+
+    Numbers are > 0 (1), < 0 (-1), or unknown (0).
+    """
     begin, left = step.begin.time, SPLITS
     todo = [(begin, step.end)]
     while todo:
@@ -749,12 +779,13 @@ def certify(
     progress: bool = False,
     **options: Any,
 ) -> ProvenMotion:
-    """Enclose the true motion of a scene, and bound the error of `simulate`, with proof.
+    """Enclose the true motion of a scene and bound the error of `simulate`.
 
-    A number of the scene stands for what is written and for the double that is read, or
-    for all of a range; rounding is outward. The proof passes contacts and torques at
-    their limit. It ends where the motion meets an end of the scene, or where no step is
-    proven: `until` and `reason` say so. One proof runs at a time, whatever the threads.
+    Both are proven. A number of the scene stands for what is written and for the double
+    that is read, or for all of a range; rounding is outward. The proof passes contacts
+    and torques at their limit. It ends where the motion meets an end of the scene, or
+    where no step is proven: `until` and `reason` say so. One proof runs at a time,
+    whatever the threads.
 
     Under a `Controller` the motion is that of the sampled loop: torques are held over
     `control_period`, and its law acts at the ticks as it does in `simulate`, but

@@ -76,11 +76,12 @@ def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
 
 
 def turn_near_zero(quaternion: Quadruple, rest: Any) -> Triple:
-    """Return the rotation vector of a small turn, where `law.rotation_vector` divides by 0.
+    """Return the rotation vector of a small turn.
 
-    With t = |(x, y, z)| / w it is 2 atan(t) / t (x, y, z) / w. What the alternating
-    series of atan(t) / t leaves out is less than its next term, and so is its
-    derivative: both are in those of `rest` t^(2 ATAN_TERMS), for a ball from -1 to 1.
+    `law.rotation_vector` divides by 0 there. With t = |(x, y, z)| / w it is 2 atan(t) /
+    t (x, y, z) / w. What the alternating series of atan(t) / t leaves out is less than
+    its next term, and so is its derivative: both are in those of `rest` t^(2
+    ATAN_TERMS), for a ball from -1 to 1.
     """
     x, y, z, w = quaternion
     tangent: Triple = (x / w, y / w, z / w)
@@ -447,7 +448,10 @@ class _Generators(NamedTuple):
         return self.join(one, [arb(x) for x in radii])
 
     def reduce(self, first: int) -> _Generators:
-        """Put the smallest directions into a box where they are too many, not the first."""
+        """Put the smallest directions into a box where they are too many.
+
+        The first ones are not put into it.
+        """
         columns = [*zip(*self.directions.tolist(), strict=True)]
         if len(columns) <= MOST_DIRECTIONS:
             return self

@@ -4,7 +4,7 @@
 In a step p is a polynomial, d = p' - f(t, p) its defect, and e = y - p. With J between
 p and y
 
-    e' = J(s) e - d,    so    e(s) = V(s) e(0) + w(s),    w' = J w + (J V - V') e(0) - d,
+    e' = J(s) e - d,  so  e(s) = V(s) e(0) + w(s),  w' = J w + (J V - V') e(0) - d,
 
 where the polynomial matrix V is nearly a fundamental matrix. The logarithmic norm of J
 bounds w. All holds while e stays inside of a box, which is checked afterwards: what e
@@ -111,9 +111,10 @@ def _atan2(y: Any, x: Any) -> Any:
 
 
 class _Kink:
-    """What may be on both sides of a kink: nothing is known of it, but that zero times it is zero.
+    """What may be on both sides of a kink.
 
-    So is the damping of an elastic stop that is not touched.
+    Nothing is known of it, but that zero times it is zero. So is the damping of an
+    elastic stop that is not touched.
     """
 
     def __mul__(self, other: Any) -> Any:
@@ -151,7 +152,10 @@ class _KinkWatch:
 
     @contextlib.contextmanager
     def within(self, reach: Any = None) -> Iterator[None]:
-        """Note the values in the middle of a span, or use them for times within a reach."""
+        """Note the values in the middle of a span.
+
+        With a reach, use them for times within it.
+        """
         global _watch
         before, _watch = _watch, self
         self._reach, self._next = reach, 0
@@ -205,10 +209,11 @@ def _is_constant(x: Any) -> bool:
 
 
 class SideRecord:
-    """On which side of zero the numbers of a program were, for another evaluation of it.
+    """On which side of zero the numbers of a program were.
 
-    A value that jumps there has no slope: where a set lies on both sides of the jump,
-    its values in the middle of the set must have all of the jump, too.
+    It is kept for another evaluation of the program. A value that jumps there has no
+    slope: where a set lies on both sides of the jump, its values in the middle of the
+    set must have all of the jump, too.
     """
 
     def __init__(self) -> None:
@@ -271,7 +276,10 @@ _ON_BALLS |= {"tanh": _tanh, "atan2": _atan2, "max": cut, "step": _step}
 
 
 def compile_on_balls(program: Program, constants: Sequence[Any]) -> Function:
-    """Turn a program into a function of balls or series, with these values of its last inputs."""
+    """Turn a program into a function of balls or series.
+
+    The constants are the values of its last inputs.
+    """
     count = len(program.inputs) - len(constants)
     before, after, results = program.split(range(count))
     names = _ON_BALLS | dict(zip(program.inputs[count:], constants, strict=True))
@@ -311,7 +319,10 @@ def _coefficients(x: Any, size: int) -> list[Any]:
 
 
 class Region(NamedTuple):
-    """Where the solution is at a time: centre + C a + B b with |a_i| and |b_i| bounded."""
+    """Where the solution is at a time: centre + C a + B b.
+
+    All |a_i| and |b_i| are bounded.
+    """
 
     time: float
     centre: list[Any]  # exact
@@ -366,7 +377,10 @@ class Region(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """A step: the solution is p(s) + V(s) e(0) + w, with |w_i| bounded, from begin to end."""
+    """A step from begin to end: the solution is p(s) + V(s) e(0) + w.
+
+    All |w_i| are bounded.
+    """
 
     begin: Region
     end: float
@@ -402,7 +416,10 @@ class Advance(NamedTuple):
     def expand(
         self, function: Function, where: Any, size: int, tube: Sequence[Any]
     ) -> list[Any]:
-        """Coefficients below `size` of a function of t and y = p + e at s = where, e in `tube`."""
+        """Return coefficients below `size` of a function at s = where.
+
+        It is a function of t and y = p + e, with e in `tube`.
+        """
         count = self.begin.moving
         pairs = zip(self.p[:count], tube[:count], strict=True)
         rows = (p(arb_poly([where, 1])) + e for p, e in pairs)
@@ -413,7 +430,10 @@ class Advance(NamedTuple):
         return [_coefficients(x, size) for x in found]
 
     def values(self, function: Function, where: Any, tube: Sequence[Any]) -> list[Any]:
-        """Enclose the values of a function of t and y = p + e at s in `where`, e in `tube`."""
+        """Enclose the values of a function at s in `where`.
+
+        It is a function of t and y = p + e, with e in `tube`.
+        """
         state = (p(where) + e for p, e in zip(self.p, tube, strict=True))
         return [arb(x) for x in function(arb(self.begin.time) + where, *state)]
 
@@ -425,10 +445,11 @@ class Advance(NamedTuple):
         span: tuple[Any, Any] | None = None,
         parts: int = 1,
     ) -> list[list[Any]]:
-        """Coefficients of polynomials about the middle of a span that enclose a function in it.
+        """Return coefficients of polynomials that enclose a function in a span.
 
-        The last one is what it is anywhere in the span: Lagrange's remainder. The span
-        counts from the begin of the step [s], and is all of it by default.
+        The polynomials are about the middle of the span. The last coefficient is what
+        it is anywhere in the span: Lagrange's remainder. The span counts from the begin
+        of the step [s], and is all of it by default.
         """
         begin, end = span or (arb(0), self.length)
         if order == 0:
@@ -494,7 +515,10 @@ def approximate(
 
 
 def _matrices(flat: Sequence[Sequence[Any]], n: int) -> list[Any]:
-    """Return the coefficients of a Jacobian, from those of its entries column by column."""
+    """Return the coefficients of a Jacobian.
+
+    Those of its entries are given column by column.
+    """
     rows = [[flat[n * c + r] for c in range(n)] for r in range(n)]
     return [arb_mat([[x[k] for x in row] for row in rows]) for k in range(len(flat[0]))]
 
@@ -581,8 +605,9 @@ def _bound_by_norm(
 def _bound_by_number(jacobian: Any, integrals: Sequence[Any], length: Any) -> list[Any]:
     """Bound w number by number, by integrals of what makes it grow.
 
-    |w_i|' <= J_ii |w_i| + sum |J_ik| |w_k| + |g_i|, whose right side grows with all w_k,
-    so that |w| <= exp(A h) (integral of |g|) where A bounds |J_ik|, and J_ii from 0 on.
+    |w_i|' <= J_ii |w_i| + sum |J_ik| |w_k| + |g_i|, whose right side grows with all
+    w_k, so that |w| <= exp(A h) (integral of |g|) where A bounds |J_ik|, and J_ii from
+    0 on.
     """
     every, size = range(len(integrals)), magnitude(jacobian)
     rates = [[size[i, k] * length for k in every] for i in every]
@@ -612,7 +637,10 @@ def _measure_defect(
 
 
 def _fundamental(j: Sequence[Any], half: Any, order: int) -> list[Any]:
-    """Return the coefficients of V, nearly a fundamental matrix of J about the middle."""
+    """Return the coefficients of V about the middle.
+
+    V is nearly a fundamental matrix of J.
+    """
     middles = shift([_middles(x) for x in j], -float(half))
     v = [np.eye(len(middles[0]))]
     for k in range(order):
@@ -710,7 +738,10 @@ def _loss(step: Advance) -> float:
 
 
 def fit_axes(moved: Any, b: Any, scale: Sequence[float]) -> Any:
-    """Return axes for a set moved b: its own, or orthogonal ones where these are skew."""
+    """Return axes for a set moved b: its own, or orthogonal ones.
+
+    Orthogonal ones are taken where its own are skew.
+    """
     scales = np.array(scale)[:, None]
     guide = _middles(moved) / scales
     lengths = np.linalg.norm(guide, axis=0)
@@ -891,7 +922,10 @@ class ProvenSteps:
         return 0.95 * low
 
     def _cross_kink(self, kink: KinkMet) -> Iterator[Advance]:
-        """Yield steps across a kink, each twice as long, until a step of series is proven."""
+        """Yield steps across a kink, until a step of series is proven.
+
+        Each is twice as long as the one before.
+        """
         begin, h = self._here.time, KINK_STEP * self._span
         factor, cruise = self._factor, self._cruise
         for _ in range(KINK_STEPS):

@@ -13,7 +13,10 @@ INFLATIONS = 6  # of the box in which the root is looked for
 
 
 class Root(NamedTuple):
-    """Where the unknowns of equations are: middle + slopes (given - its middle) +- rest."""
+    """Where the unknowns of equations are.
+
+    They are in middle + slopes (given - its middle) +- rest.
+    """
 
     middle: list[Any]
     slopes: Any

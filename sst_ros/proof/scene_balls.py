@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of a scene in balls, from the document on, and functions of them as programs.
+"""The numbers of a scene in balls, from the document on, and programs of them.
 
-NumberReading a scene converts some of it in floats: arcs to directions, an inertia
-about the centre of mass to one about O, a restitution to a damping. Here these
-conversions are made again, in balls, from what the document says. What no range touches
-is computed once; what a range touches becomes part of the programs, so that one number
-of the document is the same number wherever it acts.
+Programs are functions of these numbers. NumberReading a scene converts some of it in
+floats: arcs to directions, an inertia about the centre of mass to one about O, a
+restitution to a damping. Here these conversions are made again, in balls, from what the
+document says. What no range touches is computed once; what a range touches becomes part
+of the programs, so that one number of the document is the same number wherever it acts.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sst_ros.scene.torque_profile import SineTorque, TorqueProfile
 from sst_ros.scene.yaml_document import find_fields
 
 Range = float | tuple[float, float] | str
-"""A half-width, an interval, or "digits": half a unit of the last digit that is written."""
+"""A half-width, an interval, or "digits": half a unit of the last digit written."""
 
 READING = "r"  # input of programs: how numbers are taken, see `SceneBalls`
 DEGREE: Place = ("degree",)  # place of pi / 180 among the constants
@@ -91,7 +91,10 @@ class Parts(NamedTuple):
 
 
 class WrittenDocument(NamedTuple):
-    """A scene before its conversions, unchecked, and the texts of its numbers by place."""
+    """A scene before its conversions, unchecked, and the texts of its numbers.
+
+    The texts are by place.
+    """
 
     scene: Any
     texts: dict[Place, str]
@@ -151,7 +154,10 @@ def _below(place: Place, name: str) -> Place:
 
 
 def _triangle(arc_12: Any, arc_23: Any, arc_31: Any) -> tuple[Triple, Triple, Triple]:
-    """Return the corners of a spherical triangle of given arcs, as `Base` describes them."""
+    """Return the corners of a spherical triangle of given arcs.
+
+    They are as `Base` describes them.
+    """
     sine, cosine = gm.sin(arc_12), gm.cos(arc_12)
     x = gm.cos(arc_31)
     y = (gm.cos(arc_23) - x * cosine) / sine
@@ -185,14 +191,20 @@ def _axes_of(scene: Any, degree: Any) -> Axes:
 
 
 def damping_ball(restitution: Any, impact_rate: Any) -> Any:
-    """Enclose the damping [s/rad] of `model.damping_of`, by the monotony of Langevin's function."""
+    """Enclose the damping [s/rad] of `model.damping_of`.
+
+    The bounds follow from the monotony of Langevin's function.
+    """
     ratio = (1 - restitution) / (1 + restitution)
     x = between(_langevin_bound(ratio.lower(), -1), _langevin_bound(ratio.upper(), 1))
     return 2 * x / ((1 + restitution) * impact_rate)
 
 
 def _langevin_bound(y: Any, side: int) -> Any:
-    """Return a number below (side -1) or above (1) the x with coth x - 1/x = y, 0 <= y < 1."""
+    """Return a bound of the x with coth x - 1/x = y, 0 <= y < 1.
+
+    It is below x for a side of -1, above for 1.
+    """
     if not y > 0:
         return arb(0)
     # x/3 > coth x - 1/x > 1 - 1/x for x > 0.
@@ -345,7 +357,10 @@ class NumberReading(NamedTuple):
 
 
 class _Constants:
-    """Numbers of a program that no range touches, by place: balls, one for r = 0 and a slope."""
+    """Numbers of a program that no range touches, by place.
+
+    They are balls, one for r = 0 and a slope.
+    """
 
     def __init__(self, letter: str, readings: Mapping[Place, NumberReading]) -> None:
         self.balls: list[Any] = []
@@ -446,7 +461,10 @@ class SceneBalls:
         return [*balls, arb(0, 1)] if READING in self.inputs else balls
 
     def initial(self, name: str) -> list[Any]:
-        """Return gamma or gamma_dot at the start: a ball of a range, or a `NumberReading`."""
+        """Return gamma or gamma_dot at the start.
+
+        Each is a ball of a range, or a `NumberReading`.
+        """
         return [self._initial["initial", name, k] for k in range(3)]
 
     def _convert_in_balls(self) -> dict[Place, NumberReading | float]:
@@ -496,7 +514,7 @@ class SceneBalls:
         inputs: Sequence[str],
         by: Sequence[str] = (),
     ) -> enclosure.Function:
-        """Compile function(parts, *inputs), whose `Parts` depend on the inputs `self.inputs`.
+        """Compile function(parts, *inputs), whose `Parts` depend on `self.inputs`.
 
         The compiled function has the inputs, then `self.inputs`; with `by` it returns
         the derivatives by these inputs, too.

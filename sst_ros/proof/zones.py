@@ -100,7 +100,10 @@ LIMITS_OF_LEG = 4
 
 
 class UnitVectors(NamedTuple):
-    """The vectors of a geometry, rows by leg, shape (3, 3), or how far each may be, (3,)."""
+    """The vectors of a geometry, or how far each may be from its place.
+
+    Vectors are rows by leg, shape (3, 3), distances have the shape (3,).
+    """
 
     v: Array
     w: Array
@@ -248,7 +251,10 @@ def determinant_and_slope(vectors: UnitVectors, rotation: Array) -> tuple[Array,
 
 
 def bound_sines(geometry: TolerantGeometry, poses: PoseBalls) -> tuple[Array, Array]:
-    """Bound sin(mu_k) in balls of poses from below and from above, shape (n, 3) each."""
+    """Bound sin(mu_k) in balls of poses from below and from above.
+
+    Each bound has the shape (n, 3).
+    """
     _, w, e, _ = geometry.vectors
     _, of_w, of_e, _ = geometry.tolerance
     t = e @ np.swapaxes(poses.rotation, -1, -2)
@@ -263,13 +269,19 @@ def _sum_of_axes(tolerance: UnitVectors) -> float:
 
 
 def _spread(tolerance: UnitVectors) -> Array:
-    """Return how far the two vectors of each product may be off in sum, (leg, limit)."""
+    """Return how far the two vectors of each product may be off in sum.
+
+    The axes are (leg, limit).
+    """
     v, w, e, g = tolerance
     return np.stack([v + e, np.roll(v, -1) + e, w, w + g], axis=-1)
 
 
 def _sine(angle: Array) -> Array:
-    """Return the sine of an angle up to a right one, and 2 beyond: no product is larger."""
+    """Return the sine of an angle up to a right one, and 2 beyond.
+
+    No product is larger than 2.
+    """
     return np.where(angle < 0.5 * np.pi, np.sin(angle), 2.0)
 
 
@@ -294,7 +306,10 @@ class Cells(NamedTuple):
         return Cells(*(array[rows] for array in self))
 
     def halve(self, axis: NDArray[np.intp]) -> Cells:
-        """Halve each cell along an axis, shape (n,): all first halves, then the second."""
+        """Halve each cell along an axis, shape (n,).
+
+        All first halves come first, then the second ones.
+        """
         row = np.arange(len(self.low))
         size = self.size.copy()
         size[row, axis] *= 0.5
@@ -310,9 +325,10 @@ def join_cells(parts: Sequence[Cells]) -> Cells:
 
 
 class OrientationCap:
-    """Orientations by azimuth and tilt of E and torsion about it, from a reference pose.
+    """Orientations by azimuth and tilt of E and torsion about it.
 
-    R = R_0 Rz(azimuth) Ry(tilt) Rz(torsion - azimuth): the tilt moves E, the torsion
+    They count from a reference pose:
+    R = R_0 Rz(azimuth) Ry(tilt) Rz(torsion - azimuth). The tilt moves E, the torsion
     turns the star about it (Bonev, Zlatanov & Gosselin, Parallel Kinematic Machines,
     2002). Equal volumes of the coordinates are equal shares of all orientations.
     """
@@ -396,7 +412,10 @@ def _whole(known_at: Array, known: Array) -> Cells:
 
 
 def tilted(azimuth: Array, tilt: Array, torsion: Array) -> Array:
-    """Matrices Rz(azimuth) Ry(tilt) Rz(torsion - azimuth), shape (n, 3, 3), of angles (n,)."""
+    """Return matrices Rz(azimuth) Ry(tilt) Rz(torsion - azimuth).
+
+    They have the shape (n, 3, 3), the angles (n,).
+    """
     psi = torsion - azimuth
     ca, sa = np.cos(azimuth), np.sin(azimuth)
     ct, st = np.cos(tilt), np.sin(tilt)
@@ -455,7 +474,10 @@ class GammaBox:
         return np.asarray((cells.size * (self.high - self.low)).argmax(axis=1))
 
     def poses(self, cells: Cells) -> PoseBalls:
-        """Return balls that hold the assembly for all angles of cells, where it is followed."""
+        """Return balls that hold the assembly for all angles of cells.
+
+        They do so where the assembly is followed.
+        """
         rotation, followed = self._follow(cells)
         half = 0.5 * cells.size * (self.high - self.low)
         gamma = self.angles(cells.middle)
@@ -537,7 +559,10 @@ def _arcs(v: Array) -> Array:
 
 
 def _least_singular(matrices: Array) -> Array:
-    """Return bounds below the least singular values of matrices (n, 3, 3), shape (n,)."""
+    """Return bounds below the least singular values of matrices.
+
+    The matrices have the shape (n, 3, 3), the bounds (n,).
+    """
     sigma = np.asarray(np.linalg.svd(matrices, compute_uv=False), dtype=float)
     return np.asarray(sigma[:, 2] - ZONE_ROUNDING, dtype=float)
 
@@ -717,10 +742,10 @@ class ProvenZone(Explained):
         return ", ".join(words)
 
     def status_of(self, poses: ArrayLike) -> NDArray[np.int8]:
-        """Return the status of poses, shape (m,): 1 proven, -1 refuted, 0 anything else.
+        """Return the status of poses, shape (m,).
 
-        Poses are rotations R, shape (m, 3, 3); of a box of actuator angles these, (m,
-        3).
+        It is 1 for proven, -1 for refuted, 0 for anything else. Poses are rotations R,
+        shape (m, 3, 3); of a box of actuator angles these, (m, 3).
         """
         low, high = self._cells.low, self._cells.low + self._cells.size
         status = np.zeros(len(np.asarray(poses)), dtype=np.int8)
@@ -805,13 +830,13 @@ def certify_zone(
     max_boxes: int = 200_000,
     progress: bool = False,
 ) -> ProvenZone:
-    """Prove where the manipulator is regular and inside all limits, for given tolerances.
+    """Prove where the manipulator is regular and inside all limits.
 
-    A pose is inside where 0 < gamma_k < arc P_k P_k+1, E lies on the base triangle and
-    0 < beta_k < beta_max; it is regular where neither det J1 nor det J2 is zero. What
-    is proven is so for every geometry of the ranges, with one sign of det J2: that of
-    the reference pose. Rounding is outward. What the scene does at an end or an edge
-    (`at_end`, `at_edge`) has no part in it.
+    The proof is for given tolerances. A pose is inside where 0 < gamma_k < arc P_k
+    P_k+1, E lies on the base triangle and 0 < beta_k < beta_max; it is regular where
+    neither det J1 nor det J2 is zero. What is proven is so for every geometry of the
+    ranges, with one sign of det J2: that of the reference pose. Rounding is outward.
+    What the scene does at an end or an edge (`at_end`, `at_edge`) has no part in it.
 
     Without `gamma_box` the zone is all orientations whose E is within the angle `tilt`
     of that of the reference pose, and which are turned about E by no more than
@@ -927,5 +952,8 @@ def _refuse_other_ranges(balls: Mapping[Place, Any]) -> None:
     """Refuse ranges of numbers that the geometry does not depend on."""
     for place in balls:
         is_geometry = any(place[: len(key)] == key for key in GEOMETRY_KEYS)
-        allowed = f"is no part of the geometry, which is {', '.join(map(key_of, GEOMETRY_KEYS))}"
+        allowed = (
+            "is no part of the geometry, which is "
+            f"{', '.join(map(key_of, GEOMETRY_KEYS))}"
+        )
         refuse_unless("certify_zone", ("ranges", key_of(place), is_geometry, allowed))

@@ -183,7 +183,7 @@ class Bag:
     def _compare_counts(
         self, declared: Mapping[str, int], counts: Counter[str]
     ) -> None:
-        """Note where the recording has other numbers of messages than it says of itself."""
+        """Note where the recording has other numbers of messages than it says."""
         lines = [
             f"{name}: {counts[name]} messages of {number} that metadata.yaml counts"
             for name, number in declared.items()
@@ -194,10 +194,11 @@ class Bag:
         self.damage += tuple(lines)
 
     def _files(self) -> tuple[list[Path], dict[str, int]]:
-        """Return the files in their order, and how many messages of each topic they hold.
+        """Return the files in their order, and their numbers of messages.
 
-        Without metadata.yaml, which a killed recorder has not written, they are those
-        that are there, and nothing says how much they hold.
+        The numbers are by topic. Without metadata.yaml, which a killed recorder has not
+        written, the files are those that are there, and nothing says how much they
+        hold.
         """
         if not self.path.is_dir():
             return [self.path], {}
@@ -230,7 +231,10 @@ class Bag:
         return files, counts
 
     def _listed(self) -> list[Path]:
-        """List the files of one recording in the folder, in the order of their numbers."""
+        """List the files of one recording in the folder.
+
+        They are in the order of their numbers.
+        """
         parts = [
             (match, path) for path in self.path.iterdir() if (match := _name(path))
         ]
@@ -255,7 +259,10 @@ class Bag:
         self.unverified += file.unverified
 
     def _read_database(self, path: Path, folder: Path) -> Iterator[RawMessage]:
-        """Yield the messages of requested topics in a database, with all that SQLite sees."""
+        """Yield the messages of requested topics in a database.
+
+        They are read with all that SQLite sees.
+        """
         count = 0
         beside = [path.with_name(path.name + ending) for ending in _UNFINISHED]
         unfinished = [one for one in beside if one.exists() and one.stat().st_size]
@@ -410,7 +417,10 @@ class McapFile:
     def _read_gaps(
         self, file: IO[bytes], gaps: Sequence[tuple[int, int]], kinds: Collection[int]
     ) -> Iterator[McapRecord]:
-        """Yield the records of some kinds that lie between chunks: most have none there."""
+        """Yield the records of some kinds that lie between chunks.
+
+        Most recordings have none there.
+        """
         for begin, end in gaps:
             place = begin
             while place < end:
@@ -480,7 +490,10 @@ class McapFile:
             yield from self._open(stored, place)
 
     def _read_on(self, file: IO[bytes]) -> Iterator[McapRecord]:
-        """Yield the records from the beginning to where they end, or to what is no record."""
+        """Yield the records from the beginning to where they end.
+
+        They also end at what is no record.
+        """
         file.seek(len(MCAP0_MAGIC))
         stored = _records(file, chunks=True)
         while True:
@@ -523,7 +536,10 @@ class McapFile:
         return found
 
     def _check_data(self, file: IO[bytes], end: int) -> None:
-        """Check the data section, which ends at `end`: also what lies between its chunks."""
+        """Check the data section, which ends at `end`.
+
+        What lies between its chunks is checked, too.
+        """
         begin, checksum, record = end - _DATA_END_SIZE, file.seek(0), None
         while piece := file.read(min(_PIECE, begin - file.tell())):
             checksum = zlib.crc32(piece, checksum)
@@ -557,7 +573,10 @@ _MESSAGES = (Opcode.MESSAGE,)
 
 
 def _gaps(chunks: Sequence[ChunkIndex], end: int) -> Iterator[tuple[int, int]]:
-    """Yield where the parts of the data section begin and end that are no chunk or its index."""
+    """Yield where the parts between the chunks begin and end.
+
+    These are the parts of the data section that are no chunk or its index.
+    """
     begin = len(MCAP0_MAGIC)
     for one in chunks:
         yield begin, one.chunk_start_offset

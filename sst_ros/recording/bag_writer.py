@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a rosbag2 recording in MCAP, with checksums, chunk by chunk, or a damaged one anew."""
+"""Writes a rosbag2 recording in MCAP chunk by chunk, or a damaged one anew.
+
+Recordings are written with checksums.
+"""
 
 from __future__ import annotations
 
@@ -163,11 +166,11 @@ class Recovered(NamedTuple):
 
 
 def recover(path: Path, out: Path | None = None) -> Recovered:
-    """Write the intact messages of a recording, a folder with one .mcap file or the file, anew.
+    """Write the intact messages of a recording anew.
 
-    The new folder is `path` with _recovered behind by default. Raises InputError where
-    there is no such file, it cannot be read or holds nothing, or where the new folder
-    exists.
+    The recording is a folder with one .mcap file, or the file. The new folder is `path`
+    with _recovered behind by default. Raises InputError where there is no such file, it
+    cannot be read or holds nothing, or where the new folder exists.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if len(files) != 1:

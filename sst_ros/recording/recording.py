@@ -111,15 +111,19 @@ class Signals:
 
     @cached_property
     def missing(self) -> tuple[str, ...]:
-        """Keys of the topics that are not in the recording, or without a row of the run."""
+        """Keys of the topics that are not in the recording.
+
+        Those without a row of the run are among them.
+        """
         missing = [key for key, series in self.topic_series.items() if not len(series)]
         return (*missing, *([] if self.scene else [topics.SCENE_TOPIC.key]))
 
     def statuses_of(self, part: str, key: str) -> list[RecordedStatus]:
-        """Diagnostics of a part of the node that publishes a topic: other nodes send theirs, too.
+        """Diagnostics of a part of the node that publishes a topic.
 
-        All of that part where none has the name of the node, as in a bag that was
-        played under another name and recorded again.
+        Other nodes send theirs, too. All of that part are returned where none has the
+        name of the node, as in a bag that was played under another name and recorded
+        again.
         """
         name = f"{self.bag.topics.get(key, '').rpartition('/')[0]}: {part}"
         named = [one for one in self.statuses if one.name.endswith(f": {part}")]
@@ -159,7 +163,10 @@ class Signals:
         return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
 
     def true_legs(self, name: str) -> Array:
-        """Return true angles or rates, as `legs`, or what was measured where none are recorded."""
+        """Return true angles or rates, as `legs`.
+
+        Where none are recorded, return what was measured.
+        """
         recorded = len(self.topic_series[topics.TRUE_JOINT_STATES.key])
         return self.legs(f"true_{name}" if recorded else name)
 
@@ -317,7 +324,10 @@ class JointSamples(NamedTuple):
 
     @classmethod
     def of(cls, series: Series, start_ns: int) -> JointSamples:
-        """Return those of a topic, whose first one may be after the start of the run."""
+        """Return the joint samples of a topic.
+
+        Its first one may be after the start of the run.
+        """
         parts = np.split(series.values, 7, axis=1)
         return cls(series.stamp_ns - start_ns, series.received_ns, *parts)
 
@@ -514,7 +524,10 @@ class Recording(Explained, ReadOnly):
 
     @cached_property
     def _shown_joints(self) -> Array:
-        """Angles gamma and all rates that go with orientation and body rate, shape (n, 12)."""
+        """Angles gamma and all rates, shape (n, 12).
+
+        They go with orientation and body rate.
+        """
         model = model_of(self.scene)
         with np.errstate(all="ignore"):
             found = kernel.joints(model, tuple(self.states[:, :7].T))
@@ -551,10 +564,10 @@ class Recording(Explained, ReadOnly):
 
     @cached_property
     def effort_difference(self) -> Array:
-        """Largest difference of a sample's effort and the torque of the tick that ends at it.
+        """Largest difference of a sample's effort and the torque of its tick.
 
-        [N m], shape (n,); nan where that tick is not recorded. Where actuators lag it
-        is the lag.
+        The tick is the one that ends at the sample. [N m], shape (n,); nan where that
+        tick is not recorded. Where actuators lag it is the lag.
         """
         at = places(self.ticks.end_ns, self.time_ns)
         largest = np.abs(self.effort - self.ticks.torque[at]).max(axis=1)
@@ -585,9 +598,10 @@ class Recording(Explained, ReadOnly):
 
     @cached_property
     def states(self) -> Array:
-        """Quaternion, body rate and torques that lag at each sample, shape (n, 7 or 10).
+        """Quaternion, body rate and torques that lag at each sample.
 
-        Torques that lag are the efforts; nan where the orientation was lost.
+        The shape is (n, 7 or 10). Torques that lag are the efforts; nan where the
+        orientation was lost.
         """
         rates = self.gamma_dot, self.mu_dot, self.beta_dot
         body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
@@ -634,10 +648,10 @@ class Recording(Explained, ReadOnly):
         )
 
     def _find_gaps(self, time_ns: Integers) -> list[tuple[int, int]]:
-        """Find the spans [ns] between these samples of which some torques are lost, too.
+        """Find the spans [ns] between samples of which torques are lost.
 
-        A span of one period is none: the torque of its last tick is the effort of its
-            sample.
+        A span counts also where only some torques are lost. A span of one period is
+        none: the torque of its last tick is the effort of its sample.
         """
         begin, end = time_ns[:-1], time_ns[1:]
         edges = np.stack([self.ticks.start_ns, self.ticks.end_ns], axis=1).ravel()
@@ -675,7 +689,10 @@ def _finite_rows(found: Signals, table: TopicTable) -> Series:
 
 
 def _shorten(quantities: list[str]) -> str:
-    """Write quantities, as in "mu_1, mu_2, mu_3, tau_1", with all three of a kind as one."""
+    """Write quantities, as in "mu_1, mu_2, mu_3, tau_1", in short.
+
+    All three of a kind become one.
+    """
     text = ", ".join(quantities)
     for kind in dict.fromkeys(name.rpartition("_")[0] for name in quantities):
         text = text.replace(
@@ -716,7 +733,10 @@ def read(
 
 
 def read_run_motion(bag: str | Path, namespace: str | None = None) -> Trajectory:
-    """Read the motion of a run, to be done again: two or more samples that have an orientation."""
+    """Read the motion of a run, to be done again.
+
+    It needs two or more samples that have an orientation.
+    """
     motion = read(bag, namespace=namespace).trajectory
     if len(motion) < 2:
         raise refusal(

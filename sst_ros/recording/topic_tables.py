@@ -71,9 +71,10 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TopicTable(Topic):
-    """A topic, the columns of its rows, and the function that reads the rows of a message.
+    """A topic, the columns of its rows, and the function that reads a message.
 
-    The function returns None for a message of another robot, and raises InvalidMessage.
+    The function reads the rows of a message. It returns None for a message of another
+    robot, and raises InvalidMessage.
     """
 
     columns: tuple[Column, ...]
@@ -81,7 +82,10 @@ class TopicTable(Topic):
 
 
 class InvalidMessage(ValueError):
-    """A message has numbers or names that cannot be used: what was found, what is allowed."""
+    """A message has numbers or names that cannot be used.
+
+    The text says what was found and what is allowed.
+    """
 
 
 @dataclass(frozen=True)
@@ -195,7 +199,10 @@ def _take_known(part: Sequence[float], at: Sequence[int]) -> list[float]:
 def _find_joints(
     requested: Sequence[str], names: Sequence[str]
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Find the place of each joint among the names, -1 where it is not there, and which are not."""
+    """Find the place of each joint among the names, and which are absent.
+
+    An absent joint has the place -1.
+    """
     at = [names.index(name) if name in names else -1 for name in requested]
     absent = tuple(name for name in requested if name not in names)
     return at, absent
@@ -223,7 +230,10 @@ def _read_parts(
 
 
 def _read_ticks(message: Any) -> Rows:
-    """Read the length of each tick [ns], exact in a double, its torques, and moments or nan."""
+    """Read the length of each tick, its torques, and moments or nan.
+
+    The length [ns] is exact in a double.
+    """
     start = nanoseconds(message.header.stamp)
     if not start:
         return []
@@ -380,7 +390,7 @@ TABLES: dict[str, tuple[TopicTable, ...]] = {
     "commands_stamped": (STAMPED_COMMANDS,),
     "external_moment": (MOMENT_TABLE,),
 }
-"""The tables of a run, and the topics in each: samples have a row at each stamp of their topics."""
+"""The tables of a run and their topics: samples have a row at each of their stamps."""
 
 # topics whose rows are ordered by stamps, one at each
 STAMPED = (*TABLES["samples"], TICK_TABLE)
@@ -415,7 +425,10 @@ class RunTopics(NamedTuple):
     others: frozenset[str] = frozenset()  # namespaces of other runs in the recording
 
     def is_of_another(self, name: str) -> bool:
-        """Return whether a topic, or a status by the name of its node, is of another run."""
+        """Return whether a topic, or a status, is of another run.
+
+        A status is named after its node.
+        """
         return _parent(name.partition(":")[0]) in self.others
 
 
@@ -526,9 +539,10 @@ def _find_namespaces(candidates: Mapping[str, Topic]) -> set[str]:
 def _find_controllers(
     bag: Bag, heard: Collection[str], namespace: str, alone: bool
 ) -> dict[str, str]:
-    """Topics of the controller of a run by their keys: of the node that publishes most of them.
+    """Find the topics of the controller of a run by their keys.
 
-    It is a node in the namespace; where the recording has one run `alone`, of any.
+    They are those of the node that publishes most of them. It is a node in the
+    namespace; where the recording has one run `alone`, of any.
     """
     nodes: dict[str, dict[str, str]] = {}
     for name, topic in bag.candidates.items():

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work-precision study: error and computing time of every method and setting on a scene.
+"""Work-precision study: error and computing time of methods on a scene.
 
-Each method has settings from coarse to fine. Fixed steps use no error estimate.
-Tolerances go to `Simulation`, whose estimate of the global error is counted and timed
-with it. The report shows the studies on the terminal, in files, and as one page.
+Every method and setting is studied. Each method has settings from coarse to fine. Fixed
+steps use no error estimate. Tolerances go to `Simulation`, whose estimate of the global
+error is counted and timed with it. The report shows the studies on the terminal, in
+files, and as one page.
 """
 
 from __future__ import annotations
@@ -109,11 +110,11 @@ class WorkPrecision:
         return bool(np.abs(states - states[0]).max() < REFERENCE_ROUNDING)
 
     def best(self, target: float) -> Series[Any] | None:
-        """Return the fastest setting with an orientation error of at most `target` [rad].
+        """Return the fastest setting with an error of at most `target` [rad].
 
-        A setting counts only if at least one finer setting of its method was tried and
-        every one of them is as good: a coarse setting whose errors happen to cancel is
-        no recommendation.
+        The error is that of the orientation. A setting counts only if at least one
+        finer setting of its method was tried and every one of them is as good: a coarse
+        setting whose errors happen to cancel is no recommendation.
         """
         good: list[Any] = []
         if self.rests:
@@ -128,7 +129,10 @@ class WorkPrecision:
 
     @cached_property
     def fastest(self) -> dict[float, Series[Any]]:
-        """The fastest setting for each of ERROR_TARGETS that has one and is not below the floor."""
+        """The fastest setting for each of ERROR_TARGETS that has one.
+
+        Targets below the floor are left out.
+        """
         found = {
             target: self.best(target)
             for target in ERROR_TARGETS
@@ -232,7 +236,10 @@ def _refine(
     problem: InitialValueProblem,
     truth: ReferenceSolution,
 ) -> list[dict[str, Any]]:
-    """Go from coarse to fine until a run takes long or two errors lie below the floor."""
+    """Go from coarse to fine until a run takes long.
+
+    Also stop where two errors lie below the floor.
+    """
     rows, below = list[dict[str, Any]](), 0
     floor = max(ABOVE_REFERENCE * truth.own.orientation, REFERENCE_ROUNDING)
     for setting in settings:

@@ -167,10 +167,11 @@ class Comparison(NamedTuple):
 
 
 def integration(recording: Recording) -> Comparison:
-    """Compare with the exact motion under the recorded torques: the error of the integrator.
+    """Compare with the exact motion under the recorded torques.
 
-    A sample from which the reference restarts is not compared, and neither are samples
-    between lost torques and the next restart; none where the moment is not recorded.
+    The difference is the error of the integrator. A sample from which the reference
+    restarts is not compared, and neither are samples between lost torques and the next
+    restart; none where the moment is not recorded.
     """
     ticks, moment = recording.ticks, recording.scene.moment
     drives = ticks.torque
@@ -185,10 +186,10 @@ def integration(recording: Recording) -> Comparison:
 
 
 def ideal(recording: Recording) -> Comparison | None:
-    """Compare with the motion under continuous torques: the effect of hold and transport.
+    """Compare with the motion under continuous torques.
 
-    None where the scene has no torques, its moment comes from a topic, or the recording
-    lacks the start of the run.
+    The difference is the effect of hold and transport. None where the scene has no
+    torques, its moment comes from a topic, or the recording lacks the start of the run.
     """
     scene, time = recording.scene, recording.time_ns
     pushed = scene.moment is not None and scene.moment.topic
@@ -274,7 +275,10 @@ def _compare(
 
 
 def _joints(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
-    """Return unit quaternions, gamma [rad] and gamma_dot [rad/s] of states (n, 7 or more)."""
+    """Return unit quaternions, gamma [rad] and gamma_dot [rad/s] of states.
+
+    States have the shape (n, 7 or more).
+    """
     unit = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
     found = kernel.joints(model, tuple(states[:, :7].T))
     return unit, np.stack(found.gamma, axis=1), np.stack(found.gamma_dot, axis=1)
@@ -288,7 +292,10 @@ def _energy(model: kernel.Model, states: Array) -> Array:
 
 
 def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
-    """Distances of quaternions, gamma and gamma_dot, in the columns COMPARED_UNITS, shape (n, 3)."""
+    """Return distances of quaternions, gamma and gamma_dot, shape (n, 3).
+
+    The columns are COMPARED_UNITS.
+    """
     # Recorded angles may count whole turns, computed ones do not.
     turn, difference = 2.0 * np.pi, one[1] - other[1]
     gamma = np.abs(difference - turn * np.round(difference / turn)).max(axis=1)

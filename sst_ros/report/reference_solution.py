@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene as an initial value problem, and its reference solution, with the error of that.
+"""A scene as an initial value problem, and its reference solution with its error.
 
 Torques are continuous functions of time, not held over control periods: zero where the
 scene has none. The span ends at the first limit that stops the run. DOP853 solves in
@@ -40,7 +40,10 @@ from sst_ros.state import NANOSECONDS
 
 LongArray: TypeAlias = NDArray[np.longdouble]
 Run: TypeAlias = tuple[Array, int]
-"""States at the instants of comparison, (count + 1, n), and evaluations of the right-hand side."""
+"""States at the instants of comparison, and evaluations of the right-hand side.
+
+The states have the shape (count + 1, n).
+"""
 
 _MOST_REFERENCE_STEPS = 25_000  # in extended precision: half a minute's work
 INTERVALS = 20  # solutions are compared at this many instants or more
@@ -57,7 +60,10 @@ which no step size would show; here they do, exactly.
 
 
 class StateError(NamedTuple):
-    """Distance from the reference: orientation [rad], gamma [rad], gamma_dot [rad/s]."""
+    """Distance from the reference.
+
+    Of the orientation [rad], gamma [rad] and gamma_dot [rad/s].
+    """
 
     orientation: float
     gamma: float
@@ -120,7 +126,10 @@ class InitialValueProblem:
         )
 
     def joints(self, solution: Array | LongArray) -> Array:
-        """Angles gamma [rad] and rates gamma_dot [rad/s] of states (m, 7 or more), (2, 3, m)."""
+        """Return angles gamma [rad] and rates gamma_dot [rad/s], (2, 3, m).
+
+        States have the shape (m, 7 or more).
+        """
         with np.errstate(all="ignore"):
             found = kernel.joints(
                 self.dynamics.model, tuple(solution[:, :7].astype(float).T)
@@ -156,7 +165,10 @@ class InitialValueProblem:
 
 
 class ReferenceSolution(NamedTuple):
-    """States at the instants of comparison, their own error, and how they were found."""
+    """States at the instants of comparison, and their own error.
+
+    Also how they were found.
+    """
 
     states: LongArray
     own: StateError
@@ -193,9 +205,10 @@ def solve_reference(problem: InitialValueProblem) -> ReferenceSolution:
 def _halve_steps(
     problem: InitialValueProblem,
 ) -> tuple[LongArray, LongArray, int] | None:
-    """Halve the steps until the solution stops changing: the last two, and steps an interval.
+    """Halve the steps until the solution stops changing.
 
-    None where so many steps as are allowed do not suffice.
+    Returns the last two solutions, and the steps an interval. None where so many steps
+    as are allowed do not suffice.
     """
     steps, change = 1, math.inf
     before = after = run_extended(problem, 1)
@@ -222,10 +235,10 @@ def exact_derivative(problem: InitialValueProblem) -> Derivative:
 
 
 def run_extended(problem: InitialValueProblem, steps: int) -> LongArray:
-    """States at the instants, in long doubles, with `steps` steps of EXACT_DOP853 an interval.
+    """Return states at the instants, in long doubles.
 
-    The quaternion is kept at length 1. A row of nan stands where there is no finite
-    state.
+    There are `steps` steps of EXACT_DOP853 an interval. The quaternion is kept at
+    length 1. A row of nan stands where there is no finite state.
     """
     derivative, number = exact_derivative(problem), np.longdouble
     result = np.full((problem.count + 1, len(problem.start)), np.nan, dtype=number)

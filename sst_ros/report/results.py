@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all reports share: tables by pandas, pages from templates by Jinja, files, provenance."""
+"""What all reports share: tables, pages, files, provenance.
+
+Tables are made by pandas, pages from templates by Jinja.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +130,10 @@ def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
 
 
 def provenance(made: Mapping[str, Any] | None = None) -> str:
-    """Return versions, machine and date of a report in one line: of `made_on`, by default now."""
+    """Return versions, machine and date of a report in one line.
+
+    They are those of `made_on`, by default of now.
+    """
     made = made or made_on()
     compiler = f"llvmlite {made['llvmlite']}" if made["llvmlite"] else "plain Python"
     return (

@@ -131,7 +131,10 @@ def summary_table(summary: dict[str, Any]) -> str:
 def summarise(
     run: Recording, integration: Comparison, ideal: Comparison | None
 ) -> dict[str, Any]:
-    """Collect the figures of what was computed anew: errors, energy, tracking, efforts."""
+    """Collect the figures of what was computed anew.
+
+    These are errors, energy, tracking and efforts.
+    """
     tracked = tracking.of(run)
     found, off = tracked and tracked.metrics, largest(run.effort_difference)
     measured = run.motion is not run.measured
@@ -173,7 +176,10 @@ def summarise(
 
 
 def _count(run: Recording, measured: Timing) -> dict[str, Any]:
-    """Collect what was recorded: the last diagnostics of the simulator, samples, ticks, losses."""
+    """Collect what was recorded.
+
+    These are the last diagnostics of the simulator, samples, ticks and losses.
+    """
     period, recorded, spacing = run.period_ns, len(run.time_ns), np.diff(run.time_ns)
     said = pd.to_numeric(pd.Series(run.diagnostics, dtype=object), errors="coerce")
     numbers = {key: value for key, value in said.items() if np.isfinite(value)}
@@ -336,7 +342,10 @@ def _changes(torque: Array) -> NDArray[np.intp]:
 def _measure_answers(
     recording: Recording, paired: DataFrame
 ) -> dict[str, float | None]:
-    """Share of samples that a command answered, and the mean age [s] of the command of a tick."""
+    """Return the share of samples that a command answered.
+
+    Also the mean age [s] of the command of a tick.
+    """
     commands, start_ns = recording.commands, recording.ticks.start_ns
     share = age = None
     # a torque that is commanded once and for all answers no samples

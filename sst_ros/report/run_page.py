@@ -70,7 +70,10 @@ def draw_errors(run: Recording, found: RunEvaluation) -> Figure:
 
 
 def _draw_comparison(axes: Axes, run: Recording, comparison: Comparison) -> None:
-    """Draw the errors of a run on logarithmic axes, and the largest one of the reference."""
+    """Draw the errors of a run on logarithmic axes.
+
+    Also the largest error of the reference.
+    """
     gaps = run.signals.gaps()
     least = figures.SMALLEST_SHOWN
     floor = np.fmax(comparison.own.max(axis=1), least)

@@ -78,7 +78,10 @@ def operations(scene: Scene) -> int:
 
 
 class Cost(NamedTuple):
-    """What a term of a scene costs: operations of the scene, less those of the scene without it."""
+    """What a term of a scene costs.
+
+    These are the operations of the scene, less those of the scene without it.
+    """
 
     name: str
     adds: int
@@ -86,7 +89,10 @@ class Cost(NamedTuple):
 
 
 def costs(scene: Scene) -> list[Cost]:
-    """Count the operations of every term that a scene has: traced with it and without it."""
+    """Count the operations of every term that a scene has.
+
+    The scene is traced with the term and without it.
+    """
     total = operations(scene)
     bare = {term: operations(without(scene, term)) for term in terms(scene)}
     return [Cost(term, total - count, count) for term, count in bare.items()]
@@ -100,7 +106,10 @@ STABLE_GROWTH = 1e-6
 
 
 class StepAdvice(NamedTuple):
-    """A recommendation in words, and what `auto` takes: method and mean step [s], nan for none."""
+    """A recommendation in words, and what `auto` takes.
+
+    That is a method and a mean step [s], nan for none.
+    """
 
     text: str
     method: str = ""

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stability report of one scene: which steps are stable along its motion, and what it survives.
+"""The stability report of one scene: its stable steps, and what it survives.
 
-The eigenvalues of the linearised dynamics along the motion give the longest step in
-which each method is stable. Then the scene is run as it is and with other numbers: ten
-times the torque, ten times the rates, a hundred times the stiffness and the friction,
-from poses at its limits and beside its nearest singularity. Each run has to end with a
-value within its error estimate, which a run for a hundredth of the tolerance checks, or
-with a limit or an error that names the reason.
+Stable steps are found along its motion. The eigenvalues of the linearised dynamics
+along the motion give the longest step in which each method is stable. Then the scene is
+run as it is and with other numbers: ten times the torque, ten times the rates, a
+hundred times the stiffness and the friction, from poses at its limits and beside its
+nearest singularity. Each run has to end with a value within its error estimate, which a
+run for a hundredth of the tolerance checks, or with a limit or an error that names the
+reason.
 """
 
 from __future__ import annotations
@@ -90,11 +91,11 @@ class StabilityReport(NamedTuple):
 
 
 def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
-    """Examine a scene, print the report and write stability.csv, .json, .md and .png into `out`.
+    """Examine a scene, print the report and write its files into `out`.
 
-    `only` names rows of CHANGED_RUNS; by default all. Returns whether no run failed.
-    Raises InputError where a name is unknown or `out` cannot be written, SstError where
-    the scene cannot start.
+    The files are stability.csv, .json, .md and .png. `only` names rows of CHANGED_RUNS;
+    by default all. Returns whether no run failed. Raises InputError where a name is
+    unknown or `out` cannot be written, SstError where the scene cannot start.
     """
     found = examine_stability(scene, only, shown=True)
     said = stability_page(found)
@@ -119,7 +120,10 @@ def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) ->
 def examine_stability(
     scene: Scene, only: Sequence[str] = (), *, shown: bool = False
 ) -> StabilityReport:
-    """Find the stable steps along the motion of a scene, and run it with other numbers."""
+    """Find the stable steps along the motion of a scene.
+
+    Also run the scene with other numbers.
+    """
     known = f"must be one of {', '.join(CHANGED_RUNS)}"
     wrong = (
         ("--only", name, name in CHANGED_RUNS, known + suggestion(name, CHANGED_RUNS))
@@ -164,7 +168,10 @@ def examine_stability(
 
 
 def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
-    """Run a scene at two tolerances, and say how it ended: the last columns of a row."""
+    """Run a scene at two tolerances, and say how it ended.
+
+    These are the last columns of a row.
+    """
     row = {
         "passed": None,
         "result": changed,
@@ -227,9 +234,9 @@ def _faster(scene: Scene, motion: Trajectory) -> Scene | str:
 
 
 def _turn_to(*names: str, spin: float = 0.0, before: float = 0.0) -> Change:
-    """Start at the nearest pose in which a measure of the workspace is zero, turning on by `spin`.
+    """Start at the nearest pose in which a measure of the workspace is zero.
 
-    Or by an angle `before` it.
+    Or by an angle `before` it. The star turns on at the rate `spin`.
     """
 
     def change(scene: Scene, motion: Trajectory) -> Scene | str:
@@ -321,7 +328,7 @@ CHANGED_RUNS: dict[str, tuple[str, Change]] = {
         _turn_to("det_j1", "det_j2", before=BESIDE),
     ),
 }
-"""Rows by the name that `--only` takes: what is other than in the scene, and who makes it."""
+"""Rows by the name that `--only` takes: what differs from the scene, and its maker."""
 
 
 def stability_page(found: StabilityReport) -> str:

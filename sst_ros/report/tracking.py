@@ -45,7 +45,10 @@ class TrackedRun:
 
     @property
     def metrics(self) -> TrackingMetrics:
-        """Metrics; how often a torque was limited is in the last diagnostics of the controller."""
+        """Metrics of the run.
+
+        How often a torque was limited is in the last diagnostics of the controller.
+        """
         counts = (
             status.values.get("samples_limited", "")
             for status in reversed(
@@ -75,10 +78,10 @@ class TrackedRun:
 
 
 def read_tracking(path: Path) -> TrackedRun:
-    """Read a rosbag2 recording of a run with the topics of the inverse-dynamics controller.
+    """Read a rosbag2 recording of a run with a controller.
 
-    Raises InputError where it is no recording of a run that followed a reference, or a
-    damaged one.
+    It has the topics of the inverse-dynamics controller. Raises InputError where it is
+    no recording of a run that followed a reference, or a damaged one.
     """
     run = recording.read(path)
     missing = run.signals.absent
@@ -119,10 +122,10 @@ def of(run: Recording) -> TrackedRun | None:
 
 
 def write_tracking_report(bag: Path, out: Path) -> str:
-    """Evaluate how a recorded run followed its reference: write table and pictures into `out`.
+    """Evaluate how a recorded run followed its reference.
 
-    The table is returned. Raises InputError as `read_tracking`, or where `out` cannot
-    be written.
+    Table and pictures are written into `out`. The table is returned. Raises InputError
+    as `read_tracking`, or where `out` cannot be written.
     """
     tracked = read_tracking(bag)
     title = f"Tracking of {tracked.recording.scene.name}, from {bag}"

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mechanism of a scene: base triangle, star, links and payload, and the range they move in.
+"""The mechanism of a scene: base triangle, star, links, payload, and its range.
 
-Bodies rotate about the fixed centre O, so every inertia here is about O but the
-payload's; one that a document gives about the centre of mass is shifted when it is read
-(parallel axes). Letters and frames are the paper's: base directions v_k, angles alpha_k
-between the arcs of the moving spherical star (MSS), {E} fixed in the star, {1k} in
-actuated link k, {2k} in intermediate link k.
+The range is the one that they move in. Bodies rotate about the fixed centre O, so every
+inertia here is about O but the payload's; one that a document gives about the centre of
+mass is shifted when it is read (parallel axes). Letters and frames are the paper's:
+base directions v_k, angles alpha_k between the arcs of the moving spherical star (MSS),
+{E} fixed in the star, {1k} in actuated link k, {2k} in intermediate link k.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sst_ros.state import ZERO, Array, Vector3
 RELATIVE_ROUNDING = 1e-9
 
 SMALLEST_SIDE = 4e-5
-"""Side [rad] of an equilateral base triangle whose volume is lost in RELATIVE_ROUNDING."""
+"""Side [rad] of an equilateral base whose volume is lost in RELATIVE_ROUNDING."""
 
 ABOUT_O, ABOUT_CENTRE = "O", "centre_of_mass"
 
@@ -126,7 +126,10 @@ class Base(Section):
 def _directions_of(
     a12: float, a23: float, a31: float
 ) -> tuple[Vector3, Vector3, Vector3]:
-    """Directions of the corners of a spherical triangle with these arcs [rad], as in `Base`."""
+    """Return the directions of the corners of a spherical triangle.
+
+    It has these arcs [rad], as in `Base`.
+    """
     half = 0.5 * (a12 + a23 + a31)
     product = (
         math.sin(half)
@@ -215,7 +218,10 @@ class Star(Link):
     radius: float = amount("radius of the star's sphere, distance O E", "m")
 
     def rules(self) -> Rules:
-        """Refuse arcs that do not close around E, and a mass that contradicts the inertia."""
+        """Refuse open arcs, and a mass that contradicts the inertia.
+
+        Arcs are open where they do not close around E.
+        """
         total = sum(self.alpha_deg)
         open_ = np.greater(abs(total - 360.0), 360.0 * RELATIVE_ROUNDING)
         yield (
@@ -272,7 +278,10 @@ class Stroke(Section):
     )
 
     def rules(self) -> Rules:
-        """Refuse coefficients of another kind of end, a kind without its own, and two dampings."""
+        """Refuse coefficients of another kind of end, and two dampings.
+
+        A kind without its own coefficients is refused, too.
+        """
         elastic, damped = self.at_end == "elastic", np.not_equal(self.damping, 0.0)
         bounces = self.restitution is not None
         only = "is given with at_end: elastic, and only there"
@@ -321,7 +330,10 @@ def entries_of(inertia: Inertia | None) -> list[Any]:
 
 
 def shift_inertia(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
-    """Six numbers about O of an inertia about the centre of mass (parallel axes), or columns."""
+    """Return six numbers about O of an inertia about the centre of mass.
+
+    They are shifted by parallel axes. They may be columns.
+    """
     square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
     point = [mass * (square * float(i == j) - centre[i] * centre[j]) for i, j in PLACES]
     return [own + part for own, part in zip(entries_of(inertia), point, strict=True)]
@@ -337,7 +349,10 @@ def _inertia_of(entries: Iterable[float]) -> Inertia:
 
 
 def _is_positive(entries: Sequence[Any], more: Any) -> Any:
-    """Whether a symmetric matrix + more 1 is positive definite: the pivots of its L D L^T are."""
+    """Return whether a symmetric matrix + more 1 is positive definite.
+
+    The pivots of its L D L^T are positive then.
+    """
     xx, yy, zz, xy, xz, yz = map(np.asarray, entries)
     first, second = xx + more, yy + more - xy * xy / (xx + more)
     off = yz - xy * xz / first

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scene may have beside its mechanism: loads, actuators, start, a desired motion.
+"""What a scene may have beside its mechanism: loads, actuators, start, motion.
 
 A term that a scene does not name has no operation in its dynamics. Every desired motion
 begins at rest and ends at rest, except a recorded one, which begins and ends as the
@@ -31,7 +31,10 @@ class Gravity(Section):
 
 
 class Moment(Section):
-    """An external moment on the star: constant, or received on the topic ~/external_moment."""
+    """An external moment on the star: constant, or received on a topic.
+
+    The topic is ~/external_moment.
+    """
 
     ONE_OF = "value", "topic"
 
@@ -95,8 +98,8 @@ class Actuators(Section):
     """
 
     EFFECTS = (
-        "rotor_inertia", "torque_limit", "time_constant", "idle_damping", "velocity_limit",
-        "acceleration_limit",
+        "rotor_inertia", "torque_limit", "time_constant", "idle_damping",
+        "velocity_limit", "acceleration_limit",
     )  # fmt: skip
 
     rotor_inertia: float = coefficient("inertia of the motor's rotor", "kg m^2")
@@ -137,14 +140,20 @@ class Initial(Section):
 
 
 class ToAngles(Section):
-    """The actuators go straight from their initial angles to others, with minimum jerk."""
+    """The actuators go straight from their initial angles to others.
+
+    The motion has minimum jerk.
+    """
 
     gamma: Vector3 = angles("actuator angles at the end")
     duration: float = _duration()
 
 
 class ToOrientation(Section):
-    """The star turns about one axis from its initial orientation to another, with minimum jerk."""
+    """The star turns about one axis from its initial orientation to another.
+
+    The motion has minimum jerk.
+    """
 
     orientation: Quaternion = entry(
         "quaternion (x, y, z, w) of {E} in {B} at the end, of any length",
@@ -179,10 +188,10 @@ class Sweep(Section):
 
 
 class Spiral(Section):
-    """E winds outwards from where it is: tilt phi, its direction theta, and psi about E.
+    """E winds outwards from where it is, by three angles.
 
-    R = R(0) Rz(theta) Ry(phi) Rz(psi - theta). All three grow from zero by one minimum
-    jerk.
+    These are the tilt phi, its direction theta, and psi about E. R = R(0) Rz(theta)
+    Ry(phi) Rz(psi - theta). All three grow from zero by one minimum jerk.
     """
 
     phi: float = entry("tilt at the end", "rad", least=0.0, most=3.141592653589793)

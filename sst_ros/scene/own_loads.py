@@ -35,8 +35,8 @@ STATE_NAMES = (*POSE_NAMES, *OMEGA, *BODY_RATE, *RATE_NAMES)
 """Names that a moment may use."""
 
 FORMULA_FUNCTIONS = {
-    "sqrt": 1, "exp": 1, "sin": 1, "cos": 1, "tan": 1, "tanh": 1, "abs": 1, "positive": 1,
-    "atan2": 2, "min": 2, "max": 2,
+    "sqrt": 1, "exp": 1, "sin": 1, "cos": 1, "tan": 1, "tanh": 1, "abs": 1,
+    "positive": 1, "atan2": 2, "min": 2, "max": 2,
 }  # fmt: skip
 """Number of arguments of each function.
 

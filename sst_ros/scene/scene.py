@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is simulated, as one document: bodies, terms, the start, and where each value is from.
+"""What is simulated, as one document: bodies, terms, start, and provenance.
 
-`Scenarios` are many of it, whose numbers differ: a row of each array makes a scene,
-which meets all requirements of a document. What has no effect in a row is left out of
-it, as documents demand: a friction whose coefficients are zero there, the gear of a
-rotor without inertia.
+Provenance is where each value is from. `Scenarios` are many of it, whose numbers
+differ: a row of each array makes a scene, which meets all requirements of a document.
+What has no effect in a row is left out of it, as documents demand: a friction whose
+coefficients are zero there, the gear of a rotor without inertia.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ from sst_ros.scene.yaml_document import (
 from sst_ros.state import Array, Explained, LostMeaning, freeze, real_numbers
 
 LARGEST_NUMBER = 1e9
-"""No number of a scene is larger: it is a slip of units, and its powers leave double precision."""
+"""No number of a scene is larger.
+
+A larger one is a slip of units, and its powers leave double precision.
+"""
 
 
 LINKS = ("actuated_links", "intermediate_links")
@@ -131,9 +134,10 @@ class Scene(Explained, Section):
         }
 
     def rules(self) -> schema.Rules:
-        """Refuse slips of units, centres of mass far from the bodies, gravity without a mass.
+        """Refuse slips of units, and values that do not fit the bodies.
 
-        And provenance of what no scene has.
+        Refused are centres of mass far from the bodies, gravity without a mass, and
+        provenance of what no scene has.
         """
         allowed = f"must not exceed {LARGEST_NUMBER:g} in size: use m, kg, s, rad, N"
         for place, value in schema.leaves(self).items():
@@ -200,10 +204,11 @@ SceneInput: TypeAlias = Scene | Mapping[str, Any] | str | Path
 
 
 def scene_of(scene: SceneInput) -> Scene:
-    """Return a scene by its path (ends in .yaml) or by the name of one that comes with sst_ros.
+    """Return a scene by its path or by its name.
 
-    It may also be its document as a dict, or a `Scene`, which is returned as it is.
-    InputError is raised where there is no such scene, or its document is refused.
+    A path ends in .yaml; a name is of a scene that comes with sst_ros. It may also be
+    its document as a dict, or a `Scene`, which is returned as it is. InputError is
+    raised where there is no such scene, or its document is refused.
     """
     if isinstance(scene, Scene):
         return scene
@@ -216,9 +221,10 @@ def scene_of(scene: SceneInput) -> Scene:
 
 
 def with_initial(scene: Scene, initial: Any) -> Scene:
-    """Return the scene with another initial state: (gamma, gamma_dot), a mapping or `Initial`.
+    """Return the scene with another initial state.
 
-    InputError is raised where it is none of these, or its numbers are refused.
+    It is (gamma, gamma_dot), a mapping or `Initial`. InputError is raised where it is
+    none of these, or its numbers are refused.
     """
     if initial is None:
         return scene
@@ -247,12 +253,18 @@ def load(name_or_path: str | Path) -> Scene:
 
 @lru_cache(maxsize=64)
 def _parse(text: str, origin: str) -> bytes:
-    """Return the scene of a text, pickled: so each call of `load` has one of its own."""
+    """Return the scene of a text, pickled.
+
+    So each call of `load` has one of its own.
+    """
     return pickle.dumps(read(Scene, text, origin), pickle.HIGHEST_PROTOCOL)
 
 
 def text_of(name_or_path: str | Path) -> tuple[str, str]:
-    """Return the YAML text of a scene, found as by `load`, and the path that it is from."""
+    """Return the YAML text of a scene, and the path that it is from.
+
+    The scene is found as by `load`.
+    """
     path = Path(name_or_path)
     if is_name := path.suffix not in (".yaml", ".yml"):
         path = share_directory() / "config" / "scenes" / f"{name_or_path}.yaml"
@@ -274,7 +286,10 @@ def names() -> list[str]:
 
 
 def share_directory() -> Path:
-    """Folder that holds config/ and launch/: the source tree, or share/sst_ros of a prefix."""
+    """Return the folder that holds config/ and launch/.
+
+    It is the source tree, or share/sst_ros of a prefix.
+    """
     for parent in Path(__file__).resolve().parents:
         for candidate in (parent, parent / "share" / "sst_ros"):
             if (candidate / "config" / "scenes").is_dir():
@@ -370,7 +385,10 @@ class Scenarios:
         return faults
 
     def _doubtful(self) -> NDArray[np.bool_]:
-        """Rows whose scene may be refused: a zero may refuse a number, or leave its section out."""
+        """Rows whose scene may be refused.
+
+        A zero may refuse a number, or leave its section out.
+        """
         doubtful: Any = np.zeros(self.count or 0, dtype=bool)
         for key, spec in self._specs.items():
             allowed = spec.allows(self.rows[key])
@@ -390,7 +408,10 @@ class Scenarios:
 
 
 def _columns(values: Array) -> Any:
-    """Contiguous columns (N,) of an array (N, ...), nested tuples where it has more dimensions."""
+    """Return contiguous columns (N,) of an array (N, ...).
+
+    They are nested tuples where the array has more dimensions.
+    """
     if values.ndim == 1:
         return np.ascontiguousarray(values)
     return tuple(map(_columns, np.moveaxis(values, 1, 0)))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Documents as trees of frozen dataclasses: every field has a unit and bounds, which are checked.
+"""Documents as trees of frozen dataclasses: every field has a unit and bounds.
 
-A class that derives from `Section` is checked whenever it is built, from YAML or from
-Python. Building one gives either the object or one `InputError` with every fault.
+The bounds are checked. A class that derives from `Section` is checked whenever it is
+built, from YAML or from Python. Building one gives either the object or one
+`InputError` with every fault.
 """
 
 from __future__ import annotations
@@ -38,7 +39,10 @@ else:
 
 
 NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-"""A decimal number of YAML 1.2 and JSON: no 3_5, 0x10 or 1:30, of which YAML 1.1 makes others."""
+"""A decimal number of YAML 1.2 and JSON.
+
+There is no 3_5, 0x10 or 1:30, of which YAML 1.1 makes others.
+"""
 
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """What a terminal obeys, and halves of characters."""
@@ -51,9 +55,10 @@ Place = tuple[str | int, ...]  # names and indices of a part of a tree from the 
 
 @dataclass(frozen=True)
 class Spec:
-    """What a field may hold. `shape` () is a scalar, (3,) a vector, (3, 3) a list of rows.
+    """What a field may hold.
 
-    Without any of the fields `acts_on` it has no effect.
+    `shape` () is a scalar, (3,) a vector, (3, 3) a list of rows. Without any of the
+    fields `acts_on` it has no effect.
     """
 
     kind: str
@@ -131,7 +136,10 @@ angles = partial(entry, unit="rad", least=-FULL_TURN, most=FULL_TURN)
 """Angles of the three actuators, at most a turn."""
 positive = partial(entry, above=0.0)
 amount = partial(entry, least=1e-12)
-"""A positive number of a scene: less is a slip of units, and powers leave double precision."""
+"""A positive number of a scene.
+
+A smaller one is a slip of units, and powers leave double precision.
+"""
 coefficient = partial(entry, least=0.0, default=0.0)
 
 
@@ -160,7 +168,7 @@ class Section:
     """What messages are headed by; by default the name of the class."""
 
     EFFECTS: ClassVar[tuple[str, ...]] = ()
-    """A section has no effect, and is refused, where all of these are zero or not given."""
+    """A section is refused, as without effect, if all of these are zero or absent."""
 
     ONE_OF: ClassVar[tuple[str, ...]] = ()
     """Fields of which a document gives exactly one."""
@@ -276,8 +284,8 @@ S = TypeVar("S", bound=Section)
 
 
 _ENTRY_KINDS = {
-    float: "number", int: "integer", bool: "flag", str: "text", tuple[str, ...]: "texts",
-    tuple[tuple[str, str], ...]: "notes", Array: "samples",
+    float: "number", int: "integer", bool: "flag", str: "text",
+    tuple[str, ...]: "texts", tuple[tuple[str, str], ...]: "notes", Array: "samples",
 }  # fmt: skip
 
 
@@ -353,20 +361,29 @@ def texts_of(section: Section) -> dict[str, Any]:
 
 
 def converted_of(section: Section) -> dict[str, Any]:
-    """Return the fields that were converted when the section was read, as they were given."""
+    """Return the fields that were converted when the section was read.
+
+    They are returned as they were given.
+    """
     converted: dict[str, Any] = getattr(section, "_converted", {})
     return converted
 
 
 def _has_text(value: Any) -> bool:
-    """Return whether a number, or any in a list, has digits: text, or a whole number."""
+    """Return whether a number, or any in a list, has its digits.
+
+    A text and a whole number have them.
+    """
     if isinstance(value, (list, tuple)):
         return any(map(_has_text, value))
     return isinstance(value, (str, int))
 
 
 def keep_texts(old: Any, new: Any) -> None:
-    """Let a tree of sections remember how another one was written, where their numbers agree."""
+    """Let a tree of sections remember how another one was written.
+
+    It does so where their numbers agree.
+    """
     if isinstance(old, tuple) and isinstance(new, tuple):
         for before, after in zip(old, new, strict=False):
             keep_texts(before, after)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques over time, as a user gives them: numbers, sines, tables, polynomials, functions."""
+"""Torques over time, as a user gives them.
+
+They are numbers, sines, tables, polynomials or functions.
+"""
 
 from __future__ import annotations
 
@@ -70,14 +73,18 @@ class TorqueProfile(ReadOnly):
         return np.full((len(t), 3), np.nan)
 
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
-        """Return the times [s] at which torques, or their derivatives, jump or pass a limit [N m].
+        """Return the times [s] at which torques have kinks.
 
-        Those of a limit are the ones from 0 to `end` [s].
+        There torques, or their derivatives, jump or pass a limit [N m]. Those of a
+        limit are the ones from 0 to `end` [s].
         """
         return np.empty(0)
 
     def acting(self, begin: float, end: float) -> Any:
-        """Return what acts on [begin, end], in which no kink lies, as a `Stepper` takes it."""
+        """Return what acts on [begin, end], as a `Stepper` takes it.
+
+        No kink lies in the interval.
+        """
         return self
 
 
@@ -226,10 +233,10 @@ class PolynomialTorque(TorqueProfile):
 
 
 class FunctionTorque(TorqueProfile):
-    """A function f(t) of the time [s], or f(t, state) of it and the `State` -> three torques [N m].
+    """A function f(t), or f(t, state), of time and `State` -> three torques.
 
-    `feedback` says whether the state is an argument. InputError: it needs other
-    arguments.
+    The time is in s, the torques are in N m. `feedback` says whether the state is an
+    argument. InputError: it needs other arguments.
     """
 
     def __init__(self, function: Callable[..., Sequence[float]]) -> None:
@@ -327,10 +334,10 @@ class TorqueTable(TorqueProfile):
     @classmethod
     @check_kinds
     def read(cls, path: str | Path) -> TorqueTable:
-        """Read a CSV file with columns time, tau_1, tau_2 and tau_3 [s, N m], in any order.
+        """Read a CSV file with columns time, tau_1, tau_2 and tau_3 [s, N m].
 
-        Columns of other names are skipped. InputError says why the file cannot be read,
-        or lists every bad row with its line.
+        The columns may be in any order; columns of other names are skipped. InputError
+        says why the file cannot be read, or lists every bad row with its line.
         """
         origin = str(path)
         unread = OSError, UnicodeDecodeError, csv.Error
@@ -383,11 +390,14 @@ class TorqueTable(TorqueProfile):
 
 
 Torque = Vector3 | SineTorque | TorqueFunction
-"""A function is called with the time [s], and with the `State` if its `feedback` is true."""
+"""A function is called with the time [s], and the `State` if `feedback` is true."""
 
 
 def torque_at(torque: Any, *given: Any) -> Any:
-    """Torques [N m] of numbers, a sine or a function, given the time [s] and what it asks for."""
+    """Return the torques [N m] of numbers, a sine or a function.
+
+    Given are the time [s] and what it asks for.
+    """
     if isinstance(torque, SineTorque):
         return torque.at(*given)
     return torque(*given) if callable(torque) else torque
@@ -413,7 +423,10 @@ _PROFILE_KINDS = {
 
 
 def record_of(profile: TorqueProfile) -> dict[str, Any]:
-    """Return kind and numbers of a profile, from which `profile_from` builds it again."""
+    """Return kind and numbers of a profile.
+
+    `profile_from` builds it again from these.
+    """
     kind = next(
         kind
         for kind, profiles in _PROFILE_KINDS.items()

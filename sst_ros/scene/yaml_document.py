@@ -31,8 +31,8 @@ _INFINITE = re.compile(r"[-+]?\.inf")
 
 LONGEST_DOCUMENT, MOST_NODES, DEEPEST_DOCUMENT = 1_000_000, 20_000, 20
 LIMITS_TEXT = (
-    f"no more than {LONGEST_DOCUMENT} characters, {MOST_NODES} values and {DEEPEST_DOCUMENT} levels are"
-    " allowed, and no aliases"
+    f"no more than {LONGEST_DOCUMENT} characters, {MOST_NODES} values and"
+    f" {DEEPEST_DOCUMENT} levels are allowed, and no aliases"
 )
 """Of a document: PyYAML reads 20,000 values in 0.5 s, and its time grows with the
 square of the levels.
@@ -40,7 +40,10 @@ square of the levels.
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's reader, which refuses aliases and ends at the first event that breaks a limit."""
+    """PyYAML's reader, which refuses aliases and documents beyond a limit.
+
+    It ends at the first event that breaks a limit.
+    """
 
     depth = nodes = 0
 
@@ -90,10 +93,11 @@ def read_values(source: str, origin: str) -> Any:
 
 
 def read_file(path: Path) -> str:
-    """Return the text of a YAML file, or its beginning, if `read` refuses it as too long.
+    """Return the text of a YAML file.
 
-    Raises OSError where there is no such file, or a pipe or a device, which may never
-    end; and UnicodeDecodeError.
+    Return only its beginning if `read` refuses it as too long. Raises OSError where
+    there is no such file, or a pipe or a device, which may never end; and
+    UnicodeDecodeError.
     """
     check_regular(path)
     with path.open(encoding="utf-8") as file:
@@ -101,7 +105,10 @@ def read_file(path: Path) -> str:
 
 
 def resolve_numbers(value: Any) -> Any:
-    """Turn text in what `read_values` returns into numbers and truth values, as in YAML 1.2."""
+    """Turn text into numbers and truth values, as in YAML 1.2.
+
+    The text is in what `read_values` returns.
+    """
     if isinstance(value, dict):
         return {key: resolve_numbers(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -137,7 +144,10 @@ def dump(document: Section) -> str:
 
 
 def line_of(source: str, key: str) -> int | None:
-    """Line of a key, as in "links[0].centre", or of the deepest part of it that YAML text has."""
+    """Return the line of a key, as in "links[0].centre".
+
+    Return that of the deepest part of the key that YAML text has.
+    """
     lines: dict[str, int] = {}
     _values(yaml.compose(source, Loader=_Loader), "", lines, [])
     return _line_at(lines, key)
