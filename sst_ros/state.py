@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import functools
 import html
 import math
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
-from typing import Any, NamedTuple, TypeAlias, Union
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -104,6 +105,26 @@ def freeze(array: Array) -> Array:
         array = array.copy()
     array.flags.writeable = False
     return array
+
+
+if TYPE_CHECKING:
+    from functools import cached_property as cached_property
+else:
+
+    class cached_property(functools.cached_property):
+        """Compute a property once, without a lock.
+
+        Python 3.10 and 3.11 hold a lock of the property meanwhile, for all instances of
+        the class. A process forked at that moment would wait for it without end, as the
+        thread that holds it exists only in the parent. Threads that read the property at
+        once compute it more than once, and all receive the result of the first to end.
+        """
+
+        def __get__(self, instance: Any, owner: type | None = None) -> Any:
+            if instance is None:
+                return self
+            value = self.func(instance)
+            return instance.__dict__.setdefault(self.attrname, value)
 
 
 class ReadOnly:

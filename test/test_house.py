@@ -104,6 +104,15 @@ def test_no_import_cycle():
     TopologicalSorter(GRAPH).prepare()  # a CycleError names the files
 
 
+@pytest.mark.parametrize("name", sorted({*FILES} - {"sst_ros.state"}))
+def test_no_property_holds_a_lock_that_a_forked_process_would_wait_for(name):
+    """`functools.cached_property` does in Python 3.10 and 3.11; see `sst_ros.state`."""
+    for node in ast.walk(ast.parse(FILES[name].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module == "functools":
+            assert "cached_property" not in {alias.name for alias in node.names}
+        assert not isinstance(node, ast.Attribute) or node.attr != "cached_property"
+
+
 def test_every_class_name_has_one_definition():
     places = defaultdict(list)
     for name, path in FILES.items():

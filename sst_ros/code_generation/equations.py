@@ -9,7 +9,6 @@ library, as a unit of the Functional Mock-up Interface, or as a model of MuJoCo.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from sst_ros.description.mjcf import mjcf
 from sst_ros.errors import check_kinds, refuse_unless, require
 from sst_ros.files import replace_file, require_free, write_into
 from sst_ros.scene.scene import SceneInput, scene_of
-from sst_ros.state import Explained
+from sst_ros.state import Explained, cached_property
 
 WRITERS: dict[str, Callable[[SceneEquations], Mapping[str, str | bytes]]] = {
     "c": c_files,

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -33,6 +32,7 @@ from sst_ros.scene.yaml_document import (
     plain,
     replace_values,
 )
+from sst_ros.state import cached_property
 from sst_ros.version import VERSION
 
 CALLER = "equations"  # heads the messages of what is refused

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from sst_ros.state import (
     QUANTITIES,
     Explained,
     ReadOnly,
+    cached_property,
     freeze,
 )
 

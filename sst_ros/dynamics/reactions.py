@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -66,7 +66,7 @@ from sst_ros.programs.expression import (
 from sst_ros.scene.bodies import entries_of
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import leaves, rebuild
-from sst_ros.state import ZERO, Explained
+from sst_ros.state import ZERO, Explained, cached_property
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,7 @@ varies. A term whose coefficients are zero in some scenarios changes no bit ther
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -34,7 +34,7 @@ from sst_ros.programs.expression import (
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import Place, leaves, rebuild
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.state import Joints
+from sst_ros.state import Joints, cached_property
 
 Function = Callable[..., Sequence[float]]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Mapping
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ from sst_ros.programs.llvm import LANES
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import FULL_TURN
-from sst_ros.state import Explained, freeze
+from sst_ros.state import Explained, cached_property, freeze
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",

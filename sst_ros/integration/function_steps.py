@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,6 +52,7 @@ from sst_ros.programs.compiled import (
 )
 from sst_ros.programs.expression import Program, Routine, trace
 from sst_ros.programs.llvm import Function
+from sst_ros.state import cached_property
 
 Polynomial = Callable[[Array], Array]
 """Times after the begin of a step [s], shape (n,) -> states, shape (n, size)."""

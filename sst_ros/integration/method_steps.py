@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from sst_ros.programs.compiled import (
 )
 from sst_ros.programs.expression import Program, Routine, trace
 from sst_ros.programs.llvm import Function
+from sst_ros.state import cached_property
 
 JACOBIAN_COST = 30
 """Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""

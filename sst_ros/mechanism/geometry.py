@@ -12,6 +12,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+
+# `np.unique` imports it in its first call. A process forked meanwhile by another thread
+# would wait for the end of this import, which it never sees.
+import numpy.ma
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import check_kinds, refuse_unless

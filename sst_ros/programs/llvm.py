@@ -61,11 +61,12 @@ Function = Callable[..., "list[float]"]
 
 def llvmlite_version() -> str | None:
     """Version of llvmlite, None where it cannot be imported."""
-    try:
-        import llvmlite
-    except ImportError:
-        return None
-    return str(llvmlite.__version__)
+    with _ENGINE_LOCK:
+        try:
+            import llvmlite
+        except ImportError:
+            return None
+        return str(llvmlite.__version__)
 
 
 class Module(NamedTuple):
@@ -656,8 +657,9 @@ def _close(engine: Any) -> None:
 
 
 _ENGINE_LOCK = threading.RLock()
-"""Held in each call of LLVM. A fork waits for it, for the child would find LLVM halfway
-through a module, and its locks held by a thread that it does not have."""
+"""Held in each call of LLVM and while llvmlite is imported. A fork waits for it, for
+the child would find LLVM halfway through a module, and the locks of LLVM and of the
+import held by a thread that it does not have."""
 
 os.register_at_fork(
     before=_ENGINE_LOCK.acquire,

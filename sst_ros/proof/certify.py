@@ -15,7 +15,6 @@ import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -71,7 +70,7 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.simulation.simulate import TorqueInput, simulate
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Explained
+from sst_ros.state import NANOSECONDS, Explained, cached_property
 
 # begin, end, sign of a number in between; 0 where not known
 Span = tuple[float, float, int]

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 from array import array
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,7 +38,7 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.tables import write_table
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Explained, ReadOnly, freeze
+from sst_ros.state import NANOSECONDS, Explained, ReadOnly, cached_property, freeze
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,7 @@ import math
 import timeit
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
+from sst_ros.state import cached_property
 
 FIXED, TOLERANCE_KIND = "fixed steps", "tolerance"
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import REFERENCE_TABLE, TRACKING_ERROR, places
 from sst_ros.report.results import largest, publish, render
-from sst_ros.state import NANOSECONDS, Array
+from sst_ros.state import NANOSECONDS, Array, cached_property
 
 TRACKING_TOPICS = (REFERENCE_TABLE.key, TRACKING_ERROR.key)
 TRACKING_DRAWN = ("tracking", "tracking_error", "control_torques")

@@ -12,7 +12,6 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +51,15 @@ from sst_ros.scene.torque_profile import (
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.tables import SUFFIXES, load_table, write_table
-from sst_ros.state import DIMENSIONS, MOTION_UNITS, QUANTITIES, Array, TimesLike, freeze
+from sst_ros.state import (
+    DIMENSIONS,
+    MOTION_UNITS,
+    QUANTITIES,
+    Array,
+    TimesLike,
+    cached_property,
+    freeze,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from functools import cached_property
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -31,6 +30,7 @@ from sst_ros.mechanism.generic_math import axpy, cos, dot3, log, positive, selec
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.programs.columns import ColumnFunction, compile_columns
 from sst_ros.programs.expression import Expression, trace
+from sst_ros.state import cached_property
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
 CONTROL_NEWTON_STEPS = 5

@@ -19,7 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -36,7 +36,7 @@ from sst_ros.progress import Bar
 from sst_ros.report.results import render
 from sst_ros.scene.scene import Scenarios
 from sst_ros.simulation.tables import compute_checksum
-from sst_ros.state import DIMENSIONS, MOTION_UNITS, QUANTITIES, Joints
+from sst_ros.state import DIMENSIONS, MOTION_UNITS, QUANTITIES, Joints, cached_property
 from sst_ros.sweeps.cluster import SweepFailed, run_on_cluster
 from sst_ros.sweeps.controlled_batch import ControlledBatch
 from sst_ros.sweeps.sweep_study import SweepStudy

@@ -11,7 +11,7 @@ import os
 import re
 import warnings
 from collections.abc import Mapping
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from sst_ros.scene.schema import (
 )
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.scene.yaml_document import plain, read_file, read_values, resolve_numbers
-from sst_ros.state import QUANTITIES, finite_vector
+from sst_ros.state import QUANTITIES, cached_property, finite_vector
 from sst_ros.sweeps.variations import (
     SAMPLINGS,
     TINY,

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +28,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.bodies import Inertia
 from sst_ros.scene.schema import Place, Section, Spec, key_of
 from sst_ros.scene.yaml_document import NO_NUMBER, find_fields
-from sst_ros.state import freeze, real_numbers
+from sst_ros.state import cached_property, freeze, real_numbers
 
 VARIATION_KINDS = ("uniform", "normal", "grid", "linspace")
 EXPECTED = {"uniform": "low, high", "normal": "mean, standard deviation[, low, high]"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New processes that compile under odd conditions: cold threads, no home."""
+"""Processes that compile under odd conditions: cold threads, forks meanwhile, no home."""
 
 import os
 import subprocess
@@ -37,6 +37,66 @@ for thread in threads:
 print(len(found), *sorted(set(found)))
 """
 
+FORKS = """
+import signal, time
+
+def compile_others():
+    for name in ("friction", "elastic_stops", "general"):
+        simulate(name, duration=0.01)
+
+thread = threading.Thread(target=compile_others, daemon=True)
+thread.start()
+children = []
+while thread.is_alive() and len(children) < 12:
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)  # a child that waits for a lost lock ends by this signal
+        os.write(1, (bits() + "\\n").encode())
+        os._exit(0)
+    children.append(child)
+    time.sleep(0.04)
+codes = [os.waitpid(child, 0)[1] for child in children]
+thread.join()
+print(len(children), sum(codes))
+"""
+
+COMPUTED_MEANWHILE = """
+import os, signal, threading
+from sst_ros.state import cached_property
+
+begun, forked = threading.Event(), threading.Event()
+
+class Slow:
+    @cached_property
+    def number(self):
+        if threading.current_thread() is not threading.main_thread():
+            begun.set()
+            forked.wait()
+        return 7
+
+slow = Slow()
+thread = threading.Thread(target=lambda: slow.number)
+thread.start()
+begun.wait()
+child = os.fork()
+if child == 0:
+    signal.alarm(20)  # a child that waits for a lost lock ends by this signal
+    os._exit(0 if (slow.number, Slow().number) == (7, 7) else 1)
+code = os.waitpid(child, 0)[1]
+forked.set()
+thread.join()
+print(code, slow.number, "number" in vars(slow))
+"""
+
+IMPORTS = """
+import sys
+from sst_ros import simulate
+before = set(sys.modules)
+simulate("example2", duration=0.01, method="auto")
+added = {name.partition(".")[0] for name in set(sys.modules) - before}
+print(*sorted(added - set(sys.stdlib_module_names)))
+"""
+
 
 def bits_here():
     """Return what all processes must print."""
@@ -71,3 +131,28 @@ def test_eight_cold_threads_have_the_bits_of_one(repeat):
 @pytest.mark.parametrize("home", [None, "/nonexistent", "/proc"])
 def test_no_home_is_needed(home):
     assert run_code(BEGIN + "print(bits())", HOME=home) == [bits_here()]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+@pytest.mark.parametrize("repeat", range(REPEATS))
+def test_processes_forked_while_a_thread_compiles_have_its_bits(repeat):
+    """A child neither hangs nor computes other numbers.
+
+    This holds for what sst_ros does: tracing, compiling, and the import of llvmlite. A
+    fork during any other first import (of `sst_ros` itself, SciPy or matplotlib) in
+    another thread leaves that module's lock held in the child; Python offers no cure.
+    """
+    *printed, forks, codes = run_code(BEGIN + FORKS, timeout=150)
+    assert codes == "0"
+    assert printed == [bits_here()] * int(forks)
+    assert printed
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_a_process_forked_while_a_property_is_computed_computes_it_too():
+    assert run_code(COMPUTED_MEANWHILE, timeout=60) == ["0", "7", "True"]
+
+
+def test_a_first_run_imports_llvmlite_alone():
+    """A fork waits for the import of llvmlite, and could not wait for another one."""
+    assert run_code(IMPORTS) in ([], ["llvmlite"])
