@@ -21,7 +21,10 @@ from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
 SINGULAR_START = 1.5e-5
-"""det J2 below which rounding, over its square, leaves gamma_dot less than six digits."""
+"""Least det J2 of a start with rates.
+
+Below it rounding, over its square, leaves gamma_dot less than six digits.
+"""
 
 # Codes of runs that cannot start.
 NO_ASSEMBLY = -1  # gamma has no unique admissible assembly

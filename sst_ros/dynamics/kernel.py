@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dynamics that run: state (quaternion q of {E} in {B}, body angular velocity W), rational.
+"""The dynamics that run, rational in the state.
+
+The state is the quaternion q of {E} in {B} and the body angular velocity W.
 
 In {E} the axis t_k of arc k is constant and the actuator axis w_k is a combination of
 rows of R. With a = cos(mu_k) = t.w, p = t x w, u = 1 - a^2 and g = (w - a t)/u a leg
@@ -84,10 +86,11 @@ def derivative(
     torque: Triple,
     moment: Triple | None = None,
 ) -> tuple[Scalar, ...]:
-    """Time derivative of the state: quaternion (x, y, z, w), of any length > 0, W [rad/s] in {E}.
+    """Return the time derivative of the state: quaternion (x, y, z, w), then W.
 
-    Where the actuators lag, the torques [N m] that they give follow, and `torque` has
-    the commanded ones. `moment` acts on the star, in {B} [N m].
+    The quaternion has any length > 0; W [rad/s] is in {E}. Where the actuators lag, the
+    torques [N m] that they give follow, and `torque` has the commanded ones. `moment`
+    acts on the star, in {B} [N m].
     """
     x, y, z, w, wx, wy, wz, *lagged = state
     lag_rates: tuple[Scalar, ...] = ()
@@ -230,7 +233,10 @@ def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
 def actuator_acceleration(
     model: Model, state: Sequence[Scalar], acceleration: Triple
 ) -> Triple:
-    """Return gamma_ddot [rad/s^2] of a state, which begins with quaternion and W, and W_dot."""
+    """Return gamma_ddot [rad/s^2] of a state and its W_dot.
+
+    The state begins with quaternion and W.
+    """
     at_rest = (
         (at, rest_accelerations(at, triple(state[4:7])))
         for at in leg_motions(model, state)
@@ -289,10 +295,10 @@ def power(
     torque: Triple,
     moment: Triple | None = None,
 ) -> Scalar:
-    """Power [W] that actuators and external moments put in, less what friction takes out.
+    """Return the power [W] that is put in, less what friction takes out.
 
-    It is the rate of kinetic plus potential energy. With lag the torques are the
-    state's own.
+    Actuators and external moments put it in. It is the rate of kinetic plus potential
+    energy. With lag the torques are the state's own.
     """
     x, y, z, w, wx, wy, wz, *given = state
     rows = rotation_rows((x, y, z, w))

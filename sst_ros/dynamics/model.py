@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the dynamics take from a scene: inertias by leg, loads of its joints, and where it stops."""
+"""What the dynamics take from a scene: leg inertias, joint loads, where it stops."""
 
 from __future__ import annotations
 
@@ -135,9 +135,10 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
 
 
 def damping_of(stroke: Stroke) -> Any:
-    """Damping of elastic stops [s/rad], as given or from the restitution at the impact rate.
+    """Return the damping of elastic stops [s/rad].
 
-    Its numbers may be columns.
+    It is as given, or from the restitution at the impact rate. Its numbers may be
+    columns.
 
     For one freedom of inertia m, m v dv/dx = -k x (1 + c v) separates: from the rate v
     into the stop to e v out of it, with d = c v,
@@ -254,7 +255,7 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
 
 
 def contact_events_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
-    """Yield begin and end of contact at the elastic stops of a `Scene`, one limit each."""
+    """Yield begin and end of contact at a `Scene`'s elastic stops, a limit each."""
     if scene.stroke.at_end == "elastic":
         for k in range(3):
             for end in (0.0, float(geometry.arc[k])):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of motion: quantities with units over time, over scenarios, or over both."""
+"""The table of motion: quantities with units over time, scenarios, or both."""
 
 from __future__ import annotations
 
@@ -77,9 +77,9 @@ class MotionTable(Explained, ReadOnly):
     def columns(
         self, names: Iterable[str] = (*QUANTITIES, "energy")
     ) -> dict[str, Array]:
-        """Return the time and these quantities, a column a number, by the names of `state.MOTION_UNITS`.
+        """Return the time and these quantities, a column a number.
 
-        Each has the shape of t.
+        The names are those of `state.MOTION_UNITS`. Each has the shape of t.
         """
         columns: dict[str, Array] = {"t": self.t}
         for name in names:
@@ -100,7 +100,10 @@ class MotionTable(Explained, ReadOnly):
         return {}
 
     def to_pandas(self) -> pd.DataFrame:
-        """Table with a row an instant or a scenario, a column a number, units in its `attrs`."""
+        """Return a table with a row an instant or a scenario, a column a number.
+
+        Units are in its `attrs`.
+        """
         more = self._of_each()
         columns = {name: values for name, (values, _) in more.items()} | self.columns()
         table: pd.DataFrame = require("pandas").DataFrame(columns)

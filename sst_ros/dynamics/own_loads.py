@@ -75,7 +75,7 @@ def load_constants(load: FormulaLoad) -> LoadConstants:
 
 
 class LoadProgram(NamedTuple):
-    """The program of an own load: inputs are quantities of the state, then the parameters.
+    """The program of an own load: inputs are state quantities, then parameters.
 
     Its outputs are the energy and the derivatives by each quantity, or the three
     moments.
@@ -367,7 +367,7 @@ def own_load(
     parameters: Mapping[str, float] | None = None,
     frame: str = "base",
 ) -> FormulaLoad:
-    """Write a load of your own for `Scene.own_loads`: by its potential energy or by its moment.
+    """Write a load of your own for `Scene.own_loads`: by potential energy or moment.
 
     A function is run once, on symbols, and what it does becomes formulas of the scene.
     So all that takes a scene has the load: `simulate`, `Simulation`, `Batch`, `sweep`,
@@ -443,7 +443,10 @@ def _write(
 def write_formulas(
     program: Program,
 ) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
-    """Write a program as terms, what is used more than once, and a formula for each output."""
+    """Write a program as terms and a formula for each output.
+
+    The terms are what is used more than once.
+    """
     first = len(program.inputs)
     uses = [0] * (first + len(program.steps))
     for _, operands in program.steps:

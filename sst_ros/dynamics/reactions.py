@@ -74,9 +74,10 @@ if TYPE_CHECKING:
 LINK_JOINTS = ("actuated", "revolute", "prismatic")
 """Joints of a leg from the base to the star."""
 AXES = {"actuated": 2, "revolute": 0, "prismatic": 2}
-"""Which axis of its frame a joint turns about: w_k of {1k}, r_k of {2k}, t_k of {2k}."""
+"""Which axis of its frame a joint turns about: w_k of {1k}; r_k and t_k of {2k}."""
 SIZES = {
-    "radial_force": "N", "axial_force": "N", "bending_moment": "N m", "axis_torque": "N m",
+    "radial_force": "N", "axial_force": "N",
+    "bending_moment": "N m", "axis_torque": "N m",
 }  # fmt: skip
 """What a bearing and a motor are chosen by, with units."""
 REACTION_UNITS = {
@@ -91,10 +92,11 @@ REACTION_UNITS = {
 
 @dataclass(frozen=True)
 class JointLoads:
-    """What the joints of one kind transmit to the next link, shapes (..., 3, 3), rows by leg.
+    """What joints of one kind transmit to the next link, shapes (..., 3, 3).
 
-    The vectors have the axes of the joint's frame: {1k} = [r, w x r, w] for the
-    actuated joints, {2k} = [r, t x r, t] for the revolute and the prismatic ones.
+    Rows are by leg. The vectors have the axes of the joint's frame: {1k} = [r, w x r,
+    w] for the actuated joints, {2k} = [r, t x r, t] for the revolute and the prismatic
+    ones.
     """
 
     force: Array  #: through O [N]
@@ -118,12 +120,15 @@ class JointLoads:
 
     @property
     def axis_torque(self) -> Array:
-        """Moment about the axis: motor, friction, springs and stops [N m], shape (..., 3)."""
+        """Moment about the axis [N m], shape (..., 3).
+
+        Motor, friction, springs and stops make it.
+        """
         return self.moment[..., self.axis]
 
 
 class LoadFigures(NamedTuple):
-    """Largest absolute value of a load over a motion, and its root mean square over time."""
+    """Largest absolute load over a motion, and its root mean square over time."""
 
     peak: Array  #: by leg, shape (..., 3)
     time: Array  #: when the peak is taken [s], shape (..., 3)
@@ -174,7 +179,10 @@ class Reactions(Explained):
 
     @cached_property
     def figures(self) -> dict[str, dict[str, LoadFigures]]:
-        """Peak and root mean square of each of SIZES by kind of joint, over the first axis of t."""
+        """Peak and root mean square of each of SIZES by kind of joint.
+
+        They are over the first axis of t.
+        """
         return {
             name: {size: load_figures(self.t, getattr(loads, size)) for size in SIZES}
             for name, loads in self.joints()
@@ -418,7 +426,7 @@ class _Leg(NamedTuple):
         torque: Scalar,
         loads: Triple,
     ) -> _Leg:
-        """Solve the moments of leg k under the torque of its actuator and loads at its joints."""
+        """Solve the moments of leg k under its actuator's torque and joint loads."""
         root = sqrt(at.u)  # c_k = (r x t).w = sin(mu_k)
         r, t, w = triple(part / root for part in at.p), at.along, at.axis
         across = cross3(w, r)

@@ -167,12 +167,15 @@ class Dynamics:
         return compile_program(trace(energies, self.state))
 
     def total_energy(self, state: Sequence[float]) -> float:
-        """Kinetic and potential energy [J] of a state, which may have further numbers."""
+        """Return the kinetic plus potential energy of a state [J].
+
+        The state may have further numbers.
+        """
         return sum(self.energies(*state[: len(self.state)]))
 
     @cached_property
     def numbers(self) -> kernel.Model:
-        """The model, in which what is not 0 or 1 may have another value in another scene."""
+        """The model, whose numbers but 0 and 1 may differ in another scene."""
         model: kernel.Model = number_constants(self.model, ("model",))
         return model
 
@@ -181,7 +184,7 @@ recent = lru_cache(maxsize=32)(Dynamics)
 
 
 class ODE:
-    """Derivative of a scene's state, as programs with the inputs t, `state` and `drive`.
+    """Derivative of a scene's state, as programs with inputs t, `state`, `drive`.
 
     These are those of `dynamics`, with these differences: `torque` over time, clamped
     to `limit` [N m], replaces the torques of the drive; with `phases` the drive keeps
@@ -221,9 +224,10 @@ class ODE:
         return trace(self._of_numbers, self._inputs, ("t", *self.state))
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
-        """Eigenvalues of the exact Jacobian at time [s], state and drive [1/s], shape (size,).
+        """Return the eigenvalues of the exact Jacobian [1/s], shape (size,).
 
-        Raises ArithmeticError where the Jacobian is not finite.
+        It is that at a time [s], a state and a drive. Raises ArithmeticError where the
+        Jacobian is not finite.
         """
         return np.asarray(np.linalg.eigvals(self.matrix(t, y, d)))
 
@@ -250,7 +254,7 @@ class ODE:
 
     @cached_property
     def linearised_by_torque(self) -> Function:
-        """The derivative, and its derivatives by t, the state and the drive's torques."""
+        """The derivative, and its derivatives by t, state and the drive's torques."""
         program = trace(
             self._of_numbers, self._inputs, ("t", *self.state, *TORQUE_SYMBOLS)
         )
@@ -259,7 +263,7 @@ class ODE:
     def derivative(
         self, time: Any, *inputs: Any, numbered: bool = False
     ) -> tuple[Any, ...]:
-        """Return the derivative at the time, the state and the drive given, of any kind.
+        """Return the derivative at a time, a state and a drive of any kind.
 
         If `numbered` it is that of constants that may be others in another scene.
         """

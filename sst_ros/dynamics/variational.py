@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Variational equations: a motion and its derivatives by parameters, integrated together.
+"""Variational equations: integrate a motion with its derivatives by parameters.
 
 The sensitivities S = dy/dp of the motion y' = f(y, t, p) obey
 
@@ -65,7 +65,10 @@ SENSITIVITY_TOLERANCE = 1e-12
 """Error of a step, relative and absolute; the latter over the size of a parameter."""
 
 AT_STOPS = 0.1
-"""Share of it where stops are elastic: a step across a jump of derivatives loses order."""
+"""Share of it where stops are elastic.
+
+A step across a jump of derivatives loses order.
+"""
 
 MOST_MOTION_EVALUATIONS = 4_000_000
 """Evaluations of a motion: minutes, where a stiff one needs hours by explicit steps."""
@@ -232,7 +235,10 @@ class VariationalEquations:
         return parameters, factor
 
     def differentiate_joints(self, motion: Array) -> Array:
-        """Differentiate gamma and gamma_dot by quaternion and W, (7, n): shape (7, 6, n)."""
+        """Differentiate gamma and gamma_dot by quaternion and W, shape (7, 6, n).
+
+        `motion` has the shape (7, n).
+        """
         return self._joint_slopes(motion, ())
 
     def differentiate_joints_by_geometry(self, motion: Array) -> Array:
@@ -248,7 +254,7 @@ class VariationalEquations:
         return slopes
 
     def _joint_slopes(self, motion: Array, names: tuple[str, ...]) -> Array:
-        """Differentiate gamma and gamma_dot by quaternion, W and numbers of geometry."""
+        """Differentiate gamma and gamma_dot by quaternion, W and geometry numbers."""
         numbers = [find_number(self.scene, name) for name in names]
         columns = _trace_joints(self.scene, names)(*motion, *numbers)
         rows = np.stack([np.broadcast_to(row, motion.shape[1]) for row in columns])
@@ -295,7 +301,10 @@ class VariationalEquations:
     def _forcing(
         self, begin: float, end: float, limit: float | None
     ) -> Callable[[float], Array]:
-        """Return the function of derivatives of torques by their numbers between kinks."""
+        """Return the torques' derivatives by their numbers.
+
+        They are returned as a function for the times between two kinks.
+        """
         if not self._by_torque:
             return lambda time: np.empty((0, 0))
         slopes = _differentiate_torque(self._torque, begin, end)
@@ -399,7 +408,7 @@ def trace_derivatives(
 def _trace_joints(
     scene: Scene, names: tuple[str, ...]
 ) -> Callable[..., tuple[Any, ...]]:
-    """Return gamma and gamma_dot, then derivatives by quaternion, W and named numbers."""
+    """Return gamma, gamma_dot and derivatives by quaternion, W and named numbers."""
     inputs = (*MOTION, *(f"p{i}" for i in range(len(names))))
 
     def angles_and_rates(*values: Any) -> tuple[Any, ...]:
@@ -412,7 +421,7 @@ def _trace_joints(
 
 
 def _numbers(torque: TorqueProfile) -> Array:
-    """Return the numbers of a profile that torques are differentiated by, shape (q,)."""
+    """Return a profile's numbers that torques are differentiated by, shape (q,)."""
     if isinstance(torque, SineTorque):
         return np.array([*torque.amplitude, *torque.frequency, *torque.phase])
     if isinstance(torque, PolynomialTorque):
@@ -425,7 +434,7 @@ def _numbers(torque: TorqueProfile) -> Array:
 def _differentiate_torque(
     torque: TorqueProfile, begin: float, end: float
 ) -> Callable[[float], Array]:
-    """Return derivatives of the torques by `_numbers`, (3, q), between two kinks [s]."""
+    """Return derivatives of torques by `_numbers`, (3, q), between kinks [s]."""
     unit = np.eye(3)
     if isinstance(torque, SineTorque):
         size, f, phase = map(
@@ -529,7 +538,7 @@ class Sensitivities:
         self._given = np.array([find_number(scene, name) for name in flat], dtype=float)
 
     def at(self, t: Array) -> dict[str, Sensitivity]:
-        """Sensitivities by the name of their parameter at ascending times [s] >= 0, (n,)."""
+        """Return sensitivities by parameter name at ascending times [s] >= 0, (n,)."""
         states, slopes = self._equations.run(self._given, t)
         motion, slopes = states[:, :7].T, slopes[:, :7]
         turn = np.array(

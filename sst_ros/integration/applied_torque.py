@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques that act at the actuators: those that were given, within the limit of the actuators."""
+"""Torques that act at the actuators: the given ones, within the actuators' limit."""
 
 from __future__ import annotations
 
@@ -25,9 +25,15 @@ from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 _SEARCHED = 8
 """Parts of a step in which a jump is looked for."""
 _TIME_STEP = 1e-7
-"""For the derivative of a torque by time [s]: an error of 1e-9 where it changes within 1 ms."""
+"""Step of the derivative of a torque by time [s].
+
+Its error is 1e-9 where the torque changes within 1 ms.
+"""
 _STATE_STEP = 1e-7
-"""For its derivatives by the state, relative to numbers above 1: half of the digits remain."""
+"""Step of its derivatives by the state, relative to numbers above 1.
+
+Half of the digits remain.
+"""
 _NOT_FINITE = (math.nan, math.nan, math.nan)
 
 
@@ -116,13 +122,16 @@ class AppliedTorque:
         return evaluate
 
     def of_drive(self, drive: Drive, t: float, y: Sequence[float]) -> Vector3:
-        """Torques of a drive with a function at a time of the steps [s] and a state [N m]."""
+        """Return the torques of a drive with a function [N m].
+
+        They are those at a time of the steps [s] and a state.
+        """
         return self.at(drive.function, drive.start + t, y)
 
     def locate_jump(
         self, drive: Drive, begin: float, end: float, y: Sequence[float]
     ) -> tuple[float, float] | None:
-        """Locate a jump of a function's torques: the last time before it and the first one after.
+        """Locate a jump of a function's torques: the last time before, the first after.
 
         Bisection keeps the half with the larger change: that of a jump stays, any other
         shrinks (Gear & Osterby, ACM Trans. Math. Softw. 10 (1984) 23-44, locate them
@@ -150,10 +159,10 @@ class AppliedTorque:
     def rate(
         self, drive: Drive, t: float, y: Sequence[float], torque: Vector3
     ) -> Array:
-        """Differentiate a function's torques by time, forward from `torque` [N m/s], shape (3,).
+        """Differentiate a function's torques by time [N m/s], shape (3,).
 
-        Forward, as a step may begin at a kink, behind which the torque has another
-        rate.
+        The difference is forward from `torque`, as a step may begin at a kink, behind
+        which the torque has another rate.
         """
         near, far = (
             np.array(self.of_drive(drive, t + k * _TIME_STEP, y)) for k in (1, 2)
@@ -165,7 +174,7 @@ class AppliedTorque:
     def by_state(
         self, drive: Drive, t: float, y: Sequence[float], torque: Vector3
     ) -> Array:
-        """Differentiate a function's torques by each number of the state, shape (3, size)."""
+        """Differentiate a function's torques by the state, shape (3, size)."""
         slopes = np.zeros((3, len(y)))
         if has_feedback(drive.function):
             # the last number is the work, which no torque sees
@@ -183,7 +192,10 @@ def has_feedback(torque: Torque) -> bool:
 
 
 def _three_numbers(value: Any, time: float) -> Vector3:
-    """Return what a torque function returned as three floats, finite or not, or refuse it."""
+    """Return a torque function's value as three floats, or refuse it.
+
+    The floats need not be finite.
+    """
     try:
         first, second, third = value
         if isinstance(first + second + third, np.complexfloating):

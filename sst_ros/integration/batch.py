@@ -51,7 +51,10 @@ _UNUSED = {
 }
 
 _BATCH_BLOCK = 1024
-"""States whose joints are computed at once: all numbers of the program are arrays as long."""
+"""States whose joints are computed at once.
+
+All numbers of the program are arrays of this length.
+"""
 
 _MOST_BATCH_STEPS = 10**9
 """Steps of a run."""
@@ -67,7 +70,10 @@ _REASONS = {
     OUTSIDE_STATUS: "initial gamma outside the stroke",
     NOT_FINITE_CODE: "not finite",
 }
-"""How a scenario ended, by the codes that are no limit's: below zero it did not start."""
+"""How a scenario ended, by the codes that are no limit's.
+
+Below zero it did not start.
+"""
 
 _SCENARIO = {"status": "", "message": "", "fault_time": "s", "local_error": ""}
 """What is known of a scenario beside its motion, with units."""
@@ -137,18 +143,22 @@ class Batch(Explained):
         )
 
     def result_of(
-        self, code: NDArray[np.int64], fault_time: Array, error: Array, t: Array, torque: Array,
-        y: Array,
+        self, code: NDArray[np.int64], fault_time: Array, error: Array, t: Array,
+        torque: Array, y: Array,
     ) -> BatchResult:  # fmt: skip
-        """Return states of all scenarios as a result, see `BatchResult` for the arguments."""
+        """Return the states of all scenarios as a `BatchResult`.
+
+        See there for the arguments.
+        """
         return BatchResult(
             self.model, self.columns, torque, code, fault_time, error, t, y
         )
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
-        """Return a batch of other scenarios, already checked, that shares this one's programs.
+        """Return a batch of other scenarios that shares this one's programs.
 
-        Numbers that do not differ in this batch must not differ in that.
+        The scenarios are already checked. Numbers that do not differ in this batch must
+        not differ in that.
         """
         other = Batch.__new__(Batch)  # a copy would trace its programs again
         vars(other).update(vars(self))
@@ -492,7 +502,10 @@ class BatchResult(MotionTable):
 
     @cached_property
     def reasons(self) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
-        """The distinct texts of how scenarios ended, and the index of that of each, shape (N,)."""
+        """The distinct texts of how scenarios ended.
+
+        With them comes the index of the text of each scenario, shape (N,).
+        """
         geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
         # only these depend on the geometry
         limited = (self.code > 0) & (self.code < NOT_FINITE_CODE)

@@ -57,7 +57,10 @@ Others are 1 + the limit's index.
 """
 
 EARLIEST = 1e-8
-"""Least share of a step at which a crossing is reported, so that its time lies in this step."""
+"""Least share of a step at which a crossing is reported.
+
+So its time lies in this step.
+"""
 
 _NO_SHARE = 2.0
 """In place of the share of a step at which a limit is passed, where none is."""
@@ -258,7 +261,7 @@ class Block:
     def _end_columns(
         self, number: int, h: float, code: NDArray[np.int64], time: Array
     ) -> None:
-        """End the columns that have passed a limit in a step, or are not finite after it."""
+        """End columns that passed a limit in a step, or are not finite after it."""
         before, after = self._states[1 - self._now], self._states[self._now]
         columns = np.flatnonzero(self._flag > 0.0)
         found, share = self._first_crossings(before, after, h, columns)
@@ -274,9 +277,10 @@ class Block:
     def _first_crossings(
         self, before: Array, after: Array, h: float, columns: NDArray[np.intp]
     ) -> tuple[NDArray[np.int64], Array]:
-        """Find 1 + the index of the limit that each column passes first in a step, and when.
+        """Find which limit each column passes first in a step, and when.
 
-        Returns 0 where none is passed, and the share of the step, 1 where none is.
+        Returns 1 + the index of the limit, 0 where none is passed, and the share of the
+        step, 1 where none is.
         """
         count, limits, size = len(columns), self._limits, self._size
         found, share = np.zeros(count, dtype=np.int64), np.ones(count)
@@ -325,9 +329,10 @@ def share_of_crossing(
     after: Scalar,
     rate_after: Scalar,
 ) -> tuple[Scalar]:
-    """Return the share of a step of h at which a distance becomes negative, _NO_SHARE if not.
+    """Return the share of a step of h at which a distance becomes negative.
 
-    Given are the distance and its rate at both ends, between which it is a cubic.
+    It is _NO_SHARE where none does. Given are the distance and its rate at both ends,
+    between which it is a cubic.
     """
     falling, rising = h * rate_before, h * rate_after
     square = 3.0 * (after - before) - 2.0 * falling - rising
@@ -388,7 +393,10 @@ def advance_blocks(
 
 
 REFINED_PARTS = 16
-"""Parts of a step that is repeated to locate an end: the error of a cubic falls 65,536 times."""
+"""Parts of a step that is repeated to locate an end.
+
+The error of a cubic falls 65,536 times.
+"""
 
 Advance = Callable[..., None]
 """(first, count, step, *arrays, rows=None): advances states by steps from step `first`,

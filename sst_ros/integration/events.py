@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events inside a step: when a joint reaches a limit, or meets or leaves an elastic stop.
+"""Events inside a step: a joint reaches a limit, or meets or leaves an elastic stop.
 
 The force of a stop has a kink where contact begins and ends, so steps end there.
 """
@@ -21,7 +21,7 @@ JointRanges = Sequence[tuple[int, float, float]]
 TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
 _REACH = 10.0
-"""A joint whose rate has turned comes at most this many times as far as its rates allow."""
+"""Most that a joint whose rate has turned goes, over what its rates allow."""
 
 
 def all_far(

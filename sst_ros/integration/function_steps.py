@@ -282,7 +282,7 @@ class TimeSteps(FunctionSteps):
     def _torques_inside(
         self, steps: Sequence[Step], counts: Sequence[int], x: Array
     ) -> Array:
-        """Return the torques in the stages of steps to times inside, shape (n, s, 3)."""
+        """Return torques in the stages of steps to times inside, shape (n, s, 3)."""
         fit = fit_of(self.method)
         known = np.array([step.stages for step in steps])
         coefficients = fit.solution @ known[:, fit.fitted]
@@ -417,7 +417,7 @@ class FeedbackSteps(FunctionSteps):
         joints: Sequence[float],
         drive: Drive,
     ) -> tuple[list[float], list[float]]:
-        """Take a step; return the slopes in its stages, and the new state with its error.
+        """Take a step: return the slopes in its stages, the new state and its error.
 
         `joints` are those of y.
         """
@@ -438,7 +438,7 @@ class FeedbackSteps(FunctionSteps):
         return slopes, numbers[size:]
 
     def interpolate(self, step: Step) -> Polynomial | None:
-        """Return the states inside a step by the method's dense output, if it has one."""
+        """Return the states inside a step by the dense output, if there is one."""
         dense = self.method.dense
         if dense is None:
             return super().interpolate(step)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A motion under torques that are held, and its derivatives by its start and the torques.
+"""A motion under held torques, and its derivatives by its start and the torques.
 
 With the motion y' = f(y, u) the sensitivities S = dy/dy(0) and dy/du obey
 
@@ -26,7 +26,10 @@ from sst_ros.state import Vector3
 _TOLERANCE = 1e-12
 """Largest error of a step, relative to numbers above 1."""
 _AT_STOPS = 0.1
-"""Of it where stops are elastic: a step across a jump of derivatives loses its order."""
+"""Share of it where stops are elastic.
+
+A step across a jump of derivatives loses its order.
+"""
 _NO_DIVISION = 1e-300
 """Added where all may be zero; less than what rounding takes off any other number."""
 _SAFETY, _LARGEST_GROWTH, _LARGEST_SHRINKAGE = 0.9, 5.0, 0.2
@@ -131,7 +134,7 @@ def follow_held_torque(
 
 
 def _change_of_step(error: float) -> float:
-    """Return the factor for the next step after one with an error over the tolerance."""
+    """Return the next step's factor by the last error, relative to the tolerance."""
     if error == 0.0:
         return _LARGEST_GROWTH
     factor: float = _SAFETY * error ** (-1.0 / (DOP853.error_order + 1))

@@ -39,7 +39,7 @@ from sst_ros.programs.llvm import Function
 from sst_ros.state import cached_property
 
 JACOBIAN_COST = 30
-"""Evaluations that a Jacobian with its factorisation counts as: measured in plain Python."""
+"""Measured cost of a Jacobian with factorisation, in evaluations of plain Python."""
 
 JOINT_NUMBERS = 18
 """Numbers of `joints`: nine angles and nine rates."""
@@ -92,7 +92,7 @@ class MethodSteps:
     def pair(
         self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
     ) -> Outcome:
-        """Advance both solutions of a point by h: one by a step, the other by two of h / 2.
+        """Advance both solutions of a point by h: by one step, and by two of h / 2.
 
         The second one has the drive `other`, by default that of the first. Returns
         where they end, and the local error estimate in units of the tolerance; infinite
@@ -123,7 +123,7 @@ class MethodSteps:
         return state
 
     def states_after(self, rows: Array) -> Array:
-        """Return what `single` gives for rows of t, h, state and drive, shape (n, size)."""
+        """Return what `single` gives for rows of t, h, state and drive, (n, size)."""
         return self._single_of_rows(rows)
 
     def states_inside(
@@ -156,7 +156,7 @@ class MethodSteps:
 
 @lru_cache(maxsize=64)
 def steps_of(ode: ODE, method: Method) -> MethodSteps:
-    """Return the steps of an ODE by a method, compiled once for all runs of the same ODE."""
+    """Return the steps of an ODE by a method, compiled once for all its runs."""
     return MethodSteps(ode, method)
 
 

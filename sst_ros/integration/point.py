@@ -10,7 +10,10 @@ from typing import Any, NamedTuple
 from sst_ros.integration.methods import Method
 
 _ERROR_MARGIN = 2.0
-"""Of the distance of both solutions: an error that only halves with the steps is twice as large."""
+"""Factor on the distance of both solutions.
+
+An error that only halves with the steps is twice as large.
+"""
 _STEP_ROUNDING = 8 * 2.220446049250313e-16
 """Error of a step by rounding, which a run of n steps has at least sqrt(n) times."""
 
@@ -58,7 +61,7 @@ class Point(NamedTuple):
 
 
 def estimate_error(distance: float, steps: int) -> float:
-    """Estimate the error of a solution by that of a second one, by steps of half the length."""
+    """Estimate the error of a solution by a second one, of steps half as long."""
     return max(_ERROR_MARGIN * distance, _STEP_ROUNDING * math.sqrt(steps + 1.0))
 
 
@@ -71,9 +74,10 @@ def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
 
 
 def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
-    """Distance of orientations [rad], or that of the rest relative to the rate if it is larger.
+    """Return the distance of orientations [rad], or that of the rest if larger.
 
-    Rates below 1 rad/s count as 1 rad/s; infinite where a number is not finite.
+    That of the rest is relative to the rate. Rates below 1 rad/s count as 1 rad/s;
+    infinite where a number is not finite.
     """
     speed = max(1.0, math.hypot(*z[4:7]))
     distance = max(orientation_distance(y, z), math.dist(y[4:], z[4:]) / speed)

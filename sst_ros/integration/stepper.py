@@ -56,34 +56,49 @@ from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import Vector3
 
 Moment = tuple[float, ...]
-"""External moment on the star in {B} [N m] where the scene takes it from a topic, else empty."""
+"""External moment on the star in {B} [N m] from a topic of the scene, else empty."""
 Steps = MethodSteps | FunctionSteps
 
 WHOLE_MOTION_BUDGET = 10_000_000
-"""Evaluations where a period may be a whole motion, offline: minutes in plain Python."""
+"""Evaluations where a period may be a whole motion, offline.
+
+They take minutes in plain Python.
+"""
 
 _LARGEST_GROWTH, _LARGEST_SHRINKAGE, _SAFETY = 5.0, 0.2, 0.9
 """Factors by which a step changes at most; share of the step that the error allows."""
 _LAST_SLIVER = 1e-3
-"""A step takes the rest of a period, too, where it is shorter than this share of the step."""
+"""A step also takes the rest of a period that is shorter than this share of it."""
 _SHORTEST_STEP = 1e-15
 """Relative to the time: below it, the rounding of time is as long as a step."""
 _SHORTEST_SEARCH = 1e-13
-"""Relative to the time: in a shorter step no jump is looked for, it would lie within rounding."""
+"""Relative to the time: in a shorter step no jump is looked for.
+
+It would lie within rounding.
+"""
 _JUMP_MARGIN = 4e-16
-"""Relative to the time: a step ends so long before a jump, and the next one so long after it."""
+"""Relative to the time: distance of steps from a jump, before it and after it."""
 _BEHIND_A_KINK = 1e-14
-"""A step goes beyond a kink by this angle [rad], to where the Jacobian is that of its far side."""
+"""Angle [rad] by which a step goes beyond a kink.
+
+There the Jacobian is that of its far side.
+"""
 _LARGEST_SHARE_BEHIND = 1e-3
 """...but by no more than this share of the step, where the joint hardly moves."""
 
 _CHOOSE_EVERY = 16
 """Attempts after which `auto` looks at the method."""
 _CHOOSE_AFTER_REJECTIONS = 3
-"""...or so many rejections in a row: a Coulomb torque that changes sign sharply would otherwise
-shrink explicit steps below its time constant before it is seen."""
+"""Rejections in a row after which it does so, too.
+
+A Coulomb torque that changes sign sharply would otherwise shrink explicit steps below
+its time constant before it is seen.
+"""
 _STIFF = 2.0
-"""Step times fastest decay above which an explicit method is left: it is stable to about 3."""
+"""Step times fastest decay above which an explicit method is left.
+
+It is stable to about 3.
+"""
 _EASY = 0.5
 """Step times fastest rate below which an implicit method is left."""
 ACCURATE = 1e-7
@@ -191,9 +206,10 @@ class Stepper:
         self._steps: dict[tuple[object, str], Steps] = {}
 
     def begin(self, y: Sequence[float], method: Method | None = None) -> Point:
-        """Complete quaternion, body rate and lagged torques, zero by default, to a point.
+        """Complete quaternion, body rate and lagged torques to a point.
 
-        A run begins with `method`, by default the first of those that it may use.
+        The torques are zero by default. A run begins with `method`, by default the
+        first of those that it may use.
         """
         full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
         joints = tuple(self.dynamics.joints(*full[:7]))
@@ -297,7 +313,7 @@ class Stepper:
         return self._steps[key]
 
     def _make_steps(self, function: Any, method: Method) -> Steps:
-        """Make the steps of a method under numbers, where None is given, or a function."""
+        """Make the steps of a method under a function, or numbers where it is None."""
         if function is None:
             return steps_of(self.ode, method)
         if isinstance(function, SineTorque):
@@ -371,9 +387,10 @@ class Stepper:
     def _choose_method(
         self, steps: Steps, t: float, h: float, at: Point, drive: Drive, rejected: int
     ) -> Point:
-        """Change the method if, by the eigenvalues of the Jacobian, another takes longer steps.
+        """Change the method if another takes longer steps.
 
-        `rejected` counts the attempts in a row that were rejected.
+        The eigenvalues of the Jacobian decide. `rejected` counts the attempts in a row
+        that were rejected.
         """
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(
             at.method, Rosenbrock
@@ -408,7 +425,7 @@ class Stepper:
     def _jump_in(
         self, t: float, h: float, y: Sequence[float], drive: Drive
     ) -> list[float]:
-        """Return times just before and after a jump of the torques in a step, if there is one."""
+        """Return times just before and after a torque's jump in a step, if any."""
         if not callable(drive.function) or isinstance(drive.function, SineTorque):
             return []
         time = drive.start + t
@@ -466,7 +483,10 @@ class Stepper:
 
 
 def methods_of(name: str) -> tuple[Method, ...]:
-    """Methods that a run by a method, or by auto, may use, the one it begins with first."""
+    """Return the methods that a run may use, the one it begins with first.
+
+    `name` is that of a method, or auto.
+    """
     method = METHODS.get(name)
     return (method,) if method else (DORMAND_PRINCE, DOP853, RODAS5P)
 
@@ -474,10 +494,10 @@ def methods_of(name: str) -> tuple[Method, ...]:
 def better_method(
     method: Method, tolerance: float, steps: NDArray[Any], *, only_stiff: bool
 ) -> tuple[Method, str]:
-    """Choose the method that would take longer steps, the one in use if none is, and state why.
+    """Choose the method that would take longer steps, and state why.
 
-    `steps` is the length of a step times the eigenvalues of the Jacobian; `only_stiff`
-    looks for stiffness alone.
+    It is the one in use where none would. `steps` is the length of a step times the
+    eigenvalues of the Jacobian; `only_stiff` looks for stiffness alone.
     """
     radius, decay = np.abs(steps).max(), -steps.real.min()
     implicit = isinstance(method, Rosenbrock)
@@ -499,17 +519,17 @@ def bound_of_eigenvalues(matrix: Array) -> float:
 
 
 def _next_length(at: Point, h: float, error: float, *, cut: bool) -> float:
-    """Longest step after an accepted one of h with a local error, relative to the tolerance.
+    """Return the longest step after an accepted one of h, by its local error.
 
-    A step that was cut does not say that the next must be shorter than the longest of
-    before.
+    The error is relative to the tolerance. A step that was cut does not say that the
+    next must be shorter than the longest of before.
     """
     length = h * _step_factor(error, at.method)
     return max(at.h, length) if cut else length
 
 
 def _step_factor(error: float, method: Method) -> float:
-    """Factor for the next step after one with a local error, relative to the tolerance."""
+    """Return the next step's factor by a local error relative to the tolerance."""
     if error == 0.0:
         return _LARGEST_GROWTH
     if not error < math.inf:

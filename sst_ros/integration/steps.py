@@ -22,7 +22,10 @@ What a drive is, the caller knows.
 """
 
 _RADIANS_PER_STEP = 1e-3
-"""Below so much in a step a rate counts as so large: else rest could not be reached [rad]."""
+"""Least angle in a step that a rate counts as [rad].
+
+Otherwise rest could not be reached.
+"""
 _NO_DIVISION_BY_ZERO = 1e-300
 """Added where all may be zero; less than what rounding takes off any other number."""
 
@@ -95,7 +98,7 @@ def _weigh(weights: Sequence[float], numbers: Numbers) -> Number:
 def _estimate_error(
     method: Tableau, h: Number, slopes: Sequence[Numbers]
 ) -> list[Number] | None:
-    """Return the error estimate of each number of the state, None where there is none."""
+    """Return the error estimate of each number of the state, None without one."""
     if not method.error:
         return None
     errors = []
@@ -112,7 +115,7 @@ def _estimate_error(
 
 
 class Linearisation(NamedTuple):
-    """The derivative at a point, and its derivatives by the time and by each number of the state.
+    """The derivative at a point, and its derivatives by the time and the state.
 
     `columns[j][i]` is that of the i-th number by the j-th.
     """
@@ -131,10 +134,11 @@ def rosenbrock_step(
     y: Numbers,
     drive: Any,
 ) -> NewState:
-    """Take one step of a Rosenbrock method (Hairer & Wanner, Solving ODEs II, section IV.7).
+    """Take one step of a Rosenbrock method.
 
-    The last stage is what the solution adds to the embedded one. The Jacobian may be
-    that of a point near y. See `explicit_step` for the arguments.
+    See Hairer & Wanner, Solving ODEs II, section IV.7. The last stage is what the
+    solution adds to the embedded one. The Jacobian may be that of a point near y. See
+    `explicit_step` for the arguments.
     """
     size = len(y)
     matrix = [[-column[i] for column in linearisation.columns] for i in range(size)]
@@ -256,7 +260,7 @@ def size_of_error(
 def _compare(
     error: Numbers, old: Numbers, new: Numbers, part: slice, least: float
 ) -> tuple[Number, Number]:
-    """Return the largest absolute number of a part of two states, and its largest error."""
+    """Return a part's largest absolute number in two states, and its largest error."""
     length: Number = least
     worst: Number = 0.0
     for before, after, change in zip(old[part], new[part], error[part], strict=True):

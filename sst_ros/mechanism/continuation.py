@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Follow one assembly along a motion gamma, with a proof at every step that it is the same one.
+"""Follow one assembly along a motion gamma, proving at every step that it is the same.
 
 Let A have the rows t_k x r_k, so that turning R by a small phi changes r_k . R e_k by A
 phi, and let sigma be its least singular value. Along a straight segment of length d in
@@ -57,7 +57,7 @@ class BranchEnds(SingularConfiguration):
 def follow(
     geometry: Geometry, gamma: ArrayLike, rotation: ArrayLike | None = None
 ) -> tuple[Array, Array]:
-    """Follow a branch along the straight segments between the points gamma [rad], shape (n, 3).
+    """Follow a branch along straight segments between points gamma [rad], (n, 3).
 
     Sample a curved motion finely enough that the chords stand for it. `rotation` is R
     of the assembly at gamma[0], by default of the admissible one. Returns R, shape (n,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arithmetic on any kind of number: functions beyond + - * /, vectors of three, rotations.
+"""Arithmetic on any kind of number: functions beyond + - * /, 3-vectors, rotations.
 
 Floats use `math`; anything else brings the function as a method of its own type (traced
 expressions) or through NumPy (columns, complex numbers) or mpmath.
@@ -88,7 +88,7 @@ number below 2^13 is exact.
 """
 
 TO_WHOLE = 1.5 * 2.0**52
-"""A double as large has no fraction: to add and subtract it rounds to a whole number."""
+"""A double as large has no fraction: to add and subtract it rounds to an integer."""
 
 _EXPM1_SERIES = tuple(1.0 / math.factorial(n) for n in range(2, 14))
 """Coefficients of the exponential series from r^2 on. For abs(r) <= ln(2) / 2 the rest

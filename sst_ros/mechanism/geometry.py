@@ -113,7 +113,7 @@ class Geometry(Explained):
 
     @classmethod
     def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
-        """Derive the distinct geometries of `Scenarios`, and the index of each row's."""
+        """Derive distinct geometries of `Scenarios`, and the index of each row's."""
         scene = scenarios.document
         columns_by_key = [scenarios.rows.get(key) for key in KEYS]
         varied = []
@@ -162,9 +162,10 @@ def _recent(v: Any, alpha_deg: Any, beta_max_deg: float) -> Geometry:
 
 
 def rotation_matrix(quaternion: ArrayLike) -> Array:
-    """Rotation R of {E} in {B}, shape (..., 3, 3), of quaternions (x, y, z, w), (..., 4).
+    """Return the rotation R of {E} in {B}, shape (..., 3, 3).
 
-    A quaternion of length zero raises ValueError.
+    The quaternions (x, y, z, w) have the shape (..., 4). A quaternion of length zero
+    raises ValueError.
     """
     q = np.asarray(quaternion, dtype=float)
     length = np.sqrt(np.sum(q * q, axis=-1, keepdims=True))
@@ -230,7 +231,9 @@ def zyz_angles(rotation: ArrayLike) -> Array:
 
 
 def unwrap_zyz(angles: ArrayLike) -> Array:
-    """ZYZ angles [rad] of a trajectory without jumps, shape (n, 3), as from `zyz_angles`.
+    """Return ZYZ angles [rad] of a trajectory without jumps, shape (n, 3).
+
+    The given angles are as from `zyz_angles`.
 
     (theta, phi, psi) and (theta + pi, -phi, psi + pi) are the same rotation, so a
     motion straight through the pole is smooth in angles if phi may change its sign.

@@ -318,7 +318,7 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _turn_forms(count: int) -> tuple[Array, Array]:
-    """Angles x_0, and matrices that turn the coefficients of a quartic form to x - x_0."""
+    """Angles x_0, and matrices that turn coefficients of a quartic form to x - x_0."""
     angles = np.arange(count) * np.pi / count
     matrices = np.zeros((count, 5, 5))
     for turn, angle in enumerate(angles):
@@ -355,7 +355,7 @@ def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
 
 
 def _second_angles(x: Array, a: Array, b: Array, c: Array) -> tuple[Array, Mask]:
-    """Angles y at x, shape (n, 4, 2), and which fit both legs: two where the legs agree.
+    """Angles y at x, shape (n, 4, 2), and which fit both legs: two where they agree.
 
     They are those of the leg that depends more on y.
     """
@@ -411,7 +411,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
 
 
 def _newton_step(slope: Array, residual: Array) -> Array:
-    """Solve slope step = -residual, by the shortest step where slope is nearly singular."""
+    """Solve slope step = -residual, by the shortest step where nearly singular."""
     first, second, third = slope[:, 0], slope[:, 1], slope[:, 2]
     # A^-1 is the adjugate over the determinant; its columns are these vector products.
     adjugate = columns(cross(second, third), cross(third, first), cross(first, second))

@@ -38,7 +38,7 @@ class Mechanism:
 
     @classmethod
     def of(cls, scene: Scene) -> Mechanism:
-        """Collect what the equations need: payload and rotors are part of the bodies."""
+        """Collect what the equations need; bodies include payload and rotors."""
         star = scene.star.inertia.matrix
         if scene.payload is not None:
             star = star + scene.payload.about_o

@@ -40,7 +40,7 @@ FOUND = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
 
 @dataclass(frozen=True, repr=False)
 class Measures(Explained):
-    """What a designer asks of poses, in read-only arrays of the shape (...) of the poses."""
+    """What a designer asks of poses, in read-only arrays of the poses' shape."""
 
     gamma: Array  #: joint angles [rad], shape (..., 3)
     mu: Array
@@ -169,7 +169,7 @@ def _condition(normal: Array, c: Array) -> Array:
 def workspace(
     geometry: Geometry, divisions: int = 40, turns: int = 180, progress: bool = False
 ) -> OrientationMap:
-    """Map the workspace: every direction of E on the base triangle, every turn about it.
+    """Map the workspace: all directions of E on the base triangle, all turns about it.
 
     The geometry is `Geometry.of(scene)` or `Geometry.build(v, alpha)`. An edge of the
     triangle has `divisions`; `turns` are values of the third ZYZ angle psi, evenly over
@@ -305,7 +305,7 @@ def parallel_singularities(chart: OrientationMap) -> SingularPoses:
 
 
 def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
-    """Poses with c_k = 0 at the edge of what is admissible, where all else is inside."""
+    """Return poses with c_k = 0 at the edge of the admissible, all else inside."""
     rows = []
     z = np.array([0.0, 0.0, 1.0])
     for k, sign in product(range(3), (1.0, -1.0)):
@@ -335,7 +335,7 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
 
 @dataclass(frozen=True, repr=False)
 class NearestSingularity(Explained):
-    """The singular pose that the least turn of the star reaches, in read-only arrays."""
+    """The singular pose that the least turn of the star reaches; read-only arrays."""
 
     kind: str  #: "parallel" or "serial"
     leg: int  #: index k of the singular leg; -1 of a parallel one, which involves all

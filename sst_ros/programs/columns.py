@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Programs over the columns of arrays: by machine code where there is llvmlite, else by NumPy.
+"""Programs over columns of arrays: machine code where there is llvmlite, else NumPy.
 
 The bits are the same.
 """
@@ -28,7 +28,7 @@ class ArrayFunction:
         inputs: Sequence[NDArray[np.float64]],
         outputs: Sequence[NDArray[np.float64]],
     ) -> None:
-        """Compute rows of outputs from inputs that all columns share, and rows of others."""
+        """Compute rows of outputs from inputs all columns share, and rows of others."""
         with np.errstate(all="ignore"):
             results = self._function(*shared, *inputs)
         for row, result in zip(outputs, results, strict=True):

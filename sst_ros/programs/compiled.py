@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Programs as functions of floats: machine code where llvmlite is installed, else plain Python.
+"""Programs as functions of floats: machine code with llvmlite, else plain Python.
 
 Both have the same bits. Neither raises an error where a number has no value: it is nan
 then.

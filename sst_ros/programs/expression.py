@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Straight-line programs out of ordinary functions: what a scene does not have vanishes.
+"""Straight-line programs out of ordinary functions: what a scene lacks vanishes.
 
 A function is run once on expressions instead of numbers. Constants fold, products with
 zero and sums with zero disappear, equal subexpressions are computed once, and what no
@@ -97,7 +97,7 @@ class Routine:
     outputs: int
 
     def __call__(self, *arguments: Value) -> tuple[Value, ...]:
-        """Note a call in the graph of the arguments, of which one at least is an expression."""
+        """Note a call in the graph of the arguments, at least one an expression."""
         if len(arguments) != self.inputs:
             raise TypeError(
                 f"{self.name} takes {self.inputs} numbers, not {len(arguments)}"
@@ -215,7 +215,7 @@ class Expression:
 
 
 def mark_present(value: Any) -> Any:
-    """Return an expression as one that counts as not zero, so that no term of it is left out."""
+    """Return an expression that counts as not zero: no term of it is left out."""
     is_traced = isinstance(value, Expression)
     return Expression(value.graph, value.index, is_present=True) if is_traced else value
 
@@ -323,7 +323,7 @@ class Program:
         )
 
     def prune(self, outputs: Sequence[float | int]) -> Program:
-        """Return the program of some outputs alone, without the steps that none of them needs."""
+        """Return the program of some outputs alone, without steps they do not need."""
         inputs, needed = len(self.inputs), {x for x in outputs if isinstance(x, int)}
         for number in reversed(range(inputs, inputs + len(self.steps))):
             if number in needed:
@@ -364,7 +364,7 @@ class Program:
         kept: Sequence[int],
         outputs: Sequence[float | int],
     ) -> Program:
-        """Return the program of the steps `kept`, whose inputs are the operands `given`."""
+        """Return the program of the steps `kept`, its inputs the operands `given`."""
         places = {old: new for new, old in enumerate([*given, *kept])}
 
         def renumber(operands: Sequence[float | int]) -> tuple[float | int, ...]:
@@ -417,7 +417,7 @@ class Program:
 
 
 class Slots:
-    """Where the numbers of some programs are in the vector p that their compiled code takes.
+    """Places of programs' numbers in the vector p that their compiled code takes.
 
     `values` is the vector for the scene that the programs were traced for.
     """
@@ -427,7 +427,7 @@ class Slots:
         self._slots: dict[Any, int] = {}
 
     def slot(self, number: Number) -> int:
-        """Return the place of a number, a new one if no number of its origin was there."""
+        """Return the place of a number, a new one if its origin had none."""
         slot = self._slots.setdefault(number.origin, len(self.values))
         if slot == len(self.values):
             self.values.append(float(number))
@@ -496,7 +496,7 @@ def compile_program(
 
 @lru_cache(maxsize=1)
 def tanh_program() -> Program:
-    """Trace the hyperbolic tangent: what writers of machine code and C put for "tanh"."""
+    """Trace the hyperbolic tangent, as written for "tanh" in machine code and C."""
     return trace(lambda x: (tanh_steps(x),), ("x",))
 
 

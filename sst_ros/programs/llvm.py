@@ -77,7 +77,7 @@ class Module(NamedTuple):
     numbers: tuple[float, ...]
 
     def function(self, name: str) -> Function:
-        """Return a program as a function of floats, which returns its results as a list."""
+        """Return a program as a function of floats whose results are a list."""
         program = self.programs[name]
         code = compile_text(self.text)
         # A call takes microseconds: to hand the interpreter's lock to another thread
@@ -180,10 +180,11 @@ class RowFunction:
         inputs: Sequence[NDArray[np.float64]],
         outputs: Sequence[NDArray[np.float64]],
     ) -> Callable[..., None]:
-        """Return a function of the shared inputs alone, for rows of a multiple of `LANES`.
+        """Return a function of the shared inputs alone.
 
-        It keeps the addresses of the rows, so a call takes about a microsecond besides
-        its work. It is for one thread at a time.
+        It is for rows of a multiple of `LANES`. It keeps the addresses of the rows, so
+        a call takes about a microsecond besides its work. It is for one thread at a
+        time.
         """
         self._check_rows(inputs, outputs)
         count = len(outputs[0])
@@ -472,7 +473,7 @@ class _Writer:
         self._put(result, f"bitcast {whole} {name}.b to {kind}")
 
     def _call_libm(self, result: str, name: str, words: Sequence[str]) -> None:
-        """Call a function of libm, lane by lane: so each lane has the bits of Python."""
+        """Call a function of libm lane by lane, so each lane has Python's bits."""
         if self._width == 1:
             arguments = ", ".join(f"double {word}" for word in words)
             self._put(result, f"call double @{name}({arguments})")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene in motion: step by step, a whole motion in one call, and the trajectory of it."""
+"""A scene in motion: step by step, a whole motion in one call, and its trajectory."""

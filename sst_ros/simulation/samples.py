@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a motion: times and states that are noted as it runs, and computed at its end."""
+"""Samples of a motion: times and states, noted as it runs, computed at its end."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ class SampleTable(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """Consecutive samples inside one step: each state is one shorter step from its begin."""
+    """Consecutive samples inside one step.
+
+    Each state is one shorter step from its begin.
+    """
 
     first: int  # number of the first sample
     step: Step

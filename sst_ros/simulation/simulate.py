@@ -36,7 +36,10 @@ from sst_ros.simulation.trajectory import Trajectory, check_error
 from sst_ros.state import NANOSECONDS, Array, TimesLike
 
 _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
-"""Control periods that the budget of a motion reaches: a step and its check are three steps."""
+"""Control periods that the budget of a motion reaches.
+
+A step and its check are three steps.
+"""
 
 _DEFAULT_SAMPLES, _MOST_SAMPLES = 200, 10_000_000
 """Even intervals of a motion by default, and the most."""
@@ -46,7 +49,10 @@ _RUN_ATTEMPTS = 4
 _FINEST = 1e-14
 """Least tolerance of a step: below it rounding decides."""
 _LEAST_GAIN = 0.5
-"""A run by a fifth of the tolerance or less that keeps more of the error is the last."""
+"""Share of the error: a run that keeps more of it is the last.
+
+The run is one by a fifth of the tolerance or less.
+"""
 _FUNCTION_BUDGET = 1_000_000
 """Evaluations where each calls a function of the state: half a minute."""
 _BUDGET_PER_SECOND = 5_000
@@ -181,14 +187,16 @@ def simulate(
     if parameters:  # refuses what no motion is differentiated by
         Sensitivities(given, parameters, profile)
     task = Task(
-        given, profile, (0.0, end), times, method, tolerance, period, memoryless, inside,
-        float(longest), parameters,
+        given, profile, (0.0, end), times, method, tolerance, period, memoryless,
+        inside, float(longest), parameters,
     )  # fmt: skip
     return _integrate(task, progress=progress)
 
 
 def _integrate(task: Task, *, progress: bool) -> Trajectory:
-    """Run a motion by steps, again by smaller ones if its error estimate exceeds the tolerance.
+    """Run a motion by steps, again by smaller ones if the tolerance is not met.
+
+    It is met where the error estimate does not exceed it.
 
     A function whose torques are held, and which may have a memory, runs once. All runs
     share one budget; of two that do not meet the tolerance the one that reached the end
@@ -218,7 +226,7 @@ def _integrate(task: Task, *, progress: bool) -> Trajectory:
 
 
 def _budget_of(task: Task) -> int:
-    """Return how many evaluations a motion may take: fewer where they call a function."""
+    """Return the evaluations a motion may take: fewer where they call a function."""
     if task.period is None and task.torque.feedback:
         return _FUNCTION_BUDGET
     begin, end = task.span

@@ -47,7 +47,7 @@ from sst_ros.state import (
 INTEGRATORS = (AUTO, *METHODS)
 
 EQUATIONS = ("quaternion", "virtual_work")
-"""Equations of motion: in the quaternion and the body rate, or the paper's Eqs. 1 to 92."""
+"""Equations of motion: in quaternion and body rate, or the paper's Eqs. 1 to 92."""
 
 _MOST_CALL_STEPS = 10**9
 """Steps of one call."""
@@ -61,13 +61,19 @@ _PLAIN_BUDGET = 3_000_000
 _STAGE_OPERATIONS = 100
 """Operations of a stage beside the scene's equations, which have 140 to 450."""
 _COMPILED_BUDGET = 120_000
-"""Evaluations a step in machine code may take: 0.12 s, at most 1 us each with the loop."""
+"""Evaluations a step in machine code may take.
+
+They take 0.12 s, at most 1 us each with the loop.
+"""
 _VIRTUAL_WORK_BUDGET = 1000
 """Evaluations of the paper's equations that a step may take: 0.3 s, at 0.3 ms each."""
 
 
 def default_budget(dynamics: Dynamics, equations: str) -> int:
-    """Return evaluations that keep a step below about 0.2 s: 5,000 to 12,000 in plain Python."""
+    """Return evaluations that keep a step below about 0.2 s.
+
+    They are 5,000 to 12,000 in plain Python.
+    """
     if equations == "virtual_work":
         return _VIRTUAL_WORK_BUDGET
     if llvmlite_version() is not None:
@@ -78,7 +84,7 @@ def default_budget(dynamics: Dynamics, equations: str) -> int:
 
 
 def _whole(value: Any) -> int:
-    """Return a whole number of any type as int, 0 for anything else and from 2^63 on."""
+    """Return a whole number below 2^63 of any type as int, 0 for anything else."""
     try:
         is_duration = isinstance(value, (bool, np.timedelta64))
         found = 0 if is_duration else operator.index(value)
@@ -152,7 +158,8 @@ class Simulation(Explained):
             "simulation",
             ("integrator", integrator, integrator in INTEGRATORS, _one_of(INTEGRATORS)),
             ("tolerance", tolerance, tolerance > 0.0, "must be > 0"),
-            ("step_budget", step_budget, step_budget is None or step_budget > 0, "must be > 0"),
+            ("step_budget", step_budget, step_budget is None or step_budget > 0,
+             "must be > 0"),
             ("equations", equations, equations in EQUATIONS, _one_of(EQUATIONS)),
             ("equations", equations, explicit or equations != "virtual_work",
              "needs an explicit integrator"),
@@ -205,7 +212,7 @@ class Simulation(Explained):
     def steps(
         self, torque: Torque, dt_ns: int, count: int, moment: Vector3 = (0.0, 0.0, 0.0)
     ) -> None:
-        """Advance by `count` times dt_ns: the bits are those of `count` calls of `step`.
+        """Advance by `count` times dt_ns, bit for bit as by `count` calls of `step`.
 
         Errors are those of `step`: the state is then that after the last step before,
         at `time_ns`.
@@ -325,7 +332,7 @@ class Simulation(Explained):
         return self.state
 
     def load_code(self) -> None:
-        """Have the code of all methods compiled that steps under constant torques may turn to.
+        """Compile the code of all methods that steps under constant torques may use.
 
         Otherwise the first step, and one that changes the method, compiles it, which
         takes tenths of a second. The state does not change.
@@ -342,7 +349,11 @@ class Simulation(Explained):
 
     @property
     def sample(self) -> tuple[Sequence[float], Sequence[float], Vector3]:
-        """Numbers of `state`: quaternion and body rate first, nine angles and rates, torques."""
+        """Numbers of `state`.
+
+        Quaternion and body rate come first, then nine angles and nine rates, then
+        torques.
+        """
         now = self._now
         return now.point.y, now.point.joints, self._torque(now)
 
@@ -404,7 +415,7 @@ class Simulation(Explained):
 
     @property
     def energy_residual(self) -> float:
-        """Energy now, less energy at the start, less the work done on the manipulator [J]."""
+        """Energy now, less that at the start, less work done on the manipulator [J]."""
         y = self._now.point.y
         return self.dynamics.total_energy(y) - self._energy - y[-1]
 
@@ -417,7 +428,10 @@ class Simulation(Explained):
 
     @property
     def conditioning(self) -> dict[str, float]:
-        """The least sin(mu_k), zero at a serial singularity, and det J2, zero at a parallel one."""
+        """The least sin(mu_k), and det J2.
+
+        The first is zero at a serial singularity, the second at a parallel one.
+        """
         return conditioning(self.geometry, self.state)
 
     def _facts(self) -> dict[str, object]:
@@ -455,7 +469,10 @@ def _continue_simulation(
 
 
 def conditioning(geometry: Geometry, state: State) -> dict[str, float]:
-    """Return the least sin(mu_k), zero at a serial singularity, and det J2, at a parallel one."""
+    """Return the least sin(mu_k), and det J2.
+
+    The first is zero at a serial singularity, the second at a parallel one.
+    """
     r = kinematics.carriage_directions(geometry, state.joints.gamma)
     rotation = rotation_matrix(state.quaternion)
     _, _, determinant, _ = kinematics.describe_assemblies(geometry, r, rotation)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A motion by steps with error control: any torque, control periods, limits, stiff scenes."""
+"""A motion by steps with error control.
+
+It takes any torque, control periods, limits and stiff scenes.
+"""
 
 from __future__ import annotations
 
@@ -146,7 +149,7 @@ class SteppedMotion:
             self._advance(start, stop - start, stop, task.torque.acting(start, stop))
 
     def _hold_periods(self, period: int) -> None:
-        """Go through control periods, in each of which the torques of a function are held."""
+        """Go through control periods, which hold the torques of a function."""
         task, end = self._task, round(self._task.span[1] * NANOSECONDS)
         for start in range(0, end, period):
             time = start / NANOSECONDS
@@ -167,7 +170,7 @@ class SteppedMotion:
         return clamp(torque, self.stepper.torque.limit)
 
     def _advance(self, begin: float, h: float, end: float, torque: Torque) -> None:
-        """Go through a segment under a torque, from `begin` to `end` [s], whose length is h."""
+        """Go through a segment of length h under a torque, `begin` to `end` [s]."""
         self._segment = begin, end
         self._torque = self.stepper.torque.acting(torque)
         self._take_if_wanted(begin, self.at.y)
@@ -210,7 +213,7 @@ class SteppedMotion:
             self.samples.add_inside(times, self._torque, step, begin)
 
     def _warn_if_hopeless(self, share: float) -> None:
-        """Warn once where the rest of the motion would take far more than the budget."""
+        """Warn once if the rest of the motion would far exceed the budget."""
         self._warn_after, most = math.inf, self._budget.per_period
         spent = self._budget.spent - self._spent_before
         if _HOPELESS * most * share < spent:
@@ -251,6 +254,6 @@ class SteppedMotion:
 
 
 def _first_method(task: Task) -> Method | None:
-    """Return the method that `auto` begins a long and accurate motion with, else None."""
+    """Return the method `auto` begins a long and accurate motion with, or None."""
     accurate = task.period is None and task.tolerance < ACCURATE
     return DOP853 if task.method == AUTO and accurate else None

@@ -67,7 +67,8 @@ if TYPE_CHECKING:
 
 _KEY, _FORMAT = "sst_ros", 1
 _FIGURES = (
-    "status", "message", "method", "error_estimate", "energy_residual", "evaluations", "step",
+    "status", "message", "method", "error_estimate", "energy_residual",
+    "evaluations", "step",
 )  # fmt: skip
 """What a run says of itself, in its files and in xarray."""
 
@@ -80,7 +81,7 @@ _ACCURACY = 1e-13
 
 _STATUSES = (-1, 0, 1, 2)
 _UNMET = 2
-"""Status of a motion that reached its end with an error estimate above the tolerance."""
+"""Status of a motion that reached its end, its error estimate above the tolerance."""
 
 
 def check_error(
@@ -104,7 +105,7 @@ the noise of its encoders. What exceeds this is the orientation of another motio
 
 
 def _check_columns(path: str | Path, columns: dict[str, Array]) -> None:
-    """Refuse columns of a file that are no numbers, not finite, or not of equal length."""
+    """Refuse columns of a file that are no numbers, not finite or unequally long."""
     count = columns["t"].shape
     for name, column in columns.items():
         number = column.dtype.kind in "fiu"
@@ -235,7 +236,10 @@ class Trajectory(MotionTable):
         self.dense, self._parameters = dense, tuple(parameters)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy or another process gets: `at` integrates there from the samples."""
+        """Return what a copy or another process gets.
+
+        `at` integrates there from the samples.
+        """
         arrays = {
             name: getattr(self, name) for name in ("quaternion", "body_rate", "torque")
         }
@@ -280,9 +284,10 @@ class Trajectory(MotionTable):
 
     @cached_property
     def gamma_ddot(self) -> Array:
-        """Accelerations of the actuators under `torque` and the scene's loads [rad/s^2], (n, 3).
+        """Accelerations of the actuators [rad/s^2], shape (n, 3).
 
-        A moment from a topic is no part of them.
+        They are those under `torque` and the scene's loads. A moment from a topic is no
+        part of them.
         """
         model, y = self._dynamics.model._replace(time_constant=None), self._columns
         with np.errstate(all="ignore"):
@@ -294,9 +299,10 @@ class Trajectory(MotionTable):
 
     @cached_property
     def reactions(self) -> Reactions:
-        """Forces and moments at every joint under `torque` and the scene's loads, see `Reactions`.
+        """Forces and moments at every joint, see `Reactions`.
 
-        A moment from a topic is no part of them.
+        They are those under `torque` and the scene's loads. A moment from a topic is no
+        part of them.
         """
         found = reactions_of(
             self.scene, self.t, self.quaternion, self.body_rate, self.torque
@@ -305,7 +311,7 @@ class Trajectory(MotionTable):
 
     @cached_property
     def euler_zyz(self) -> Array:
-        """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], shape (n, 3)."""
+        """ZYZ angles (theta, phi, psi) of {E} in {B} without jumps [rad], (n, 3)."""
         return freeze(unwrap_zyz(super().euler_zyz))
 
     @cached_property
@@ -339,7 +345,7 @@ class Trajectory(MotionTable):
 
     @cached_property
     def sensitivities(self) -> dict[str, Sensitivity]:
-        """Derivatives of the samples by each parameter that `simulate` was given, by its name.
+        """Derivatives of the samples by each parameter given to `simulate`, by name.
 
         They are computed when they are first asked for. Raises InputError: no motion is
         found.
@@ -408,9 +414,10 @@ class Trajectory(MotionTable):
         return Trajectory(
             self.scene, *arrays, joints=joints,
             status=self.status, message=self.message, method=self.method,
-            error_estimate=self.error_estimate, energy_residual=lambda: self.energy_residual,
-            evaluations=self.evaluations, step=self.step, law=self.law, dense=self.dense,
-            parameters=self._parameters, gaps=self.gaps,
+            error_estimate=self.error_estimate,
+            energy_residual=lambda: self.energy_residual,
+            evaluations=self.evaluations, step=self.step, law=self.law,
+            dense=self.dense, parameters=self._parameters, gaps=self.gaps,
         )  # fmt: skip
 
     def to_pandas(self, *, reactions: bool = False) -> pd.DataFrame:
@@ -605,7 +612,10 @@ def _own(name: str, value: TimesLike) -> Array:
 
 
 def _propagate(trajectory: Trajectory, times: Array) -> Array:
-    """States (quaternion, body rate, acting torque) at times [s] inside, shape (m, 10)."""
+    """Return states at times [s] inside, shape (m, 10).
+
+    A state is the quaternion, the body rate and the acting torque.
+    """
     if trajectory.dense is not None:
         states = trajectory.dense(times)
         if states.shape[1] > 7 or trajectory.law is None:

@@ -127,7 +127,10 @@ def run_on_cluster(
         return died
 
     def retire(worker: str, fault: str) -> None:
-        """Take a worker out of the cluster, and say so once: else job after job fails on it."""
+        """Take a worker out of the cluster, and say so once.
+
+        Otherwise job after job fails on it.
+        """
         if worker not in faults:
             faults[worker] = fault
             print(
@@ -156,7 +159,10 @@ def run_on_cluster(
 
 
 def _on_worker(number: int, work: bytes, versions: str) -> Any:
-    """Run a job; raises UnfitWorker where this worker has other versions or cannot write."""
+    """Run a job on this worker.
+
+    Raises UnfitWorker where it has other versions or cannot write.
+    """
     try:
         if (here := describe_versions()) != versions:
             raise OSError(f"it has {here} in place of {versions}")

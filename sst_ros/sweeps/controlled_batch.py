@@ -44,7 +44,7 @@ _DESIRED = {
 }
 
 REFERENCES = {"first": 1, **_DESIRED, "feedforward": 3, "held": 3}
-"""Sizes of what a sample is given: whether it is the first, the reference, its torques."""
+"""Sizes of a sample's inputs: whether it is the first, the reference, its torques."""
 
 GAINS = {
     "kp": 3,
@@ -120,7 +120,7 @@ class Feedback(NamedTuple):
 
 
 class ControlledBlock(Block):
-    """Columns whose torques the control law gives at each sample, and holds until the next.
+    """Columns whose torques the control law gives at a sample and holds to the next.
 
     Which columns they are is known from `load` on.
     """
@@ -173,7 +173,7 @@ class ControlledBlock(Block):
 
 
 class ControlledBatch:
-    """A batch of plants whose torques come from the controller of a study, with zero-order hold.
+    """A batch of plants under the controller of a study, with zero-order hold.
 
     The controller's model of the plant is the scene of the study, which does not vary.
     A run has `samples` control periods; a length or a number of steps that does not fit
@@ -247,7 +247,7 @@ class ControlledBatch:
         return compile_columns({"answer": program}, sizes["references"])["answer"]
 
     def _command(self, joints: Any, of: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Return what the law and its channel send, three torques, and the new memory."""
+        """Return what law and channel send, three torques, and the new memory."""
         control, space = self._control, ActuatorSpaceMap(Geometry.of(self._scene))
         given, gains = divide(REFERENCES, of["references"]), divide(GAINS, of["gains"])
         memory = divide(self._memory_sizes, of["memory"])

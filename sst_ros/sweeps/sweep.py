@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many runs of a scene: chunks of a study on threads of this process, or on a Dask cluster.
+"""Many runs of a scene: chunks of a study on threads, or on a Dask cluster.
+
+The threads are those of this process.
 
 A chunk depends on the study and its index alone, so it may be computed again. Its
 Parquet file is complete or absent. The metadata of the file hold the study, its digest,
@@ -83,7 +85,7 @@ def sweep(
     progress: bool = True,
     **options: Any,
 ) -> Table:
-    """Run a scene many times with other numbers, and return a table with a row for each run.
+    """Run a scene many times with other numbers; return a table, a row for each run.
 
     Args:
         scene: a Scene, its name, its path, or its document as a dict.
@@ -198,7 +200,7 @@ def hold_folder(out: Path, origin: str) -> Iterator[None]:
 def _compute(
     study: SweepStudy, out: Path | None, *, client: Any, workers: int, progress: bool
 ) -> pd.DataFrame:
-    """Compute the chunks of a study that are not in `out`, and return the whole table."""
+    """Compute the chunks of a study not yet in `out`; return the whole table."""
     complete, steps = set[int](), None
     if out is not None:
         # With the number of steps that was chosen when it was started.
@@ -248,7 +250,7 @@ def _compute(
 def run_chunk(
     ready: PreparedSweep, out: Path | None, index: int
 ) -> tuple[dict[str, int], Any]:
-    """Return how runs of a chunk ended early, and its table if there is no folder for its file.
+    """Return how runs of a chunk ended early, and its table if no folder is given.
 
     Raises OSError where the file cannot be written.
     """
@@ -265,10 +267,10 @@ def run_chunk(
 
 
 class PreparedSweep:
-    """A study ready to run: its programs and its number of steps, which may be known already.
+    """A study ready to run: its programs and its number of steps.
 
-    Refuses one whose ranges end in no scene, and one whose tolerance no number of steps
-    reaches.
+    The number of steps may be known already. A study whose ranges end in no scene is
+    refused, and so is one whose tolerance no number of steps reaches.
     """
 
     def __init__(self, study: SweepStudy, steps: int | None = None) -> None:
@@ -297,7 +299,7 @@ class PreparedSweep:
         return PreparedSweep, (self.study, self.steps)  # a worker compiles for itself
 
     def _choose_steps(self) -> int:
-        """Find the least number of steps, about, that keeps the tolerance in the pilot rows.
+        """Find about the least number of steps that keeps the tolerance in pilot rows.
 
         The error of c steps is the difference from 2c steps; it falls with the eighth
         power of c. It is nan where no run reaches the end.
@@ -331,7 +333,10 @@ class PreparedSweep:
             count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
             if count > MOST_RUN_STEPS:
                 break
-        allowed = f"is not reached by {MOST_RUN_STEPS} steps; give `steps`, or a larger tolerance"
+        allowed = (
+            f"is not reached by {MOST_RUN_STEPS} steps; give `steps`, or a larger"
+            " tolerance"
+        )
         raise refusal("sweep", "tolerance", tolerance, allowed)
 
     def check(self, values: dict[str, Array]) -> None:
@@ -412,7 +417,7 @@ class PreparedSweep:
     def scenarios(
         self, values: dict[str, Array]
     ) -> tuple[Scenarios, dict[str, Array], dict[int, InputError]]:
-        """Scenarios of rows, their starts and gains, and the rows that make no scene."""
+        """Scenarios of rows, their starts and gains, and rows that make no scene."""
         numbers, starts = self._split(values)
         scenarios = Scenarios(self.study.model_scene, numbers)
         faults = scenarios.faults(most=len(next(iter(values.values()))))
@@ -430,7 +435,10 @@ class PreparedSweep:
         rows: NDArray[np.int64],
         steps: int,
     ) -> tuple[BatchResult, dict[str, NDArray[Any]]]:
-        """Return results of rows by a number of steps, and their extremes or tracking figures."""
+        """Return results of rows by a number of steps.
+
+        With them come their extremes or tracking figures.
+        """
         batch = self.batch.with_parameters(scenarios)
         outputs = self.study.outputs
         every = (
@@ -494,7 +502,7 @@ class PreparedSweep:
     def _split(
         self, values: Mapping[str, Array]
     ) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Numbers of the scene by key, and what a run is given: initial state and gains."""
+        """Numbers of the scene by key, and those of a run: initial state, gains."""
         inside: dict[str, Array] = {}
         outside: dict[str, Array] = {}
         for one in self.study.variations:
@@ -545,7 +553,7 @@ def write_part(
 
 
 def _checksum(about: Mapping[str, Any], table: pa.Table) -> str:
-    """Return the checksum of what a file says of itself, and of the bits of its columns."""
+    """Return the checksum of what a file says of itself, and its columns' bits."""
     said = {key: value for key, value in about.items() if key != "checksum"}
     columns: dict[str, NDArray[Any]] = {}
     texts = {"about": json.dumps(said, sort_keys=True)}
@@ -648,7 +656,10 @@ def find_complete(folder: Path, study: SweepStudy) -> tuple[set[int], int | None
 
 
 def read_sweep(folder: Path) -> pd.DataFrame:
-    """Read the results in a folder as one table, units and study in its `attrs`, or refuse it."""
+    """Read the results in a folder as one table, or refuse it.
+
+    Units and study are in its `attrs`.
+    """
     read = [(path, read_part(path)) for path in sorted(folder.glob("part-*.parquet"))]
     parts = [(path, *part) for path, part in read if part is not None]
     if not parts:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a study: distributions of the outputs, scatter matrix of the worst runs."""
+"""Pictures of a study: output distributions, scatter matrix of the worst runs."""
 
 from __future__ import annotations
 
@@ -64,7 +64,10 @@ def draw_distributions(outputs: pd.DataFrame, units: Mapping[str, str]) -> Figur
 
 @styled
 def draw_scatter(inputs: pd.DataFrame, worst: NDArray[np.intp], title: str) -> Figure:
-    """Scatter matrix of inputs: a sample of all runs, and over it the worst, by their positions."""
+    """Draw a scatter matrix of inputs: a sample of all runs, the worst over it.
+
+    The worst runs are given by their positions.
+    """
     size = len(inputs.columns)
     figure = Figure(figsize=(1.2 + 1.8 * size, 1.2 + 1.8 * size))
     grid = figure.subplots(size, size, squeeze=False)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study of many runs as one document: checked before anything runs, identified by a digest."""
+"""A study of many runs as one document.
+
+It is checked before anything runs, and identified by a digest.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,10 @@ from sst_ros.sweeps.variations import (
 DEFAULT_OUTPUTS = ("gamma", "gamma_dot", "quaternion", "body_rate", "energy")
 
 CHUNK_ROWS = 32_768
-"""Rows of a chunk by default: a second of work, and a power of two, as Sobol points want."""
+"""Rows of a chunk by default.
+
+They are a second of work, and a power of two, as Sobol points want.
+"""
 
 SWEEP_OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
 """What `outputs` may name: of the final state.
@@ -186,7 +192,7 @@ class SweepStudy(Section):
 
     @cached_property
     def model_scene(self) -> Scene:
-        """The scene with the torques of the study: none of its own where a controller acts."""
+        """The scene with the study's torques, none of its own under a controller."""
         torque = self.torque
         if self.control is not None or isinstance(torque, SineTorque):
             return dataclasses.replace(self.scene, torque=torque)
@@ -271,7 +277,7 @@ class SweepStudy(Section):
         return rows
 
     def draw(self, first: int, count: int, sampling: str = "") -> dict[str, Array]:
-        """Draw rows `first` to `first + count`: arrays (count, components) by varied key."""
+        """Draw rows `first` to `first + count`: (count, components) by varied key."""
         quantiles, used = self._quantiles(first, count, sampling or self.sampling), 0
         found, index = {}, np.arange(first, first + count)
         for one in self.variations:

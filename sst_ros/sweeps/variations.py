@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What varies in a study: keys of the scene, the distribution or the values of each, and the rows.
+"""What varies in a study: keys of the scene, their distributions or values, the rows.
 
 A distribution is ("uniform", low, high), ("normal", mean, standard deviation[, low,
 high]), or a list of values, which spans a grid with those of other keys; in a YAML file
@@ -40,7 +40,7 @@ MOST_VALUES = 10_000_000  # of a grid
 
 
 class Target(NamedTuple):
-    """A number of the scene that a variation sets: its key, value in the scene, specification."""
+    """A number that a variation sets: key, value in the scene, specification."""
 
     key: str
     nominal: Array
@@ -70,7 +70,7 @@ class Variation:
     factor: bool
 
     def __post_init__(self) -> None:
-        """Raise ValueError if a target must not have a value that a distribution or grid has."""
+        """Raise ValueError if a value of the distribution or grid is not allowed."""
         reached = self.numbers[[0, 2, 3]] if self.kind == "normal" else self.numbers
         for target in self.targets if self.kind != "table" else ():
             numbers, spec = self.parameters(reached)[target.key], target.spec
@@ -126,7 +126,10 @@ class Variation:
 
 
 def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
-    """Return what a key of a scene, or of settings at a place of the study, names, or refuse it."""
+    """Return what a key names, or refuse it.
+
+    It is one of a scene, or of settings at a place of the study.
+    """
     found = []
     for at, value, spec in find_fields(tree, key, place=place):
         here = key_of(at)
@@ -170,7 +173,8 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
     listed = np.iterable(numbers) and not isinstance(numbers, (str, bytes, bytearray))
     if kind not in VARIATION_KINDS or not isinstance(relative, bool) or not listed:
         raise ValueError(
-            f"must be a list of values, or one of {', '.join(VARIATION_KINDS)} with its numbers"
+            f"must be a list of values, or one of {', '.join(VARIATION_KINDS)} with"
+            " its numbers"
         )
     factor = _scales_tensor(key, targets)
     if factor and not relative:
@@ -219,7 +223,7 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
 def tabulate(
     key: str, columns: Mapping[str, Array], targets: Sequence[Target]
 ) -> Variation:
-    """Return the variation of a key whose values are columns of a table, which must be complete."""
+    """Return the variation of a key by columns of a table, which must be complete."""
     if len(set(map(len, columns.values()))) > 1:
         raise ValueError("must have columns of equal length")
     values, factor = (
