@@ -2,7 +2,8 @@
 """Processor time of the simulator's node, beside loops that only sleep, or sleep and
 publish.
 
-python -m benchmark.bare_loops [--seconds 20] [--rounds 3]   # scene swing, compiled, 1 kHz
+# scene swing, compiled, 1 kHz
+python -m benchmark.bare_loops [--seconds 20] [--rounds 3]
 
 All keep the deadlines of the node, one after the other, several times in turn, each
 with a recorder of its own where messages are published. The loops make and publish the
@@ -89,7 +90,7 @@ def exchange(number: int, read: int) -> Callable[[int], None]:
 
 
 def run_loop(name: str, seconds: float, latency_us: int) -> dict[str, float]:
-    """Run a loop in this process: processor time [% of a core], deadlines missed [%]."""
+    """Run a loop in this process: time on a core [%], deadlines missed [%]."""
     latency = scheduling.CpuDmaLatency()
     latency.request(latency_us)
     ticks, number, read = LOOPS[name]
@@ -166,7 +167,7 @@ def _only_sleep(counts: Any, ends: Any, priority: int) -> None:
 def measure(
     watch: Client, name: str, seconds: float, latency_us: int = -1
 ) -> dict[str, float]:
-    """Measure a loop, or the node, in a process of its own, with this cpu_dma_latency."""
+    """Measure a loop, or the node, in its own process, with this cpu_dma_latency."""
     with ExitStack() as stack:
         folder = Path(
             stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))

@@ -146,7 +146,7 @@ def find_difference(
     call: Callable[[str, np.ndarray, list[np.ndarray]], Any],
     states: int,
 ) -> float:
-    """Return the largest difference to the package, of the largest number of a result."""
+    """Return the largest difference to the package, over a result's largest number."""
     worst = 0.0
     for state in [*package.states()][:states]:
         for output, expected in package.values(state).items():
@@ -180,7 +180,7 @@ def end_of(scene: Scene) -> np.ndarray:
 
 
 def compare_unit(scene: Scene, folder: Path) -> tuple[int, float]:
-    """Return what fmpy finds wrong in a unit, and its largest error of an angle [rad]."""
+    """Return what fmpy finds wrong in a unit, and its largest angle error [rad]."""
     from fmpy import simulate_fmu
     from fmpy.validation import validate_fmu
 
@@ -265,7 +265,7 @@ def compare(name: str) -> dict[str, str]:
 def compare_library(
     scene: Scene, package: Package, library: str
 ) -> tuple[float, float | None]:
-    """Return the difference of values, and the error of the motion where it is quick."""
+    """Return the difference of values, and the error of the motion if it is quick."""
     written = equations(scene, library)
 
     def call(output: str, state: np.ndarray, drive: list[np.ndarray]) -> Any:

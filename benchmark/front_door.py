@@ -33,7 +33,7 @@ PERIOD = 0.001
 TICK_NS = 1_000_000
 
 ALLOWED_MS = 0.15
-"""What a call may take besides four times its compiled steps, and twice its functions."""
+"""What a call may take besides 4 times its compiled steps and twice its functions."""
 
 
 class MuJoCo(NamedTuple):

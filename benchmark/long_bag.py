@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report of a long run: time and memory of `report run` for ten minutes at 500 Hz.
 
-python -m benchmark.long_bag [--seconds 600] [--bag FOLDER]   # is kept there, used if it exists
+# --bag: is kept there, used if it exists
+python -m benchmark.long_bag [--seconds 600] [--bag FOLDER]
 
 The bag is a true run: Example 2 with springs and friction in its actuators, so that it
 stays inside for ever, solved by single steps at 1 kHz. Its messages are made by the
@@ -46,7 +47,7 @@ AT_MOST_S, AT_MOST_GB = 60.0, 1.5
 START_NS, TICK_NS, TICKS_A_SAMPLE = 1_700_000_000_000_000_000, 1_000_000, 2
 SAMPLE_NS = TICKS_A_SAMPLE * TICK_NS
 SENT_NS, ANSWER_NS = 150_000, 400_000
-"""Receptions of a sample, and of the command that answers it, after the sample's stamp."""
+"""Receptions of a sample, and of the command answering it, after the sample's stamp."""
 
 STORE = message_types()
 TOPICS = {

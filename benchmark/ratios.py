@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ten ratios of each release, and a page that shows how they went.
 
-python -m benchmark.ratios [--write] [--tests]    # adds a row of this version to docs/ratios.csv
+# --write: adds a row of this version to docs/ratios.csv
+python -m benchmark.ratios [--write] [--tests]
 
 Each ratio is of two things that run in turn, by processor time, so that machines and
 loads differ less in them than in times. Functions have the names that asv looks for:
@@ -55,8 +56,13 @@ def _used_by(*words: str, starts: int = STARTS, **env: str) -> float:
     found = []
     for _ in range(starts):
         before = os.times()
-        subprocess.run([sys.executable, *words], check=True, timeout=600, env=os.environ | env,
-                       stdout=subprocess.DEVNULL)  # fmt: skip
+        subprocess.run(
+            [sys.executable, *words],
+            check=True,
+            timeout=600,
+            env=os.environ | env,
+            stdout=subprocess.DEVNULL,
+        )
         after = os.times()
         found.append(sum(after[2:4]) - sum(before[2:4]))
     return min(found)

@@ -3,8 +3,9 @@
 
 And its fastest speed.
 
-python -m benchmark.realtime --minutes 10 --write   # the official figures, on an idle machine
-python -m benchmark.realtime --fleet 10 --rate 200  # namespaced simulators side by side
+# the official figures, on an idle machine; namespaced simulators side by side
+python -m benchmark.realtime --minutes 10 --write
+python -m benchmark.realtime --fleet 10 --rate 200
 
 Simulator and recorder run for so long with SCHED_FIFO, half as long with
 cpu_dma_latency 0 as well, and as long with neither; in the same minutes a loop that

@@ -209,7 +209,8 @@ def main() -> None:
                 flush=True,
             )
     print(
-        f"{len(plan) - failed} of {len(plan)} whole; {len(bits)} kinds of bits in lockstep"
+        f"{len(plan) - failed} of {len(plan)} whole;"
+        f" {len(bits)} kinds of bits in lockstep"
     )
     print(join_line(describe_machine("rclpy", "ros-rmw-fastrtps-cpp")))
     sys.exit(failed > 0 or len(bits) > 1)

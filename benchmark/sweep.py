@@ -85,13 +85,17 @@ def _study(rows: int) -> dict[str, float]:
     assert len(table) == rows
     assert (table["status"] == 0).all()
     return {
-        "rows": rows, "steps": ready.steps, "error of pilot rows [rad]": ready.pilot_error,
-        "seconds": seconds, "of these to choose the steps": prepared_s,
+        "rows": rows,
+        "steps": ready.steps,
+        "error of pilot rows [rad]": ready.pilot_error,
+        "seconds": seconds,
+        "of these to choose the steps": prepared_s,
         "seconds to read the files again": reading,
-        "us a run": 1e6 * seconds / rows, "us a run, processor time": 1e6 * processor / rows,
+        "us a run": 1e6 * seconds / rows,
+        "us a run, processor time": 1e6 * processor / rows,
         "files [MB]": size / 1e6,
         "largest memory [GB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-    }  # fmt: skip
+    }
 
 
 def _arrays(ready: PreparedSweep) -> tuple[Any, list[Any]]:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manipulator as a benchmark problem of multibody dynamics: statement, reference, solutions.
+"""The manipulator as a benchmark problem of multibody dynamics.
 
-Two methods that share no equation of motion find the reference: the body rates of the
-star in extended precision by fixed steps, and the paper's virtual work in the actuator
-angles, with the assembly solved at each evaluation, by SciPy with an error control of
-its own.
+The page has its statement, its reference and solutions. Two methods that share no
+equation of motion find the reference: the body rates of the star in extended precision
+by fixed steps, and the paper's virtual work in the actuator angles, with the assembly
+solved at each evaluation, by SciPy with an error control of its own.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ ROUNDS = 9
 
 
 class Agreement(NamedTuple):
-    """Largest differences of the two methods: orientation [rad], gamma [rad], gamma_dot [rad/s]."""
+    """Largest differences of the two methods.
+
+    They are those of the orientation [rad], gamma [rad] and gamma_dot [rad/s].
+    """
 
     orientation: float
     gamma: float
@@ -68,7 +71,10 @@ class Agreement(NamedTuple):
 def solve_apart(
     scene: Scene, times: Array, tolerance: float = 1e-13
 ) -> tuple[Array, Array]:
-    """Solve the paper's equations by SciPy: (gamma, gamma_dot) (m, 6), quaternions (m, 4)."""
+    """Solve the paper's equations by SciPy.
+
+    Return (gamma, gamma_dot) (m, 6) and quaternions (m, 4).
+    """
     if scene.torque is None:
         raise InputError(scene.name, [Problem("torque", None, "must be given")])
     mechanism, geometry = virtual_work.Mechanism.of(scene), Geometry.of(scene)
@@ -124,7 +130,7 @@ def data_file(problem: InitialValueProblem, reference: ReferenceSolution) -> str
 
 
 def solve_by_package(problem: InitialValueProblem, truth: Array) -> DataFrame:
-    """Solutions of this package: error as the problem defines it, and processor time."""
+    """Solutions of this package: error as the problem defines it, processor time."""
     rows = []
     for method, tolerance in SETTINGS:
         options: dict[str, Any] = {

@@ -43,7 +43,7 @@ from sst_ros.sweeps.sweep_study import SampledControl
 from studies.sampled_data import largest_stable, stability_limit
 
 OFFSET = 1e-8
-"""Error at the start [rad] of a search for a limit: so small that the plant is linear around it."""
+"""Start error [rad] of a search for a limit, so small that the plant is linear."""
 
 SHARE = 0.2
 """Part by which the model's bodies are too heavy or too light."""
@@ -53,7 +53,7 @@ _GONE, _LOST = 1e-3, 1e2 * OFFSET
 
 @dataclass(frozen=True)
 class ModelError:
-    """One error of a controller: in its model of the plant's scene, or in the channel to it."""
+    """Error of a controller: in its model of the plant's scene, or in the channel."""
 
     name: str
     change: Callable[[Scene], Scene] | None = None
@@ -65,7 +65,7 @@ class ModelError:
         return plant if self.change is None else self.change(plant)
 
     def changes(self, plant: Scene) -> bool:
-        """Whether this plant can have it: friction that is not there cannot be unknown."""
+        """Whether this plant can have it: absent friction cannot be unknown."""
         return bool(self.channel) or self.model(plant) != plant
 
 
@@ -73,10 +73,10 @@ BODIES = ("star", "actuated_links", "intermediate_links", "payload", "actuators"
 
 
 def make_heavier(scene: Scene, factor: float, kinds: Sequence[str] = BODIES) -> Scene:
-    """Return a scene whose bodies have `factor` times the mass and inertia, in the same places.
+    """Return a scene whose bodies have `factor` times the mass and inertia.
 
-    With all kinds of bodies every torque of inertia and of weight is `factor` times as
-    large.
+    Places stay the same. With all kinds of bodies every torque of inertia and of weight
+    is `factor` times as large.
     """
     document = plain(scene)
     for found in filter(None, map(document.get, kinds)):
@@ -229,7 +229,10 @@ def at_start(plant: Scene, motion: ReferenceMotion, offset: float = 0.0) -> Scen
 
 
 def ideal_plant(scene: Scene) -> Scene:
-    """Return the plant of the theory: no friction, which acts between samples too, and no lag."""
+    """Return the plant of the theory: without friction and lag.
+
+    Friction acts between samples, too.
+    """
     actuators = scene.actuators
     if actuators is not None:
         # A limit that is never met: actuators that change nothing are refused.
@@ -244,7 +247,10 @@ def bandwidth_in_theory(loop: ControlLoop) -> float:
 
 
 def bandwidth_limit(loop: ControlLoop) -> float:
-    """Find the largest bandwidth [rad/s] at which computed torque holds the start of the motion."""
+    """Find the largest bandwidth [rad/s] that holds the start of the motion.
+
+    The mode is computed torque.
+    """
     first = 0.5 * bandwidth_in_theory(loop)
     return largest_stable(
         lambda bandwidth: is_stable(loop, bandwidth), first, 1.15, 2e-3
@@ -252,7 +258,7 @@ def bandwidth_limit(loop: ControlLoop) -> float:
 
 
 def is_stable(loop: ControlLoop, bandwidth: float) -> bool:
-    """Return whether a small error is less in the last quarter of a run than in the second."""
+    """Return whether a small error is less in a run's last quarter than its second."""
     ticks = 600 + 200 * loop.settings.delay
     start, seconds = loop.motion.at(0.0), ticks * loop.period_ns / NANOSECONDS
     pose = Reference(start.quaternion, ZERO, ZERO, start.gamma, ZERO, ZERO)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error against processor time of the run loop: control rate, method, and how torques are held.
+"""Error of the run loop against its processor time.
 
-Each point is a run of the tick loop of the simulator node, compared with the reference
-of the continuous motion; `sampled_data` derives the orders of the hold.
+Varied are the control rate, the method, and how torques are held. Each point is a run
+of the tick loop of the simulator node, compared with the reference of the continuous
+motion; `sampled_data` derives the orders of the hold.
 """
 
 from __future__ import annotations
@@ -47,19 +48,19 @@ RATES = (100, 200, 500, 1000, 2000, 5000, 10_000)
 
 START, MIDDLE, EXACT = "start", "middle", "exact"
 HOLDS = (START, MIDDLE, EXACT)
-"""What acts over a period: the torque at its start, at its middle, or the profile itself."""
+"""What acts over a period: the torque at its start, at its middle, or the profile."""
 
 TOLERANCE = 1e-10
 """Local tolerance of a step, the default of the node."""
 
 OWN_ERROR = 0.1
-"""A method's own error below this part of that of the hold leaves the latter as it is."""
+"""A method's own error below this part of the hold's error leaves that as it is."""
 
 SAME_ERROR = 1.05
 """Methods whose errors differ by less than this ratio have the same error."""
 
-COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad", "estimate_rad",
-           "tick_us", "core_share")  # fmt: skip
+COLUMNS = ("scene", "rate_Hz", "method", "hold", "final_rad", "largest_rad",
+           "estimate_rad", "tick_us", "core_share")  # fmt: skip
 
 
 Run = tuple[NDArray[np.int64], Array, float, float]
@@ -71,7 +72,9 @@ the end [rad], median processor time of a tick [s].
 def run_controlled(
     scene: Scene, seconds: float, rate: int, method: str, hold: str
 ) -> Run:
-    """Run a scene with torques at a control rate [Hz], a divisor of 1e9, with a sample a tick.
+    """Run a scene with torques at a control rate [Hz], with a sample a tick.
+
+    The rate is a divisor of 1e9.
 
     Raises:
         RunStopped: the run stopped early.
@@ -96,7 +99,7 @@ def run_controlled(
 
 @dataclass(frozen=True)
 class ControlStudy:
-    """Result of a study: the grid as a table of COLUMNS, and the reference that it is held to."""
+    """Result of a study: the grid as a table of COLUMNS, and its reference."""
 
     scene: str
     seconds: float
@@ -138,7 +141,7 @@ class ControlStudy:
         return slope((1.0 / rows.rate_Hz).tolist(), rows.largest_rad.tolist())
 
     def spread(self, hold: str) -> float:
-        """Largest ratio of the errors of two methods at the same rate, of those `resolved`."""
+        """Largest ratio of `resolved` errors of two methods at the same rate."""
         errors = self.resolved(hold).groupby("rate_Hz").largest_rad
         return float((errors.max() / errors.min()).max())
 
@@ -150,10 +153,10 @@ def control_study(
     methods: Sequence[str] = tuple(METHODS),
     shown: bool = False,
 ) -> ControlStudy:
-    """Run the grid, one point after another: processor times are those of a core that is free.
+    """Run the grid, one point after another.
 
-    Errors are taken at every tick, so that the rates [Hz], divisors of 1e9, have a
-    common tick.
+    Processor times are those of a core that is free. Errors are taken at every tick, so
+    that the rates [Hz], divisors of 1e9, have a common tick.
 
     Raises:
         InputError: the scene has no torques of its own, or cannot start.
@@ -241,15 +244,20 @@ def grid(study: ControlStudy) -> DataFrame:
         low, high = group.largest_rad.min(), group.largest_rad.max()
         error = f"{high:.3e}" if high < 1.001 * low else f"{low:.0e} to {high:.0e}"
         fast, slow = group.tick_us.min(), group.tick_us.max()
-        rows.append({
-            "rate [Hz]": f"{rate:g}",
-            "torque": hold,
-            "largest error [rad]": error,
-            "at the end [rad]": f"{group.final_rad.max():.1e}",
-            "per tick [us]": f"{fast:.0f} to {slow:.0f}" if slow > 1.1 * fast else f"{slow:.0f}",
-            "share of a core [%]": "{:.2g} to {:.2g}".format(
-                *(100 * group.core_share.agg(["min", "max"]))),
-        })  # fmt: skip
+        rows.append(
+            {
+                "rate [Hz]": f"{rate:g}",
+                "torque": hold,
+                "largest error [rad]": error,
+                "at the end [rad]": f"{group.final_rad.max():.1e}",
+                "per tick [us]": (
+                    f"{fast:.0f} to {slow:.0f}" if slow > 1.1 * fast else f"{slow:.0f}"
+                ),
+                "share of a core [%]": "{:.2g} to {:.2g}".format(
+                    *(100 * group.core_share.agg(["min", "max"]))
+                ),
+            }
+        )
     return data_frame(rows)
 
 
@@ -287,8 +295,13 @@ def figure(study: ControlStudy) -> Figure:
         error = np.maximum(group.largest_rad.to_numpy(), 1e-17)
         look: Any = {"color": HOLD_NAMES[hold][0], "marker": MARKERS[method][1],
                      "markerfacecolor": "none"}  # fmt: skip
-        left.plot(1e3 / group.rate_Hz, error, markersize=5 + 2.5 * list(MARKERS).index(method),
-                  linewidth=float(hold == EXACT), **look)  # fmt: skip
+        left.plot(
+            1e3 / group.rate_Hz,
+            error,
+            markersize=5 + 2.5 * list(MARKERS).index(method),
+            linewidth=float(hold == EXACT),
+            **look,
+        )
         right.plot(100.0 * group.core_share, error, markersize=7, linewidth=1.0, **look)
     for hold, power in ORDERS.items():
         colour, group = HOLD_NAMES[hold][0], study.resolved(hold).sort_values("rate_Hz")
@@ -330,9 +343,16 @@ def page(studies: Sequence[ControlStudy]) -> str:
 def main(words: Sequence[str] | None = None) -> int:
     """Study scenes from the command line."""
     return run(
-        report, "control_rate", DOCS, words,
-        scene={"nargs": "+", "default": SCENES, "help": "with torques: names, or .yaml files"},
-    )  # fmt: skip
+        report,
+        "control_rate",
+        DOCS,
+        words,
+        scene={
+            "nargs": "+",
+            "default": SCENES,
+            "help": "with torques: names, or .yaml files",
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A design study: arcs, star angles and size against workspace, dexterity, torque and accuracy.
+"""A design study: arcs, star angles and size.
 
-What no other design betters in workspace, torque and accuracy at once is the Pareto
-front.
+Designs are compared by workspace, dexterity, torque and accuracy. What no other design
+betters in workspace, torque and accuracy at once is the Pareto front.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 COUNT = 1024  # a power of two
 LOW = (70.0, 70.0, 70.0, 100.0, 100.0, 0.7)
 HIGH = (110.0, 110.0, 110.0, 140.0, 140.0, 1.4)
-"""Arcs [deg], the first two star angles [deg], and the size over that of the shipped scene."""
+"""Arcs [deg], first two star angles [deg], and size over that of the shipped scene."""
 DIVISIONS, TURNS = 14, 48  # of the map of a workspace
 SAMPLES = 201  # of the motion
 # kg/m: the printed mass on three arcs of 90 deg
@@ -85,23 +85,34 @@ class Design:
                 "name": "design",
                 "gravity.acceleration": down.tolist(),
                 "star": {
-                    "alpha_deg": alpha, "radius": star, "inertia": _inertia(tensor),
-                    "mass": 3.0 * mass, "centre": middle.tolist(),
+                    "alpha_deg": alpha,
+                    "radius": star,
+                    "inertia": _inertia(tensor),
+                    "mass": 3.0 * mass,
+                    "centre": middle.tolist(),
                 },
-                "actuated_links": [{
-                    "inertia": _inertia(arc_inertia(link, base, [1, 0, 0], [0, 0, 1]).matrix),
-                    "mass": link, "centre": [centre, 0.0, centre],
-                }],
-                "intermediate_links": [{
-                    "inertia": {"xx": own, "yy": slider + own, "zz": slider + own},
-                    "mass": SLIDER, "centre": [star, 0.0, 0.0],
-                }],
+                "actuated_links": [
+                    {
+                        "inertia": _inertia(
+                            arc_inertia(link, base, [1, 0, 0], [0, 0, 1]).matrix
+                        ),
+                        "mass": link,
+                        "centre": [centre, 0.0, centre],
+                    }
+                ],
+                "intermediate_links": [
+                    {
+                        "inertia": {"xx": own, "yy": slider + own, "zz": slider + own},
+                        "mass": SLIDER,
+                        "centre": [star, 0.0, 0.0],
+                    }
+                ],
                 "payload": {"mass": PAYLOAD, "centre": [0.0, 0.0, star]},
                 "springs": None,
                 "initial": {"gamma": (np.radians(arcs) / 2.0).tolist()},
                 "motion": MOTION,
             }
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -175,7 +186,7 @@ def evaluate(design: Design) -> Indices | None:
 
 
 def follow(scene: Scene, geometry: Geometry) -> tuple[float, float]:
-    """Return the peak torque and bending moment [N m] of the motion, or refuse one that leaves."""
+    """Return peak torque and bending moment [N m], or refuse a motion that leaves."""
     motion = reference_motion(scene)
     t = np.linspace(0.0, motion.duration, SAMPLES)
     desired = [motion.at(time) for time in t.tolist()]
@@ -198,7 +209,10 @@ def follow(scene: Scene, geometry: Geometry) -> tuple[float, float]:
 
 
 def orientation_error(design: Design, geometry: Geometry, poses: Array) -> Array:
-    """Return the standard deviation of orientations (n, 3, 3) by tolerances [rad], shape (n,)."""
+    """Return the standard deviation [rad] of orientations by tolerances.
+
+    Orientations have the shape (n, 3, 3), the result (n,).
+    """
     by = rates.orientation_sensitivity(geometry, poses)
     on_base, on_star = (
         PART_ERROR / (0.35 * design.size),
@@ -233,7 +247,10 @@ def isotropy() -> list[tuple[float, float]]:
 
 @styled
 def draw(table: DataFrame, front: Array) -> Figure:
-    """Draw error and workspace of the designs over the peak torque, the first and front marked."""
+    """Draw error and workspace of the designs over the peak torque.
+
+    The first design and the front are marked.
+    """
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     labels = {
         "error": "orientation error (RMS) [mrad]",
@@ -253,15 +270,25 @@ def draw(table: DataFrame, front: Array) -> Figure:
 
 
 def page(frame: DataFrame, designs: int, symmetric: list[tuple[float, float]]) -> str:
-    """Write the page, with ten designs of the front from the least torque to the largest."""
+    """Write the page, with ten designs of the front from least to largest torque."""
     front = frame[frame["front"]].sort_values("peak_torque")
     shown = front.iloc[np.unique(np.linspace(0, len(front) - 1, 10).astype(int))]
     values = shown.drop(columns="front").map(lambda x: f"{x:.3g}")
     return render(
-        PAGES / "design.md", frame=frame, designs=designs, symmetric=symmetric, front=front,
-        shown=values, first=frame.iloc[0], low=LOW, high=HIGH, motion=MOTION["spiral"],
-        part=PART_ERROR, percentile=PERCENTILE, payload=PAYLOAD,
-    )  # fmt: skip
+        PAGES / "design.md",
+        frame=frame,
+        designs=designs,
+        symmetric=symmetric,
+        front=front,
+        shown=values,
+        first=frame.iloc[0],
+        low=LOW,
+        high=HIGH,
+        motion=MOTION["spiral"],
+        part=PART_ERROR,
+        percentile=PERCENTILE,
+        payload=PAYLOAD,
+    )
 
 
 def report(options: argparse.Namespace) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration of the error estimate of `simulate`: estimate over true error in random scenes.
+"""Calibration of the error estimate of `simulate`: its ratio to the true error.
 
 Random scenes of each class, from a seed and from one that was not used while building,
 each by a random method and tolerance, are compared with two solutions whose tolerance
@@ -81,7 +81,7 @@ def smooth(rng: np.random.Generator) -> Case:
 
 
 def sharp_friction(rng: np.random.Generator) -> Case:
-    """Draw Coulomb friction that changes sign within a thousandth of the usual rates."""
+    """Draw Coulomb friction that changes sign within 1e-3 of the usual rates."""
     joint = {"coulomb": _log(rng, 0.01, 0.3), "smoothing": _log(rng, 1e-3, 1e-1)}
     return Case(_scene(rng, friction={"gamma": joint}), _torques(rng, 2.0), None, 0.3)
 
@@ -113,7 +113,7 @@ def jump(rng: np.random.Generator) -> Case:
 
 
 def held(rng: np.random.Generator) -> Case:
-    """Draw a controller whose torques are held, for so long that steps within have errors."""
+    """Draw a controller that holds torques so long that steps within have errors."""
     gain, period = float(rng.uniform(1.0, 10.0)), round(_log(rng, 0.03, 0.3), 3)
     return Case(_scene(rng), partial(_feedback, gain), period, 0.9, memoryless=True)
 
@@ -147,16 +147,20 @@ def _feedback(gain: float, t: float, state: Any) -> list[float]:
 
 
 def lag(rng: np.random.Generator) -> Case:
-    """Draw actuators with a time constant, and sines so fast that stable steps have errors."""
+    """Draw actuators with a time constant, and fast sines.
+
+    The sines are so fast that stable steps have errors.
+    """
     constant, rate = _log(rng, 2e-4, 1e-1), _log(rng, 0.1, 1.0)
     scene = _scene(rng, actuators={"time_constant": constant})
     return Case(scene, _torques(rng, 5.0, max(rate / constant, 50.0)), None, 0.08)
 
 
 def rotor(rng: np.random.Generator) -> Case:
-    """Draw rotors behind gears, and a stiff spring that holds no more than 1 J at the start.
+    """Draw rotors behind gears, and a stiff spring.
 
-    With more the motion ends at a serial singularity, where there is no end to compare.
+    The spring holds no more than 1 J at the start. With more the motion ends at a
+    serial singularity, where there is no end to compare.
     """
     joint, leg = str(rng.choice(["gamma", "mu", "beta"])), int(rng.integers(3))
     stiffness, energy = _log(rng, 10.0, 1e4), _log(rng, 0.01, 1.0)
@@ -171,10 +175,18 @@ def rotor(rng: np.random.Generator) -> Case:
 CLASSES: dict[str, Callable[[np.random.Generator], Case]] = {
     function.__name__: function
     for function in (
-        smooth, sharp_friction, elastic_stops, torque_clamp, jump, held, held_with_memory, feedback,
-        lag, rotor,
+        smooth,
+        sharp_friction,
+        elastic_stops,
+        torque_clamp,
+        jump,
+        held,
+        held_with_memory,
+        feedback,
+        lag,
+        rotor,
     )
-}  # fmt: skip
+}
 
 
 def measure(job: tuple[str, int, int]) -> dict[str, Any]:
@@ -197,10 +209,15 @@ def measure(job: tuple[str, int, int]) -> dict[str, Any]:
 
         def solve(method: str, tolerance: float) -> Trajectory:
             return simulate(
-                case.scene, copy.deepcopy(case.torque), case.duration, t_eval=[case.duration],
-                control_period=case.period, memoryless=case.memoryless,
-                method=method, tolerance=tolerance,
-            )  # fmt: skip
+                case.scene,
+                copy.deepcopy(case.torque),
+                case.duration,
+                t_eval=[case.duration],
+                control_period=case.period,
+                memoryless=case.memoryless,
+                method=method,
+                tolerance=tolerance,
+            )
 
         found = solve(method, tolerance)
         tighter = max(TIGHTER * tolerance, FINEST)
@@ -222,7 +239,10 @@ def measure(job: tuple[str, int, int]) -> dict[str, Any]:
 
 
 def compare_bounds(job: tuple[int, int]) -> dict[str, Any]:
-    """Run a smooth case: true error by 60 digits, estimate, and proven bound of the error [rad]."""
+    """Run a smooth case: its true error, estimate and proven bound [rad].
+
+    The truth has 60 digits.
+    """
     seed, number = job
     rng = np.random.default_rng([seed, number, *b"proof"])
     method, tolerance, case = (
@@ -273,18 +293,24 @@ def summarise(rows: DataFrame) -> DataFrame:
         ratios = resolved.estimate / resolved.error
         beyond = (resolved.status == 0) & (resolved.error > 3 * resolved.tolerance)
         quantiles = map("{:.2g}".format, ratios.quantile(QUANTILES))
-        found.append({
-            "class": name.replace("_", " "), "runs": len(runs), "stopped": (~compared).sum(),
-            "resolved": len(resolved),
-            **dict(zip(heads, quantiles, strict=True)), "below 1/3": (ratios < 1 / 3).sum(),
-            "below 1/10": (ratios < 1 / 10).sum(), "beyond 3 tolerances": beyond.sum(),
-        })  # fmt: skip
+        found.append(
+            {
+                "class": name.replace("_", " "),
+                "runs": len(runs),
+                "stopped": (~compared).sum(),
+                "resolved": len(resolved),
+                **dict(zip(heads, quantiles, strict=True)),
+                "below 1/3": (ratios < 1 / 3).sum(),
+                "below 1/10": (ratios < 1 / 10).sum(),
+                "beyond 3 tolerances": beyond.sum(),
+            }
+        )
     return data_frame(found)
 
 
 @styled
 def draw(rows: DataFrame, seeds: Sequence[int]) -> Figure:
-    """Draw the share of the runs over estimate / error, a panel a class and a curve a seed."""
+    """Draw the share of runs over estimate / error: a panel a class, a curve a seed."""
     figure = Figure(figsize=(9.0, 6.5))
     panels = figure.subplots(2, 5, sharex=True, sharey=True)
     for axes, name in zip(panels.flat, CLASSES, strict=True):
@@ -345,12 +371,23 @@ def report(options: argparse.Namespace) -> bool:
 def main(words: Sequence[str] | None = None) -> int:
     """Calibrate from the command line."""
     return run(
-        report, "estimate", DOCS, words,
+        report,
+        "estimate",
+        DOCS,
+        words,
         count={"type": int, "default": 200, "help": "scenes of each class"},
         seed={"type": int, "default": 1, "help": "of the random numbers"},
-        proofs={"type": int, "default": 40, "help": "smooth scenes whose error is proven"},
-        fresh={"type": int, "default": 77, "help": "of those that were not used while building"},
-    )  # fmt: skip
+        proofs={
+            "type": int,
+            "default": 40,
+            "help": "smooth scenes whose error is proven",
+        },
+        fresh={
+            "type": int,
+            "default": 77,
+            "help": "of those that were not used while building",
+        },
+    )
 
 
 if __name__ == "__main__":

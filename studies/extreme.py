@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of stability: runs of extreme cases and what they have to agree with, and regions.
+"""Page of stability: runs of extreme cases, what they must agree with, and regions.
 
 A method multiplies the solution of y' = lambda y by its stability function R(h lambda)
 a step; it is stable where abs(R) <= 1 (Hairer & Wanner, Solving ODEs II, sections IV.2
@@ -153,7 +153,7 @@ def run_case(
 
 
 def evaluate_case(case: Case, *, plain: bool = True) -> CaseResult:
-    """Run a case, compare it with the truth, with the tick loop, and with plain Python."""
+    """Run a case, and compare it with the truth, the tick loop and plain Python."""
     began = time.perf_counter()
     first = run_case(case)
     found: dict[str, Any] = {"compiled_s": time.perf_counter() - began}
@@ -173,14 +173,23 @@ def evaluate_case(case: Case, *, plain: bool = True) -> CaseResult:
                 remarks += [] if found["same_bits"] else ["plain Python differs"]
     remarks += [] if check.holds else [f"error estimate: {check.verdict}"]
     return CaseResult(
-        case.name, case.group, case.difficulty, case.expected, case.bound, "; ".join(remarks),
-        deviation=deviation, correct=correct and check.holds, loose_error=check.true,
-        loose_estimate=check.estimate, check=check.verdict, **found,
-    )  # fmt: skip
+        case.name,
+        case.group,
+        case.difficulty,
+        case.expected,
+        case.bound,
+        "; ".join(remarks),
+        deviation=deviation,
+        correct=correct and check.holds,
+        loose_error=check.true,
+        loose_estimate=check.estimate,
+        check=check.verdict,
+        **found,
+    )
 
 
 def _judge(case: Case, done: CaseRun) -> tuple[float | None, bool, str]:
-    """Compare the end of a run with the truth: deviation, whether it is correct, and words."""
+    """Compare a run's end with the truth: deviation, whether correct, and words."""
     simulation, error = done
     if error is not None:
         result = f"{type(error).__name__}: {str(error).splitlines()[0]}"
@@ -208,7 +217,7 @@ def _measure_end(simulation: Simulation) -> dict[str, float]:
 
 
 def estimate_check(case: Case, accurate: CaseRun) -> EstimateCheck:
-    """Compare the error estimate with the true error, by the run at the default tolerance."""
+    """Compare the error estimate with the true error, at the default tolerance."""
     if accurate.error is not None or accurate.simulation is None:
         held = "its time is held to theory" if case.stop_time else "there is no motion"
         return EstimateCheck(None, None, f"none: the run is refused, {held}")
@@ -267,7 +276,10 @@ def _evaluate(number: int) -> CaseResult:
 
 
 def prove_case(case: Case) -> str:
-    """Say what the error of `simulate` is proven to be below at twenty instants, or why not."""
+    """Say what the error of `simulate` is proven to be below, or why it is not.
+
+    The bound holds at twenty instants.
+    """
     if case.refusal and case.stop_time is None:
         return "-: there is no motion"
     if case.feedback or case.long:
@@ -311,17 +323,22 @@ def _row(case: CaseResult) -> dict[str, str]:
         "truth": case.expected,
         "proven": case.proven,
         "result": ("" if case.passed else "**FAILED** ") + case.result,
-        "deviation (bound)": "-" if case.deviation is None
-        else f"{case.deviation:.0e} ({case.bound:.0e})",
+        "deviation (bound)": (
+            "-"
+            if case.deviation is None
+            else f"{case.deviation:.0e} ({case.bound:.0e})"
+        ),
         "energy": number(case.energy),
         "true error": number(case.loose_error),
-        "estimate": ("" if case.loose_estimate is None else f"{case.loose_estimate:.0e}: ")
+        "estimate": (
+            "" if case.loose_estimate is None else f"{case.loose_estimate:.0e}: "
+        )
         + case.check,
         "plain Python [s]": number(case.wall_s, ".2f") if case.wall_s else "-",
         "compiled [s]": number(case.compiled_s, ".2f"),
         "bits of plain Python": bits[case.same_bits],
         "run loop": bits[case.run_loop],
-    }  # fmt: skip
+    }
 
 
 def limits_of_theory() -> Iterator[str]:
@@ -353,7 +370,7 @@ def _growth(method: Method, z: NDArray[Any]) -> Array:
 
 
 def scene_points() -> dict[str, NDArray[np.complex128]]:
-    """Eigenvalues of the shipped scenes times the steps that `step_advice` recommends."""
+    """Eigenvalues of the shipped scenes times the steps `step_advice` recommends."""
     found = {}
     for name in scenes.names():
         step = step_advice(scenes.load(name)).step
@@ -364,7 +381,7 @@ def scene_points() -> dict[str, NDArray[np.complex128]]:
 
 @styled
 def draw_regions(points: Mapping[str, NDArray[np.complex128]]) -> Figure:
-    """Draw the regions of absolute stability, and by scene its eigenvalues times its step."""
+    """Draw regions of absolute stability and, by scene, eigenvalues times its step."""
     x, y = np.linspace(-8.0, 2.0, 401), np.linspace(-6.0, 6.0, 401)
     z = x[None, :] + 1j * y[:, None]
     figure = Figure(figsize=(13.0, 8.0))
@@ -382,9 +399,16 @@ def draw_regions(points: Mapping[str, NDArray[np.complex128]]) -> Figure:
         shown = rates[(np.abs(rates.real + 3.0) <= 5.0) & (np.abs(rates.imag) <= 6.0)]
         label = name if len(shown) == len(rates) else f"{name} (some beyond the axes)"
         for axes in (*panels.flat, near):
-            axes.plot(shown.real, shown.imag, linestyle="", marker="osD^v<>phX*P"[k % 12],
-                      color=colours[(k + k // 12) % 6], markersize=6, markerfacecolor="none",
-                      label=label)  # fmt: skip
+            axes.plot(
+                shown.real,
+                shown.imag,
+                linestyle="",
+                marker="osD^v<>phX*P"[k % 12],
+                color=colours[(k + k // 12) % 6],
+                markersize=6,
+                markerfacecolor="none",
+                label=label,
+            )
     for axes in (*panels.flat, near):
         axes.axhline(0.0, color=INK, linewidth=0.6)
         axes.axvline(0.0, color=INK, linewidth=0.6)
@@ -393,8 +417,14 @@ def draw_regions(points: Mapping[str, NDArray[np.complex128]]) -> Figure:
         axes.label_outer()
     near.set(xlim=(-0.6, 0.6), ylim=(-0.6, 0.6), title="Near the origin")
     key.axis("off")
-    key.legend(*near.get_legend_handles_labels(), loc="upper left", ncols=2, frameon=False,
-               fontsize=8, title="hλ of the scenes at their start, step h as advised")  # fmt: skip
+    key.legend(
+        *near.get_legend_handles_labels(),
+        loc="upper left",
+        ncols=2,
+        frameon=False,
+        fontsize=8,
+        title="hλ of the scenes at their start, step h as advised",
+    )
     return figure
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes and torques of the extreme cases: `example2_heavy` with other values by key."""
+"""Scenes and torques of the extreme cases: `example2_heavy` with values by key."""
 
 from __future__ import annotations
 
@@ -123,7 +123,10 @@ def about_e(angle: float) -> Array:
 
 
 def near_singularity(angle: float, spin: float) -> Changes:
-    """Start `angle` [rad] about OE from a singular pose, with that spin about OE [rad/s]."""
+    """Start `angle` [rad] from a singular pose, turning at a rate [rad/s].
+
+    Both are about OE.
+    """
     scene, rotation = changed(SINGULAR), singular_pose() @ about_e(angle)
     gamma, _, _ = kinematics.inverse(Geometry.of(scene), rotation)
     quaternion = quaternion_of(rotation)
@@ -137,7 +140,7 @@ def near_singularity(angle: float, spin: float) -> Changes:
 
 
 def at_edge(beta: float) -> Changes:
-    """Start where E has the angular distance beta [rad] from the arc P1 P2, to first order."""
+    """Start where E has the distance beta [rad] from the arc P1 P2, to first order."""
     geometry = Geometry.of(changed({}))
     chart = workspace.over_orientations(geometry, [[1.0, 0.9, 1e-3]], turns=60)
     psi = chart.psi[np.flatnonzero(chart.measures.admissible[0])[0]]
@@ -162,7 +165,7 @@ def at_largest_beta(off: float) -> Changes:
 
 
 def at_the_pole(rate: Vector3) -> Changes:
-    """Rotate the base so that its centre, where E starts, is the z axis of {B}: phi = 0."""
+    """Rotate the base so that its centre, where E starts, is z of {B}: phi = 0."""
     x = np.array([1.0, -1.0, 0.0]) / math.sqrt(2.0)
     z = np.full(3, math.sqrt(1.0 / 3.0))
     turn = np.stack([x, np.cross(z, x), z])
@@ -170,7 +173,10 @@ def at_the_pole(rate: Vector3) -> Changes:
 
 
 def in_triangle(v: ArrayLike) -> Changes:
-    """Take a base triangle, and go from the middle of its arcs, at rates in proportion to them."""
+    """Take a base triangle, and go from the middle of its arcs.
+
+    Rates are in proportion to the arcs.
+    """
     geometry = Geometry.of(changed({"base.v": v}))
     a, b, c = (0.5 * float(arc) for arc in geometry.arc)
     return {**FREE, "base.v": v, **start((a, b, c), (0.1 * a, 0.2 * b, -0.1 * c))}
@@ -243,7 +249,7 @@ class SampledPd:
         self._sizes: list[float] = []
 
     def __call__(self, k: int, simulation: Simulation) -> Vector3:
-        """Return the torques of period k, and keep the size of the error at its start."""
+        """Return the torques of period k, and keep the error's size at its start."""
         joints = simulation.state.joints
         off, rate = joints.gamma - np.array(POSE), np.array(joints.gamma_dot)
         if k == 0:
@@ -254,14 +260,17 @@ class SampledPd:
         return (first, second, third)
 
     def from_pole(self, *_: Any) -> float:
-        """Return the difference of the growth a period, over the second half, from the pole."""
+        """Return how far a period's growth, in the second half, is from the pole."""
         half = len(self._sizes) // 2
         found: float = (self._sizes[-1] / self._sizes[-1 - half]) ** (1.0 / half)
         return abs(found - self.pole)
 
 
 def mass_matrix(scene: Scene) -> Array:
-    """Mass matrix in gamma at the start of a scene at rest [kg m^2], from its accelerations."""
+    """Mass matrix in gamma at the start of a scene at rest [kg m^2].
+
+    It is found from accelerations of the scene.
+    """
     rates = [
         Simulation(scene).step(torque, 1000).joints.gamma_dot
         for torque in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -53,9 +53,10 @@ REST_S = 0.3
 OPEN_LOOP = "feedforward"  # the mode that has no bandwidth
 
 COLUMNS = (
-    "scene", "error", "mode", "bandwidth_rad_per_s", "damping_ratio", "period_s", "seed",
-    "rms_rad", "largest_rad", "settling_s", "torque_rms_Nm", "torque_largest_Nm",
-    "feedforward_share", "feedback_share", "samples_limited", "failure",
+    "scene", "error", "mode", "bandwidth_rad_per_s", "damping_ratio", "period_s",
+    "seed", "rms_rad", "largest_rad", "settling_s", "torque_rms_Nm",
+    "torque_largest_Nm", "feedforward_share", "feedback_share", "samples_limited",
+    "failure",
 )  # fmt: skip
 """Columns of the table of loops; those from rms_rad on are empty for a failure."""
 
@@ -122,7 +123,10 @@ class FeedforwardStudy:
         )
 
     def least_benefit(self, error: str, bandwidth: float) -> float:
-        """Return the bound of linear theory on the benefit where bodies weigh SHARE too much."""
+        """Return the bound of the benefit by linear theory.
+
+        Bodies of the model weigh SHARE too much.
+        """
         exact = self.rms("nominal", "feedforward_pd", bandwidth)
         return 1.0 / (SHARE + exact / self.rms(error, "pd", bandwidth))
 
@@ -197,10 +201,14 @@ def _track(
     error, settings = job
     motion, open_loop = _motion(plan.scene), settings.mode == OPEN_LOOP
     named = {
-        "scene": plan.scene.name, "error": error.name, "mode": settings.mode,
+        "scene": plan.scene.name,
+        "error": error.name,
+        "mode": settings.mode,
         "bandwidth_rad_per_s": None if open_loop else settings.bandwidth,
-        "damping_ratio": settings.damping_ratio, "period_s": settings.period, "seed": plan.seed,
-    }  # fmt: skip
+        "damping_ratio": settings.damping_ratio,
+        "period_s": settings.period,
+        "seed": plan.seed,
+    }
     model, settings = error.model(plan.scene), replace(settings, **error.channel)
     loop = ControlLoop(model, motion, settings, plan.scene, plan.seed, REST_S)
     track, limited, failure = run_loop(loop)
@@ -221,9 +229,15 @@ def _track(
         for share in found.shares
     ]
     numbers = (
-        float(np.sqrt(np.mean(found.rms**2))), float(found.largest.max()), found.settling,
-        float(np.sqrt(power.mean())), float(found.torque_largest.max()), *shares, found.limited, "",
-    )  # fmt: skip
+        float(np.sqrt(np.mean(found.rms**2))),
+        float(found.largest.max()),
+        found.settling,
+        float(np.sqrt(power.mean())),
+        float(found.torque_largest.max()),
+        *shares,
+        found.limited,
+        "",
+    )
     return named | dict(zip(COLUMNS[len(named) :], numbers, strict=True))
 
 
@@ -251,16 +265,23 @@ def _held(plant: Scene, settings: SampledControl) -> dict[str, Any]:
 
 
 def _unheld(plant: Scene) -> tuple[float, float]:
-    """Hold nothing: return the largest error of gamma, and the error estimate at the end [rad]."""
+    """Hold nothing: return the largest error of gamma [rad].
+
+    Also return the error estimate at the end [rad].
+    """
     inverse, motion = InverseDynamics(plant), _motion(plant)
 
     def torque(time: float) -> Vector3:
         return inverse.reference_torque(motion.at(time))
 
     found = simulate(
-        loops.at_start(plant, motion), torque, motion.duration, method="dop853", tolerance=1e-12,
+        loops.at_start(plant, motion),
+        torque,
+        motion.duration,
+        method="dop853",
+        tolerance=1e-12,
         t_eval=np.linspace(0.0, motion.duration, 21),
-    )  # fmt: skip
+    )
     desired = [motion.at(t).gamma for t in found.t.tolist()]
     return float(np.abs(desired - found.gamma).max()), found.error_estimate
 
@@ -281,7 +302,10 @@ def report(options: argparse.Namespace) -> bool:
 
 
 def rms_table(study: FeedforwardStudy) -> DataFrame:
-    """Return RMS errors as texts by model error, bandwidth and mode, and pd / feedforward_pd."""
+    """Return RMS errors as texts, and pd / feedforward_pd.
+
+    Errors are by model error, bandwidth and mode.
+    """
     failed = (
         study.failed[["error", "mode", "bandwidth_rad_per_s"]]
         .fillna(0.0)
@@ -317,8 +341,11 @@ def title(study: FeedforwardStudy) -> str:
 def findings(study: FeedforwardStudy) -> Iterator[str]:
     """Yield predictions of the theory beside what was found, line by line."""
     for at, order in study.orders().items():
-        cells = ", ".join(f"{hold.error:.2e} rad at {1e3 * hold.period_s:g} ms"
-                          for hold in study.holds.itertuples() if hold.at == at)  # fmt: skip
+        cells = ", ".join(
+            f"{hold.error:.2e} rad at {1e3 * hold.period_s:g} ms"
+            for hold in study.holds.itertuples()
+            if hold.at == at
+        )
         yield (
             f"Exact model, feedforward alone, torque at the {at} of the hold: {cells};"
             f" order {order:.3f}, theory {ORDERS[at]}"
@@ -374,7 +401,7 @@ _FAILED, _SPREAD = 12.0, 0.13
 
 @styled
 def draw_study(study: FeedforwardStudy, title: str) -> Figure:
-    """Draw a study: a panel of errors for each bandwidth, orders of the hold, and limits."""
+    """Draw a study: a panel of errors a bandwidth, orders of the hold, and limits."""
     figure = Figure(figsize=(12.5, 10.6))
     figure.suptitle(title, fontsize=12)
     halves: Any = figure.subfigures(2, 1, height_ratios=(1.6, 1.0))
@@ -433,7 +460,7 @@ def _errors(axes: Axes, loops: DataFrame, bandwidth: float) -> None:
 
 
 def _holds(axes: Axes, study: FeedforwardStudy) -> None:
-    """Error over period, each with the line of its theory through the shortest period."""
+    """Error over period, each with its theory's line through the shortest period."""
     holds, unheld, orders = study.holds, study.unheld[0], study.orders()
     for (at, group), colour, marker in zip(
         holds.groupby("at", sort=False), (BLUE, VERMILION), ("o", "s"), strict=False
@@ -472,8 +499,15 @@ def _limits(axes: Axes, limits: DataFrame) -> None:
               label="poles of the sampled double integrator")  # fmt: skip
     axes.plot(limits.delay, limits.ideal, "^", color=GREEN, markersize=8,
               label="simulated, without friction and lag")  # fmt: skip
-    axes.plot(limits.delay, limits.real, "o", color=BLUE, markersize=8, markerfacecolor="none",
-              label="simulated, the plant as it is")  # fmt: skip
+    axes.plot(
+        limits.delay,
+        limits.real,
+        "o",
+        color=BLUE,
+        markersize=8,
+        markerfacecolor="none",
+        label="simulated, the plant as it is",
+    )
     axes.set(yscale="log", ylim=(0.5 * limits.theory.min(), 2.0 * limits.theory.max()))
     axes.set_xticks(limits.delay)
     axes.legend(loc="upper right", fontsize=8.5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo of identification: a wrong model, an exciting motion, and the identified model.
+"""Demo of identification: a wrong model, an exciting motion, the identified model.
 
 The nodes follow a designed motion with a model that is wrong, and record it. From the
 recording, as encoders and torque sensors would give it, the model is identified; then
@@ -28,7 +28,7 @@ from studies import run
 from studies.control_loop import SHARE, make_heavier
 
 GUESS = {"gamma": {"viscous": 0.1, "coulomb": 0.1, "smoothing": 0.05}}
-"""Friction of the model: half of what the actuators have, and none in the passive joints."""
+"""Friction of the model: half of the actuators', and none in the passive joints."""
 
 UNKNOWN = ("star", "actuated_links", "intermediate_links", "friction.gamma",
            "friction.mu.viscous", "friction.beta.viscous")  # fmt: skip
@@ -39,10 +39,10 @@ MODE = "feedforward_pd"
 
 
 def identification(out: Path, name: str = FOLLOWED) -> bool:
-    """Identify a plant with wrong inertias and friction, and follow a motion before and after.
+    """Identify a plant, and follow a motion before and after.
 
-    Results lie in `out`: the scenes plant, model, exciting and identified, three bags,
-    the table and the picture.
+    Inertias and friction of the first model are wrong. Results lie in `out`: the scenes
+    plant, model, exciting and identified, three bags, the table and the picture.
 
     Raises:
         SstError: a node failed or a motion is refused; names it.
@@ -77,7 +77,7 @@ def identification(out: Path, name: str = FOLLOWED) -> bool:
 
 
 def unknown(scene: Scene) -> Scene:
-    """Return a plant whose bodies differ from those of a scene: two kinds heavier, one lighter."""
+    """Return a scene's plant with other bodies: two kinds heavier, one lighter."""
     heavier = make_heavier(scene, 1.0 + SHARE, ("star", "intermediate_links"))
     plant = make_heavier(heavier, 1.0 - SHARE, ("actuated_links",))
     return dataclasses.replace(plant, name=f"{scene.name}_plant")
@@ -124,7 +124,10 @@ def compare(out: Path, identified: str) -> str:
 
 
 def _follow(out: Path, model: str) -> None:
-    """Follow the motion of a model's scene on the plant, and record it in a folder of its name."""
+    """Follow the motion of a model's scene on the plant, and record it.
+
+    The record lies in a folder of its name.
+    """
     print(f"following {model}", flush=True)
     follow(str(out / "plant.yaml"), out / model, MODE, model=str(out / f"{model}.yaml"))
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orders of the methods, and errors of samples, events and energy, each over what controls it.
+"""Orders of the methods, and errors of samples, events and energy.
 
-`python -m studies.orders` writes the page. Every truth is a run by DOP853 at the
-tightest tolerance that is sensible; the distance from one by Dormand-Prince 5 says how
-far it is known.
+Each error is drawn over what controls it. `python -m studies.orders` writes the page.
+Every truth is a run by DOP853 at the tightest tolerance that is sensible; the distance
+from one by Dormand-Prince 5 says how far it is known.
 """
 
 from __future__ import annotations
@@ -83,9 +83,11 @@ MOTIONS = {
                         duration=0.02),
     "clamp": Motion("sine cut by the torque limit: kinks are found",
                     {**FREE, "actuators.torque_limit": LIMIT}),
-    "function": Motion("the same as a function: kinks are unknown", FREE, clipped, truth="clamp"),
+    "function": Motion("the same as a function: kinks are unknown", FREE, clipped,
+                       truth="clamp"),
     "stop": Motion("end of the stroke", {"friction": FRICTION}, (0.9, 0.8, 0.7), 2.0),
-    "contact": Motion("contact with an elastic stop", bouncing(1e4), (0.0, 0.0, 0.0), 0.3),
+    "contact": Motion("contact with an elastic stop", bouncing(1e4), (0.0, 0.0, 0.0),
+                      0.3),
 }  # fmt: skip
 TITLES = {"swing": "swing"} | {name: motion.title for name, motion in MOTIONS.items()}
 LABELS = {
@@ -107,7 +109,7 @@ PERIOD_NS, UNIT = 5_000_000, 0.1
 
 @cache
 def truth(name: str, instants: int = 0) -> tuple[Trajectory, float]:
-    """Return a motion at its end, or at random instants, and how far it is known [rad]."""
+    """Return a motion at its end or random instants, and how far it is known [rad]."""
     motion = MOTIONS[MOTIONS[name].truth or name]
     times = np.array([motion.duration])
     if instants:  # whole nanoseconds
@@ -136,7 +138,7 @@ def measure_steps(job: tuple[str, str]) -> list[Row]:
 
 
 def measure_tolerance(job: tuple[str, str, float]) -> list[Row]:
-    """Run a motion by a method and a tolerance: errors of samples, or of the time it stops."""
+    """Run a motion by a method and tolerance: errors of samples or of its stop time."""
     name, method, tolerance = job
     motion, found = MOTIONS[name], {}
     if name == "stop":
@@ -171,7 +173,7 @@ def _largest(found: Trajectory, exact: Trajectory) -> float:
 
 
 def measure_energy(job: tuple[str, float]) -> list[Row]:
-    """Run `swing`, without friction, for some seconds by a method: its energy residual [J]."""
+    """Run `swing` without friction for some seconds: a method's energy residual [J]."""
     method, seconds = job
     simulation = Simulation("swing", method, step_budget=WHOLE_MOTION_BUDGET)
     rows, done = [], 0
@@ -187,7 +189,7 @@ def measure_energy(job: tuple[str, float]) -> list[Row]:
 
 
 def order_table(rows: DataFrame) -> DataFrame:
-    """Return the orders found over the shortest steps and over all, and the error constant."""
+    """Return the orders over the shortest steps and over all, and error constants."""
     found = []
     for (name, method), each in rows[rows.of == "step"].groupby(
         ["scene", "method"], sort=False
@@ -202,18 +204,23 @@ def order_table(rows: DataFrame) -> DataFrame:
         short = resolved[:7]
         order = slope(short.x, short.error)
         constant = np.exp(np.mean(np.log(short.error) - order * np.log(short.x / UNIT)))
-        found.append({
-            "motion": TITLES[name], "method": method, "order in theory": ORDER[method],
-            "order, shortest steps": f"{order:.2f}",
-            "order, all steps": f"{slope(resolved.x, resolved.error):.2f}",
-            "steps [ms]": f"{1e3 * resolved.x.min():.2g} to {1e3 * resolved.x.max():.2g}",
-            "error constant [rad]": f"{constant:.1e}",
-        })  # fmt: skip
+        found.append(
+            {
+                "motion": TITLES[name],
+                "method": method,
+                "order in theory": ORDER[method],
+                "order, shortest steps": f"{order:.2f}",
+                "order, all steps": f"{slope(resolved.x, resolved.error):.2f}",
+                "steps [ms]": f"{1e3 * resolved.x.min():.2g}"
+                f" to {1e3 * resolved.x.max():.2g}",
+                "error constant [rad]": f"{constant:.1e}",
+            }
+        )
     return data_frame(found)
 
 
 def ratio_table(rows: DataFrame) -> DataFrame:
-    """Return the largest error over the tolerance, of errors that are resolved, by method."""
+    """Return the largest error over the tolerance, of resolved errors, by method."""
     chosen = rows[~rows.of.isin(["step", "energy"]) & (rows.error > 10.0 * rows.known)]
     ratios = (
         (chosen.error / chosen.x)
@@ -240,7 +247,10 @@ def draw(
     xlabel: str,
     guide: Guide | None = None,
 ) -> Figure:
-    """Draw panels of (kind of error, scene), a line a method, and how far the truth is known."""
+    """Draw panels of (kind of error, scene), a line a method.
+
+    A dotted line shows how far the truth is known.
+    """
     down, across = -(-len(panels) // 2), min(len(panels), 2)
     figure = Figure(figsize=(9.0, 0.8 + 3.0 * down + (1.0 if across == 1 else 0.0)))
     grid = figure.subplots(down, across, squeeze=False)
@@ -253,8 +263,15 @@ def draw(
                 MARKERS[method],
             )
             if len(mine):
-                axes.plot(mine.x, np.maximum(mine.error, known), color=look[0], marker=look[1],
-                          label=method, markersize=4, linewidth=1.2)  # fmt: skip
+                axes.plot(
+                    mine.x,
+                    np.maximum(mine.error, known),
+                    color=look[0],
+                    marker=look[1],
+                    label=method,
+                    markersize=4,
+                    linewidth=1.2,
+                )
         axes.axhline(known, color=GREY, linestyle=":", label="truth known to")
         if guide:
             axes.plot(
@@ -267,8 +284,13 @@ def draw(
             ylabel=LABELS[of],
             title=TITLES[name],
         )
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
-                  fontsize=9, frameon=False)  # fmt: skip
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=7,
+        fontsize=9,
+        frameon=False,
+    )
     return figure
 
 

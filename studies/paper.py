@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figs. 8 to 14 of the paper from scratch: nodes, continuous solution, independent engine."""
+"""Figs. 8 to 14 of the paper anew: nodes, continuous solution, independent engine."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def paper(out: Path) -> list[LargestDifference]:
 def _solve(
     scene: Scene, bag: Path
 ) -> tuple[Array, dict[str, Array], list[LargestDifference], list[str]]:
-    """Return the samples of a run, the solutions at them, how far apart they are, and notes."""
+    """Return a run's samples, the solutions at them, their distances, and notes."""
     run = recording.read(bag)
     times = run.seconds
     motion = simulate(scene, duration=float(times[-1]), t_eval=times, tolerance=1e-12)
@@ -149,12 +149,12 @@ def _solve(
 
 
 def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
-    """Integrate a scene by Pinocchio, whose equations share nothing with those of this package.
+    """Integrate a scene by Pinocchio.
 
-    The seven links are a tree, base -> actuated -> intermediate link of each leg with
-    the star on leg 1; a point of the axis t_k on legs 2 and 3 is tied to the star.
-    SciPy's DOP853 integrates Pinocchio's accelerations in the angles of the seven
-    joints of the tree.
+    Its equations share nothing with those of this package. The seven links are a tree,
+    base -> actuated -> intermediate link of each leg with the star on leg 1; a point of
+    the axis t_k on legs 2 and 3 is tied to the star. SciPy's DOP853 integrates
+    Pinocchio's accelerations in the angles of the seven joints of the tree.
 
     Returns:
         Quaternions of the star (n, 4) and actuator angles [rad], shape (n, 3), at the
@@ -174,9 +174,15 @@ def integrate_by_pinocchio(scene: Scene, times: Array) -> tuple[Array, Array]:
         force = np.zeros(size)
         force[model.drives] = task.torque_at(t)
         acceleration = pin.constraintDynamics(
-            model.model, model.data, state[:size], state[size:], force, model.ties, model.tied,
+            model.model,
+            model.data,
+            state[:size],
+            state[size:],
+            force,
+            model.ties,
+            model.tied,
             model.proximal,
-        )  # fmt: skip
+        )
         return np.append(state[size:], acceleration)
 
     span = (0.0, float(times[-1]))
@@ -234,7 +240,7 @@ def _compare(
     label: str,
     least: float,
 ) -> Figure:
-    """Draw columns of several solutions over time, and below how far they are from the first."""
+    """Draw columns of solutions over time; below, how far they are from the first."""
     unit = label.split("[")[1].rstrip("]")
     figure, (above, below) = stack(
         [label, f"difference from\n{names[0]} [{unit}]"], 2.7
@@ -265,10 +271,10 @@ def _compare(
 
 
 def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]:
-    """Check Example 1 as the paper does: inverse dynamics of the motion gives the torques back.
+    """Check Example 1 as the paper does.
 
-    Accelerations are those of a spline through the rates, so that no direct dynamics
-    enters.
+    Inverse dynamics of the motion gives the torques back. Accelerations are those of a
+    spline through the rates, so that no direct dynamics enters.
     """
     assert scene.torque is not None and scene.duration is not None
     times = np.arange(0.0, scene.duration, STEP)
@@ -277,19 +283,30 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
     mechanism = virtual_work.Mechanism.of(scene)
     rows = zip(motion.gamma, motion.gamma_dot, accelerations,
                rotation_matrix(motion.quaternion), strict=True)  # fmt: skip
-    torque = np.array([
-        virtual_work.inverse_dynamics(
-            mechanism, virtual_work.posture(mechanism.geometry, gamma, rotation), rate, change
-        )
-        for gamma, rate, change, rotation in rows
-    ])  # fmt: skip
+    torque = np.array(
+        [
+            virtual_work.inverse_dynamics(
+                mechanism,
+                virtual_work.posture(mechanism.geometry, gamma, rotation),
+                rate,
+                change,
+            )
+            for gamma, rate, change, rotation in rows
+        ]
+    )
     given = scene.torque.amplitude[0] * np.sin(scene.torque.frequency[0] * times)
     apart = np.abs(torque - given[:, None]).max(axis=1)
     labels = ["torque [N m]", "largest difference\nof three actuators [N m]"]
     figure, (above, below) = stack(labels, 2.7)
     above.plot(times, given, color=BLUE, linewidth=2.6, label="1.13 sin 12t")
-    above.plot(times, torque[:, 0], "--", color=VERMILION, linewidth=1.8,
-               label="inverse dynamics of the simulated motion, actuator 1")  # fmt: skip
+    above.plot(
+        times,
+        torque[:, 0],
+        "--",
+        color=VERMILION,
+        linewidth=1.8,
+        label="inverse dynamics of the simulated motion, actuator 1",
+    )
     above.legend(fontsize=9)
     below.plot(times, hide_zeros(apart), color=VERMILION)
     below.set_yscale("log")
@@ -306,8 +323,13 @@ def _inverse_dynamics(scene: Scene, out: Path) -> tuple[Path, LargestDifference]
 def main(words: Sequence[str] | None = None) -> int:
     """Draw the figures from the command line."""
     out = Path("paper_out")
-    return run(lambda given: all(each.within for each in paper(given.out)), "paper", out, words,
-               careful=True)  # fmt: skip
+    return run(
+        lambda given: all(each.within for each in paper(given.out)),
+        "paper",
+        out,
+        words,
+        careful=True,
+    )
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sampled-data theory of a control loop: the largest stable bandwidth, and the error of a hold.
+"""Sampled-data theory of a control loop: largest stable bandwidth, error of a hold.
 
 **Bandwidth.** Exact computed torque leaves a double integrator for each axis, x'' = u,
 and asks for u = -(omega^2 x + 2 zeta omega x'). The state is sampled every T, u acts d
@@ -31,7 +31,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 ORDERS = {"start": 1, "middle": 2}
-"""Power of the period with which the error of feedforward alone falls, by the instant held."""
+"""Power of the period in the error of feedforward alone, by the instant held."""
 
 _FINEST = 1e-4
 

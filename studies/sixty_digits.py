@@ -65,7 +65,7 @@ class Motion:
             self.known = {mpf(0): np.array([*self.start(scene), *lagged], dtype=object)}
 
     def start(self, scene: Scene) -> Any:
-        """Return quaternion and body rate, by Newton's method on the closure of the loops."""
+        """Return quaternion and body rate by Newton's method on the loop closure."""
         initial = scene.initial
         gamma, gamma_dot = (
             exact(np.array(initial.gamma)),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams of trajectories beside a run that keeps real time: tracking error, missed periods.
+"""Streams of trajectories beside a real-time run: tracking error, missed periods.
 
 Each message has one point, one second ahead on a slow path around the start, as jogging
 tools send them. `python -m studies.streams --seconds 60` prints a row a rate;
@@ -102,7 +102,7 @@ def stream(given: argparse.Namespace, rate: float) -> tuple[str, ...]:
 
 
 def _schedule(process: int) -> None:
-    """Give a process a priority below that of the simulator, and a lower one to its children."""
+    """Give a process a priority below the simulator's, and its children a lower one."""
     tasks = [int(task.name) for task in Path(f"/proc/{process}/task").iterdir()]
     children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
     for number, priority in [

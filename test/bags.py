@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of a run as the nodes would record it, without ROS: simulated, edited, written."""
+"""Bags of a run as nodes would record it, without ROS: simulated, edited, written."""
 
 import copy
 import dataclasses

@@ -141,7 +141,7 @@ class Lagrange:
         return self._known[key]
 
     def spins(self, path, t=0):
-        """Angular velocities in {B} of all frames along gamma = path(t), shape (7, 3)."""
+        """All frames' angular velocities in {B} along gamma = path(t), (7, 3)."""
         rate = slope(lambda x: self.at(path(x)).frames, t)
         w = rate @ self.at(path(t)).frames.transpose(0, 2, 1)
         return np.stack([w[:, 2, 1], w[:, 0, 2], w[:, 1, 0]], axis=1)

@@ -14,7 +14,7 @@ from sst_ros.errors import explanation
 
 
 def skip_if_missing(error):
-    """Skip where an ImportError is that of an optional package, with what installs it."""
+    """Skip at an ImportError of an optional package, with what installs it."""
     if isinstance(error, ImportError) and (how := explanation(error)):
         pytest.skip(how, allow_module_level=True)
 

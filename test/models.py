@@ -33,7 +33,7 @@ FAST = settings(
 
 @dataclass(frozen=True)
 class Sample:
-    """A manipulator in a regular admissible state, under torques and a moment in {B}."""
+    """A manipulator in a regular admissible state, with torques and moment in {B}."""
 
     scene: Scene
     geometry: Geometry

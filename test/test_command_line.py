@@ -30,7 +30,8 @@ def status(words):
 sys.exit(max(map(status, {{commands!r}})))
 """
 OPTIONAL = (
-    "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow", "llvmlite",
+    "rclpy", "std_msgs", "rosbags", "viser", "matplotlib", "pandas", "pyarrow",
+    "llvmlite",
 )  # fmt: skip
 
 TOP = [name for name in SUBCOMMANDS if " " not in name]
@@ -41,7 +42,8 @@ import os, signal, sys
 
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
-        if name == "datetime":  # of which NumPy makes an ImportError with a page of advice
+        # NumPy makes an ImportError with a page of advice of this one.
+        if name == "datetime":
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.modules.pop("datetime", None)
@@ -91,9 +93,12 @@ def test_the_version_is_that_of_the_package(capsys):
         (["export", "bag", "--format", "parket"], "did you mean 'parquet'?"),
         *((["view", "bag", "--port", port], "must be a whole number from 1024 to 65535")
           for port in ("-1", "0", "65536", "http")),
-        (["simulate", "example2", "--samples", "0"], "must be a whole number from 1 to 10000000"),
-        (["identify", "bag", "--method", "inverse"], "did you mean 'inverse_dynamics'?"),
-        (["simulate", "example2", "--samples", "\u0661"], "must be a whole number from 1 to"),
+        (["simulate", "example2", "--samples", "0"],
+         "must be a whole number from 1 to 10000000"),
+        (["identify", "bag", "--method", "inverse"],
+         "did you mean 'inverse_dynamics'?"),
+        (["simulate", "example2", "--samples", "\u0661"],
+         "must be a whole number from 1 to"),
         (["simulate", "example2", "--duration", "1_0"], "must be a number, not '1_0'"),
         (["simulate", "example2", "--duration", "ten"], "invalid float value: 'ten'"),
         (["identify", "design", "reach", "--seed", "\u0661"], "must be a number, not"),
@@ -283,7 +288,8 @@ def test_beside_a_ros_installation_the_package_of_apt_or_pip_is_named(line, how)
 
 
 def test_what_needs_no_extra_runs_without_any():
-    commands = [["scene", "list"], ["scene", "show", "reach"], ["plan", "check", "spiral"],
+    commands = [["scene", "list"], ["scene", "show", "reach"],
+                ["plan", "check", "spiral"],
                 ["describe"], [], ["--version"]]  # fmt: skip
     python(BLOCKED.format(names=OPTIONAL, commands=commands))
 

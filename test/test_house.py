@@ -152,14 +152,16 @@ files, counts = set(), True
 PACKAGE = str(pathlib.Path(sst_ros.__file__).parent)
 
 def profile(frame, event, argument):
-    if not counts or event != "call" or not frame.f_code.co_filename.startswith(PACKAGE):
+    file = frame.f_code.co_filename
+    if not counts or event != "call" or not file.startswith(PACKAGE):
         return
     if threading.current_thread().name != "watch":
-        files.add(".".join(pathlib.Path(frame.f_code.co_filename).parts[-2:]).removesuffix(".py"))
+        files.add(".".join(pathlib.Path(file).parts[-2:]).removesuffix(".py"))
 
 def passed(name, call):
     files.clear()
-    threading.setprofile(profile)  # the run of a node and the report have threads of their own
+    # The run of a node and the report have threads of their own.
+    threading.setprofile(profile)
     sys.setprofile(profile)
     try:
         call()
@@ -185,8 +187,10 @@ def answer():
         assert node.done.wait(60.0)
 
     publications.SimulatorTopics.sample = sample
-    words = ["duration:=0.002", "wait_for_command:=true", "wait_for_subscribers:=['joint_states']"]
-    rclpy.init(args=["simulator", "--ros-args", *(part for one in words for part in ("-p", one))])
+    words = ["duration:=0.002", "wait_for_command:=true",
+             "wait_for_subscribers:=['joint_states']"]
+    given = [part for one in words for part in ("-p", one)]
+    rclpy.init(args=["simulator", "--ros-args", *given])
     node, states = rclpy.create_node("observer"), topics.SIMULATOR["joint_states"]
     node.create_subscription(states.kind, "joint_states", print, 10)
     counts = False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package, a plain run and the list of scenes load nothing that is slow to import."""
+"""The package, a plain run and the list of scenes load nothing slow to import."""
 
 import pytest
 from programs import python
@@ -79,6 +79,6 @@ print(*sorted(set(sys.modules) - before))
     ("scene", "torque"), [("example2_heavy", 50.0), ("elastic_stops", 1.0)]
 )
 def test_steps_import_nothing_after_the_code_is_loaded(scene, torque):
-    """A limit or a stop that a run in real time meets costs no import: it takes 0.4 s."""
+    """A limit or a stop met by a run in real time costs no import: it takes 0.4 s."""
     done = python(STEPS.format(scene=scene, torque=torque))
     assert done.stdout.splitlines()[-1] == ""

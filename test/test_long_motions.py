@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions of many thousand seconds: they end, in time and memory, and estimates hold."""
+"""Motions of many thousand seconds end, in time and memory, and estimates hold."""
 
 import math
 import resource

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each package that may be missing, hidden in turn: one line says how it is installed."""
+"""Each package that may be missing, hidden in turn: one line says how to install it."""
 
 import ast
 import re
@@ -40,7 +40,7 @@ sys.exit(main({words!r}))
 
 
 def imported_names(tree):
-    """Yield the name of each module that a source imports, and whether by a statement."""
+    """Yield the name of each module a source imports, and whether by a statement."""
     for statement in ast.walk(tree):
         if isinstance(statement, ast.Import):
             yield from ((alias.name, True) for alias in statement.names)
@@ -53,7 +53,7 @@ def imported_names(tree):
 
 
 def find_importers():
-    """Return the modules of this package that import each other package by a statement."""
+    """Return this package's modules that import each other package by a statement."""
     found = defaultdict(list)
     for path in sorted(PACKAGE.rglob("*.py")):
         if path.name == "launch_parts.py":  # its `require` names packages of ROS

@@ -82,7 +82,7 @@ def test_version_and_metadata_are_those_of_package_xml():
 
 
 def test_what_a_person_fills_in_is_in_one_file():
-    """Addresses that exist nowhere stand in package.xml and its copy, and nothing else."""
+    """Addresses that exist nowhere stand in package.xml and its copy, nothing else."""
     assert len(metadata.placeholders()) == 3
     listed = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True
@@ -122,7 +122,7 @@ def depends():
 
 @pytest.fixture(scope="module")
 def required():
-    """Names of the Python packages that setup.py asks for, without the wheels of ROS."""
+    """Names of Python packages that setup.py asks for, without the wheels of ROS."""
     given = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
@@ -140,7 +140,7 @@ def test_the_stored_table_has_the_keys_of_today():
 
 @pytest.mark.parametrize("distribution", KEYS["platforms"])
 def test_every_key_resolves_on_every_platform(distribution):
-    """A package of ROS that is released there, or a package of the system: none of pip."""
+    """A package of ROS released there, or a package of the system: none of pip."""
     platforms = {
         f"{system} {release}"
         for system, releases in KEYS["platforms"][distribution].items()

@@ -29,7 +29,8 @@ x, y, z, w = state.quaternion
 geometry: Geometry = Geometry.of(scene)
 gamma, mu, beta = sst_ros.inverse_kinematics(geometry, np.eye(3))
 rotation = sst_ros.direct_kinematics(geometry, run.gamma[0])[0].rotation
-torque: tuple[float, float, float] = sst_ros.InverseDynamics(scene).gravity_torque(state.quaternion)
+inverse = sst_ros.InverseDynamics(scene)
+torque: tuple[float, float, float] = inverse.gravity_torque(state.quaternion)
 sst_ros.nothing
 """
 

@@ -266,7 +266,8 @@ def test_the_switches_of_yaml_1_1_are_words(word):
         ("motion", {"waypoints": [{"time": 0, "gamma": [1, 1, 1]},
                                   {"time": 1e-300, "gamma": [1, 1, 1]}]},
          "motion.waypoints[1].time"),
-        ("friction", {"gamma": {"coulomb": 1, "smoothing": 1e-300}}, "friction.gamma.smoothing"),
+        ("friction", {"gamma": {"coulomb": 1, "smoothing": 1e-300}},
+         "friction.gamma.smoothing"),
     ],
 )  # fmt: skip
 def test_numbers_that_only_a_slip_can_make_are_refused(old, new, key):

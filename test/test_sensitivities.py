@@ -36,8 +36,9 @@ TORQUES = {
 TERMS = (
     "star.inertia.zz", "star.centre[2]", "payload.mass", "actuated_links[0].inertia.zz",
     "gravity.acceleration[1]", "moment.value[0]", "friction.gamma.smoothing",
-    "friction.gamma.coulomb", "springs[0].stiffness", "springs[0].rest", "actuators.time_constant",
-    "actuators.rotor_inertia", "initial.gamma[0]", "initial.gamma_dot[1]",
+    "friction.gamma.coulomb", "springs[0].stiffness", "springs[0].rest",
+    "actuators.time_constant", "actuators.rotor_inertia", "initial.gamma[0]",
+    "initial.gamma_dot[1]",
 )  # fmt: skip
 STOPS = (
     "stroke.stiffness",

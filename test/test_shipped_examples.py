@@ -107,7 +107,7 @@ def test_heavy_example_2_stays_inside_for_its_second():
 
 
 def time_of_the_end():
-    """When gamma_1 of the thin scene passes pi/2, by SciPy's root of its dense output."""
+    """When gamma_1 of the thin scene passes pi/2: a root of SciPy's dense output."""
     model = kernel.model_of(THIN)
 
     def margin(t, y):

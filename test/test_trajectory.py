@@ -21,8 +21,8 @@ from sst_ros.simulation.trajectory import Trajectory
 
 EXAMPLE2 = load("example2_heavy")
 ARRAYS = (
-    "t", "quaternion", "body_rate", "torque", "gamma", "mu", "beta", "gamma_dot", "mu_dot",
-    "beta_dot", "euler_zyz", "energy",
+    "t", "quaternion", "body_rate", "torque", "gamma", "mu", "beta", "gamma_dot",
+    "mu_dot", "beta_dot", "euler_zyz", "energy",
 )  # fmt: skip
 
 

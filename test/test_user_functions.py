@@ -75,7 +75,7 @@ def call(function, how):
 )
 @pytest.mark.parametrize("name", RAISED)
 def test_the_exception_of_a_function_comes_out_of_every_call(name, how):
-    """At a random moment: in a first stage, a later one, a rejected step or a sample."""
+    """At a random moment: in a first or later stage, a rejected step or a sample."""
     action, kind = RAISED[name]
     draw = random.Random(f"{name} {how}")
     for _ in range(3):

@@ -159,7 +159,7 @@ def command_lines(ledger: Ledger) -> None:
 
 
 def surroundings(ledger: Ledger) -> None:
-    """Run commands without a home, with a full disk, in plain ASCII, as another user."""
+    """Run commands without a home, on a full disk, in plain ASCII, as another user."""
     nobody = 65534 if os.geteuid() == 0 else None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -83,7 +83,7 @@ def stop(ledger: Ledger, process: Process, number: int = signal.SIGINT) -> None:
 
 
 def messages(ledger: Ledger) -> None:
-    """Send commands of every wrong kind: no state that is published is ever not finite."""
+    """Send commands of every wrong kind: no published state is ever not finite."""
     from geometry_msgs.msg import WrenchStamped
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What users bring: cold processes, own functions, foreign files, contradictory data."""
+"""What users bring: cold processes, own functions, foreign files, conflicting data."""
 
 from __future__ import annotations
 

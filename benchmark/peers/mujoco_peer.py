@@ -292,9 +292,15 @@ class Rollout(Python):
             else [self.mujoco.MjData(model) for _ in range(threads)]
         )
         self.rollout = partial(
-            rollout.rollout, model, own, start[None].repeat(copies, axis=0), controls, nstep=steps,
-            state=self.states, sensordata=np.empty((copies, steps, 0)),
-        )  # fmt: skip
+            rollout.rollout,
+            model,
+            own,
+            start[None].repeat(copies, axis=0),
+            controls,
+            nstep=steps,
+            state=self.states,
+            sensordata=np.empty((copies, steps, 0)),
+        )
 
     def run(self) -> None:
         self.model.reset(self.steps)

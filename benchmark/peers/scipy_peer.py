@@ -42,7 +42,7 @@ def series(task: Task, quick: bool) -> list[Series]:
 
 
 class _Joints(Engine):
-    """State (gamma, gamma_dot): the admissible assembly is found at every evaluation."""
+    """State (gamma, gamma_dot): each evaluation finds the admissible assembly."""
 
     def __init__(self, task: Task, tolerance: float) -> None:
         self.task, self.tolerance = task, tolerance

@@ -138,8 +138,10 @@ class Task:
     def moving(self) -> list[Moving]:
         """States of the motion itself, well after its start."""
         steps = MethodSteps(self.system, DOP853)
-        return [self._moving(time, steps.fixed(0.0, time / 50, 50, self.start, Drive(())))
-                for time in (0.21, 0.53, 0.87)]  # fmt: skip
+        return [
+            self._moving(time, steps.fixed(0.0, time / 50, 50, self.start, Drive(())))
+            for time in (0.21, 0.53, 0.87)
+        ]
 
     def _moving(self, time: float, y: list[float]) -> Moving:
         first, now = (

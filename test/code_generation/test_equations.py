@@ -29,7 +29,8 @@ jax.config.update("jax_enable_x64", True)  # no other test has JAX
 
 SCENES = [*names(), "loaded", "own loads"]
 OWN = (
-    "tanh(beta_2) + positive(mu_1 - 0.1)**2 + max(R11, -2) * abs(R22) / (2 + min(R33, 5))"
+    "tanh(beta_2) + positive(mu_1 - 0.1)**2"
+    " + max(R11, -2) * abs(R22) / (2 + min(R33, 5))"
     " + abs(gamma_1 - 0.7) * atan2(beta_1, 2) + tan(0.2 * gamma_2) - max(R11, R22)"
 )
 """A potential with every function that formulas have."""
@@ -139,7 +140,7 @@ def test_a_library_of_python_has_the_values_of_the_package(name, library):
 
 @pytest.mark.parametrize("name", ["general", "loaded"])
 def test_jacobians_are_those_of_casadi(name):
-    """Derivatives by CasADi of the written derivative, against those that are written."""
+    """Derivatives by CasADi of the written derivative, against the written ones."""
     casadi = pytest.importorskip("casadi", reason="needs casadi: pip install .[test]")
     scene = scene_of(name)
     parameters = ["star.inertia.xx", "star.inertia.xy", "actuated_links.inertia.zz"]

@@ -42,8 +42,8 @@ from sst_ros.simulation.simulation import Simulation
 START = (0.75, 0.7, 0.75)
 POINTS = ((0.4, (0.8, 0.75, 0.8)), (0.9, (0.9, 0.55, 0.7)), (1.6, (0.6, 0.8, 0.65)))
 SWEEP = Sweep(
-    amplitude=(0.1, 0.15, 0.05), frequency=(3.0, 4.0, 5.0), last_frequency=(10.0, 9.0, 1.0),
-    fade=0.5, duration=2.0,
+    amplitude=(0.1, 0.15, 0.05), frequency=(3.0, 4.0, 5.0),
+    last_frequency=(10.0, 9.0, 1.0), fade=0.5, duration=2.0,
 )  # fmt: skip
 KINDS = {
     "to_angles": ToAngles(gamma=(0.9, 0.6, 0.85), duration=0.8),

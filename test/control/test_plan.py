@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a motion asks for, against closed forms, and the speed at which it can be had."""
+"""What a motion asks for, against closed forms, and the speed it can be had at."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def swing(**limits):
 
 
 def swing_torque(time):
-    """Of each actuator, from the inertia M1(x) of the one coordinate x = gamma - pi/4."""
+    """Of each actuator, from the inertia M1(x) of the coordinate x = gamma - pi/4."""
     law = WAY * np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     u = time / TIME
     x, rate, acceleration = law(u), law.deriv()(u) / TIME, law.deriv(2)(u) / TIME**2
@@ -183,7 +183,7 @@ def rubbing(duration, limit):
 
 
 def test_the_highest_speed_is_where_the_check_turns():
-    """The motion itself is squeezed in time here, not the torques of the planned one."""
+    """The motion itself is squeezed in time, not the torques of the planned one."""
     limit = 9.0
     found = time_scaling(planned(rubbing(1.0, limit)))
     assert found.lowest == 0.0 and 1.5 < found.highest < 10.0

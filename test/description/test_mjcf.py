@@ -35,7 +35,7 @@ def without_dry_friction(scene):
 
 
 def accelerations(scene, mobility=None):
-    """Accelerations of the actuators in a moving state, by MuJoCo and by the package."""
+    """Accelerations of actuators in a moving state, by MuJoCo and by the package."""
     model = mujoco.MjModel.from_xml_string(mjcf(scene))
     if mobility is not None:
         model.body_invweight0[:] = mobility

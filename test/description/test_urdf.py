@@ -580,7 +580,7 @@ def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name)
 def test_the_tags_have_the_joints_the_topics_and_the_states_before_the_first_message(
     lockstep,
 ):
-    """Without those a controller that is activated first holds nan, and no run starts."""
+    """Without those a controller activated first holds nan, and no run starts."""
     scene = load("swing")
     text = urdf(scene, ("/a/commands", "/a/states"), lockstep=lockstep)
     tag, passive = ET.fromstring(text).findall("ros2_control")

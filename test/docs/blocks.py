@@ -7,8 +7,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 GENERATED = (
-    "accuracy.md", "control_rate.md", "estimate.md", "feedforward.md", "peers.md", "realtime.md",
-    "stability.md",
+    "accuracy.md", "control_rate.md", "estimate.md", "feedforward.md", "peers.md",
+    "realtime.md", "stability.md",
 )  # fmt: skip
 """Reports, whose words are not instructions."""
 
@@ -49,7 +49,7 @@ def prose(page):
 
 
 def commands(text):
-    """Lines of a shell block: continued ones joined, comments and empty ones left out."""
+    """Lines of a shell block: continued ones joined, no comments and no empty ones."""
     joined = re.sub(r"\s*\\\n\s*", " ", text)
     bare = (
         re.sub(r"(^|\s)#(?!!).*$", "", line).strip() for line in joined.splitlines()

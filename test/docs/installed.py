@@ -146,5 +146,6 @@ def _pip(words):
 
 KINDS = {
     "ros2": _ros2, "make": _make, "pip": _pip,
-    **dict.fromkeys(("cd", "export", "for", "done"), lambda words: None),  # nothing of ours
+    # nothing of ours
+    **dict.fromkeys(("cd", "export", "for", "done"), lambda words: None),
 }  # fmt: skip

@@ -28,7 +28,8 @@ pytestmark = [
 ]
 TORQUE = [0.4, -0.3, 0.2]
 PAGE = """<!doctype html><meta charset="utf-8"><div id="live-manipulator"></div>
-<script src="live_equations.js"></script><script src="live.js"></script><pre id="found"></pre>
+<script src="live_equations.js"></script><script src="live.js"></script>
+<pre id="found"></pre>
 <script>
 let y = manipulator.initial;
 for (let n = 0; n < 1000; n += 1) y = advance(y, {torque});

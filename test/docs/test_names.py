@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file, module or name that a text mentions is there: texts, docstrings and comments."""
+"""A file, module or name that is mentioned exists: texts, docstrings, comments."""
 
 import ast
 import builtins

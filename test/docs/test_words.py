@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Texts use the terms of the field: words that a reader would have to decode stay out."""
+"""Texts use terms of the field: words that a reader would have to decode stay out."""
 
 import re
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The vector environment: gymnasium's own checker, truncation at limits, equal seeds."""
+"""Vector environment: gymnasium's own checker, truncation at limits, equal seeds."""
 
 import runpy
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data of a wrong sign, unit, leg or time are refused by name, or named in a warning."""
+"""Data of a wrong sign, unit, leg or time are refused or warned of by name."""
 
 from functools import cache
 

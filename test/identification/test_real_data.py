@@ -90,7 +90,7 @@ def measured(seed, t=None):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_95_percent_intervals_cover_93_to_97_percent_of_the_truths():
-    """200 data sets with noise, delay and friction: all base parameters, and the delay."""
+    """200 data sets with noise, delay, friction: all base parameters and the delay."""
     rows, delays = [], []
     for seed in range(200):
         found = identify(measured(seed), plant().model)

@@ -208,7 +208,9 @@ batch = Batch(load_scene("swing"))
 batch.programs
 begun = threading.Timer(0.5, lambda: print("runs", flush=True))
 begun.start()
-batch.run([(0.8, 0.8, 0.8)] * 20_000, (0.0, 0.0, 0.0), step=1e-6, count=10**8, threads={threads})
+rest = 0.0, 0.0, 0.0
+many = [(0.8, 0.8, 0.8)] * 20_000
+batch.run(many, rest, step=1e-6, count=10**8, threads={threads})
 """
 
 
@@ -229,7 +231,8 @@ def test_a_batch_needs_no_numba():
 import sys
 sys.modules["numba"] = None
 from sst_ros import Batch
-found = Batch("example2_heavy").run((0.8, 0.8, 0.8), (0.0, 0.0, 0.0), step=1e-3, count=3)
+batch = Batch("example2_heavy")
+batch.run((0.8, 0.8, 0.8), (0.0, 0.0, 0.0), step=1e-3, count=3)
 """
     program = program.replace("(0.8, 0.8, 0.8), (0.0", "[(0.8, 0.8, 0.8)], (0.0")
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters as arrays: every row is the scene that has these numbers in its document."""
+"""Parameters as arrays: every row is the scene with these numbers in its document."""
 
 import dataclasses
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots that are driven step by step: as `Batch.run` and as `Simulation`, row by row."""
+"""Robots driven step by step: as `Batch.run` and as `Simulation`, row by row."""
 
 from dataclasses import replace
 

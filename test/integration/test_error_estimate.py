@@ -98,7 +98,7 @@ def test_contacts_lose_no_order(name):
 
 @pytest.mark.parametrize("name", list(SPANS))
 def test_energy_balance_and_closure_show_no_loss(name):
-    """The balance is judged at tolerance 1e-10 by the largest energy that turns over."""
+    """The balance is judged at tolerance 1e-10 by the largest energy turned over."""
     simulation = travelled(name, "auto", 1e-10)
     turned_over = max(1.0, simulation._energy)
     assert abs(simulation.energy_residual) < 1e-8 * turned_over

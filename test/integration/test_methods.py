@@ -146,7 +146,7 @@ def rates(t, y, _):
 
 
 def stepper(tableau):
-    """One step by the function that is traced: the new state, and its error estimate."""
+    """One step by the traced function: the new state, and its error estimate."""
 
     def step(t, h, y):
         moved, error = explicit_step(rates, tableau, t, h, y, [None] * len(tableau.a))

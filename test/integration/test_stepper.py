@@ -50,7 +50,7 @@ def pairs(monkeypatch):
 
 @pytest.mark.parametrize("coefficient", [1e3, 1e4, 1e5])
 def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pairs):
-    """Steps that an explicit method would need for stability grow with the coefficient."""
+    """Steps an explicit method would need for stability grow with the coefficient."""
     simulation = Simulation(viscous(coefficient), tolerance=1e-10, step_budget=10**6)
     simulation.step(REST, 1_000_000_000)
     assert simulation.method == "rodas5p"

@@ -156,7 +156,8 @@ def test_pinocchios_internal_forces(seed):
     scene = scene.with_values(
         {
             "actuated_links.mass": 0.3, "actuated_links.centre": [0.05, 0.02, 0.0],
-            "intermediate_links.mass": 0.2, "intermediate_links.centre": [0.03, 0.0, 0.02],
+            "intermediate_links.mass": 0.2,
+            "intermediate_links.centre": [0.03, 0.0, 0.02],
         }
     )  # fmt: skip
     rng = np.random.default_rng(seed)

@@ -82,7 +82,7 @@ def bounced(**stroke):
 def test_three_contacts_at_once_stay_symmetric_and_bounce_as_one_freedom_does(
     stiffness, restitution
 ):
-    """Example 1 moved symmetrically is one equation, which SciPy integrates by itself."""
+    """Example 1 in symmetric motion is one equation that SciPy integrates by itself."""
     how = {"stiffness": stiffness, "restitution": restitution, "impact_rate": 1.0}
     simulation = bounced(**how)
     joints, c = simulation.state.joints, damping_of(Stroke(at_end="elastic", **how))

@@ -186,7 +186,7 @@ def test_quaternion_rate_turns_the_frame_by_the_body_rate(sample):
 
 @every_sample
 def test_branch_without_products_of_inertia_is_the_general_one(sample):
-    """A product of 1e-300 takes the long way round and changes nothing above rounding."""
+    """A product of 1e-300 takes the long way and changes nothing above rounding."""
     bare = [leg._replace(ixy=0.0, ixz=0.0, iyz=0.0) for leg in sample.model.legs]
     full = [leg._replace(iyz=1e-300) for leg in bare]
     short, long = (

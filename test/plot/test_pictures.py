@@ -154,7 +154,7 @@ def test_work_is_not_known_beyond_a_lost_torque(tmp_path, bags, example2):
 
 
 def test_a_lost_orientation_is_a_gap_and_no_end(tmp_path, bags, example2):
-    """As where a recorder hears joint_states first: SciPy refuses quaternions of nan."""
+    """As if a recorder hears joint_states first: SciPy refuses quaternions of nan."""
     kept = [e for e in example2 if (e.topic, e.sample) != (bags.ORIENTATION, 60)]
     bag = bags.write(tmp_path / "bag", kept)
     run = read_signals(bag)
@@ -237,7 +237,7 @@ def test_a_picture_on_a_full_disk(tmp_path):
 
 
 def shifted(bags, entries, by_ns, turn=0.0, keep=lambda sample: True):
-    """The same run at another time, with gamma_1 of some samples changed by 1e-3 rad."""
+    """The same run at another time, gamma_1 of some samples changed by 1e-3 rad."""
     result = []
     for entry in entries:
         content = entry.content

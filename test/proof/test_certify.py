@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is proven holds for solutions of 60 digits, and no longer where a part breaks."""
+"""What is proven holds for solutions of 60 digits, but not where a part breaks."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -212,7 +212,7 @@ def test_a_slope_that_is_not_a_number_is_refused(unknown):
 
 
 def remove_rounding(patch):
-    """Leave Lagrange's remainder of the defect alone, and take reached ends as exact."""
+    """Leave Lagrange's remainder of the defect alone; take reached ends as exact."""
     bound, end = enclosure.bound_defect, enclosure.region_at_end
     patch.setattr(enclosure, "bound_defect", lambda *given: [
         [*(0 * x for x in row[:-1]), row[-1]] for row in bound(*given)

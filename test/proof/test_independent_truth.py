@@ -345,7 +345,8 @@ def summarize(rows):
         middle = np.median([row["distance"] for row in whole])
         events = sum(row["events"] for row in some)
         print(
-            f"| {kind} | {len(some)} | {len(whole)} | {motions} | {events} | {outside} |"
+            f"| {kind} | {len(some)} | {len(whole)} | {motions} | {events} |"
+            f" {outside} |"
             f" {max(row['worst'] for row in some):.6f} | {middle:.6f} |"
             f" {np.median([row['bound'] for row in whole]):.2g} rad |",
             flush=True,

@@ -85,7 +85,7 @@ class Manipulator:
         return min(margins), np.linalg.det(j2), min(sines), sigma
 
     def assemblies(self, gamma, rng, tries=60):
-        """Rotations that close the loops at gamma, from many starts of Newton's method."""
+        """Rotations closing the loops at gamma, from many starts of Newton."""
         r = np.array([self.carriage(k, gamma[k]) for k in range(3)])
         found = []
         for _ in range(tries):

@@ -222,7 +222,7 @@ def test_diagnostics_of_another_simulator_are_not_those_of_the_run(
 
 @pytest.mark.parametrize("encoding", ["", "unknown"])
 def test_a_database_with_an_action_is_whole(written, bags, example2, encoding):
-    """`ros2 bag record -a -s sqlite3` leaves the definition of an action's types empty."""
+    """`ros2 bag record -a -s sqlite3` leaves an action's type definitions empty."""
     path, name = written(example2, sqlite=True), "/fibonacci/_action/feedback"
     kind = "example_interfaces/action/Fibonacci_FeedbackMessage"
     (file,) = path.glob("*.db3")

@@ -364,7 +364,7 @@ def test_an_altered_torque_shows_when_it_was(read, bags, example2):
 def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(
     read, bags, example2
 ):
-    """The torque of every other tick answers the sample of two milliseconds before it."""
+    """The torque of every other tick answers the sample of 2 ms before it."""
     entries = list(example2)
     for tick in range(2, 300, 2):
         stamp, torque = (
@@ -464,7 +464,7 @@ def long_run(tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_long_run_is_reported_whole(long_run, monkeypatch):
-    """The work that a report does for it, which is what its time and memory come from."""
+    """The work a report does for it, which is what its time and memory come from."""
     follow, calls = TickStepper.follow, []
     monkeypatch.setattr(
         TickStepper, "follow", lambda *given: calls.append(0) or follow(*given)

@@ -152,7 +152,7 @@ SHIPPED = {
 
 
 def random_scenes():
-    """Random manipulators that a sine moves: without friction, with some, with so much."""
+    """Random manipulators that a sine moves: with no, some and very much friction."""
     for sample, viscous in zip(seeded_samples(31, 3), (0.0, 1.0, 300.0), strict=True):
         start = Initial(
             gamma=tuple(sample.gamma.tolist()),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stability of one scene: steps, runs with other numbers, and what is said of them."""
+"""Stability of one scene: steps, runs with other numbers, what is said of them."""
 
 import dataclasses
 import json

@@ -32,8 +32,8 @@ DEFINITIONS = Path(__file__).with_name("message_types.yaml")
 SHARED = ("rosidl_generator_c", "rosidl_typesupport_c", "rosidl_typesupport_fastrtps_c")
 RUNTIME = ("rosidl_runtime_c", "rosidl_typesupport_c", "rosidl_typesupport_fastrtps_c",
            "rosidl_typesupport_fastrtps_cpp", "rcutils", "rmw", "fastcdr")  # fmt: skip
-USED = ("action_msgs", "builtin_interfaces", "geometry_msgs", "service_msgs", "std_msgs",
-        "trajectory_msgs", "unique_identifier_msgs")  # fmt: skip
+USED = ("action_msgs", "builtin_interfaces", "geometry_msgs", "service_msgs",
+        "std_msgs", "trajectory_msgs", "unique_identifier_msgs")  # fmt: skip
 """Packages of the wheels whose types the definitions contain."""
 
 
@@ -92,8 +92,8 @@ def _generate(root, package, definitions):
         path.write_text(definition["fields"].replace(", ", "\n"))
     shared = {"package_name": package, "include_paths": [str(PREFIX / "share")]}
     files = translate(
-        interface_files=[f"{source}:{name}" for name in definitions], output_format="idl",
-        output_path=out, **shared,
+        interface_files=[f"{source}:{name}" for name in definitions],
+        output_format="idl", output_path=out, **shared,
     )  # fmt: skip
     only = ["rosidl_typesupport_fastrtps_c"]
     for generator in (

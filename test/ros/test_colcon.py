@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The other world: built by colcon, found as `ros2 run` and `ros2 launch` find things."""
+"""The other world: built by colcon, found as by `ros2 run` and `ros2 launch`."""
 
 import os
 import shutil

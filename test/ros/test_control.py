@@ -159,7 +159,7 @@ def test_a_clock_is_followed_through_pause_jump_and_return(nodes, observer):
     at = [100 * 10**9]
 
     def run(samples, what):
-        """Publish time, 10 ms further each time, until there are so many samples more."""
+        """Publish time, 10 ms further each time, until so many samples more."""
         begin, before = at[0], len(observer.stamps())
 
         def condition():

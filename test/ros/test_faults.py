@@ -47,7 +47,8 @@ NAMED = [named([math.nan, 0.0, 0.0]), named([0.0] * 2, names=NAMES[:2])]
 @pytest.mark.parametrize(
     ("good", "bad", "because", "said"),
     [
-        (torques(*GOOD), PLAIN, "wrong size 1, not finite 1", "must be 3 finite torques"),
+        (torques(*GOOD), PLAIN, "wrong size 1, not finite 1",
+         "must be 3 finite torques"),
         (named(GOOD[::-1], names=NAMES[::-1]), NAMED, "not finite 1, wrong names 1",
          "must be gamma_1, gamma_2, gamma_3, each once"),
     ],

@@ -292,7 +292,8 @@ def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(
     assert observer.phase("running") and controller.poll() is None
     stamps, gamma, rate = (
         np.array(row)
-        for row in ([observer.stamp(m) for m in reference], [m.position for m in reference],
+        for row in ([observer.stamp(m) for m in reference],
+                    [m.position for m in reference],
                     [m.velocity for m in reference])
     )  # fmt: skip
     dt = 1e-9 * np.diff(stamps)[:, None]

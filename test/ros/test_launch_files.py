@@ -159,17 +159,24 @@ UNPLAYED = (
     ("name", "words", "status", "said"),
     [
         ("simulate", "scene:=example2 play:=true", 0, "finished"),  # that of the README
-        ("simulate", "play:=true duration:=0.0 sync:=lockstep", 0, "the profile of 1 s is played"),
+        ("simulate", "play:=true duration:=0.0 sync:=lockstep", 0,
+         "the profile of 1 s is played"),
         ("simulate", "scene:=swing play:=true", 1, UNPLAYED),
         pytest.param("view", "rviz:=true", 1, f"{NEEDS}rviz2", marks=without("rviz2")),
-        pytest.param("simulate", "rviz:=true", 1, f"{NEEDS}rviz2", marks=without("rviz2")),
-        pytest.param("ros2_control", "", 1, f"{NEEDS}controller_manager, .*joint_trajectory_contr.*"
+        pytest.param("simulate", "rviz:=true", 1, f"{NEEDS}rviz2",
+                     marks=without("rviz2")),
+        pytest.param("ros2_control", "", 1,
+                     f"{NEEDS}controller_manager, .*joint_trajectory_contr.*"
                      f"apt install ros-{DISTRIBUTION}-controller-manager .*ros-",
                      marks=without("controller_manager")),
-        ("ros2_control", "controllers:=nowhere.yaml", 1, "controllers:=nowhere.yaml: no such file"),
-        ("simulate", "scen:=swing", 1, "scen:=swing: no such argument; did you mean 'scene'?"),
-        ("simulate", "params_file:=nowhere.yaml", 1, "params_file:=nowhere.yaml: no such file"),
-        ("simulate", "duration:=x play:=true", 1, "--duration = 'x': must be a finite number"),
+        ("ros2_control", "controllers:=nowhere.yaml", 1,
+         "controllers:=nowhere.yaml: no such file"),
+        ("simulate", "scen:=swing", 1,
+         "scen:=swing: no such argument; did you mean 'scene'?"),
+        ("simulate", "params_file:=nowhere.yaml", 1,
+         "params_file:=nowhere.yaml: no such file"),
+        ("simulate", "duration:=x play:=true", 1,
+         "--duration = 'x': must be a finite number"),
         ("feedforward", "mode:=nosuch", 1, r"\"mode\".*\"nosuch\".*feedforward_pd.*pd"),
         ("simulate", "use_sim_time:=yes", 1, r"\"yes\" is not valid.*'true', 'false'"),
         ("record", "bag:=mcap", 1, r"\"mcap\" is not valid.*'ros2', 'sst'"),
@@ -327,7 +334,7 @@ STAND_INS = {
 
 
 def stand_in(monkeypatch, prefix, packages):
-    """Make those packages of an installation that are not there, with their programs."""
+    """Make those packages that an installation lacks, with their programs."""
     index = prefix / "share" / "ament_index" / "resource_index" / "packages"
     index.mkdir(parents=True)
     for package, programs in packages.items():

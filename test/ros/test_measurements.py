@@ -19,8 +19,9 @@ def measured(nodes, observer, *, sync="lockstep", seconds=1.0, **given):
     begun = [len(messages) for messages in heard]
     waits = f"[joint_states,{TRUE}]"
     simulator = nodes.run(
-        "simulator", sync=sync, duration=seconds, publish_rate=RATE, wait_for_subscribers=waits,
-        real_time_factor=0.0 if sync == "lockstep" else 4.0, **given,
+        "simulator", sync=sync, duration=seconds, publish_rate=RATE,
+        wait_for_subscribers=waits, real_time_factor=0.0 if sync == "lockstep" else 4.0,
+        **given,
     )  # fmt: skip
     if sync == "lockstep":
         nodes.run("torque_player", rate=RATE)

@@ -49,8 +49,8 @@ BURST = """
 tasks = [task for task in Path("/proc/self/task").iterdir()
          if (task / "comm").read_text().startswith("dds.ev")]
 def wakes():
-    rows = (task / "status" for task in tasks)
-    return sum(int(row.read_text().partition("\\nvoluntary_ctxt_switches:")[2].split()[0])
+    rows = ((task / "status").read_text() for task in tasks)
+    return sum(int(row.partition("\\nvoluntary_ctxt_switches:")[2].split()[0])
                for row in rows)
 before = wakes()
 for _ in range(500):
@@ -69,7 +69,9 @@ simulator, samples = Simulator(), []
 node = rclpy.create_node("observer")
 node.create_subscription(JointState, "joint_states", samples.append, 10)
 end = time.monotonic() + 60.0
-while not any(sample.header.frame_id == "" for sample in samples) and time.monotonic() < end:
+def seen():
+    return any(sample.header.frame_id == "" for sample in samples)
+while not seen() and time.monotonic() < end:
     rclpy.spin_once(node, timeout_sec=0.1)
 print(gc.isenabled(), len(gc.get_objects()))
 simulator.close()
@@ -83,7 +85,7 @@ from sst_ros.nodes import process
 
 class Hangs(Node):
     def destroy_node(self):
-        # As in a deadlock of Fast DDS rclpy holds the interpreter's lock: PyDLL does, too.
+        # PyDLL holds the interpreter's lock as rclpy does in a deadlock of Fast DDS.
         ctypes.PyDLL(None).sleep(60)
 
 class Worker:

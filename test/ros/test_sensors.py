@@ -236,7 +236,8 @@ def test_a_node_publishes_what_is_asked_for_with_the_stamps_of_its_samples(
     assert {one.header.frame_id for one in heard["reaction"]} == {"left/intermediate_2"}
     assert {one.header.frame_id for one in heard["imu"]} == {"left/imu"}
     rotations = np.array([
-        rotation_matrix((q.x, q.y, q.z, q.w)) for q in (one.quaternion for one in samples)
+        rotation_matrix((q.x, q.y, q.z, q.w))
+        for q in (one.quaternion for one in samples)
     ])  # fmt: skip
     gravity = np.array(load_scene(SCENE).gravity.acceleration)
     for k in range(100, 104):

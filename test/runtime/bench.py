@@ -32,7 +32,7 @@ def stamped(stamp_ns, effort=(0.0, 0.0, 0.0), names=ACTUATED_JOINTS):
 
 
 class Arrived(list):
-    """Messages that arrived long ago, at `arrived_ns`, or after some requests for them."""
+    """Messages that came long ago, at `arrived_ns`, or after some requests for them."""
 
     arrived_ns = -math.inf
     after_requests = 0

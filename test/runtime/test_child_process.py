@@ -18,7 +18,8 @@ KEEP = """
 import os, sys
 from sst_ros.runtime import child_process
 child_process.keep_domain()
-print(os.environ["ROS_DOMAIN_ID"], os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"], flush=True)
+names = "ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"
+print(*map(os.environ.__getitem__, names), flush=True)
 sys.stdin.read()
 """
 

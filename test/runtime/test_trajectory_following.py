@@ -122,18 +122,21 @@ def test_a_reset_of_the_simulator_begins_the_motion_anew():
     ("model", "settings", "reason"),
     [
         ({"motion": None}, {}, "motion"),
-        ({"motion": DesiredMotion(to_angles=ToAngles(gamma=(1.7, 0.8, 0.8), duration=1.0))}, {},
-         "gamma_1"),
-        ({"motion": DesiredMotion(to_angles=ToAngles(gamma=(0.35, 0.3, 1.35), duration=1.0))}, {},
-         "beta_"),
+        ({"motion": DesiredMotion(
+            to_angles=ToAngles(gamma=(1.7, 0.8, 0.8), duration=1.0))}, {}, "gamma_1"),
+        ({"motion": DesiredMotion(
+            to_angles=ToAngles(gamma=(0.35, 0.3, 1.35), duration=1.0))}, {}, "beta_"),
         ({"actuators": Actuators(torque_limit=0.5)}, {}, "exceeds the limit 0.5 N m"),
-        ({"actuators": Actuators(torque_limit=50.0)}, {"torque_limit": 0.5}, "limit 0.5 N m"),
-        ({"actuators": Actuators(torque_limit=0.5)}, {"torque_limit": 50.0}, "limit 0.5 N m"),
+        ({"actuators": Actuators(torque_limit=50.0)}, {"torque_limit": 0.5},
+         "limit 0.5 N m"),
+        ({"actuators": Actuators(torque_limit=0.5)}, {"torque_limit": 50.0},
+         "limit 0.5 N m"),
         ({}, {"integral_rate": 100.0, "mode": "pd"}, "integral_rate"),
         ({}, {"mode": "pid"}, "mode"),
         ({}, {"stiffness": (1.0, np.nan, 1.0)}, "stiffness"),
         ({}, {"rate": 7}, "rate"),
-        ({}, {"mode": "computed_torque", "space": "so3", "stiffness": (1.0,) * 3}, "stiffness"),
+        ({}, {"mode": "computed_torque", "space": "so3", "stiffness": (1.0,) * 3},
+         "stiffness"),
         ({}, {"damping": (1.0, 1.0, 1.0), "integral_rate": 1.0}, "integral_rate"),
     ],
 )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every YAML document that a user gives is read by the scene's reader, with its limits."""
+"""Every YAML document of a user is read by the scene's reader, with its limits."""
 
 import os
 import re

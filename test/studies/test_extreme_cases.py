@@ -92,7 +92,7 @@ def named(name):
 
 
 def test_forty_contacts_multiply_differences():
-    """The reason why their error estimate is not checked: 5e5 times in half of the run."""
+    """Why their error estimate is not checked: 5e5 times in half of the run."""
     changes = bouncing_thrice(1e4, 20.0)
     first, second, third = changes["initial"]["gamma"]
     other = {**changes["initial"], "gamma": (first + 1e-10, second, third)}
@@ -128,8 +128,9 @@ def test_an_estimate_of_an_error_that_is_not_resolved_is_bounded(monkeypatch):
 
 
 LOOPED = (
-    "time x 1e-06", "pushed outwards at an end of the stroke", "noise of 1 N m at 10 kHz",
-    "control period of 333333 ns", "sampled PD control at 0.98 of the limit of its bandwidth",
+    "time x 1e-06", "pushed outwards at an end of the stroke",
+    "noise of 1 N m at 10 kHz", "control period of 333333 ns",
+    "sampled PD control at 0.98 of the limit of its bandwidth",
     "three simultaneous contacts", "torque of 1e8 N m into a serial singularity",
 )  # fmt: skip
 
@@ -178,12 +179,12 @@ def test_accelerations_at_any_ratio_of_inertias_are_those_of_mpmath(scale):
 
 
 def started(angle, spin):
-    """Start about E beside a singular pose, with an angular velocity about E [rad/s]."""
+    """Start about E beside a singular pose, with angular velocity about E [rad/s]."""
     return Simulation(changed(near_singularity(angle, spin)))
 
 
 def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays():
-    """There gamma tells the pose to the root of rounding only, for two assemblies meet."""
+    """There gamma tells the pose only to the root of rounding: two assemblies meet."""
     simulation = started(0.0, 0.0)
     assert abs(simulation.conditioning["det_j2"]) < 1e-7
     at = quaternion_of(singular_pose())

@@ -72,8 +72,8 @@ def small():
     """A study of 0.4 s with one failure in it: delay 5 at 180 rad/s."""
     pytest.importorskip("llvmlite", reason="takes minutes without: pip install .[fast]")
     plan = FeedforwardPlan(
-        SHORT, bandwidths=(180.0,), errors=errors("inertia +20%", "inertia -20%", "delay 5"),
-        delays=(0,),
+        SHORT, bandwidths=(180.0,), delays=(0,),
+        errors=errors("inertia +20%", "inertia -20%", "delay 5"),
     )  # fmt: skip
     return feedforward_study(plan, workers=1)
 
@@ -125,7 +125,8 @@ def test_a_loop_that_is_lost_says_so():
 @pytest.mark.slow
 def test_the_same_bits_on_any_number_of_workers():
     plan = FeedforwardPlan(
-        SHORT, 4 * PERIOD_NS, (40.0,), errors=errors("noise"), multiples=(1, 2), delays=(),
+        SHORT, 4 * PERIOD_NS, (40.0,), errors=errors("noise"), multiples=(1, 2),
+        delays=(),
     )  # fmt: skip
     first, second = (feedforward_study(plan, workers=n) for n in (1, 2))
     assert first.loops.to_csv() == second.loops.to_csv()

@@ -78,16 +78,17 @@ class Processes:
 
     def start_scheduler(self):
         self.file = file = self.folder / f"scheduler_{time.monotonic_ns()}.json"
-        words = ["-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1",
-                 "--no-dashboard", "--scheduler-file", str(file)]  # fmt: skip
+        words = ["-m", "distributed.cli.dask_scheduler", "--port", "0",
+                 "--host", "127.0.0.1", "--no-dashboard",
+                 "--scheduler-file", str(file)]  # fmt: skip
         self.scheduler = self.start(words)
         until(lambda: file.exists() and file.stat().st_size > 0)
 
     def add_worker(self, patch=""):
         words = [
-            "-c", f"{patch}\n{WORKER}", "--scheduler-file", str(self.file), "--nthreads", "1",
-            "--no-dashboard", "--local-directory", str(self.folder / "work"),
-            "--no-nanny",
+            "-c", f"{patch}\n{WORKER}", "--scheduler-file", str(self.file),
+            "--nthreads", "1", "--no-dashboard", "--local-directory",
+            str(self.folder / "work"), "--no-nanny",
         ]  # fmt: skip
         self.workers.append(self.start(words))
         return self.workers[-1]

@@ -34,7 +34,8 @@ CASES = [
     {"mode": "computed_torque", "space": "so3", "integral_rate": 3.0},
     {"mode": "feedforward_pd", "feedforward_at": "middle", "delay": 2, "counts": 4096},
     {"mode": "pd", "stiffness": (300.0, 200.0, 100.0), "damping": (10.0, 8.0, 5.0),
-     "integral_rate": 2.0, "torque_limit": 4.0, "angle_noise": 1e-4, "rate_noise": 1e-2},
+     "integral_rate": 2.0, "torque_limit": 4.0, "angle_noise": 1e-4,
+     "rate_noise": 1e-2},
     {"mode": "computed_torque", "counts": 20_000, "delay": 1, "angle_noise": 1e-5,
      "feedforward_at": "middle", "torque_limit": 6.0, "integral_rate": 4.0},
 ]  # fmt: skip
@@ -58,8 +59,8 @@ def test_each_torque_is_that_of_the_python_controller(monkeypatch, case, by):
     else:
         pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     study = SweepStudy(
-        SCENE, VARY, n=3, seed=11, steps=2 * SAMPLES, control={"period": PERIOD, **case},
-        duration=SAMPLES * PERIOD,
+        SCENE, VARY, n=3, seed=11, steps=2 * SAMPLES,
+        control={"period": PERIOD, **case}, duration=SAMPLES * PERIOD,
     )  # fmt: skip
     ready = PreparedSweep(study)
     torques, prepare_step = [], ControlledBlock.prepare_step
@@ -127,7 +128,8 @@ def test_a_closed_loop_tracks_as_that_of_the_simulation():
             assert found.loc[row, columns].tolist() == pytest.approx(errors, abs=1e-8)
         torque, last = track.torque[:-1], TrackingMetrics(track)
         for name, torques in (
-            ("rms", np.sqrt(np.mean(torque**2, axis=0))), ("max", np.abs(torque).max(axis=0)),
+            ("rms", np.sqrt(np.mean(torque**2, axis=0))),
+            ("max", np.abs(torque).max(axis=0)),
         ):  # fmt: skip
             columns = [f"torque_{name}_{k}" for k in (1, 2, 3)]
             assert found.loc[row, columns].tolist() == pytest.approx(torques, rel=1e-6)
@@ -187,8 +189,8 @@ def test_the_time_at_which_a_controlled_run_leaves_does_not_depend_on_its_steps(
     rates = [[rate, 0.0, 0.0] for rate in (0.0, 12.0, 20.0, -20.0)]
     control = {"mode": "gravity_pd", "bandwidth": 5.0, "period": 0.01, "delay": 1}
     coarse, fine = (
-        sweep("reach", {"initial.gamma_dot": rates}, duration=0.1, control=control, steps=steps,
-              outputs=("gamma", "extremes"))
+        sweep("reach", {"initial.gamma_dot": rates}, duration=0.1, control=control,
+              steps=steps, outputs=("gamma", "extremes"))
         for steps in (40, 160)
     )  # fmt: skip
     assert np.all(coarse["gamma_max_1"] >= coarse["gamma_1"])

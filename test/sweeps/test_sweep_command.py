@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sst-ros sweep`: a study file to a folder of results, its summary and its pictures."""
+"""`sst-ros sweep`: a study file to a folder of results, a summary and pictures."""
 
 import pytest
 from scipy.stats import spearmanr
