@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from programs import python
 
 from sst_ros import simulate
 
@@ -71,3 +72,28 @@ def test_eight_cold_threads_have_the_bits_of_one(repeat):
 @pytest.mark.parametrize("home", [None, "/nonexistent", "/proc"])
 def test_no_home_is_needed(home):
     assert run_code(BEGIN + "print(bits())", HOME=home) == [bits_here()]
+
+
+ENDING = r"""
+import itertools, threading
+from sst_ros.programs import llvm
+
+begun, optimise = threading.Event(), llvm._optimise
+
+def tell(module, machine):
+    begun.set()
+    optimise(module, machine)
+
+llvm._optimise = tell
+rows = [f"  %y{i + 1} = fmul double %y{i}, %y0" for i in range(4000)]
+text = ["define double @power(double %y0) {", *rows, "  ret double %y4000", "}"]
+compiled = ["\n".join(text)]
+threading.Thread(target=llvm.compile_text, args=compiled, daemon=True).start()
+assert begun.wait(60.0)
+"""
+
+
+def test_a_process_that_ends_while_a_thread_compiles_ends_in_order():
+    """LLVM's assertions and faults are SIGABRT and SIGSEGV, of a node that is stopped."""
+    pytest.importorskip("llvmlite")
+    assert python(ENDING).stderr == ""
