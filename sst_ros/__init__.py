@@ -3,17 +3,15 @@
 
 `simulate` returns a whole motion as a `Trajectory`; `Simulation` goes step by step, for
 control loops; `sweep` runs a study of many runs, on this machine or on a cluster. All
-names are imported when they are first used.
+names are imported when they are first used, and no module of the package before: a
+command handles an interrupt only after this.
 """
 
 from __future__ import annotations
 
 import importlib
 
-from sst_ros.removed import REMOVED_FUNCTIONS
-from sst_ros.version import VERSION
-
-# typing takes long to import, and a node handles signals only after this
+# typing takes long to import
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from sst_ros.code_generation.equations import Equations as Equations
@@ -60,11 +58,11 @@ if TYPE_CHECKING:
     from sst_ros.simulation.trajectory import Trajectory as Trajectory
     from sst_ros.state import State as State
     from sst_ros.sweeps.sweep import sweep as sweep
+    from sst_ros.version import VERSION
 
     direct_kinematics, inverse_kinematics = _kinematics.direct, _kinematics.inverse
     load_scene, read_bag = _scene.scene_of, _recording.read
-
-__version__ = VERSION
+    __version__ = VERSION
 
 # Names of each module; one that has another name there is followed by it.
 _MODULES = {
@@ -94,6 +92,7 @@ _MODULES = {
     "simulation.trajectory": "Trajectory",
     "state": "State",
     "sweeps.sweep": "sweep",
+    "version": "__version__:VERSION",
 }
 
 if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all others
@@ -101,12 +100,13 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
         (module, word) for module, words in _MODULES.items() for word in words.split()
     ]
     _EXPORTS = {word.partition(":")[0]: (module, word) for module, word in _WORDS}
-    __all__ = ["__version__", *sorted(_EXPORTS)]
+    __all__ = sorted(_EXPORTS)
 
     def __getattr__(name: str) -> object:
-        if name in REMOVED_FUNCTIONS:
-            return _refuse_function(name)
         if name not in _EXPORTS:
+            removed = importlib.import_module("sst_ros.removed").REMOVED_FUNCTIONS
+            if name in removed:
+                return _refuse_function(name, removed[name])
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module, word = _EXPORTS[name]
         found = importlib.import_module(f"sst_ros.{module}")
@@ -114,12 +114,12 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
         globals()[name] = value
         return value
 
-    def _refuse_function(name: str) -> object:
+    def _refuse_function(name: str, advice: str) -> object:
         """Return a function that refuses to be called, and says what to use instead."""
 
         def refuse(*_: object, **__: object) -> None:
             errors = importlib.import_module("sst_ros.errors")
-            raise errors.refusal("sst_ros", name, "called", REMOVED_FUNCTIONS[name])
+            raise errors.refusal("sst_ros", name, "called", advice)
 
         return refuse
 

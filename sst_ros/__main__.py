@@ -12,9 +12,9 @@ NODES = ("simulator", "torque_player", "inverse_dynamics", "recorder", "viewer")
 def main(arguments: list[str] | None = None) -> int:
     """Run a command or a node; return the exit status.
 
-    While modules are imported a SIGINT ends the process of a command at once and in
-    silence: a KeyboardInterrupt there would come out of them as it is, or as an
-    ImportError of numpy's.
+    While modules are imported, and once the command has ended, a SIGINT ends the
+    process of a command at once and in silence: a KeyboardInterrupt there would come
+    out of them as it is, or as an ImportError of numpy's.
     """
     given = sys.argv[1:] if arguments is None else arguments
     try:
@@ -28,9 +28,12 @@ def main(arguments: list[str] | None = None) -> int:
 
         if arguments is None:
             signals.interrupt(at_once=False)
-    except KeyboardInterrupt:
+        status = run_command(given)
+        if arguments is None:
+            signals.interrupt(at_once=True)
+    except KeyboardInterrupt:  # just before `run_command`, or a second one within it
         return 130
-    return run_command(given)
+    return status
 
 
 if __name__ == "__main__":

@@ -63,6 +63,50 @@ def test_an_interrupt_while_modules_are_imported_ends_in_silence():
     assert done.stdout == done.stderr == ""
 
 
+def test_an_interrupt_once_the_command_has_ended_makes_no_traceback():
+    program = """if True:
+        import atexit, os, signal, sys
+        from sst_ros.__main__ import main
+
+        atexit.register(os.kill, os.getpid(), signal.SIGINT)
+        sys.argv = ["sst-ros", "scene", "list"]
+        sys.exit(main())
+        """
+    told = {
+        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)
+    }
+    done = python(program, status=-signal.SIGINT, **told)
+    assert "example2" in done.stdout and done.stderr == ""
+
+
+def test_a_second_interrupt_while_the_first_is_reported_makes_no_traceback():
+    program = """if True:
+        import os, signal, sys
+        from sst_ros.__main__ import main
+
+        class Stream:
+            def write(self, text):
+                os.kill(os.getpid(), signal.SIGINT)
+            flush = write
+
+        sys.stdout = sys.stderr = Stream()
+        sys.argv = ["sst-ros", "scene", "list"]
+        status = main()
+        sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__
+        sys.exit(status)
+        """
+    told = {
+        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)
+    }
+    assert python(program, status=130, **told).stderr == ""
+
+
+def test_the_package_alone_imports_no_module_of_its_own():
+    """Python would print a traceback for an interrupt that comes before `main`."""
+    program = "import sys, sst_ros; print([x for x in sys.modules if 'sst_ros.' in x])"
+    assert python(program).stdout == "[]\n"
+
+
 def test_alone_it_prints_help_with_every_command_and_node(capsys):
     assert main([]) == 0
     said = capsys.readouterr().out

@@ -77,8 +77,8 @@ def stop(ledger: Ledger, process: Process, number: int = signal.SIGINT) -> None:
     if time.monotonic() - began > CLOSE_S * ledger.patience:
         ledger.found("hangs", f"it took {time.monotonic() - began:.1f} s to close")
     if status not in (0, 1):
-        ledger.found("tracebacks", f"exit status {status}")
-    if "Traceback" in text:
+        ledger.found("tracebacks", f"exit status {status}: {text[-300:]}")
+    elif "Traceback" in text:
         ledger.found("tracebacks", text[-300:])
 
 

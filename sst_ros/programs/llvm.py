@@ -12,11 +12,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import os
 import re
 import struct
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -636,6 +638,29 @@ def _write_loop(
 # Compilation.
 
 
+_ENGINE_LOCK = threading.RLock()
+"""Held in each call of LLVM. A fork waits for it, for the child would find LLVM halfway
+through a module, and its locks held by a thread that it does not have."""
+
+os.register_at_fork(
+    before=_ENGINE_LOCK.acquire,
+    after_in_parent=_ENGINE_LOCK.release,
+    after_in_child=_ENGINE_LOCK.release,
+)
+# The end of the process waits for it, and keeps it: LLVM would take down its tables
+# below a daemon thread that compiles, and the process would end by SIGABRT or SIGSEGV.
+atexit.register(_ENGINE_LOCK.acquire)
+
+
+def _close(
+    engine: Any, lock: Any = _ENGINE_LOCK, ends: Callable[[], bool] = sys.is_finalizing
+) -> None:
+    """Free an engine, but not while the process ends: then globals have gone already."""
+    if not ends():
+        with lock:
+            engine.close()
+
+
 class MachineCode:
     """Compiled code of one module; it is freed with the last function that uses it.
 
@@ -650,23 +675,6 @@ class MachineCode:
         """Return the address of a function."""
         with _ENGINE_LOCK:
             return int(self._engine.get_function_address(name))
-
-
-def _close(engine: Any) -> None:
-    with _ENGINE_LOCK:
-        engine.close()
-
-
-_ENGINE_LOCK = threading.RLock()
-"""Held in each call of LLVM and while llvmlite is imported. A fork waits for it, for
-the child would find LLVM halfway through a module, and the locks of LLVM and of the
-import held by a thread that it does not have."""
-
-os.register_at_fork(
-    before=_ENGINE_LOCK.acquire,
-    after_in_parent=_ENGINE_LOCK.release,
-    after_in_child=_ENGINE_LOCK.release,
-)
 
 
 def compile_text(text: str) -> MachineCode:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from programs import python
 
 from sst_ros import simulate
 
@@ -156,3 +157,28 @@ def test_a_process_forked_while_a_property_is_computed_computes_it_too():
 def test_a_first_run_imports_llvmlite_alone():
     """A fork waits for the import of llvmlite, and could not wait for another one."""
     assert run_code(IMPORTS) in ([], ["llvmlite"])
+
+
+ENDING = r"""
+import itertools, threading
+from sst_ros.programs import llvm
+
+begun, optimise = threading.Event(), llvm._optimise
+
+def tell(module, machine):
+    begun.set()
+    optimise(module, machine)
+
+llvm._optimise = tell
+rows = [f"  %y{i + 1} = fmul double %y{i}, %y0" for i in range(4000)]
+text = ["define double @power(double %y0) {", *rows, "  ret double %y4000", "}"]
+compiled = ["\n".join(text)]
+threading.Thread(target=llvm.compile_text, args=compiled, daemon=True).start()
+assert begun.wait(60.0)
+"""
+
+
+def test_a_process_that_ends_while_a_thread_compiles_ends_in_order():
+    """LLVM's assertions and faults are SIGABRT and SIGSEGV, of a node that is stopped."""
+    pytest.importorskip("llvmlite")
+    assert run_code(ENDING) == []
