@@ -9,7 +9,8 @@
    whose steps would be longer.
 4. A step that may pass a limit, or meet or leave an elastic stop, ends at the first of
 them.
-5. A limit ends the motion: LimitReached. So does a motion that no step resolves:
+5. A step does not leap over the rates within which Coulomb friction changes its sign.
+6. A limit ends the motion: LimitReached. So does a motion that no step resolves:
 CannotStep.
 
 What a step computes is in `steps.py`; what it starts from and ends with is a `Point`.
@@ -50,6 +51,11 @@ from sst_ros.integration.methods import (
     Rosenbrock,
 )
 from sst_ros.integration.point import Drive, MethodChange, Point, Step
+from sst_ros.integration.transitions import (
+    largest_passed,
+    share_before_leap,
+    transitions_of,
+)
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque
@@ -68,6 +74,9 @@ _LAST_SLIVER = 1e-3
 """A step takes the rest of a period, too, where it is shorter than this share of the step."""
 _SHORTEST_STEP = 1e-15
 """Relative to the time: below it, the rounding of time is as long as a step."""
+_SHORTEST_IN_TRANSITION = 1e-9
+"""Relative to the time: friction that changes within less is one that jumps, and a step
+is not made shorter for it."""
 _SHORTEST_SEARCH = 1e-13
 """Relative to the time: in a shorter step no jump is looked for, it would lie within rounding."""
 _JUMP_MARGIN = 4e-16
@@ -181,6 +190,7 @@ class Stepper:
         contacts = tuple(contact_events_of(scene, geometry))
         self._events = (*ends, *contacts)
         self._ranges = ranges_of([*ends, *free_range(contacts)])
+        self._transitions = transitions_of(scene, tolerance)
         traced = derivative is None
         self.torque = AppliedTorque(self.dynamics, scene.torque_limit, traced=traced)
         self._derivative = derivative
@@ -326,7 +336,7 @@ class Stepper:
         `stops` are the times just before and after a jump that was found, where steps
         end; `steps` those that the last step was taken by.
         """
-        rejected = 0
+        rejected = leaps = 0
         while True:
             if steps.method is not at.method:
                 steps = self._steps_of(drive, at.method)
@@ -340,8 +350,20 @@ class Stepper:
             after, size, stages = steps.pair(t, h, at, drive, other)
             error = size / self._tolerance
             if size <= self._tolerance:
+                ends = at.joints, after.joints
+                passed = largest_passed(self._transitions, *ends)
+                if passed > 1.0:
+                    share = share_before_leap(self._transitions, *ends)
+                    if leaps:  # the rates are far from linear: a joint that sticks
+                        share = min(share, 0.5)
+                    if h * share > _SHORTEST_IN_TRANSITION * max(abs(t), end - t):
+                        at = at._replace(h=h * share)
+                        leaps += 1
+                        continue
                 stopped = bool(stops) and h == stops[0] - t
                 longest = _next_length(at, h, error, cut=stopped or h == left)
+                if passed > 0.0:  # the next step is not to be refused for a leap
+                    longest = min(longest, _SAFETY * h / passed)
                 looks = self._chooses and (
                     h < left or isinstance(at.method, Rosenbrock)
                 )
