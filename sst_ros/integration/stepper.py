@@ -35,7 +35,14 @@ from sst_ros.dynamics.model import (
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque, has_feedback
-from sst_ros.integration.events import all_far, first_event, may_occur
+from sst_ros.integration.events import (
+    all_far,
+    first_event,
+    largest_passed,
+    may_occur,
+    share_before_leap,
+    transitions_of,
+)
 from sst_ros.integration.function_steps import (
     FeedbackSteps,
     FunctionSteps,
@@ -51,11 +58,6 @@ from sst_ros.integration.methods import (
     Rosenbrock,
 )
 from sst_ros.integration.point import Drive, MethodChange, Point, Step
-from sst_ros.integration.transitions import (
-    largest_passed,
-    share_before_leap,
-    transitions_of,
-)
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from sst_ros import load_scene, simulate
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.integration.transitions import (
+from sst_ros.integration.events import (
     largest_passed,
     share_before_leap,
     transitions_of,
