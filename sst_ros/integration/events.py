@@ -11,13 +11,11 @@ distance of a second solution, which leaps over the same change.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
-from sst_ros.dynamics.model import CONTACT_BAND, GRAZING, Limit
-from sst_ros.scene.scene import Scene
+from sst_ros.dynamics.model import CONTACT_BAND, GRAZING, Limit, Transition
 
 Signal = Callable[[float], float]
 Joints = Callable[[float], Sequence[float]]
@@ -29,14 +27,6 @@ TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
 _REACH = 10.0
 """A joint whose rate has turned comes at most this many times as far as its rates allow."""
-_WIDTH = 2.0
-"""Of v / smoothing, that a step may pass at most. tanh has its poles at pi / 2 from the
-real axis: steps of this width converge with the order of their method."""
-_RESOLVED = 0.1
-"""Share of the tolerance that a width exceeds: the local errors of accepted steps alone
-would leap over a narrower one, and steps would shrink for ever where a joint sticks."""
-_ENTRY = 0.5
-"""Share of the width that a step which was shortened passes: rates are not linear."""
 
 
 def all_far(
@@ -129,49 +119,6 @@ def _root(signal: Signal, begin: float, end: float) -> float:
     from scipy.optimize import brentq  # takes 0.4 s, and many runs have no event
 
     return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))
-
-
-class Transition(NamedTuple):
-    """The rates of a joint within which its friction changes."""
-
-    rate: int  # place of the joint's rate among nine angles and nine rates
-    edge: float  # magnitude from which the friction is constant [rad/s]
-    width: float  # part of the range that a step may pass [rad/s]
-
-    def passed(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """Return what lies between two rates, over the width that a step may pass."""
-        low, high = sorted((begin[self.rate], end[self.rate]))
-        return (min(high, self.edge) - max(low, -self.edge)) / self.width
-
-    def share(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """Return the share of a step after which it has passed a part of the width."""
-        before, after = begin[self.rate], end[self.rate]
-        approach = max(abs(before) - self.edge, 0.0)
-        return (approach + _ENTRY * self.width) / abs(after - before)
-
-
-def transitions_of(scene: Scene, tolerance: float) -> tuple[Transition, ...]:
-    """Return the transitions of the joints of a scene.
-
-    They end where 1 - tanh(x), about 2 exp(-2 x), is below the tolerance. One that is
-    narrower than local errors is left out.
-    """
-    edge = 0.5 * math.log(max(2.0 / tolerance, 1.0))
-    if scene.friction is None or edge == 0.0:
-        return ()
-    kinds = scene.friction.gamma, scene.friction.mu, scene.friction.beta
-    return tuple(
-        Transition(
-            9 + 3 * place + leg,
-            edge * friction.smoothing,
-            _WIDTH * friction.smoothing,
-        )
-        for place, friction in enumerate(kinds)
-        if friction is not None
-        and (friction.coulomb or friction.static)
-        and _WIDTH * friction.smoothing >= _RESOLVED * tolerance
-        for leg in range(3)
-    )
 
 
 def largest_passed(

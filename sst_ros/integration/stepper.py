@@ -32,6 +32,7 @@ from sst_ros.dynamics.model import (
     free_range,
     limits_of,
     ranges_of,
+    transitions_of,
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque, has_feedback
@@ -41,7 +42,6 @@ from sst_ros.integration.events import (
     largest_passed,
     may_occur,
     share_before_leap,
-    transitions_of,
 )
 from sst_ros.integration.function_steps import (
     FeedbackSteps,

@@ -14,10 +14,10 @@ from scipy.integrate import solve_ivp
 from sst_ros import load_scene, simulate
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
+from sst_ros.dynamics.model import transitions_of
 from sst_ros.integration.events import (
     largest_passed,
     share_before_leap,
-    transitions_of,
 )
 from sst_ros.mechanism.geometry import angle_between
 from studies.estimate import CLASSES
