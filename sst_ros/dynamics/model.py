@@ -29,8 +29,6 @@ real axis: steps of this width converge with the order of their method."""
 _RESOLVED = 0.1
 """Share of the tolerance that a width exceeds: the local errors of accepted steps alone
 would leap over a narrower one, and steps would shrink for ever where a joint sticks."""
-_ENTRY = 0.5
-"""Share of the width that a step which was shortened passes: rates are not linear."""
 
 
 class JointSpring(NamedTuple):
@@ -285,17 +283,6 @@ class Transition(NamedTuple):
     rate: int  # place of the joint's rate among nine angles and nine rates
     edge: float  # magnitude from which the friction is constant [rad/s]
     width: float  # part of the range that a step may pass [rad/s]
-
-    def passed(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """Return what lies between two rates, over the width that a step may pass."""
-        low, high = sorted((begin[self.rate], end[self.rate]))
-        return (min(high, self.edge) - max(low, -self.edge)) / self.width
-
-    def share(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """Return the share of a step after which it has passed a part of the width."""
-        before, after = begin[self.rate], end[self.rate]
-        approach = max(abs(before) - self.edge, 0.0)
-        return (approach + _ENTRY * self.width) / abs(after - before)
 
 
 def transitions_of(scene: Any, tolerance: float) -> tuple[Transition, ...]:

@@ -27,6 +27,8 @@ TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
 _REACH = 10.0
 """A joint whose rate has turned comes at most this many times as far as its rates allow."""
+_ENTRY = 0.5
+"""Share of the width that a step which was shortened passes: rates are not linear."""
 
 
 def all_far(
@@ -125,7 +127,7 @@ def largest_passed(
     transitions: Sequence[Transition], begin: Sequence[float], end: Sequence[float]
 ) -> float:
     """Return the largest part of a width that a step passes; above 1 it leaps."""
-    return max((each.passed(begin, end) for each in transitions), default=0.0)
+    return max((_passed(each, begin, end) for each in transitions), default=0.0)
 
 
 def share_before_leap(
@@ -133,5 +135,20 @@ def share_before_leap(
 ) -> float:
     """Return the share of a step that leaps by which it does not."""
     return min(
-        each.share(begin, end) for each in transitions if each.passed(begin, end) > 1.0
+        _share(each, begin, end)
+        for each in transitions
+        if _passed(each, begin, end) > 1.0
     )
+
+
+def _passed(each: Transition, begin: Sequence[float], end: Sequence[float]) -> float:
+    """Return what lies between two rates, over the width that a step may pass."""
+    low, high = sorted((begin[each.rate], end[each.rate]))
+    return (min(high, each.edge) - max(low, -each.edge)) / each.width
+
+
+def _share(each: Transition, begin: Sequence[float], end: Sequence[float]) -> float:
+    """Return the share of a step after which it has passed a part of the width."""
+    before, after = begin[each.rate], end[each.rate]
+    approach = max(abs(before) - each.edge, 0.0)
+    return (approach + _ENTRY * each.width) / abs(after - before)
