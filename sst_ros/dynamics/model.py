@@ -23,6 +23,12 @@ SINGULAR_MU = 1e-6
 CONTACT_BAND = 1e-9
 # a distance below this [rad] counts as zero: closure and rounding reach 1e-15
 GRAZING = 1e-12
+_WIDTH = 2.0
+"""Of v / smoothing, that a step may pass at most. tanh has its poles at pi / 2 from the
+real axis: steps of this width converge with the order of their method."""
+_RESOLVED = 0.1
+"""Share of the tolerance that a width exceeds: the local errors of accepted steps alone
+would leap over a narrower one, and steps would shrink for ever where a joint sticks."""
 
 
 class JointSpring(NamedTuple):
@@ -270,3 +276,35 @@ def free_range(events: Sequence[Limit]) -> list[Limit]:
         event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign)
         for event in inner
     ]
+
+
+class Transition(NamedTuple):
+    """The rates of a joint within which its friction changes."""
+
+    rate: int  # place of the joint's rate among nine angles and nine rates
+    edge: float  # magnitude from which the friction is constant [rad/s]
+    width: float  # part of the range that a step may pass [rad/s]
+
+
+def transitions_of(scene: Any, tolerance: float) -> tuple[Transition, ...]:
+    """Return the transitions of the joints of a `Scene`.
+
+    They end where 1 - tanh(x), about 2 exp(-2 x), is below the tolerance. One that is
+    narrower than local errors is left out.
+    """
+    edge = 0.5 * math.log(max(2.0 / tolerance, 1.0))
+    if scene.friction is None or edge == 0.0:
+        return ()
+    kinds = scene.friction.gamma, scene.friction.mu, scene.friction.beta
+    return tuple(
+        Transition(
+            9 + 3 * place + leg,
+            edge * friction.smoothing,
+            _WIDTH * friction.smoothing,
+        )
+        for place, friction in enumerate(kinds)
+        if friction is not None
+        and (friction.coulomb or friction.static)
+        and _WIDTH * friction.smoothing >= _RESOLVED * tolerance
+        for leg in range(3)
+    )

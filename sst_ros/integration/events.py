@@ -2,6 +2,11 @@
 """Events inside a step: a joint reaches a limit, or meets or leaves an elastic stop.
 
 The force of a stop has a kink where contact begins and ends, so steps end there.
+
+Friction of the form tanh(v / smoothing) changes its sign within a few times the
+smoothing rate. A step that is much longer meets the change with none of its stages, or
+with one by chance. Its embedded error estimate is then chance, too, and so is the
+distance of a second solution, which leaps over the same change.
 """
 
 from __future__ import annotations
@@ -10,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
-from sst_ros.dynamics.model import CONTACT_BAND, GRAZING, Limit
+from sst_ros.dynamics.model import CONTACT_BAND, GRAZING, Limit, Transition
 
 Signal = Callable[[float], float]
 Joints = Callable[[float], Sequence[float]]
@@ -22,6 +27,8 @@ TIME_TOLERANCE = 1e-15
 """Accuracy of a located time [s], above the rounding of the time itself."""
 _REACH = 10.0
 """Most that a joint whose rate has turned goes, over what its rates allow."""
+_ENTRY = 0.5
+"""Share of the width that a step which was shortened passes: rates are not linear."""
 
 
 def all_far(
@@ -114,3 +121,34 @@ def _root(signal: Signal, begin: float, end: float) -> float:
     from scipy.optimize import brentq  # takes 0.4 s, and many runs have no event
 
     return float(brentq(signal, begin, end, xtol=TIME_TOLERANCE, rtol=1e-15))
+
+
+def largest_passed(
+    transitions: Sequence[Transition], begin: Sequence[float], end: Sequence[float]
+) -> float:
+    """Return the largest part of a width that a step passes; above 1 it leaps."""
+    return max((_passed(each, begin, end) for each in transitions), default=0.0)
+
+
+def share_before_leap(
+    transitions: Sequence[Transition], begin: Sequence[float], end: Sequence[float]
+) -> float:
+    """Return the share of a step that leaps by which it does not."""
+    return min(
+        _share(each, begin, end)
+        for each in transitions
+        if _passed(each, begin, end) > 1.0
+    )
+
+
+def _passed(each: Transition, begin: Sequence[float], end: Sequence[float]) -> float:
+    """Return what lies between two rates, over the width that a step may pass."""
+    low, high = sorted((begin[each.rate], end[each.rate]))
+    return (min(high, each.edge) - max(low, -each.edge)) / each.width
+
+
+def _share(each: Transition, begin: Sequence[float], end: Sequence[float]) -> float:
+    """Return the share of a step after which it has passed a part of the width."""
+    before, after = begin[each.rate], end[each.rate]
+    approach = max(abs(before) - each.edge, 0.0)
+    return (approach + _ENTRY * each.width) / abs(after - before)

@@ -9,7 +9,8 @@
    whose steps would be longer.
 4. A step that may pass a limit, or meet or leave an elastic stop, ends at the first of
 them.
-5. A limit ends the motion: LimitReached. So does a motion that no step resolves:
+5. A step does not leap over the rates within which Coulomb friction changes its sign.
+6. A limit ends the motion: LimitReached. So does a motion that no step resolves:
 CannotStep.
 
 What a step computes is in `steps.py`; what it starts from and ends with is a `Point`.
@@ -31,10 +32,17 @@ from sst_ros.dynamics.model import (
     free_range,
     limits_of,
     ranges_of,
+    transitions_of,
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque, has_feedback
-from sst_ros.integration.events import all_far, first_event, may_occur
+from sst_ros.integration.events import (
+    all_far,
+    first_event,
+    largest_passed,
+    may_occur,
+    share_before_leap,
+)
 from sst_ros.integration.function_steps import (
     FeedbackSteps,
     FunctionSteps,
@@ -71,6 +79,9 @@ _LAST_SLIVER = 1e-3
 """A step also takes the rest of a period that is shorter than this share of it."""
 _SHORTEST_STEP = 1e-15
 """Relative to the time: below it, the rounding of time is as long as a step."""
+_SHORTEST_IN_TRANSITION = 1e-9
+"""Relative to the time: friction that changes within less is one that jumps, and a step
+is not made shorter for it."""
 _SHORTEST_SEARCH = 1e-13
 """Relative to the time: in a shorter step no jump is looked for.
 
@@ -196,6 +207,7 @@ class Stepper:
         contacts = tuple(contact_events_of(scene, geometry))
         self._events = (*ends, *contacts)
         self._ranges = ranges_of([*ends, *free_range(contacts)])
+        self._transitions = transitions_of(scene, tolerance)
         traced = derivative is None
         self.torque = AppliedTorque(self.dynamics, scene.torque_limit, traced=traced)
         self._derivative = derivative
@@ -342,7 +354,7 @@ class Stepper:
         `stops` are the times just before and after a jump that was found, where steps
         end; `steps` those that the last step was taken by.
         """
-        rejected = 0
+        rejected = leaps = 0
         while True:
             if steps.method is not at.method:
                 steps = self._steps_of(drive, at.method)
@@ -356,8 +368,20 @@ class Stepper:
             after, size, stages = steps.pair(t, h, at, drive, other)
             error = size / self._tolerance
             if size <= self._tolerance:
+                ends = at.joints, after.joints
+                passed = largest_passed(self._transitions, *ends)
+                if passed > 1.0:
+                    share = share_before_leap(self._transitions, *ends)
+                    if leaps:  # the rates are far from linear: a joint that sticks
+                        share = min(share, 0.5)
+                    if h * share > _SHORTEST_IN_TRANSITION * max(abs(t), end - t):
+                        at = at._replace(h=h * share)
+                        leaps += 1
+                        continue
                 stopped = bool(stops) and h == stops[0] - t
                 longest = _next_length(at, h, error, cut=stopped or h == left)
+                if passed > 0.0:  # the next step is not to be refused for a leap
+                    longest = min(longest, _SAFETY * h / passed)
                 looks = self._chooses and (
                     h < left or isinstance(at.method, Rosenbrock)
                 )
