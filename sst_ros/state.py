@@ -116,8 +116,9 @@ else:
 
         Python 3.10 and 3.11 hold a lock of the property meanwhile, for all instances of
         the class. A process forked at that moment would wait for it without end, as the
-        thread that holds it exists only in the parent. Threads that read the property at
-        once compute it more than once, and all receive the result of the first to end.
+        thread that holds it exists only in the parent. Threads that read the property
+        at once compute it more than once, and all receive the result of the first to
+        end.
         """
 
         def __get__(self, instance: Any, owner: type | None = None) -> Any:

@@ -276,7 +276,7 @@ def test_a_fault_in_one_place_hides_none_in_another_and_lines_rise():
     assert all(told[fault.key] in lines[fault.line - 1] for fault in problems)
 
 
-def test_what_contradicts_itself_across_sections_is_checked_once_each_of_them_is_valid():
+def test_sections_that_contradict_each_other_are_refused():
     link = "  - {mass: 1, centre: [0, 0, 9], inertia: {xx: 90, yy: 90, zz: 9}}"
     keys = [problem.key for problem in refusal(BODIES.replace(LINK, link)).problems]
     assert keys == [f"intermediate_links[{k}].centre" for k in range(3)]

@@ -144,7 +144,7 @@ def test_samples_are_even_and_accurate_and_the_motion_does_not_depend_on_them(
     np.testing.assert_allclose(few.gamma, truth.gamma[::50], rtol=0, atol=1e-9)
 
 
-def test_samples_are_even_up_to_a_limit_and_the_periods_of_a_control_unless_a_number_is_given():
+def test_samples_are_even_or_the_periods_of_a_control():
     stopped = simulate(EXAMPLE2, (5.0, 0.0, 0.0), 0.4)
     assert (
         stopped.t[:-1].tolist()

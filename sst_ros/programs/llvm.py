@@ -655,7 +655,7 @@ atexit.register(_ENGINE_LOCK.acquire)
 def _close(
     engine: Any, lock: Any = _ENGINE_LOCK, ends: Callable[[], bool] = sys.is_finalizing
 ) -> None:
-    """Free an engine, but not while the process ends: then globals have gone already."""
+    """Free an engine, but not while the process ends: its globals have gone then."""
     if not ends():
         with lock:
             engine.close()

@@ -102,7 +102,7 @@ def _choices(of):
     )
 
 
-def test_the_readme_is_short_and_begins_with_the_mechanism_and_the_two_commands_that_do_all():
+def test_the_readme_is_short_and_begins_with_the_mechanism():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(text.splitlines()) < 135
     before, picture, after = text.partition("docs/mechanism.png")

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes that compile under odd conditions: cold threads, forks meanwhile, no home."""
+"""Processes that compile in cold threads, during forks, and without a home."""
 
 import os
 import subprocess
 import sys
 
 import pytest
-from programs import python
 
 from sst_ros import simulate
 
@@ -179,6 +178,6 @@ assert begun.wait(60.0)
 
 
 def test_a_process_that_ends_while_a_thread_compiles_ends_in_order():
-    """LLVM's assertions and faults are SIGABRT and SIGSEGV, of a node that is stopped."""
+    """LLVM's assertions and faults ended a stopped node by SIGABRT and SIGSEGV."""
     pytest.importorskip("llvmlite")
     assert run_code(ENDING) == []

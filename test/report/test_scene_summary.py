@@ -89,7 +89,7 @@ def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
     assert {name for name, adds in added.items() if not adds} == folded
 
 
-def test_a_plain_scene_has_no_angle_and_no_root_and_viscous_friction_adds_few_products():
+def test_a_plain_scene_has_no_angle_and_no_root():
     plain = ODE(Dynamics.of(EXAMPLE2)).program.operations
     assert set(plain) == {"add", "sub", "mul", "div"}
     scene = replace(EXAMPLE2, friction=JointFriction(gamma=Friction(viscous=0.1)))

@@ -240,7 +240,7 @@ def test_a_run_that_waits_for_nothing_does_not_begin_between_a_reset_and_a_stop(
     assert bench.ask("halt").success and len(bench.output.samples) == samples
 
 
-def test_a_fault_among_ticks_done_at_once_is_told_at_its_tick_and_ends_a_run_with_a_duration():
+def test_a_fault_among_ticks_done_at_once_ends_a_run():
     given = {"publish_rate": 10, "wait_for_command": True, "duration": 10.0}
     bench = run_here(HEAVY, commands=[HIT], **given)
     loop, output = bench.loop, bench.output

@@ -35,7 +35,7 @@ def rows():
     return np.array([list(map(float, line.split(","))) for line in lines])
 
 
-def test_the_page_has_the_statement_of_its_generator_and_no_number_of_the_scene_is_missing():
+def test_the_page_has_the_statement_of_its_generator():
     text = (DOCS / "benchmark_problem.md").read_text(encoding="utf-8")
     statement = page(load(NAME)).partition("## Reference and results")[0]
     assert len(statement) > 2000 and text.startswith(statement)
