@@ -34,10 +34,7 @@ goal = np.array([[*at.gamma, *at.gamma_dot] for at in grid])
 
 
 def predict():
-    """Return a function of state and plan.
-
-    Its values are the joints of each stage, and what changes them.
-    """
+    """Return a function of state and plan: joints of each stage, and derivatives."""
     model = equations(scene, "casadi", outputs=["derivative", "joints"])
     y, torque = ca.SX.sym("y", 7), ca.SX.sym("torque", 3)
     slope, total = model.derivative(y, torque), 0.0
