@@ -243,8 +243,9 @@ def finite_vector(value: Any) -> Vector3 | None:
         plain = type(value) is np.ndarray and value.dtype.kind in "fiu"
         if not plain and find_lost_meaning([value, first, second, third]):
             return None
-        numbers = float(first), float(second), float(third)
-        return numbers if all(map(math.isfinite, numbers)) else None
+        if not all(map(math.isfinite, (first, second, third))):  # refuses texts
+            return None
+        return float(first), float(second), float(third)
     except (TypeError, ValueError, OverflowError):
         return None
 

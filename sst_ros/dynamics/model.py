@@ -28,7 +28,8 @@ _WIDTH = 2.0
 real axis: steps of this width converge with the order of their method."""
 _RESOLVED = 0.1
 """Share of the tolerance that a width exceeds: the local errors of accepted steps alone
-would leap over a narrower one, and steps would shrink for ever where a joint sticks."""
+would leap over a narrower one, and steps would shrink without end where a joint
+sticks."""
 
 
 class JointSpring(NamedTuple):

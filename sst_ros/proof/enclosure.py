@@ -676,11 +676,13 @@ def _check_tube(step: Advance, tolerance: float) -> Advance:
     Refused: the error may leave its tube.
     """
     s = between(0, step.length)
-    reached = entries(step.begin.spread(step.flow(s)) + step.w)
+    spread = step.begin.spread(step.flow(s))
+    reached = entries(spread + step.w)
     pairs = list(zip(reached, step.tube, strict=True))[: step.begin.moving]
     if all(x.is_finite() and x < e.rad() for x, e in pairs):
         return step._replace(tube=[arb(0, x.upper()) for x in reached])
-    widest = max(map(float, entries(step.begin.spread())[: step.begin.moving]))
+    # Numbers of ranges do not move, but what they move counts from the first step on.
+    widest = max(map(float, entries(spread)[: step.begin.moving]))
     grows = max(map(float, entries(step.w)))
     is_slow = grows < 10.0 * tolerance + REMAINDER_GROWTH * widest
     wider = None

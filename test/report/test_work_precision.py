@@ -56,7 +56,7 @@ def study_quickly(studied, longest_s):
 
 
 @pytest.fixture(scope="module")
-def short(plain_python):
+def short():
     """Study of 0.2 s of Example 2."""
     return study_quickly(SHORT, 0.02)
 
