@@ -93,6 +93,7 @@ def measured(state, noise):
 
 figure, axes = plt.subplots(2, 1, figsize=(6.5, 6.0), sharex=True, layout="constrained")
 seconds = []
+errors = {}
 settings = sst_ros.ControllerSettings(mode="computed_torque", bandwidth=60.0)
 for word, size in (("no noise", 0.0), ("noise", 1.0)):
     predictive, computed = Predictive(), Controller(scene, motion, settings, PERIOD)
@@ -105,9 +106,9 @@ for word, size in (("no noise", 0.0), ("noise", 1.0)):
 
         run = sst_ros.simulate(scene, control, DURATION, control_period=PERIOD)
         error = np.abs(run.gamma - goal[: len(run.t), :3]).max(axis=1)
+        errors[name, word] = error.max()
         axes[0].semilogy(run.t, error, label=f"{name}, {word}: {error.max():.1e} rad")
-        if size == 0.0:
-            axes[1].plot(run.t, run.torque[:, 0], label=name)
+        axes[1].plot(run.t, run.torque[:, 0], lw=0.8, label=f"{name}, {word}")
     seconds += predictive.seconds
 median, slow = 1e3 * np.percentile(seconds, [50, 99])
 print(f"a period takes {median:.2f} ms, 99 % of them less than {slow:.2f} ms")
@@ -115,6 +116,5 @@ axes[0].set(ylabel="tracking error, largest of γ [rad]", ylim=(1e-6, 30.0))
 axes[1].hlines([-LIMIT, LIMIT], 0.0, DURATION, "k", "dashed", lw=0.5)
 axes[1].set(xlabel="time t [s]", ylabel="torque of actuator 1 [N m]")
 for axis in axes:
-    axis.grid(alpha=0.3)
     axis.legend(fontsize=8, loc="upper right")
 figure.savefig("mpc.png")

@@ -16,7 +16,6 @@ import sst_ros
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 FOUND = {
-    "collocation": "methods/collocation",
     "monte": "howto/batch",
     "carlo": "howto/batch",
     "gravity": "howto/follow",
