@@ -322,8 +322,8 @@ def fill_readme(text: str, results: dict[str, Any]) -> str:
     def cell(row: dict[str, Any] | None) -> str:
         if row is None or row["ms"] is None:
             return "-"
-        time, ratio = (float(f"{row[key]:.2g}") for key in ("ms", "over_ours"))
-        return f"{time:g} ms" + ("" if ratio == 1.0 else f" ({ratio:,.0f} x)")
+        time, ratio = float(f"{row['ms']:.2g}"), row["over_ours"]
+        return f"{time:g} ms" + ("" if ratio == 1.0 else f" ({_round(ratio)} x)")
 
     date = results["machine"]["date"][:10]
     lines = [f"| Example 2, one second, {date} | to 1e-6 rad | to 1e-9 rad |"]

@@ -14,7 +14,7 @@ import contextlib
 import math
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -62,6 +62,12 @@ class Reference:
     gamma: Vector3  # of the actuators [rad]
     gamma_dot: Vector3  # [rad/s]
     gamma_ddot: Vector3  # [rad/s^2]
+
+
+REFERENCE_SIZES = {
+    part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)
+}
+"""Numbers of each part of a `Reference`, as inputs of a traced control law."""
 
 
 class ReferenceMotion(Explained):

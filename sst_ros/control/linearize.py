@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -184,10 +184,11 @@ def linearize(
     by_star = None if by_gamma else trace_derivatives(given, (), by_torque=True)
     now = np.array((*quaternion, *rate, *(lagged if given.lags else ())))
     try:
-        _, from_x, a, b, slope = _differentiate(dynamics, by_star, now, acting)
+        begin = _differentiate(dynamics, by_star, now, acting)
     except (ArithmeticError, ValueError):
         raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
-    at_equilibrium = np.abs(slope).max() <= _REST * np.abs(a).max()
+    a, b = begin.A, begin.B
+    at_equilibrium = np.abs(begin.slope).max() <= _REST * np.abs(a).max()
     if dt is not None:
         dt = float(dt)
         with np.errstate(all="ignore"):  # of steps that are too long
@@ -207,8 +208,9 @@ def linearize(
             lasts = _find_limit(given, dynamics, flow, acting, dt)
         refuse_unless("linearize", ("dt", dt, not lasts, lasts))
         assert flow is not None
-        to_x = _differentiate(dynamics, by_star, flow.states[-1], acting)[0]
-        a, b = to_x @ flow.by_start @ from_x, to_x @ flow.by_torque
+        to_x = _differentiate(dynamics, by_star, flow.states[-1], acting).x_by_y
+        a = to_x @ flow.by_start @ begin.y_by_x
+        b = to_x @ flow.by_torque
     lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []
     states = (*COORDINATES[coordinates], *lag)
     return LinearModel(a, b, states, dt, bool(at_equilibrium))
@@ -234,16 +236,24 @@ def _find_limit(
     return ""
 
 
+class _Derivatives(NamedTuple):
+    """Derivatives at a state y, of n + 1 numbers, and the continuous model there."""
+
+    x_by_y: Array  # of the coordinates, shape (n, n + 1)
+    y_by_x: Array  # of the state's own changes, shape (n + 1, n)
+    A: Array  # shape (n, n)
+    B: Array  # shape (n, 3)
+    slope: Array  # by time, of x, or of y where x are deviations
+
+
 def _differentiate(
     dynamics: Dynamics,
     by_star: Callable[..., Sequence[float]] | None,
     y: Array,
     torque: Sequence[float],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return D = dx/dy, R of the state's own changes (D R = 1), A, B, and the slope.
+) -> _Derivatives:
+    """Differentiate the dynamics at a state.
 
-    A and B are those of the continuous model; the slope is the derivative of x, or of y
-    where x are deviations. Shapes are (n, n + 1), (n + 1, n), (n, n), (n, 3), (n,).
     `by_star` gives the slope of y and its derivatives for coordinates of the star; None
     stands for those of gamma.
     """
@@ -260,11 +270,11 @@ def _differentiate(
         slope = np.split(found[0], 2)[1]
         from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
         a = x_dot[:, :size] @ from_gamma
-        return x[:, :size], from_gamma, a, x_dot[:, size:], slope
+        return _Derivatives(x[:, :size], from_gamma, a, x_dot[:, size:], slope)
     rows = np.array(by_star(*y.tolist(), *torque)).reshape(size + 4, size)
     if not np.isfinite(rows).all():
         raise ArithmeticError("the derivatives are not finite")
     slopes = to_star @ rows[1:].T
     a = slopes[:, :size] @ from_star
     a[:3, :3] = np.cross(y[4:7], np.eye(3))  # in the turning frame d' = dW - W x d
-    return to_star, from_star, a, slopes[:, size:], rows[0]
+    return _Derivatives(to_star, from_star, a, slopes[:, size:], rows[0])

@@ -377,7 +377,9 @@ def _limited_joints(
             limits["lower"] = lower
             limits["upper"] = upper
         limits["effort"] = torque_limit if driven else 0.0
-        limits["velocity"] = (driven and rate_limit) or highest_rate
+        limits["velocity"] = highest_rate
+        if driven and rate_limit:
+            limits["velocity"] = rate_limit
         yield joint, limits, getattr(scene.friction, kind, None)
 
 

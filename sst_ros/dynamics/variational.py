@@ -151,13 +151,13 @@ class VariationalEquations:
         values: Array | None = None,
         *,
         scene: Scene | None = None,
-        most: int = MOST_MOTION_EVALUATIONS,
     ) -> tuple[Array, Array] | None:
         """Integrate from a state, (m,), and its derivatives, (m, k), to times t [s].
 
         The last of the k numbers are the parameters, with these values, and those of
         the torques; of others the motion depends by its state alone. Returns as `run`,
-        None where there is no motion, or where it needs more than `most` evaluations.
+        None where there is no motion, or where it needs more evaluations than
+        MOST_MOTION_EVALUATIONS.
         """
         from scipy.integrate import solve_ivp  # takes 0.3 s, which few runs need
 
@@ -171,7 +171,7 @@ class VariationalEquations:
         y = np.concatenate([state, slopes.ravel()])
         first = slopes.shape[1] - len(numbers)  # column of the first parameter
         limit = scene.torque_limit
-        evaluations = iter(range(most))
+        evaluations = iter(range(MOST_MOTION_EVALUATIONS))
         derivatives = trace_derivatives(self.scene, self.names, self._by_torque)
         blocks = np.cumsum([1, size, 3 * self._by_torque])
 

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -553,3 +554,9 @@ def _by_element(function: Callable[..., float]) -> Callable[..., Any]:
 
     of_objects = np.frompyfunc(of_floats, 2 if function is math.atan2 else 1, 1)
     return lambda *arrays: np.asarray(of_objects(*arrays), dtype=float)
+
+
+def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
+    """Divide numbers into tuples by name, as inputs of a program come."""
+    rest = iter(numbers)
+    return {name: tuple(islice(rest, size)) for name, size in sizes.items()}

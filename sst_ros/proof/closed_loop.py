@@ -12,14 +12,12 @@ directions, so that the feedback of later ticks takes them back.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
-from itertools import islice
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.control.actuator_space import Reference
+from sst_ros.control.actuator_space import REFERENCE_SIZES, Reference
 from sst_ros.control.controller import Controller
 from sst_ros.dynamics import kernel
 from sst_ros.mechanism.generic_math import (
@@ -31,7 +29,7 @@ from sst_ros.mechanism.generic_math import (
     quaternion_product,
     triple,
 )
-from sst_ros.programs.expression import trace
+from sst_ros.programs.expression import divide, trace
 from sst_ros.proof.balls import (
     arb,
     arb_mat,
@@ -57,22 +55,20 @@ SMALL_TANGENT = 0.25  # largest square of the tangent of half an error on SO(3)
 LOST = "the orientation at the measured angles is not proven to be the only one near"
 FAR = "the error on SO(3) may exceed what the series of its logarithm is proven for"
 
-_DESIRED = {
-    part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)
+_GIVEN = {
+    "guess": 4,
+    **REFERENCE_SIZES,
+    "feedforward": 3,
+    "held": 3,
+    "limit": 1,
+    "rest": 1,
 }
-_GIVEN = {"guess": 4, **_DESIRED, "feedforward": 3, "held": 3, "limit": 1, "rest": 1}
 """Sizes of what a tick is given as exact numbers: reference, its torques, limit."""
 
 
 def name_parts(sizes: Mapping[str, int]) -> list[str]:
     """Return names of the numbers of some parts."""
     return [f"{name}_{k}" for name, size in sizes.items() for k in range(size)]
-
-
-def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
-    """Divide numbers into tuples by name."""
-    rest = iter(numbers)
-    return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
 
 
 def turn_near_zero(quaternion: Quadruple, rest: Any) -> Triple:
@@ -175,7 +171,7 @@ class SampledLoop:
         scheme = self._controller.law_with(torque, accelerate)
         limit = None if scheme.limit is None else of["limit"][0]
         scheme = scheme._replace(limit=limit, turn=turn)
-        desired = Reference(**{name: of[name] for name in _DESIRED})
+        desired = Reference(**{name: of[name] for name in REFERENCE_SIZES})
         torques = of["feedforward"], of["held"]
         command = scheme.answer(desired, torques, *measured, observed, of["integral"])
         error = axpy(1.0, desired.gamma, -1.0, gamma)
@@ -249,7 +245,7 @@ class SampledLoop:
             here, spread, box, noise
         )
         numbers: dict[str, Sequence[float]] = {"guess": guess}
-        numbers |= {name: getattr(desired, name) for name in _DESIRED}
+        numbers |= {name: getattr(desired, name) for name in REFERENCE_SIZES}
         if self._settings.space == "so3" and self._settings.mode == "computed_torque":
             numbers["quaternion"] = self._alike(guess, turn_box, desired.quaternion)
         numbers |= {"feedforward": now, "held": held, "limit": (self._limit or 0.0,)}

@@ -986,15 +986,3 @@ class ProvenSteps:
                     line = line._replace(tube=why.wider)
             h *= 0.25
         raise kink
-
-
-def enclose(
-    f: Function,
-    jacobian: Function,
-    here: Region,
-    end: float,
-    tolerance: float,
-    order: int,
-) -> Iterator[Advance]:
-    """Yield the steps of a `ProvenSteps`."""
-    yield from ProvenSteps(f, jacobian, here, end, tolerance, order)

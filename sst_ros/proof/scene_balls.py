@@ -29,7 +29,6 @@ from sst_ros.scene.schema import (
     Section,
     build_unchecked,
     converted_of,
-    key_of,
     leaves,
     rebuild,
     texts_of,
@@ -557,8 +556,3 @@ def _depend_on_first(program: Program, count: int) -> list[bool]:
     for _, operands in program.steps:
         depends.append(any(depends[x] for x in operands if isinstance(x, int)))
     return [isinstance(x, int) and depends[x] for x in program.outputs]
-
-
-def name_ranges(places: Sequence[Place]) -> str:
-    """Name the numbers of ranges."""
-    return ", ".join(map(key_of, places))

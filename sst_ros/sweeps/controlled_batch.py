@@ -11,16 +11,19 @@ is called before the steps of a period, in which the torques are held.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
-from itertools import islice
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.control import law
-from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
+from sst_ros.control.actuator_space import (
+    REFERENCE_SIZES,
+    ActuatorSpaceMap,
+    Reference,
+    ReferenceMotion,
+)
 from sst_ros.control.controller import SETTLING_BAND, Controller
 from sst_ros.dynamics import kernel
 from sst_ros.errors import refuse_unless
@@ -29,7 +32,7 @@ from sst_ros.integration.batch_step import Block, ColumnStep, advance_blocks, fi
 from sst_ros.mechanism.generic_math import axpy, cos, dot3, log, positive, select, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.programs.columns import ColumnFunction, compile_columns
-from sst_ros.programs.expression import Expression, trace
+from sst_ros.programs.expression import Expression, divide, trace
 from sst_ros.state import cached_property
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
@@ -39,11 +42,7 @@ CONTROL_NEWTON_STEPS = 5
 From one sample to the next it is small.
 """
 
-_DESIRED = {
-    part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)
-}
-
-REFERENCES = {"first": 1, **_DESIRED, "feedforward": 3, "held": 3}
+REFERENCES = {"first": 1, **REFERENCE_SIZES, "feedforward": 3, "held": 3}
 """Sizes of a sample's inputs: whether it is the first, the reference, its torques."""
 
 GAINS = {
@@ -59,12 +58,6 @@ GAINS = {
 
 _NOISE = 6
 """Normal numbers that a sample takes: of three angles and three rates."""
-
-
-def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
-    """Divide numbers into tuples by name, of the sizes given."""
-    rest = iter(numbers)
-    return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
 
 
 # Normal noise from a counter: number c of row i depends on the seed, i and c alone. The
@@ -266,7 +259,7 @@ class ControlledBatch:
             carriages = space.carriages(gamma)
             for _ in range(CONTROL_NEWTON_STEPS):
                 observed = space.newton_step(*observed, *carriages)[:4]
-        desired = Reference(**{name: given[name] for name in _DESIRED})
+        desired = Reference(**{name: given[name] for name in REFERENCE_SIZES})
         limit = gains["limit"][0] if self._limited else None
         numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
 
@@ -390,7 +383,9 @@ class ControlledBatch:
         for k in range(self.samples + 1):
             time = k * round(self._control.period * 1e9) / 1e9
             at, *torques = self._controller.desire(time)
-            desired = (number for name in _DESIRED for number in getattr(at, name))
+            desired = (
+                number for name in REFERENCE_SIZES for number in getattr(at, name)
+            )
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)
 

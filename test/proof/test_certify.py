@@ -135,7 +135,7 @@ def oscillator(radius=0.0):
 
 
 def last(f, jacobian, box, end, tolerance=1e-20, order=24):
-    *_, step = enclosure.enclose(f, jacobian, box, end, tolerance, order)
+    *_, step = enclosure.ProvenSteps(f, jacobian, box, end, tolerance, order)
     return step
 
 
