@@ -233,22 +233,29 @@ def test_gains_are_set_while_it_runs_or_refused_with_the_reason(
 
     def gains():
         """Stiffness and damping of gamma_1: the feedback is linear in the errors."""
-        begin = len(errors) + 50
-        observer.until(lambda: len(errors) >= begin + 50, "samples")
-        rows = [(e.position[0], e.velocity[0], e.effort[0]) for e in errors[begin:]]
+        rows = [(e.position[0], e.velocity[0], e.effort[0]) for e in errors[-50:]]
         *columns, torques = np.transpose(rows)
         return np.linalg.lstsq(np.transpose(columns), torques, rcond=None)[0]
 
-    before = gains()
+    def wait_for_gains(stiffness, damping):
+        """Samples from before a change may wait here: as many as the queue takes."""
+        expected = (stiffness, damping)
+        observer.until(
+            lambda: np.allclose(gains(), expected, rtol=1e-6, atol=0.0),
+            f"samples with the gains {expected}",
+        )
+
+    observer.until(lambda: len(errors) >= 100, "samples")
+    stiffness, damping = gains()
     assert put("bandwidth", 40.0) == (True, "")
-    np.testing.assert_allclose(gains(), before * (4.0, 2.0), rtol=1e-6)
+    wait_for_gains(4.0 * stiffness, 2.0 * damping)
     successful, reason = put("integral_rate", 500.0)
     assert not successful and "integral_rate = 500.0: must be < 80 1/s" in reason
     for name, value in (("bandwidth", -1.0), ("stiffness", [1.0]), ("mode", "pd")):
         successful, reason = put(name, value)
         assert not successful and reason, name
     assert put("stiffness", [5.0, 6.0, 7.0])[0] and put("damping", [0.5] * 3)[0]
-    np.testing.assert_allclose(gains(), (5.0, 0.5), rtol=1e-6)
+    wait_for_gains(5.0, 0.5)
     assert controller.poll() is None
     # The joints that it does not name have stayed where they were.
     assert np.abs(np.subtract(reference[-1].position[1:], HOME[1:])).max() < 1e-12
