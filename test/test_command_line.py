@@ -63,7 +63,7 @@ def test_an_interrupt_while_modules_are_imported_ends_in_silence():
     assert done.stdout == done.stderr == ""
 
 
-def test_an_interrupt_once_the_command_has_ended_makes_no_traceback():
+def test_an_interrupt_after_the_command_makes_no_traceback():
     program = """if True:
         import atexit, os, signal, sys
         from sst_ros.__main__ import main
@@ -79,7 +79,7 @@ def test_an_interrupt_once_the_command_has_ended_makes_no_traceback():
     assert "example2" in done.stdout and done.stderr == ""
 
 
-def test_a_second_interrupt_while_the_first_is_reported_makes_no_traceback():
+def test_a_second_interrupt_at_once_makes_no_traceback():
     program = """if True:
         import os, signal, sys
         from sst_ros.__main__ import main
@@ -226,7 +226,7 @@ BUG = "internal error, please report it with the output of --debug: "
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_what_goes_wrong_is_one_line_and_a_traceback_only_on_demand(
+def test_a_failure_is_one_line_and_a_traceback_only_on_demand(
     error, status, said, monkeypatch, capsys
 ):
     def fail(options):
@@ -324,7 +324,7 @@ def test_what_needs_an_extra_says_which(line, modules, tmp_path):
         ("recorder", "rclpy is not installed: source a ROS 2 installation"),
     ],
 )
-def test_beside_a_ros_installation_the_package_of_apt_or_pip_is_named(line, how):
+def test_beside_ros_the_package_of_apt_or_pip_is_named(line, how):
     """Of a workspace there, `pip install sst_ros` would be a second one."""
     program = BLOCKED.format(names=OPTIONAL, commands=[line.split()])
     said = python(program, status=1, env={**os.environ, "ROS_DISTRO": "kilted"}).stderr

@@ -105,7 +105,7 @@ def test_no_import_cycle():
 
 
 @pytest.mark.parametrize("name", sorted({*FILES} - {"sst_ros.state"}))
-def test_no_property_holds_a_lock_that_a_forked_process_would_wait_for(name):
+def test_no_property_holds_a_lock_that_a_fork_waits_for(name):
     """`functools.cached_property` does in Python 3.10 and 3.11; see `sst_ros.state`."""
     for node in ast.walk(ast.parse(FILES[name].read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module == "functools":
@@ -127,6 +127,22 @@ def test_every_test_file_has_a_name_of_its_own():
     # names.
     names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
     assert sorted(names) == sorted(set(names))
+
+
+LONGEST_TEST_NAME = 60
+"""Characters: with the name of its file a test fits on a line of a terminal."""
+
+
+def test_names_of_tests_are_short():
+    long_names = [
+        node.name
+        for path in Path(__file__).parent.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef)
+        and node.name.startswith("test_")
+        and len(node.name) > LONGEST_TEST_NAME
+    ]
+    assert long_names == []
 
 
 @pytest.mark.parametrize("name", FILES)

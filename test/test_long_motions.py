@@ -28,7 +28,7 @@ def test_no_warning_of_a_motion_that_only_has_to_run_again():
     assert motion.evaluations > 100_000  # where a hopeless motion is warned of
 
 
-def test_the_energy_residual_of_a_damped_motion_is_the_error_of_its_work():
+def test_a_damped_motions_energy_residual_is_its_works_error():
     scene = load("swing").with_values({"friction.gamma.viscous": 0.6})
 
     def drive(t):

@@ -113,7 +113,7 @@ def test_the_page_names_the_extra_that_it_needs(hidden, words):
     ), said
 
 
-def test_beside_ros_the_package_of_pip_that_brings_a_module_is_named(monkeypatch):
+def test_beside_ros_the_package_of_pip_with_a_module_is_named(monkeypatch):
     monkeypatch.setenv("ROS_DISTRO", "kilted")
     for module in ("trimesh", "viser", "websockets"):
         said = explanation(ModuleNotFoundError(name=module))

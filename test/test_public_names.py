@@ -36,7 +36,7 @@ sst_ros.nothing
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_name_has_a_docstring_and_one_entry_in_the_reference(name):
+def test_each_name_has_a_docstring_and_one_entry_in_reference(name):
     assert inspect.getdoc(getattr(sst_ros, name))
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES.glob("*.md"))
     entries = re.findall(rf"^\.\. auto\w+:: sst_ros\.{name}$", text, re.M)

@@ -42,7 +42,7 @@ def test_the_examples_of_the_paper_are_shipped():
 
 
 @every_scene
-def test_a_shipped_scene_is_called_like_its_file_and_survives_a_dump(name):
+def test_a_shipped_scene_has_its_files_name_and_survives_a_dump(name):
     scene = load(name)
     assert scene.name == name
     assert scene == load(FOLDER / f"{name}.yaml") == read(Scene, dump(scene), "dump")

@@ -168,9 +168,7 @@ BODIES = SOURCE[: SOURCE.index("provenance:")]
         ("provenance:\n  ' star-mass ': guessed", "provenance.star-mass", 1),
     ],
 )
-def test_a_key_that_no_line_has_is_told_with_the_line_of_the_deepest_part_of_it(
-    section, key, line
-):
+def test_a_key_without_a_line_has_that_of_its_deepest_part(section, key, line):
     (problem,) = refusal(BODIES + section).problems
     assert (problem.key, problem.line) == (key, len(BODIES.splitlines()) + line)
 
@@ -251,7 +249,7 @@ def test_a_section_is_refused(section, message):
     assert len(BODIES.splitlines()) < problem.line <= len(lines)
 
 
-def test_a_fault_in_one_place_hides_none_in_another_and_lines_rise():
+def test_a_fault_hides_no_other_and_their_lines_rise():
     source = BODIES.replace("radius: 0.35 ", "radius: wide ").replace(
         "duration: 1 ", "time: 1 "
     )

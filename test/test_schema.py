@@ -121,7 +121,7 @@ def test_sections_built_in_python_are_held_to_the_same_rules(build, message):
         build()
 
 
-def test_what_has_no_effect_and_what_contradicts_itself_are_told_at_once():
+def test_no_effect_and_contradictions_are_told_at_once():
     with pytest.raises(InputError) as caught:
         Star(
             alpha_deg=[120, 120, 121],

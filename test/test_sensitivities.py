@@ -167,7 +167,7 @@ def turned_by(scene, direction, size):
 
 
 @pytest.mark.parametrize("at_stops", [False, True])
-def test_sensitivities_by_the_geometry_are_the_limit_of_differences(at_stops):
+def test_sensitivities_by_geometry_are_the_limit_of_differences(at_stops):
     """At fixed initial angles and rates, so that the start moves, and the stops with
     the arcs.
     """

@@ -47,7 +47,7 @@ def test_a_name_a_path_a_dict_and_a_scene_are_the_same(tmp_path):
     assert plain({"a": np.float64(1.0)}) == {"a": 1.0}
 
 
-def test_the_run_of_simulate_with_a_control_period_is_that_of_simulation():
+def test_simulate_with_a_control_period_is_a_run_of_simulation():
     def controller(t, state):
         return spring(0.0, state)
 
@@ -74,7 +74,7 @@ def test_the_run_of_simulate_with_a_control_period_is_that_of_simulation():
     np.testing.assert_allclose(found.at(0.0305).gamma, between.gamma[1:], atol=1e-12)
 
 
-def test_auto_takes_order_eight_for_a_smooth_motion_and_is_as_accurate_as_it_says():
+def test_auto_takes_order_eight_if_smooth_and_meets_its_estimate():
     truth = simulate(EXAMPLE2, method="dop853", tolerance=1e-13)
     found = simulate(EXAMPLE2, tolerance=1e-9)
     assert found.method == "dop853"
@@ -123,7 +123,7 @@ def test_equal_calls_give_equal_bits_in_arrays_of_their_own(arguments):
 
 
 @pytest.mark.parametrize("arguments", RUNS.values(), ids=RUNS)
-def test_samples_are_even_and_accurate_and_the_motion_does_not_depend_on_them(
+def test_samples_are_even_and_accurate_and_change_no_motion(
     arguments,
 ):
     run = simulate(**arguments)
@@ -185,9 +185,7 @@ def test_threads_get_their_own_motions(arguments):
         ("example2_heavy", jerk, "dop853"),
     ],
 )
-def test_auto_begins_with_order_eight_and_changes_where_the_motion_is_stiff(
-    scene, torque, first
-):
+def test_auto_begins_with_order_eight_and_changes_where_stiff(scene, torque, first):
     found = simulate(scene, torque, 0.1)
     assert found.success and found.method.startswith(first)
     rough = simulate(scene, torque, 0.1, tolerance=1e-5)
@@ -333,7 +331,7 @@ def test_a_state_feedback_is_part_of_the_differential_equation(method):
     )
 
 
-def test_a_held_feedback_tends_to_the_continuous_one_in_proportion_to_the_period():
+def test_held_feedback_tends_to_continuous_one_with_the_period():
     continuous = simulate(EXAMPLE2, spring, 0.2).gamma[-1]
     apart = [
         np.abs(

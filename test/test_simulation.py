@@ -81,7 +81,7 @@ def test_energy_grows_by_the_work_of_constant_torques(seed, driven):
 @pytest.mark.parametrize(
     ("gamma", "ends"), [((0.7, 0.8, 0.9), {}), ((1.3, 1.4, 1.58), IGNORE)]
 )
-def test_the_start_is_the_one_of_the_scene_outside_an_ignored_stroke_too(gamma, ends):
+def test_the_start_is_the_scenes_outside_an_ignored_stroke_too(gamma, ends):
     initial = Initial(gamma=gamma, gamma_dot=(0.1, -0.2, 0.3))
     state = Simulation(replace(EXAMPLE2, initial=initial, **ends)).state
     assert state.time_ns == 0
@@ -111,7 +111,7 @@ def test_torques_and_moments_of_any_type_act_as_floats(kind):
         assert {type(x) for x in (*found.quaternion, *found.torque)} == {float}
 
 
-def test_a_torque_that_is_a_function_of_time_is_asked_at_simulated_times():
+def test_a_torque_function_of_time_is_asked_at_simulated_times():
     simulation, asked = Simulation(EXAMPLE2), []
     for _ in range(3):
         simulation.step(lambda t: asked.append(t) or REST, MILLISECOND)
@@ -139,7 +139,7 @@ def test_the_largest_beta_stops_the_run():
 
 
 @pytest.mark.parametrize("push", [1e308, -1e308], ids=str)
-def test_a_motion_that_no_step_resolves_is_refused_and_nothing_of_it_is_kept(push):
+def test_a_motion_that_no_step_resolves_is_refused_without_trace(push):
     simulation, other = Simulation(EXAMPLE2), Simulation(EXAMPLE2)
     simulation.step(REST, MILLISECOND)
     before, estimate = simulation.state, simulation.error_estimate
@@ -185,7 +185,7 @@ def test_a_start_without_admissible_assembly_is_refused():
 
 
 @pytest.mark.parametrize("name", ["example2_heavy", "impacts", "friction"])
-def test_a_state_within_the_last_step_is_the_state_of_a_shorter_step(name):
+def test_a_state_within_the_last_step_is_that_of_a_shorter_step(name):
     scene = load(name)
     torque = scene.torque.at
     simulation, other = Simulation(scene), Simulation(scene)
@@ -279,7 +279,7 @@ print(json.dumps(found))
 
 
 @pytest.mark.slow
-def test_bits_depend_on_the_c_library_only_as_the_page_on_lockstep_says():
+def test_bits_depend_on_the_c_library_only_as_the_page_says():
     """glibc chooses sin, cos and atan2 by FMA and AVX2.
 
     LLVM's target changes nothing.

@@ -269,9 +269,7 @@ def test_misfits_are_refused(times, n, said):
 @pytest.mark.parametrize(
     "torque", [lambda t: (t, 0.0, 0.1), lambda t, state: (t, 0.0, 0.1)]
 )
-def test_a_loaded_run_under_a_function_has_no_motion_between_its_samples(
-    torque, tmp_path
-):
+def test_a_loaded_run_under_a_function_has_only_its_samples(torque, tmp_path):
     pytest.importorskip("pyarrow", reason="files need pyarrow")
     run = simulate("example2", torque, 0.2, t_eval=[0.0, 0.1, 0.2])
     run.save(tmp_path / "run.parquet")
@@ -289,7 +287,7 @@ def test_a_picture_and_a_summary_for_notebooks(run):
     assert "<svg" in run._repr_html_()
 
 
-def test_reactions_are_columns_of_tables_and_files_that_ask_for_them(tmp_path):
+def test_reactions_are_columns_of_tables_and_files_on_demand(tmp_path):
     motion = simulate("gravity_payload", duration=0.05, samples=4)
     table = motion.to_pandas(reactions=True)
     assert len(table.columns) == len(motion.to_pandas().columns) + 54

@@ -105,7 +105,7 @@ def test_one_exception_of_a_step_comes_out_and_the_state_stays():
     )
 
 
-def test_a_result_that_is_not_finite_is_refused_or_rejects_the_step():
+def test_a_result_that_is_not_finite_is_refused_or_rejects_steps():
     with pytest.raises(
         InputError, match=r"torque\(0\) = \(nan, 0, 0\): must be three finite"
     ):

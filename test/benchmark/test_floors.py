@@ -29,7 +29,7 @@ def test_a_benchmark_runs(name, capsys):
     assert "target" in capsys.readouterr().out
 
 
-def test_a_batch_in_c_has_the_bits_of_the_batch_where_it_may_not_fuse(tmp_path):
+def test_a_batch_in_c_without_fused_operations_has_the_same_bits(tmp_path):
     number = 4 * LANES + 3
     scene, method = load("example2_heavy"), METHODS["rk4"]
     batch = Batch(scene, method, profile=True)

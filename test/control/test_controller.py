@@ -77,7 +77,7 @@ def test_feedforward_is_the_papers_inverse_dynamics(near):
     assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_modes(
+def test_gains_by_bandwidth_use_the_papers_inertia_in_all_modes(
     near,
 ):
     sample, desired, at, error, error_rate = near
@@ -93,7 +93,7 @@ def test_gains_by_bandwidth_are_those_of_the_papers_inertia_and_equal_in_all_mod
     assert np.allclose(told.torque, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics(near):
+def test_computed_torque_makes_the_error_of_gamma_linear(near):
     sample, desired, _, error, error_rate = near
     told = answer(
         sample, desired, mode="computed_torque", bandwidth=15.0, damping_ratio=0.6
@@ -106,7 +106,7 @@ def test_computed_torque_makes_the_error_of_gamma_linear_in_the_papers_dynamics(
 
 
 @pytest.mark.parametrize("sample", seeded_samples(4, 5), ids=range(5))
-def test_on_so3_an_error_about_one_axis_decays_as_the_closed_form_says(sample):
+def test_on_so3_an_error_about_one_axis_decays_in_closed_form(sample):
     """R = R_d exp(-phi n) with phi'' = -2 w phi' - w^2 phi.
 
     R_d turns about the same axis.

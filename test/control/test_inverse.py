@@ -91,7 +91,7 @@ def test_torques_are_those_of_the_paper(sample, gamma_ddot):
 
 
 @pytest.mark.parametrize("sample", seeded_samples(84, 3), ids=range(3))
-def test_the_torque_that_holds_is_the_slope_of_the_potential_energy(sample):
+def test_the_holding_torque_is_the_slope_of_the_potential_energy(sample):
     scene = dataclasses.replace(laden(sample), friction=None)
     truth = Lagrange(laden(sample), sample.rotation)
     expected = -np.array(truth.loads(sample.gamma, np.zeros(3)))
@@ -101,9 +101,7 @@ def test_the_torque_that_holds_is_the_slope_of_the_potential_energy(sample):
 
 @FEW
 @given(samples(), st.floats(0.0, 1.0))
-def test_the_equation_of_motion_at_a_state_is_that_of_the_paper_with_every_load(
-    sample, number
-):
+def test_the_equation_of_motion_is_the_papers_with_every_load(sample, number):
     scene, start = loaded(sample, number), np.array([sample.state])
     inverse, state = (
         InverseDynamics(scene),
@@ -142,7 +140,7 @@ def test_gamma_ddot_of_a_trajectory_is_the_slope_of_gamma_dot():
     )
 
 
-def test_the_forward_program_is_as_short_as_before_it_shared_its_terms():
+def test_shared_terms_do_not_lengthen_the_forward_program():
     assert ODE(Dynamics.of(load("example1"))).program.operations.total() <= 290
 
 

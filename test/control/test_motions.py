@@ -191,7 +191,7 @@ def test_a_spiral_is_what_its_angles_say():
 
 
 @pytest.mark.parametrize("centre", [None, (0.8, 0.8, 0.8)])
-def test_a_sweep_is_a_chirp_about_the_start_or_its_centre_once_it_has_grown(centre):
+def test_a_grown_sweep_is_a_chirp_about_the_start_or_its_centre(centre):
     motion, middle, time = (
         moving(sweep=replace(SWEEP, centre=centre)),
         centre or START,
@@ -208,7 +208,7 @@ def test_a_sweep_is_a_chirp_about_the_start_or_its_centre_once_it_has_grown(cent
     assert rotation_matrix(begin.quaternion) == pytest.approx(expected, abs=1e-14)
 
 
-def test_points_are_passed_at_their_times_with_rates_and_accelerations():
+def test_points_are_passed_in_time_with_rates_and_accelerations():
     motion = moving(waypoints=KINDS["waypoints"])
     assert motion.duration == POINTS[-1][0]
     for time, gamma in ((0.0, START), *POINTS):
@@ -222,7 +222,7 @@ def test_points_are_passed_at_their_times_with_rates_and_accelerations():
     assert motion.at(1.0).gamma_ddot == pytest.approx((0.4, -0.3, 0.0), abs=1e-12)
 
 
-def test_an_assembly_is_followed_and_not_the_nearest_or_the_first():
+def test_an_assembly_is_followed_not_the_nearest_or_the_first():
     """The same gamma in two assemblies: each is carried along to where continuation
     brings it.
     """
@@ -293,7 +293,7 @@ def test_a_recorded_motion_is_what_was_recorded():
     assert motion.at(-1e-9).gamma_dot == HALT
 
 
-def test_a_scene_without_motion_and_a_bag_without_reader_are_refused():
+def test_a_scene_without_motion_and_an_unread_bag_are_refused():
     with pytest.raises(InputError, match="no desired motion"):
         reference_motion(load("example1"))
     with pytest.raises(InputError, match="cannot be read here"):
@@ -357,7 +357,7 @@ def test_sections_that_say_no_motion_are_refused(named, build):
         build()
 
 
-def test_a_stop_begins_with_the_motion_and_ends_at_rest_on_its_path():
+def test_a_stop_begins_with_the_motion_and_rests_on_its_path():
     motion, begin, duration = reference_motion(load("reach")), 0.4, 0.25
     stopping = slow_down(motion, begin, duration)
     last, end = stopping.at(duration), motion.at(begin + 0.5 * duration)

@@ -92,7 +92,7 @@ VELOCITY, ACCELERATION = 15.0 / 8.0 * WAY / TIME, 10.0 / math.sqrt(3.0) * WAY / 
 """Peaks of minimum jerk."""
 
 
-def test_demands_of_the_one_degree_of_freedom_are_its_closed_form():
+def test_demands_of_one_degree_of_freedom_are_its_closed_form():
     square = quad(lambda time: swing_torque(time)[0] ** 2, 0.0, TIME, epsabs=1e-14)[0]
     root = 0.5 - math.sqrt(3.0) / 6.0
     plan = planned(swing())
@@ -215,7 +215,7 @@ def resonant(factor=1.0):
     return replace(EXAMPLE1, springs=springs, actuators=actuators, motion=motion)
 
 
-def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
+def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible():
     """At rest the springs ask for 20 * 0.1 = 2 N m at the turning points.
 
     1.2 are there.
@@ -227,7 +227,7 @@ def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible_too():
         assert planned(resonant(end / inside)).problems
 
 
-def test_what_leaves_the_stroke_is_refused_unless_the_scene_ignores_it():
+def test_leaving_the_stroke_is_refused_unless_it_is_ignored():
     away = DesiredMotion(to_angles=ToAngles(gamma=(1.7, 0.9, 0.9), duration=1.0))
     scene = replace(EXAMPLE1, motion=away, workspace=FREE["workspace"])
     with pytest.raises(
@@ -239,7 +239,7 @@ def test_what_leaves_the_stroke_is_refused_unless_the_scene_ignores_it():
     assert not planned(replace(scene, **FREE), check_motion).problems
 
 
-def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
+def test_leaving_the_workspace_is_refused_where_farthest_out():
     out = DesiredMotion(spiral=Spiral(phi=1.0, theta=0.3, duration=1.0))
     scene = replace(EXAMPLE1, motion=out)
     plan = planned(scene)
@@ -256,7 +256,7 @@ def test_what_leaves_the_workspace_is_refused_where_it_is_farthest_out():
             assert distance.least <= mine.min() + 1e-12
 
 
-def test_limits_are_held_between_samples_and_told_with_the_instant():
+def test_limits_hold_between_samples_and_name_the_instant():
     limit = abs(SUMMIT)
     assert not planned(swing(torque_limit=limit * (1.0 + 1e-12)), check_motion).problems
     with pytest.raises(MotionRefused) as told:
@@ -285,7 +285,7 @@ def test_a_turn_through_a_parallel_singularity_is_refused():
     assert abs(told.value.measure) < 1e-9
 
 
-def test_a_turn_past_a_serial_singularity_is_refused_or_far_beyond_the_edge():
+def test_a_turn_past_a_serial_singularity_is_refused_or_far_out():
     """Through t_1 = w_1: the arc of the star folds over the base's."""
     first, last = (
         tuple(Rotation.from_euler("yx", [0.5, 0.5 * math.pi + off]).as_quat().tolist())

@@ -38,7 +38,7 @@ def test_torques_of_example_2_are_the_printed_ones(t):
     assert third == pytest.approx(3.0 * math.cos(24.0 * t), abs=5e-13)
 
 
-def test_rows_hold_until_the_next_and_before_the_first_there_is_no_torque(tmp_path):
+def test_rows_hold_until_the_next_and_none_acts_before_the_first(tmp_path):
     profile = TorqueTable.read(written(tmp_path, HEADER + "0.5,1,2,3\n1.0,-4,5e-1,6\n"))
     assert profile.times[-1] == 1.0
     assert profile(math.nextafter(0.5, 0.0)) == profile(-1.0) == (0.0, 0.0, 0.0)

@@ -565,7 +565,7 @@ def test_every_scene_is_drawn(name):
 
 
 @pytest.mark.parametrize("name", ["example2_heavy", "general"])
-def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name):
+def test_arcs_of_the_star_begin_at_e_and_are_perpendicular_to_it(name):
     scene = load(name)
     geometry = Geometry.of(scene)
     arcs = [
@@ -577,7 +577,7 @@ def test_the_star_s_arcs_are_perpendicular_to_e_and_begin_at_the_end_point(name)
 
 
 @pytest.mark.parametrize("lockstep", [False, True])
-def test_the_tags_have_the_joints_the_topics_and_the_states_before_the_first_message(
+def test_tags_have_joints_topics_and_the_states_before_a_message(
     lockstep,
 ):
     """Without those a controller activated first holds nan, and no run starts."""
@@ -622,7 +622,7 @@ def test_the_tags_have_the_joints_the_topics_and_the_states_before_the_first_mes
         ]
 
 
-def test_the_command_writes_both_and_the_rest_of_the_second_is_the_first(capsys):
+def test_the_command_writes_both_and_the_second_has_the_first(capsys):
     assert main(["describe", "--scene", "swing"]) == 0
     assert capsys.readouterr().out == urdf(load("swing"))
     assert main(["describe", "--scene", "swing", "--ros2-control"]) == 0
@@ -635,7 +635,7 @@ def test_the_command_writes_both_and_the_rest_of_the_second_is_the_first(capsys)
     assert ET.tostring(root).split() == ET.tostring(plain).split()
 
 
-def test_every_controller_has_its_parameters_and_drives_the_actuators():
+def test_each_controller_has_its_parameters_and_drives_actuators():
     document = yaml.safe_load(CONTROLLERS.read_text(encoding="utf-8"))
     given = {
         name.rpartition("/")[2]: node["ros__parameters"]

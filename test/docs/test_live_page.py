@@ -87,9 +87,7 @@ def test_the_page_has_the_equations_and_the_motion_of_simulate(equations, tmp_pa
     assert np.array(found["turned"]) == pytest.approx(turned, abs=1e-6)
 
 
-def test_where_a_limit_is_passed_the_page_keeps_the_last_valid_state(
-    equations, tmp_path
-):
+def test_past_a_limit_the_page_keeps_the_last_valid_state(equations, tmp_path):
     scene = load_scene("example2_heavy").with_values({"actuators.torque_limit": 6.0})
     start = "<script>document.querySelectorAll('input')[0].value = 6;</script>"
     for name, text in {

@@ -244,7 +244,7 @@ def test_motions_under_own_loads_are_proven():
     assert proven.trajectory.gamma[-1] == pytest.approx(loose.gamma[-1], abs=1e-6)
 
 
-def test_a_scene_with_own_loads_is_the_same_from_text_and_from_another_process():
+def test_own_loads_are_the_same_from_text_and_another_process():
     scene = windy()
     assert read(Scene, dump(scene), "scene") == scene
     assert pickle.loads(pickle.dumps(scene)) == scene

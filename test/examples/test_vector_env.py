@@ -50,7 +50,7 @@ def test_one_robot_passes_gymnasiums_checker(robots_of):
     check_env(Single(), skip_render_check=True)
 
 
-def test_robots_that_leave_their_limits_are_truncated_and_begin_again(robots_of):
+def test_robots_beyond_limits_are_truncated_and_begin_again(robots_of):
     robots = robots_of(8)
     observed, _ = robots.reset(seed=3)
     assert observed in robots.observation_space

@@ -105,7 +105,7 @@ def test_a_body_that_cannot_exist_is_replaced_by_the_nearest():
     assert np.abs(values - expected.x).max() < 1e-6
 
 
-def test_a_centre_stays_within_reach_and_friction_is_not_negative():
+def test_a_centre_stays_in_reach_and_friction_is_not_negative():
     names = (*NAMES, "friction.gamma.viscous")
     given = np.append(of_points(np.random.default_rng(2)), 0.1)
     target = given.copy()

@@ -61,7 +61,7 @@ def errors(case, seeds):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_200_recordings_are_covered_by_their_95_percent_intervals():
+def test_95_percent_intervals_cover_200_recordings():
     """Each base parameter in 90 to 99 % of the recordings.
 
     Its bias is below its deviation.
@@ -73,7 +73,7 @@ def test_200_recordings_are_covered_by_their_95_percent_intervals():
 
 
 @pytest.mark.slow
-def test_a_short_recording_is_biased_by_less_than_the_standard_deviation():
+def test_the_bias_of_a_short_recording_is_below_its_deviation():
     """In 1.2 s of `reach` the star hardly turns about its axis.
 
     Torques have little noise.
@@ -89,7 +89,7 @@ def test_a_short_recording_is_biased_by_less_than_the_standard_deviation():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_feedforward_errs_twenty_times_less_than_with_the_wrong_model(seed):
+def test_feedforward_errs_20_times_less_than_by_the_wrong_model(seed):
     """Along `reach`, by the identified model."""
     case = measured()
     found = identify(case.recording(seed), case.model)
@@ -127,7 +127,7 @@ def test_the_filter_has_no_phase_and_leaves_the_motion():
     assert find_bandwidth(1e-3, gamma) == pytest.approx(3.0, abs=1.0)
 
 
-def test_angles_to_be_filtered_must_be_evenly_spaced_and_long_enough():
+def test_angles_to_be_filtered_are_evenly_spaced_and_long_enough():
     case = measured()
     t = case.t + 4e-4 * np.sin(np.arange(len(case.t)))
     with pytest.raises(InputError, match="must be evenly spaced"):

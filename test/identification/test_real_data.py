@@ -89,7 +89,7 @@ def measured(seed, t=None):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_95_percent_intervals_cover_93_to_97_percent_of_the_truths():
+def test_95_percent_intervals_cover_93_to_97_percent_of_truths():
     """200 data sets with noise, delay, friction: all base parameters and the delay."""
     rows, delays = [], []
     for seed in range(200):
@@ -171,7 +171,7 @@ def test_seconds_since_the_epoch_and_wraps_are_taken_with_a_word():
     assert found.estimate == pytest.approx(expected.estimate, rel=1e-9, abs=1e-12)
 
 
-def test_measured_joints_need_not_close_the_loops_but_be_of_this_manipulator():
+def test_measured_joints_may_leave_loops_open_by_a_little():
     t, gamma, torque = exact()
     model, random = plant().model, np.random.default_rng(7)
     orientation = manipulators.states(plant().motion, np.maximum(t - DELAY, 0.0))[0]

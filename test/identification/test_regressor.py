@@ -58,7 +58,7 @@ def by_chance(seed):
         ("thin_arcs", FOREIGN, lambda *_: np.array([0.3, 0.2, 1e-3, 0.1, -0.2, 0.3])),
     ],
 )
-def test_torques_are_the_known_part_plus_regressor_times_parameters(
+def test_torques_are_known_part_plus_regressor_times_parameters(
     name, wanted, values_of
 ):
     """Of the scene's own numbers, of other bodies, and of what it does not have."""
@@ -138,7 +138,7 @@ def designed():
     return scene, design(scene, duration=4.0, harmonics=4, iterations=15)
 
 
-def test_a_designed_motion_keeps_within_all_limits_and_rests_at_both_ends(designed):
+def test_a_designed_motion_keeps_limits_and_rests_at_both_ends(designed):
     _, found = designed
     motion = reference_motion(found.scene)
     assert examine_motion(motion, found.scene).problems == ()

@@ -122,7 +122,7 @@ def test_sensitivities_are_derivatives_of_what_simulate_finds(build, end, name):
     assert np.abs(slopes[0, :7, 0] - expected).max() < 1e-10 * np.abs(expected).max()
 
 
-def test_restitution_and_impact_rate_together_have_the_slopes_of_each():
+def test_restitution_and_impact_rate_together_have_both_slopes():
     scene, t = rebounding(), np.array([1.0])
     names = ("stroke.impact_rate", "stroke.restitution")
     values = np.array([find_number(scene, name) for name in names])
@@ -135,7 +135,7 @@ def test_restitution_and_impact_rate_together_have_the_slopes_of_each():
         assert np.abs(one).max() > 1e-3
 
 
-def test_the_slopes_of_the_damping_by_restitution_and_impact_rate():
+def test_slopes_of_the_damping_by_restitution_and_impact_rate():
     elastic = {"at_end": "elastic", "stiffness": 2000.0, "impact_rate": 0.7}
     for e in (0.05, 0.3, 0.8, 0.97):
         scene = load_scene("swing").with_values(
@@ -152,7 +152,7 @@ def test_the_slopes_of_the_damping_by_restitution_and_impact_rate():
 
 
 @pytest.mark.slow
-def test_smoothing_and_lag_which_no_torque_is_linear_in_are_found():
+def test_smoothing_and_lag_are_found_though_torque_is_nonlinear():
     plant = rubbing()
     names = (
         "friction.gamma.smoothing",
@@ -202,7 +202,7 @@ def test_torques_that_a_limit_has_cut_off_are_those_that_acted(torque):
 
 
 @pytest.mark.slow
-def test_the_standard_deviations_cover_the_errors_of_noisy_angles():
+def test_standard_deviations_cover_the_errors_of_noisy_angles():
     plant = load_scene("example2_heavy")
     names = ("star.inertia.xx", "star.inertia.zz")
     motion = simulate(plant, t_eval=np.linspace(0.0, 0.6, 31), tolerance=1e-11)
@@ -219,7 +219,7 @@ def test_the_standard_deviations_cover_the_errors_of_noisy_angles():
 
 
 @pytest.mark.slow
-def test_angles_of_example_1_fix_the_product_of_inertia_and_initial_rate():
+def test_angles_of_example_1_fix_inertia_times_initial_rate():
     """No drift over a period: I_eff gamma_dot(0) = -1.13 / 12, far better than either
     alone.
     """
@@ -283,7 +283,7 @@ def test_readings_without_torques_are_refused():
         identify({"t": t, "psi": t}, scene, ("star.inertia.zz",), method="simulation")
 
 
-def test_fig_9_fixes_the_product_of_inertia_and_initial_rate_and_little_more():
+def test_fig_9_fixes_inertia_times_initial_rate_and_little_more():
     _, name, read, rate = PANELS[0]
     labels, relative = determined(name, read, rate)
     assert relative[0] == pytest.approx(0.012, abs=0.001)
@@ -294,9 +294,7 @@ def test_fig_9_fixes_the_product_of_inertia_and_initial_rate_and_little_more():
 
 
 @pytest.mark.parametrize(("panel", "worst"), [(1, 0.05), (2, 0.2)])
-def test_example_2_fixes_the_moments_of_the_star_and_two_combinations_never(
-    panel, worst
-):
+def test_example_2_fixes_the_star_but_two_combinations_never(panel, worst):
     _, name, read, rate = PANELS[panel]
     _, relative = determined(name, read, rate)
     assert relative[0] < 0.011 and relative[2] < worst

@@ -273,7 +273,7 @@ def test_bad_arguments_are_refused_by_name(swarm, argument, said):
         swarm.batch.run(**right | argument)
 
 
-def test_torques_are_no_moments_where_a_profile_takes_their_place():
+def test_torques_in_the_place_of_a_profile_are_no_moments():
     scene = replace(EXAMPLE2, moment=Moment(topic=True))
     assert not Batch(scene, profile=True).drives((1.0, 2.0, 3.0), 2).any()
 
@@ -348,7 +348,7 @@ def test_the_result_has_the_quantities_of_simulate(changes):
     )
 
 
-def test_a_limit_passed_inside_a_step_ends_a_run_as_in_a_simulation():
+def test_a_limit_passed_in_a_step_ends_a_run_as_in_a_simulation():
     """The actuator turns near its end in the first of two steps, which end inside
     again.
     """
@@ -388,7 +388,7 @@ def test_rates_of_distances_are_their_slopes_over_time(swarm):
     np.testing.assert_allclose(program(x, y, z, w, *rate)[count:], slopes, atol=1e-9)
 
 
-def test_a_scenario_that_ends_early_has_the_time_of_its_last_state(swarm):
+def test_a_scenario_that_ends_early_has_its_last_states_time(swarm):
     result = swarm.result
     row = int(np.flatnonzero(result.status == 1)[0])
     scene = replace(EXAMPLE2, initial=Initial(gamma=tuple(swarm.gamma[row])))

@@ -239,7 +239,7 @@ def test_bad_parameters_are_refused_by_key_and_row(parameters, said):
         Batch(EXAMPLE2, parameters=parameters)
 
 
-def test_numbers_of_a_term_that_is_left_out_are_held_to_what_is_allowed_too():
+def test_numbers_of_a_term_that_is_left_out_are_checked_too():
     """Friction of zero is none, but its smoothing is no less wrong."""
     values = {"viscous": [0.0, 0.1], "coulomb": [0.0, 0.1], "smoothing": [-1.0, 0.1]}
     said = (

@@ -125,7 +125,7 @@ SHARP = [
 
 
 @pytest.mark.parametrize(("name", "coulomb", "smoothing", "step_ms"), SHARP)
-def test_fixed_steps_over_sharp_friction_are_estimated_by_the_order_that_is_left(
+def test_fixed_steps_over_sharp_friction_use_the_order_left(
     name, coulomb, smoothing, step_ms
 ):
     friction = JointFriction(gamma=Friction(coulomb=coulomb, smoothing=smoothing))

@@ -75,7 +75,7 @@ def met(simulation, error):
 
 
 @pytest.mark.parametrize("leg", [0, 1, 2])
-def test_a_serial_singularity_is_met_when_the_axes_of_a_leg_fall_together(leg):
+def test_a_serial_singularity_is_met_where_a_legs_axes_coincide(leg):
     """The star turns t_k straight into w_k, at a constant rate."""
     axis = np.cross(AT.t[leg], AT.w[leg])
     size = np.linalg.norm(axis)
@@ -87,7 +87,7 @@ def test_a_serial_singularity_is_met_when_the_axes_of_a_leg_fall_together(leg):
 
 
 @pytest.mark.parametrize("leg", [0, 1, 2])
-def test_the_edge_of_the_workspace_is_met_when_e_lies_in_the_plane_of_an_arc(leg):
+def test_the_workspace_ends_where_e_lies_in_the_plane_of_an_arc(leg):
     s = AT.rotation[:, 2]
     axis = np.cross(s, -AT.w[leg])
     axis /= np.linalg.norm(axis)
@@ -115,7 +115,7 @@ def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper, method):
     assert times[k] == min(times)
 
 
-def test_auto_follows_a_run_that_is_stiff_then_not_and_then_stiff_again():
+def test_auto_follows_a_run_that_is_stiff_then_not_then_stiff():
     """A soft end with much damping: pressed against it, torn off, pressed against it
     again.
     """

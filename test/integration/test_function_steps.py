@@ -61,7 +61,7 @@ def stepped(motion, torque, method):
 
 @pytest.mark.parametrize("method", EXPLICIT, ids=lambda method: method.name)
 @pytest.mark.parametrize("function", [smooth, clipped])
-def test_samples_under_a_function_of_time_are_as_accurate_as_steps(method, function):
+def test_samples_under_a_function_of_time_are_accurate_as_steps(method, function):
     motion = simulate(SCENE, function, 1.0, method=method.name, tolerance=1e-8)
     truth = stepped(motion, function, method.name)
     np.testing.assert_allclose(motion.quaternion, truth.quaternion, atol=1e-8)
@@ -69,7 +69,7 @@ def test_samples_under_a_function_of_time_are_as_accurate_as_steps(method, funct
     np.testing.assert_array_equal(motion.torque, [function(t) for t in motion.t])
 
 
-def test_samples_ask_a_smooth_function_of_time_for_their_torques_alone():
+def test_samples_ask_a_smooth_function_for_their_torques_alone():
     function = Counted(smooth)
     simulate(SCENE, function, 1.0, samples=1)
     alone = function.calls
@@ -86,7 +86,7 @@ def test_equal_times_of_a_step_are_asked_for_once():
     assert function.calls == 36 - 3 + 2  # and the torques of two samples
 
 
-def test_samples_under_a_function_of_the_state_cost_less_than_the_steps():
+def test_samples_under_a_feedback_function_cost_less_than_steps():
     function = CountedFeedback(damped)
     coarse = simulate(SCENE, function, 1.0, samples=1, method="dop853")
     alone = function.calls

@@ -312,7 +312,7 @@ def test_one_code_gives_the_bits_of_plain_python_for_each_scene(method, start):
     assert len({str(end) for end in ends}) == len(ends)
 
 
-def test_scenes_take_turns_and_threads_and_keep_their_own_numbers(start):
+def test_scenes_in_turns_and_threads_keep_their_own_numbers(start):
     scenes = like_loaded()[:2]
     alone = [march(scene, DORMAND_PRINCE, start) for scene in scenes]
     assert [march(scene, DORMAND_PRINCE, start) for scene in scenes * 3] == alone * 3
@@ -344,7 +344,7 @@ def test_many_steps_at_once_have_the_bits_of_each(start):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_text_that_serves_all_scenes_has_hardly_more_operations(name):
+def test_a_text_for_all_scenes_has_hardly_more_operations(name):
     """Against the trace that merges and folds whatever is equal in this scene."""
     ode = recent_ode(Dynamics.of(load(name)), work=True)
     own = trace(ode.derivative, ode.program.inputs)

@@ -108,7 +108,7 @@ def test_rows_sum_to_the_nodes(tableau):
 
 
 @every_method
-def test_weights_meet_every_order_condition_and_not_those_of_the_next_order(tableau):
+def test_weights_meet_each_order_condition_but_none_of_the_next(tableau):
     a, b = matrix(tableau), np.array(tableau.b)
     for order in range(1, tableau.order + 1):
         assert max(misses(order, b, a)) < CONDITION
@@ -124,9 +124,7 @@ def test_weights_meet_every_order_condition_and_not_those_of_the_next_order(tabl
     ],
     ids=["dopri5", "dop853-error", "dop853-damping"],
 )
-def test_error_weights_vanish_up_to_the_embedded_order_and_no_further(
-    weights, tableau, order
-):
+def test_error_weights_vanish_up_to_the_embedded_order_only(weights, tableau, order):
     a, e = matrix(tableau), np.array(weights)
     for lower in range(1, order + 1):
         assert max(misses(lower, e, a, zero=True)) < CONDITION
@@ -169,7 +167,7 @@ def march(step, count):
     [(DORMAND_PRINCE, 64, 40), (DOP853, 48, 12)],
     ids=["dopri5", "dop853"],
 )
-def test_estimates_shrink_by_their_order_and_bound_the_true_error(tableau, many, few):
+def test_estimates_shrink_by_their_order_and_bound_the_error(tableau, many, few):
     """In the median: where a weight of DOP853's passes zero a step has an estimate of
     order 6.
 
@@ -207,7 +205,7 @@ def test_nodes_of_rodas5p_are_the_sums_of_their_rows():
 
 
 @pytest.mark.parametrize("order", [4, 5], ids=["embedded", "solution"])
-def test_rodas5p_is_of_order_five_and_its_embedded_solution_of_order_four(order):
+def test_rodas5p_has_order_five_and_its_embedded_solution_four(order):
     """The embedded one is the argument of the last stage, so that the estimate is the
     last u.
     """
@@ -226,7 +224,7 @@ def stability(z):
     return 1 + z * sum(mpmath.mpf(float(b[i])) * solved[i] for i in range(STAGES))
 
 
-def test_it_is_a_stable_and_its_stability_function_vanishes_at_infinity():
+def test_it_is_a_stable_and_damps_infinitely_fast_modes_to_zero():
     with mpmath.workdps(50):
         for exponent in range(-3, 9):
             assert abs(stability(mpmath.mpc(0, 10.0**exponent))) <= 1 + 1e-12
@@ -248,7 +246,7 @@ def steps_of(y0, h, count, matrix_of, slope_of, by_time=lambda t: 0.0):
 
 
 @pytest.mark.parametrize("rate", [1.0, 1e3, 1e6, 1e9])
-def test_one_step_of_the_code_on_the_linear_test_equation_is_its_stability_function(
+def test_a_step_of_the_linear_equation_is_the_stability_function(
     rate,
 ):
     with mpmath.workdps(30):
@@ -258,7 +256,7 @@ def test_one_step_of_the_code_on_the_linear_test_equation_is_its_stability_funct
     assert abs(got) < 1.0
 
 
-def test_a_stiff_equation_follows_its_slow_solution_in_large_steps():
+def test_a_stiff_equation_follows_its_slow_part_in_large_steps():
     """Prothero & Robinson: y' = -1e6 (y - cos t) - sin t from y(0) = 1; y = cos t."""
     rate = 1e6
     got = steps_of(

@@ -98,7 +98,7 @@ TOO_FAST = {
 
 
 @pytest.mark.parametrize(("scene", "torque"), TOO_FAST.values(), ids=[*TOO_FAST])
-def test_a_step_that_takes_too_much_ends_with_the_last_valid_state(scene, torque):
+def test_a_step_that_takes_too_much_keeps_the_last_valid_state(scene, torque):
     """These steps took 73, 10 and 2.7 s before there was a budget."""
     simulation = Simulation(scene)
     before = simulation.state
@@ -223,7 +223,7 @@ def test_a_fault_comes_at_its_tick_with_the_last_valid_state():
     assert ends[0][0][0].time_ns % (50 * MILLISECOND)
 
 
-def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside():
+def test_a_turn_beyond_an_end_is_seen_within_a_step():
     scene = replace(
         EXAMPLE2,
         initial=Initial(
@@ -240,7 +240,7 @@ def test_a_turn_beyond_an_end_is_seen_though_the_step_begins_and_ends_inside():
     assert found.value.time == pytest.approx(expected.value.time, abs=1e-6)
 
 
-def test_a_state_within_ticks_that_were_done_at_once_is_on_the_way():
+def test_a_state_within_ticks_done_at_once_is_on_the_way():
     one, other = (Simulation(EXAMPLE2) for _ in range(2))
     one.steps((1.0, 2.0, 3.0), MILLISECOND, 20)
     other.step((1.0, 2.0, 3.0), 7 * MILLISECOND)

@@ -52,7 +52,7 @@ def truth_of(case, monkeypatch):
     ("number", "method", "tolerance"),
     [(43, "auto", 1.9413158686750797e-05), (11, "dop853", 3.576108161385493e-10)],
 )
-def test_the_estimate_is_no_less_than_the_error_where_friction_is_sharp(
+def test_the_estimate_covers_the_error_where_friction_is_sharp(
     number, method, tolerance, monkeypatch
 ):
     """Where steps leapt over the change, it was 0.65 and 0.88 of the error."""
@@ -99,7 +99,7 @@ def test_a_step_leaps_if_it_passes_more_than_the_width(before, after, leaps):
         assert 0.0 < largest_passed(transitions, begin, end) < 1.0
 
 
-def test_a_joint_that_comes_to_rest_between_steps_costs_few_evaluations():
+def test_a_joint_that_rests_between_steps_costs_few_evaluations():
     """Rates that fall and then stay are far from linear: a leap is halved."""
     friction = {"gamma": {"coulomb": 0.5, "smoothing": 1e-4, "viscous": 0.1}}
     start = {"initial.gamma_dot": (0.05, -0.03, 0.04)}

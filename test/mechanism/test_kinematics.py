@@ -130,7 +130,7 @@ def test_assemblies_that_meet_do_not_vanish():
             assert np.abs(first.rotation[:, 2] - second.rotation[:, 2]).max() < 1e-6
 
 
-def test_many_at_once_are_the_same_bits_and_in_the_same_order_as_one_by_one():
+def test_many_at_once_have_the_bits_and_the_order_of_one_by_one():
     rng = np.random.default_rng(2)
     for geometry in (ISOTROPIC, FOLDING, random_geometry(rng)):
         gammas = rng.uniform(0, 1, (40, 3)) * geometry.arc
@@ -216,7 +216,7 @@ def has_fermat_point(gamma):
     return True
 
 
-def test_isotropic_pose_exists_iff_the_carriages_have_a_fermat_point():
+def test_an_isotropic_pose_exists_iff_there_is_a_fermat_point():
     sweep = np.random.default_rng(5).uniform(0.02, np.pi / 2 - 0.02, (400, 3))
     many = kinematics.direct_many(ISOTROPIC, sweep)
     answers = np.isin(np.arange(400), many.configuration[many.admissible]).tolist()
@@ -244,7 +244,7 @@ def test_share_of_actuator_angles_without_a_pose():
 
 @FAST
 @given(samples())
-def test_carriages_and_arcs_of_the_star_are_vectors_turned_about_axes(sample):
+def test_carriages_and_arcs_are_vectors_turned_about_axes(sample):
     geometry = sample.geometry
     r = kinematics.carriage_directions(geometry, sample.gamma)
     for k in range(3):

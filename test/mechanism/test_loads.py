@@ -103,7 +103,7 @@ def laden(sample):
 
 
 @pytest.mark.parametrize("sample", seeded_samples(71, 3), ids=range(3))
-def test_gravity_springs_and_friction_are_lagranges_on_general_models(sample):
+def test_gravity_springs_and_friction_are_lagranges(sample):
     """Both lose some two digits of 1e-16 to M and J.
 
     The loads are of the size of the torques.
@@ -153,7 +153,7 @@ def test_two_ways_to_say_the_same_move_alike(pair):
     assert one == pytest.approx(other, rel=tolerance)
 
 
-def test_elastic_stops_push_only_beyond_the_stroke_and_never_pull():
+def test_elastic_stops_push_beyond_the_stroke_and_never_pull():
     sample = seeded_samples(9, 1)[0]
     scene = replace(
         sample.scene, stroke=Stroke(at_end="elastic", stiffness=100.0, damping=5.0)
@@ -177,7 +177,7 @@ def test_friction_is_the_documented_torque_of_its_rate(v):
     assert friction_torque(friction, v) * v >= 0.0
 
 
-def test_lagging_actuators_follow_the_command_with_their_time_constant():
+def test_lagging_actuators_follow_with_their_time_constant():
     sample = seeded_samples(10, 1)[0]
     scene = replace(sample.scene, actuators=Actuators(time_constant=0.05))
     dynamics = Dynamics.of(scene)

@@ -132,7 +132,7 @@ def newton_euler(sample):
 
 @settings(max_examples=120)
 @given(st.integers(0, 2**32 - 1))
-def test_accelerations_and_constraint_moments_are_those_of_the_model(seed):
+def test_accelerations_and_constraint_moments_are_the_models(seed):
     sample = random_sample(np.random.default_rng(seed))
     moving, expected, frames = newton_euler(sample)
     given_motion = sample.mechanism, sample.posture, sample.gamma_dot

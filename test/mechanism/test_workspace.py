@@ -136,7 +136,7 @@ def test_the_picture_has_three_maps_a_row(isotropic, folding):
     assert len(figure.axes) == 12  # six pictures, six colour bars
 
 
-def test_the_nearest_singularity_is_singular_and_no_ray_meets_one_before_it():
+def test_no_ray_meets_a_singularity_before_the_nearest():
     """Parallel: rows r_k x t_k that are dependent; serial: t_k on the line of w_k."""
     rng, kinds = np.random.default_rng(6), set()
     while len(kinds) < 2 or rng.random() < 0.9:

@@ -118,7 +118,7 @@ def test_tracking_shows_what_was_desired_and_what_was_measured(drawn, run):
     )
 
 
-def test_the_energy_is_that_of_the_simulation_and_balances_the_work(run):
+def test_the_energy_is_the_simulations_and_balances_the_work(run):
     """The states of the bag are exact; the cubic between 2 ms samples errs by h^4."""
     kinetic, potential = pictures.energies(run, run.scene)
     simulation = Simulation(run.scene)
@@ -309,7 +309,7 @@ def test_samples_at_other_times_are_not_compared(pair, bags, example2, tmp_path)
     assert differences([pair[0], other]).iloc[0].tolist()[-2:] == [1, 151]
 
 
-def test_the_panel_of_differences_says_which_runs_do_not_differ_and_which_share_nothing(
+def test_the_panel_names_equal_runs_and_those_that_share_nothing(
     pair,
 ):
     late = dataclasses.replace(pair[0], start_ns=pair[0].start_ns - 1)

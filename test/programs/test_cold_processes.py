@@ -149,7 +149,7 @@ def test_processes_forked_while_a_thread_compiles_have_its_bits(repeat):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
-def test_a_process_forked_while_a_property_is_computed_computes_it_too():
+def test_a_process_forked_within_a_property_computes_it_too():
     assert run_code(COMPUTED_MEANWHILE, timeout=60) == ["0", "7", "True"]
 
 
@@ -177,7 +177,7 @@ assert begun.wait(60.0)
 """
 
 
-def test_a_process_that_ends_while_a_thread_compiles_ends_in_order():
+def test_a_process_ends_in_order_while_a_thread_compiles():
     """LLVM's assertions and faults ended a stopped node by SIGABRT and SIGSEGV."""
     pytest.importorskip("llvmlite")
     assert run_code(ENDING) == []

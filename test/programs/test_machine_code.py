@@ -145,7 +145,7 @@ def test_scenes_of_one_structure_share_the_text():
     assert second.function("f")(2.0) == [0.75 * 2.0 + 2.5 * 0.75]
 
 
-def test_outputs_may_take_the_place_of_inputs_and_some_columns_stay():
+def test_outputs_may_take_the_inputs_place_and_some_columns_stay():
     program = trace(lambda x, y: (x + y, x - y), ("x", "y"))
     step = RowFunction(write_module({"f": program}, rows=["f"]), "f")
     x, y = np.arange(11.0), np.ones(11)

@@ -26,9 +26,7 @@ FINITE = st.floats(-10.0, 10.0)
         (lambda x, y: (exp(x * y), x + y)[1:], 1),
     ],
 )
-def test_constants_fold_and_what_is_absent_or_not_needed_costs_nothing(
-    function, operations
-):
+def test_constants_fold_and_what_is_not_needed_costs_nothing(function, operations):
     assert trace(function, ("x", "y")).operations.total() == operations
 
 

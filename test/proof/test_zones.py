@@ -288,7 +288,7 @@ def test_angles_beyond_a_stroke_are_refuted():
     assert zone.status_of(gamma).tolist() == [-1, 1, 0]
 
 
-def test_without_the_slope_of_det_j2_singular_poses_are_taken_for_regular(monkeypatch):
+def test_without_the_slope_of_det_j2_singular_poses_seem_regular(monkeypatch):
     # What the proof rests on: without its terms the random poses find singular ones.
     scene, ranges, draw = CASES["folded"]
     rng = np.random.default_rng(54)

@@ -116,9 +116,7 @@ def test_a_changed_byte_is_never_silent(count, whole, tmp_path):
     check_cuts(whole, tmp_path, 3 * count // 10, seed=count)
 
 
-def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(
-    whole, tmp_path
-):
+def test_a_flipped_bit_is_named_and_costs_a_chunk_at_most(whole, tmp_path):
     """In the first bytes of every record: its kind, its length and what else it is
     known by.
     """
@@ -133,7 +131,7 @@ def test_a_flipped_bit_at_any_record_is_named_and_costs_a_chunk_at_most(
     assert check_changes(whole, tmp_path / "bag", flips) == 0
 
 
-def test_an_index_with_a_wrong_checksum_says_nothing_of_what_is_lost(whole, tmp_path):
+def test_an_index_with_a_wrong_checksum_says_nothing_of_losses(whole, tmp_path):
     content = bytearray(content_of(whole))
     (at,) = struct.unpack_from("<Q", content, len(content) - len(MCAP0_MAGIC) - 20)
     # no end of the data: the index is read on as what comes next
@@ -147,7 +145,7 @@ def test_an_index_with_a_wrong_checksum_says_nothing_of_what_is_lost(whole, tmp_
     assert file.damage and file.lost == 0
 
 
-def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_path):
+def test_a_damaged_chunk_is_named_and_the_rest_read_when_asked(whole, tmp_path):
     content = bytearray(content_of(whole))
     content[content.index(b"gamma_1", len(content) // 2)] ^= 1
     bag = damaged_copy(tmp_path / "damaged", whole, bytes(content))
@@ -164,9 +162,7 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read_when_asked(whole, tmp_pat
     assert found.lost == CHUNK and found.damage and not found.cut
 
 
-def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(
-    whole, entries, example2_bag
-):
+def test_rosbags_reads_the_recorders_checksums_and_index(whole, entries, example2_bag):
     file = McapFile(next(whole.glob("*.mcap")))
     assert sum(1 for _ in file.messages()) == len(entries) == len(messages_of(whole))
     assert not file.describe() and file.unverified == 0
@@ -174,9 +170,7 @@ def test_the_recorder_writes_checksums_and_an_index_that_rosbags_reads(
     assert recording.read(example2_bag).signals.bag.unverified > 0
 
 
-def test_a_late_flush_makes_no_large_chunk_and_the_index_of_messages_is_not_kept(
-    tmp_path, monkeypatch
-):
+def test_a_late_flush_makes_no_large_chunk_and_keeps_no_index(tmp_path, monkeypatch):
     """What is held in memory is bounded: a chunk, and an entry of the index for each
     chunk.
     """

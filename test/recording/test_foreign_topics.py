@@ -88,7 +88,7 @@ def test_joint_states_of_another_node_are_no_substitute(
         read([*bags.without(example2, bags.JOINTS), *moved])
 
 
-def test_a_reference_of_another_controller_is_not_that_of_the_run(
+def test_a_reference_of_another_controller_is_not_the_runs(
     read, bags, example2, monkeypatch
 ):
     sent = bags.tracked(

@@ -51,7 +51,7 @@ def test_a_time_in_a_gap_is_refused_with_the_gap(motion, time):
         motion.at(time)
 
 
-def test_on_both_sides_of_a_gap_and_at_its_ends_the_motion_is_known(motion):
+def test_beside_a_gap_and_at_its_ends_the_motion_is_known(motion):
     known = [0.0, 0.033, 0.1, 5.0, 5.0333, 5.1]
     found = motion.at(known)
     assert found.gamma[[0, 2]] == pytest.approx(motion.gamma[[0, 50]], abs=0.0)

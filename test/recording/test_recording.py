@@ -204,9 +204,7 @@ def test_bags_of_every_kind_hold_the_same_run(read, tmp_path, bags, example2):
         assert run.signals.bag.topics["joint_states"] == "/cell_7/joint_states"
 
 
-def test_diagnostics_of_another_simulator_are_not_those_of_the_run(
-    read, bags, example2
-):
+def test_diagnostics_of_another_simulator_are_not_the_runs(read, bags, example2):
     """/diagnostics is one topic for all; the other one ends later."""
     other = bags.diagnostics_entry(
         example2[-1].received_ns + 1, phase="running", ticks=7
@@ -295,7 +293,7 @@ def following(bag):
     return dataclasses.replace(scene.load("example2"), motion=motion)
 
 
-def test_inverse_dynamics_of_a_recorded_motion_are_the_torques_that_made_it(
+def test_inverse_dynamics_of_a_recording_are_its_torques(
     example2_bag,
 ):
     """Held for 1 ms they are a staircase.

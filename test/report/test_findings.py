@@ -61,7 +61,7 @@ def test_answers_to_nine_samples_of_ten_are_enough(find, share, warned):
     assert verdict_of(found) == ("WARNING" if warned else "OK")
 
 
-def test_warnings_come_in_order_of_weight_and_notes_make_no_verdict(find):
+def test_warnings_come_by_weight_and_notes_make_no_verdict(find):
     found = find(tick_gaps=2, samples_lost=3, fault="singular", foreign_states=5)
     assert texts_of(found, Severity.WARNING) == [
         "fault: singular",

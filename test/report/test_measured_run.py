@@ -62,7 +62,7 @@ def measure(bags, entries, kinds, monkeypatch, *, truth):
 
 
 @pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
-def test_with_the_truth_a_measured_run_is_evaluated_as_an_exact_one(
+def test_with_the_truth_a_measured_run_is_evaluated_as_exact(
     read, bags, exact, monkeypatch, kinds
 ):
     run = read(measure(bags, exact, kinds, monkeypatch, truth=True))
@@ -94,7 +94,7 @@ def test_with_the_truth_a_measured_run_is_evaluated_as_an_exact_one(
 
 
 @pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
-def test_without_the_truth_a_measured_run_is_judged_by_what_it_can_tell(
+def test_without_the_truth_a_measured_run_is_judged_by_its_own(
     read, bags, exact, monkeypatch, kinds
 ):
     run = read(measure(bags, exact, kinds, monkeypatch, truth=False))
@@ -117,7 +117,7 @@ def test_without_the_truth_a_measured_run_is_judged_by_what_it_can_tell(
     assert found["measurement_error_max_rad"] > 1e-4
 
 
-def test_measured_angles_alone_are_enough_to_know_the_rates_are_measured(
+def test_measured_angles_alone_show_that_the_rates_are_measured(
     read, bags, exact, monkeypatch
 ):
     """Angles are exact, rates have noise: the energy of such rates is no fault of the

@@ -40,7 +40,7 @@ def start_of(some):
     return initial_state(some, Geometry.of(some))
 
 
-def test_the_integration_error_of_a_good_run_is_small_and_the_reference_tells_its_own(
+def test_integration_errors_of_run_and_reference_are_small(
     integration,
 ):
     for deviation in (integration.error, integration.own):
@@ -104,7 +104,7 @@ def test_what_is_lost_is_not_compared_and_no_error(
     assert missing == (set() if topic == "JOINTS" else lost)
 
 
-def test_after_a_tick_that_no_step_resolves_the_next_sample_is_begun_at(run):
+def test_after_an_unresolved_tick_the_next_sample_is_begun_at(run):
     torque = run.ticks.torque.copy()
     torque[40] = 1e13
     found = reference.integration(altered(run, ticks=replace(run.ticks, torque=torque)))
@@ -237,7 +237,7 @@ def test_a_recorded_moment_is_used(recorded):
     assert reference.integration(altered(run, ticks=wrong)).error.gamma.max() > 1e-7
 
 
-def test_a_moment_that_is_not_recorded_is_told_and_nothing_is_compared(recorded):
+def test_an_unrecorded_moment_is_told_and_nothing_is_compared(recorded):
     integration, ideal, notes = judged(recorded(PUSHED, change=from_topic))
     assert integration.compared == 0 and ideal is None
     assert "is not recorded: nothing is compared" in notes

@@ -263,7 +263,7 @@ def test_a_good_run_is_ok_in_few_lines(commanded):
     assert "negative" not in said and "minimum -" not in said
 
 
-def test_a_slow_controller_is_warned_of_and_a_negative_delay_has_its_meaning(commanded):
+def test_a_slow_controller_and_a_negative_delay_are_explained(commanded):
     summary, said = commanded(40, 600_000)
     assert said.startswith(
         "WARNING: example2: commands answered 5.33 % of samples, mean age 1"
@@ -274,9 +274,7 @@ def test_a_slow_controller_is_warned_of_and_a_negative_delay_has_its_meaning(com
     assert "the recorder received a command after the step that applied it" in said
 
 
-def test_an_altered_effort_and_lost_samples_are_reasons_and_show_when_they_were(
-    read, bags, example2
-):
+def test_altered_effort_and_lost_samples_are_reasons_with_times(read, bags, example2):
     change = more_effort(1e-9 * np.eye(9)[1])
     entries = bags.edited(
         bags.without(example2, bags.COMMANDS), bags.JOINTS, 75, change
@@ -313,9 +311,7 @@ def test_the_command_prints_verdict_and_files_and_all_when_asked(
 
 
 @pytest.mark.parametrize("clock_ns", [0, -(10**15)])
-def test_periods_and_latency_are_what_they_were_made_by_any_clock(
-    read, lively, clock_ns
-):
+def test_periods_and_latency_are_as_made_by_any_clock(read, lively, clock_ns):
     entries = [
         dataclasses.replace(e, received_ns=e.received_ns + clock_ns) for e in lively
     ]
@@ -361,9 +357,7 @@ def test_an_altered_torque_shows_when_it_was(read, bags, example2):
     assert np.flatnonzero(energy > 1e-9)[0] == 75
 
 
-def test_stamped_commands_tell_how_old_the_sample_was_that_they_answer(
-    read, bags, example2
-):
+def test_stamped_commands_tell_the_age_of_the_answered_sample(read, bags, example2):
     """The torque of every other tick answers the sample of 2 ms before it."""
     entries = list(example2)
     for tick in range(2, 300, 2):
@@ -390,9 +384,7 @@ def panel_of(run, title):
     return next(axes for axes in drawn.axes if axes.get_title("left").startswith(title))
 
 
-def test_error_estimates_are_drawn_against_the_computing_time_used(
-    read, bags, example2
-):
+def test_error_estimates_are_drawn_over_the_computing_time(read, bags, example2):
     entries = list(example2)
     for k in (1, 2):
         said = {"phase": "running", "ticks": 100 * k, "step_mean_us": 50.0}
@@ -518,9 +510,7 @@ def test_the_track_is_what_was_written(followed, written):
     assert found.metrics.largest == pytest.approx(largest)
 
 
-def test_the_error_of_the_orientation_is_the_angle_to_the_reference(
-    bags, followed, written
-):
+def test_the_orientations_error_is_the_angle_to_the_reference(bags, followed, written):
     plain = bags.without(followed, bags.DESIRED, bags.ERROR)
     found = read_tracking(written(bags.tracked(plain, lambda _: (HOME, STILL))))
     q = found.recording.quaternion
@@ -542,7 +532,7 @@ def test_the_report_writes_a_table_and_a_picture(followed, written, tmp_path):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
-def test_a_recording_without_a_reference_or_of_other_joints_is_refused(
+def test_a_recording_without_reference_or_our_joints_is_refused(
     bags, followed, written, tmp_path
 ):
     with pytest.raises(InputError, match="reference"):

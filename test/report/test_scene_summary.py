@@ -51,7 +51,7 @@ every_scene = pytest.mark.parametrize(
 
 
 @pytest.mark.parametrize(("name", "bare"), [("example2_heavy", 290), ("general", 388)])
-def test_a_plain_scene_costs_as_a_kernel_that_knows_no_optional_terms(name, bare):
+def test_a_plain_scene_costs_as_a_kernel_without_optional_terms(name, bare):
     """At most 3 % more than such a kernel, written once by hand, had operations."""
     assert operations(load(name)) <= 1.03 * bare
 
@@ -73,7 +73,7 @@ def with_everything():
     return replace(loaded(), own_loads=(own,))
 
 
-def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operation():
+def test_a_scene_without_its_terms_is_the_plain_one_by_operation():
     scene = with_everything()
     for term in SCENE_TERMS:
         if term not in ("actuated links", "intermediate links"):
@@ -82,7 +82,7 @@ def test_the_scene_without_all_that_it_has_is_the_plain_one_operation_by_operati
     assert ODE(Dynamics.of(scene)).program == ODE(Dynamics.of(load("general"))).program
 
 
-def test_each_term_of_a_scene_with_everything_adds_operations_or_folds():
+def test_each_term_of_a_full_scene_adds_operations_or_folds():
     """Inertias and limits fold into constants or act outside the right-hand side."""
     added = {cost.name: cost.adds for cost in costs(with_everything())}
     folded = {"actuated links", "payload", "rotors", "torque limit"}
@@ -99,7 +99,7 @@ def test_a_plain_scene_has_no_angle_and_no_root():
 
 
 @every_scene
-def test_a_summary_has_all_parts_and_every_term_adds_operations_or_folds(name):
+def test_a_summary_has_all_parts_and_each_term_adds_or_folds(name):
     scene, said = load(name), summary(load(name))
     assert said.startswith(f"{name}: {scene.description}\n")
     assert f"right-hand side: 7 states, {operations(scene)} operations" in said
@@ -197,7 +197,7 @@ def test_summary_report_and_auto_agree_on_method_and_step(scene, monkeypatch):
     assert said in accuracy.accuracy_page([study])
 
 
-def test_a_stiff_scene_is_advised_the_implicit_method_and_the_rate_is_named():
+def test_a_stiff_scene_is_advised_implicit_and_its_rate_is_named():
     advice, rates = step_advice(load("stiff")), eigenvalues(load("stiff"))
     assert (
         "then rodas5p from" in advice.method

@@ -37,7 +37,7 @@ def changed(name, scene=EXAMPLE2):
     return CHANGED_RUNS[name][1](scene, simulate(scene, duration=0.02))
 
 
-def test_every_run_ends_with_a_value_within_its_estimate_or_with_a_named_fault(found):
+def test_each_run_ends_within_its_estimate_or_with_a_named_fault(found):
     assert found.runs.name.tolist() == list(FEW) and found.passed
     whole, stroke, singular = found.runs.itertuples()
     assert (
@@ -83,7 +83,7 @@ def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch, kind, only, 
     assert f"1 runs, {0 if passes else 1} failed" in stability_page(report)
 
 
-def test_the_numbers_are_ten_and_a_hundred_times_those_of_the_scene():
+def test_the_numbers_are_10_and_100_times_those_of_the_scene():
     torque = EXAMPLE2.torque.amplitude
     assert changed("torque").torque.amplitude == tuple(10.0 * each for each in torque)
     moving = dataclasses.replace(EXAMPLE2.initial, gamma_dot=(0.1, 0.2, -0.3))

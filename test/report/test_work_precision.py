@@ -67,7 +67,7 @@ def _rows(found, method, kind=FIXED):
 
 
 @pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
-def test_the_reference_is_better_than_doubles_can_be_and_what_mpmath_finds(short):
+def test_the_reference_is_mpmaths_and_better_than_doubles(short):
     """At the same steps, so that only the arithmetic differs."""
     assert short.reference.own.orientation < 1e-16
     assert short.floor == ABOVE_REFERENCE * short.reference.own.orientation

@@ -57,7 +57,7 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
     assert are_drawn(out / part, [*PICTURES[part], "error"])
 
 
-def test_example_2_is_the_librarys_to_the_bit_however_busy_the_machine_was(out):
+def test_example_2_is_the_librarys_to_the_bit_however_busy(out):
     recording = read(out / "bag")
     played = load_scene("example2")
     profile = played.torque.at

@@ -37,7 +37,7 @@ PUBLISHED = {
 
 
 @pytest.mark.parametrize("node", NODES, ids=lambda node: node.command)
-def test_the_policies_are_those_of_the_declarations_in_the_form_of_sros2(node):
+def test_policies_are_those_of_the_declarations_in_sros2s_form(node):
     """As in sros2's policy.xsd, version 0.2.0."""
     data = (CONFIG / "sros2" / f"{node.command}.policy.xml").read_bytes()
     assert data == policy(node).encode()
@@ -125,9 +125,7 @@ def test_the_policies_allow_what_running_nodes_use_and_no_more(
             assert names <= expected[right], (node.name, right)
 
 
-def test_the_diagnostics_are_those_of_the_docs_and_the_description_can_be_left_out(
-    nodes, observer
-):
+def test_diagnostics_are_the_docs_and_description_is_optional(nodes, observer):
     # The scene has limits, and so distances to them.
     nodes.run("simulator", scene="example2_heavy", publish_description=False)
     observer.told("phase", "running")

@@ -112,9 +112,7 @@ def test_limit_and_external_moment_are_those_of_the_scene(nodes, observer, tmp_p
     observer.told("commands_dropped_because", "not finite 1")
 
 
-def test_a_moment_is_taken_in_a_scene_without_one_where_that_is_asked_for(
-    nodes, observer
-):
+def test_a_moment_is_taken_in_a_scene_without_one_when_asked(nodes, observer):
     applied = observer.listen(JointTrajectory, f"{NODE}/applied_torques")
     scenes = observer.listen(String, f"{NODE}/scene", latched=True)
     nodes.run("simulator", scene="example2", external_moment=True)
@@ -160,7 +158,7 @@ def test_a_message_of_another_type_is_reported(nodes, observer):
     assert err.count(text) == 1
 
 
-def test_commands_that_wait_while_the_process_is_held_up_are_all_used(nodes, observer):
+def test_commands_that_wait_for_a_held_up_process_are_all_used(nodes, observer):
     """A busy machine hands over at once what has arrived in a while."""
     process = nodes.run("simulator")
     commands = observer.publisher(Float64MultiArray, COMMANDS)

@@ -61,7 +61,7 @@ def twice(tmp_path_factory, forked_demos):
     return first, second
 
 
-def test_the_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
+def test_torques_of_the_inverse_dynamics_reproduce_the_motion(twice):
     """The paper's double check, through the nodes: open loop, torques held over 2 ms.
 
     What is left is the hold, of second order (test_controller.py); at 2 ms it is as
@@ -170,7 +170,7 @@ def test_a_refusal_is_told_before_any_torque(nodes, observer, tmp_path):
     assert commands == [] and controller.poll() is None
 
 
-def test_a_good_trajectory_is_followed_with_its_joints_in_any_order(
+def test_a_trajectory_is_followed_with_its_joints_in_any_order(
     nodes, observer, tmp_path
 ):
     path = written(tmp_path, motion=None)
@@ -261,9 +261,7 @@ def test_gains_are_set_while_it_runs_or_refused_with_the_reason(
     assert np.abs(np.subtract(reference[-1].position[1:], HOME[1:])).max() < 1e-12
 
 
-def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(
-    nodes, observer, tmp_path
-):
+def test_a_stream_of_trajectories_moves_a_run_without_a_jump(nodes, observer, tmp_path):
     """Ten points a second, each a second ahead.
 
     On a busy machine, so at a quarter of the speed.
@@ -311,7 +309,7 @@ def test_a_stream_of_trajectories_moves_a_free_run_without_a_jump(
     assert np.abs(off / dt**2).max() < 4.0 and np.ptp(gamma[:, 0]) > 0.1
 
 
-def test_killed_in_the_middle_the_simulator_lets_go_and_the_recording_survives(
+def test_the_recording_survives_a_killed_simulator_which_lets_go(
     nodes, observer, tmp_path
 ):
     motion = DesiredMotion(to_angles=ToAngles(gamma=AWAY, duration=20.0))

@@ -123,9 +123,7 @@ class ControllerManager:
 
 
 @pytest.mark.parametrize("rate", [100, 500])
-def test_a_controller_manager_by_our_clock_has_one_update_for_each_sample(
-    nodes, domain, rate
-):
+def test_a_controller_manager_updates_once_for_each_sample(nodes, domain, rate):
     """The same bits whether its controller is there at once or later."""
     count = int(0.2 * rate) + 1
     rates = {"rate": 500, "publish_rate": rate, "duration": 0.2}

@@ -104,7 +104,7 @@ def give(worker, message):
 
 
 @pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
-def test_a_fault_ends_who_commands_in_every_order_of_the_messages(make, kind):
+def test_a_fault_ends_who_commands_in_every_order_of_messages(make, kind):
     for messages in orders(PHASES, STATES):
         worker = make(kind)
         with pytest.raises(SstError, match="the simulator stopped: fault: stopped at"):

@@ -71,7 +71,7 @@ def test_a_state_is_read_as_it_is(state):
     np.testing.assert_allclose((angles.x, angles.y, angles.z), expected, atol=1e-14)
 
 
-def test_a_message_that_is_filled_anew_keeps_nothing_of_the_last_state(state):
+def test_a_refilled_message_keeps_nothing_of_the_last_state(state):
     messages = state_messages("idle", "left/base_link")
     filled(messages, STAMP_NS, state)
     start = Simulation(load_scene("example2")).state

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[2]
 
 
-def test_what_can_change_does_and_the_rest_is_refused_with_the_reason(nodes, observer):
+def test_what_cannot_change_is_refused_with_the_reason(nodes, observer):
     # with time to spare on a slow machine
     nodes.run("simulator", rate=100, publish_rate=100)
     observer.phase("running")
@@ -56,9 +56,7 @@ def scheduling(process):
     return sorted(found)
 
 
-def test_threads_that_the_run_may_wait_for_are_scheduled_in_real_time_too(
-    nodes, observer
-):
+def test_threads_that_the_run_may_wait_for_are_real_time_too(nodes, observer):
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
     except (AttributeError, OSError):
@@ -91,9 +89,7 @@ def machine_latency_us():
         return None
 
 
-def test_the_exit_latency_of_idle_states_is_limited_while_a_run_has_deadlines(
-    nodes, observer
-):
+def test_exit_latency_is_limited_while_a_run_has_deadlines(nodes, observer):
     before = machine_latency_us()
     if not before:
         pytest.skip(

@@ -198,9 +198,7 @@ def publish(node, *torque):
     return publisher
 
 
-def test_the_first_command_of_a_new_publisher_is_taken_within_20_ms(
-    node, reader, looks
-):
+def test_a_new_publishers_first_command_is_taken_within_20_ms(node, reader, looks):
     at = time.monotonic_ns() + 10**12  # the test does not count its own time
     assert not reader.read(at)
     publisher = publish(node, 1.0, 2.0, 3.0)
@@ -280,7 +278,7 @@ def test_a_node_ends_though_its_middleware_hangs(domain):
 
 
 @pytest.mark.parametrize(("came", "longest_s"), [({2}, 1.2), (set(), 6.0)])
-def test_a_node_whose_work_is_done_waits_longer_for_its_subscribers(
+def test_a_node_whose_work_is_done_waits_for_its_subscribers(
     monkeypatch, came, longest_s
 ):
     """One that got a signal ends within 2 s; both say what was not received."""

@@ -78,7 +78,7 @@ def test_signals_leave_a_readable_bag_with_all_samples(
     assert len(whole(tmp_path / "bag", 150).time_ns) == 151
 
 
-def test_commands_are_read_when_all_that_a_simulator_says_is_heard(
+def test_commands_are_read_once_all_of_a_simulators_topics_are(
     nodes, observer, tmp_path
 ):
     """Who commands waits for their readers: what the recorder has not found would be
@@ -113,7 +113,7 @@ def test_commands_are_read_when_all_that_a_simulator_says_is_heard(
     assert nodes.line(recorder) == "ready: 8 topics\n"
 
 
-def test_a_latched_topic_is_heard_though_its_subscriber_is_seen_first(
+def test_a_latched_topic_is_heard_if_its_subscriber_comes_first(
     nodes, observer, domain, tmp_path
 ):
     """As where a player starts before the simulator."""
@@ -181,9 +181,7 @@ def test_lost_messages_are_counted(nodes, observer, tmp_path):
     assert re.search(r"lost messages: \d+ of /joint_states", err), err
 
 
-def test_joint_states_of_another_robot_do_not_stand_for_those_of_the_simulator(
-    nodes, observer, tmp_path
-):
+def test_another_robots_joint_states_do_not_stand_for_ours(nodes, observer, tmp_path):
     """They are recorded, as the topic is, but the recorder is not ready with them
     alone.
     """
@@ -203,7 +201,7 @@ def test_joint_states_of_another_robot_do_not_stand_for_those_of_the_simulator(
     assert nodes.stop(recorder)[0] == 0
 
 
-def test_joint_states_of_another_robot_alone_are_an_incomplete_bag(
+def test_another_robots_joint_states_alone_are_an_incomplete_bag(
     nodes, observer, tmp_path
 ):
     recorder = nodes.run("recorder", output=tmp_path / "bag", topics="[/joint_states]")
@@ -217,7 +215,7 @@ def test_joint_states_of_another_robot_alone_are_an_incomplete_bag(
     )
 
 
-def test_topics_belong_to_the_nodes_whose_private_topics_are_requested():
+def test_topics_belong_to_the_nodes_of_private_topics_asked_for():
     requested = [
         "/left/joint_states",
         "/left/sim/phase",

@@ -210,9 +210,7 @@ def test_the_legs_carry_the_star_and_its_payload(motion):
     np.testing.assert_allclose(carried[1], moment, atol=1e-6)
 
 
-def test_a_node_publishes_what_is_asked_for_with_the_stamps_of_its_samples(
-    nodes, observer
-):
+def test_what_is_asked_for_is_published_with_the_samples_stamps(nodes, observer):
     point = "[0.02,-0.05,0.11]"
     topics = {
         "orientation": QuaternionStamped, "imu": Imu, "reaction": WrenchStamped,

@@ -77,7 +77,7 @@ def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_and_who_looks_sees_at_once_that_it_has_left(
+def test_signals_end_it_and_others_see_at_once_that_it_has_left(
     nodes, observer, number
 ):
     """Otherwise it would be there for 20 s more, and a new one would not be the only

@@ -42,9 +42,7 @@ def test_unknown_arguments_are_refused(run_here, tmp_path, words, refused, said)
     assert status == refused and said in err and "csv = " not in err
 
 
-def test_plain_options_are_parameters_and_a_run_goes_on_until_it_is_ended(
-    nodes, observer
-):
+def test_plain_options_are_parameters_and_a_run_has_no_end(nodes, observer):
     scene = observer.listen(String, f"{NODE}/scene", latched=True)
     words = ["--scene", "fast_spin", "--wait-for-subscribers", "/diagnostics,~/scene"]
     process = nodes.start("simulator", *words)

@@ -30,7 +30,7 @@ def no_domain(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def test_two_at_the_same_time_differ_and_the_environment_comes_back():
+def test_two_at_once_differ_and_the_environment_comes_back():
     with own_domain() as first:
         assert os.environ["ROS_DOMAIN_ID"] == str(first)
         with own_domain() as second:

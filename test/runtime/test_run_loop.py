@@ -74,7 +74,7 @@ def test_no_torque_is_unpublished_when_a_run_does_not_go_on(start):
     assert bench.output.flushed == len(bench.output.acted)  # it ends right after a step
 
 
-def test_a_run_that_is_stepped_to_its_end_is_finished_and_has_no_fault(start):
+def test_a_run_stepped_to_its_end_is_finished_without_fault(start):
     bench = start(duration=0.02, clock=HandClock())
     bench.to(Phase.RUNNING)
     bench.ask("pause", True)
@@ -84,7 +84,7 @@ def test_a_run_that_is_stepped_to_its_end_is_finished_and_has_no_fault(start):
     assert bench.output.unpublished["finished"] == 0
 
 
-def test_ticks_between_samples_are_done_together_and_commands_keep_their_tick(at_once):
+def test_ticks_are_done_together_and_commands_keep_their_tick(at_once):
     """The command comes between the beginnings of two ticks that are done together."""
     torque = (1.0, 2.0, 3.0)
     given = {"real_time_factor": 1.0, "duration": 0.02, "publish_rate": 500}
@@ -225,9 +225,7 @@ def test_a_fault_is_latched_until_a_reset(start):
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_run_that_waits_for_nothing_does_not_begin_between_a_reset_and_a_stop(
-    start, fails
-):
+def test_a_run_does_not_begin_between_a_reset_and_a_stop(start, fails):
     bench = start(HEAVY)
     bench.until(lambda: bench.output.samples)
     if fails:
@@ -289,7 +287,7 @@ def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(start, error):
 
 
 @pytest.mark.parametrize("factor", [0.0, 1.0])
-def test_lockstep_times_out_into_a_fault_which_requests_do_not_put_off(start, factor):
+def test_requests_do_not_put_off_the_fault_of_a_lockstep_timeout(start, factor):
     began = time.monotonic()
     bench = start(sync="lockstep", lockstep_timeout=0.5, real_time_factor=factor)
     output = bench.output
@@ -322,7 +320,7 @@ def test_a_pause_does_not_count_as_waiting_for_an_answer(start):
     bench.until(lambda: len(bench.output.samples) > 1)
 
 
-def test_a_step_in_lockstep_without_a_controller_does_not_hold_other_requests(start):
+def test_a_step_without_a_controller_holds_no_other_request(start):
     """Its wait has a bound of its own, and an answer that comes later is used by the
     next step.
     """
@@ -366,7 +364,7 @@ def test_it_waits_for_subscribers_and_no_longer_than_allowed(start):
     assert "no subscriber of joint_states within 0.2 s" in loop.fault
 
 
-def test_states_that_are_no_samples_have_the_time_at_which_they_hold(start):
+def test_states_that_are_no_samples_have_the_time_when_they_hold(start):
     bench = start(wait_for_command=True, real_time_factor=1.0)
     output = bench.output
 
@@ -434,7 +432,7 @@ def test_code_that_cannot_be_loaded_is_a_fault(start):
 
 @pytest.mark.parametrize("sync", ["free", "lockstep"])
 @pytest.mark.parametrize("publish_clock", [True, False])
-def test_no_two_states_have_one_stamp_though_the_clock_stands_still(
+def test_no_two_states_have_one_stamp_if_the_clock_stands_still(
     start, publish_clock, sync
 ):
     """Before the run, in a pause, in a fault and after a reset."""
@@ -483,7 +481,7 @@ def test_after_a_reset_a_late_answer_does_not_start_the_run(
     assert (len(bench.output.samples) > 1) == starts
 
 
-def test_in_lockstep_our_clock_goes_on_before_the_run_by_whole_periods(start):
+def test_before_the_run_our_clock_goes_on_by_whole_periods(start):
     """So that a controller manager, which is updated by it, can have its controllers
     activated.
     """
@@ -518,14 +516,14 @@ def test_in_lockstep_our_clock_goes_on_before_the_run_by_whole_periods(start):
 @pytest.mark.parametrize(
     ("waits", "phase"), [(False, Phase.RUNNING), (True, Phase.WAITING)]
 )
-def test_to_resume_a_reset_run_answers_with_the_phase_it_then_has(start, waits, phase):
+def test_resuming_a_reset_run_answers_with_its_new_phase(start, waits, phase):
     bench = start(wait_for_command=waits)
     assert bench.ask("pause", True).success and bench.ask("reset").success
     assert bench.ask("pause", False) == (True, phase.value)
     assert bench.loop.phase is phase
 
 
-def test_words_and_values_of_the_diagnostics_do_not_contradict_each_other():
+def test_words_and_values_of_the_diagnostics_agree():
     """The run goes on while they are read: what is not in the values is told the next
     time.
     """

@@ -23,7 +23,7 @@ def test_a_request_is_written_as_the_kernel_reads_it(tmp_path, latency_us):
     assert asked.request(-1) == "no limit"
 
 
-def test_what_is_not_permitted_is_said_and_nothing_is_opened_unasked(tmp_path):
+def test_what_is_not_permitted_is_said_and_nothing_is_opened(tmp_path):
     assert CpuDmaLatency(tmp_path / "none").request(-1) == "no limit"
     said = CpuDmaLatency(tmp_path).request(0)  # a folder cannot be written
     assert (

@@ -51,7 +51,7 @@ def test_the_last_good_command_is_held():
     assert bench.torque() == (1.0, 2.0, 3.0)
 
 
-def test_a_command_acts_from_the_tick_that_begins_after_its_arrival():
+def test_a_command_acts_from_the_tick_after_its_arrival():
     """Of ticks that are done together the first may lie before the arrival."""
     bench = Bench(command_timeout=0.5)
     bench.commands.append(plain((1.0, 2.0, 3.0)))
@@ -93,7 +93,7 @@ def test_a_stale_command_is_let_go_of_and_a_fresh_one_held_again():
     assert bench.torque((0.0, 0.0, 1.0)) == (0.0, 0.0, 1.0) and not bench.board.stale
 
 
-def test_limits_clamp_and_count_and_hold_for_the_damping_that_takes_over():
+def test_limits_clamp_count_and_hold_for_the_damping_after():
     bench = Bench(Actuators(torque_limit=0.5, idle_damping=2.0), command_timeout=100.0)
     assert bench.torque((0.1, -5.0, 0.6)) == (0.1, -0.5, 0.5)
     assert bench.board.clamped == 1 and bench.board.constant(time.monotonic_ns())
@@ -147,7 +147,7 @@ def test_moments_are_checked_and_let_go_of():
     assert bench.board.moment == ZERO
 
 
-def test_an_effort_that_is_no_number_means_not_commanded_where_that_is_asked_for():
+def test_an_effort_that_is_no_number_is_no_command_when_asked():
     """As joint_state_topic_hardware_interface of ros2_control sends it, with a stamp of
     its own.
     """

@@ -147,7 +147,7 @@ def test_what_cannot_be_followed_is_refused_at_the_start(model, settings, reason
         )
 
 
-def test_a_trajectory_beside_the_motion_of_the_scene_is_refused_for_that():
+def test_a_trajectory_beside_the_motion_of_the_scene_is_refused():
     with pytest.raises(InputError, match="must be topic"):
         follow().take(None, None)
 
@@ -274,7 +274,7 @@ class Stream:
 
 @pytest.mark.parametrize("takes", [0, 3, 40], ids=lambda takes: f"{takes} samples")
 @pytest.mark.parametrize("every", [10, 50, 167])
-def test_a_stream_is_followed_without_a_jump_however_long_its_checks_take(
+def test_a_stream_is_followed_without_a_jump_despite_long_checks(
     monkeypatch, takes, every
 ):
     stream, orders = Stream(monkeypatch, takes, mode="computed_torque"), []
@@ -368,7 +368,7 @@ def test_efforts_of_some_points_or_joints_are_refused(monkeypatch, efforts):
         )
 
 
-def test_gains_change_between_two_samples_and_the_sum_of_errors_stays():
+def test_gains_change_between_samples_and_the_error_sum_stays():
     given = {"mode": "pd", "integral_rate": 2.0}
     off = Measurement(tuple(np.subtract(HERE.gamma, 1e-3)), REST)
     tuned, plain = follow(bandwidth=30.0, **given), follow(bandwidth=30.0, **given)
@@ -386,7 +386,7 @@ def test_gains_change_between_two_samples_and_the_sum_of_errors_stays():
         np.testing.assert_allclose(after.feedback, expected, rtol=1e-9)
 
 
-def test_gains_that_would_be_unstable_are_refused_and_change_nothing():
+def test_unstable_gains_are_refused_and_change_nothing():
     follower = follow(mode="pd", bandwidth=30.0, integral_rate=2.0)
     answers(follower, [0], HERE)
     for worse in ({"integral_rate": 200.0}, {"bandwidth": 0.5, "integral_rate": 2.0}):
@@ -398,7 +398,7 @@ def test_gains_that_would_be_unstable_are_refused_and_change_nothing():
     assert answers(follower, [1], off)[0].torque == answers(same, [1], off)[0].torque
 
 
-def test_gains_of_the_node_that_no_motion_can_have_refuse_the_trajectory(monkeypatch):
+def test_gains_that_no_motion_can_have_refuse_the_trajectory(monkeypatch):
     stream = Stream(monkeypatch, 0, mode="pd")
     unstable = {"mode": "pd", "motion": "topic", "integral_rate": 200.0}
     stream.follower.tune(ControllerNodeParameters(**unstable))  # checked with a motion
@@ -464,7 +464,7 @@ def test_a_long_result_of_which_a_part_has_come_delays_no_sample():
             assert found == long
 
 
-def test_the_process_that_checks_ends_with_its_reason_and_another_begins():
+def test_a_checking_process_ends_with_reason_and_another_begins():
     with contextlib.closing(assistant_process.Assistant(math.sqrt)) as assistant:
 
         def result(*given):
@@ -482,7 +482,7 @@ def test_the_process_that_checks_ends_with_its_reason_and_another_begins():
         assert result(9.0) == 3.0
 
 
-def test_a_trajectory_begins_at_its_stamp_and_another_takes_its_place(monkeypatch):
+def test_a_trajectory_begins_at_its_stamp_and_is_replaced(monkeypatch):
     stream = Stream(monkeypatch, 2)
     first = stream.send(0.1, (0.02, 0.0, 0.0), START_NS + 10 * PERIOD_NS)
     stream.samples(10)
@@ -652,6 +652,6 @@ def test_the_index_is_that_of_the_point_ahead():
         ({"multi": ["base"]}, r"multi_dof_trajectory\.joint_names"),
     ],
 )
-def test_bad_tolerances_and_joints_of_several_freedoms_are_refused(given, place):
+def test_bad_tolerances_and_joints_of_many_freedoms_are_refused(given, place):
     with pytest.raises(InputError, match=place):
         TrajectoryGoal(message(**given), DEFAULTS)

@@ -62,7 +62,7 @@ def test_the_start_is_that_of_the_statement(rows):
     np.testing.assert_allclose(rows[0, 1:4], np.pi / 4, atol=1e-13)
 
 
-def test_loops_are_closed_and_the_torques_do_the_work_of_the_kinetic_energy(rows):
+def test_loops_are_closed_and_the_torques_do_the_work(rows):
     """By the statement alone: frames from the rows, rates by splines of them."""
     t, gamma, rotation = (
         rows[:, 0],

@@ -57,7 +57,7 @@ def test_a_method_has_its_order_on_a_smooth_motion(method):
     assert ORDER[method] - 0.2 < found < 1.4 * ORDER[method]
 
 
-def test_the_implicit_method_keeps_its_order_where_a_limit_cuts_the_torque():
+def test_the_implicit_method_keeps_its_order_past_a_torque_limit():
     """A step begins at each kink; the rate of the torque is that behind it."""
     exact, motion = truth("clamp")[0], MOTIONS["clamp"]
     runs = [motion.run("rodas5p", 1e3, max_step=0.4 / steps) for steps in (8, 16, 32)]

@@ -159,7 +159,7 @@ def test_a_run_loop_that_differs_fails_a_case(monkeypatch):
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4, 1e9])
-def test_accelerations_at_any_ratio_of_inertias_are_those_of_mpmath(scale):
+def test_accelerations_at_any_ratio_of_inertias_are_mpmaths(scale):
     """M is a sum of positive terms up to 1e9 apart; what counts is the largest part."""
     scene = replace(
         EXAMPLE2,
@@ -183,7 +183,7 @@ def started(angle, spin):
     return Simulation(changed(near_singularity(angle, spin)))
 
 
-def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays():
+def test_rest_at_a_parallel_singularity_is_taken_and_stays():
     """There gamma tells the pose only to the root of rounding: two assemblies meet."""
     simulation = started(0.0, 0.0)
     assert abs(simulation.conditioning["det_j2"]) < 1e-7
@@ -194,7 +194,7 @@ def test_rest_exactly_at_a_parallel_singularity_is_taken_and_stays():
     assert simulation.state.body_rate == REST
 
 
-def test_a_moving_start_exactly_at_a_parallel_singularity_is_refused():
+def test_a_moving_start_at_a_parallel_singularity_is_refused():
     """From gamma_dot alone the body rate came out as (1, -2.3, 1.9) rad/s, not (0, 0,
     1).
     """
@@ -212,7 +212,7 @@ def test_a_moving_start_that_is_taken_has_the_rate_that_is_meant(distance):
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-9])
-def test_starts_near_a_parallel_singularity_are_right_or_refused_by_name(distance):
+def test_starts_near_a_parallel_singularity_are_right_or_refused(distance):
     try:
         simulation = started(distance, 0.0)
     except SstError as error:

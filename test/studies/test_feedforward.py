@@ -106,7 +106,7 @@ def test_with_delay_the_limit_lies_where_theory_says():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", range(6))
-def test_the_whole_motion_is_followed_near_the_limit_and_lost_beyond(delay):
+def test_the_motion_is_followed_near_the_limit_and_lost_beyond(delay):
     bound = stability_limit(1.0, delay) * 1e9 / PERIOD_NS
     loop = dataclasses.replace(held(ideal_plant(SHORT), delay), lost=0.05)
     near, beyond = (run_loop(by_bandwidth(loop, share * bound)) for share in (0.9, 1.2))
@@ -139,9 +139,7 @@ def test_the_same_bits_on_any_number_of_workers():
 
 
 @pytest.mark.slow
-def test_what_it_writes_can_be_read_and_failures_stay_with_their_reason(
-    small, tmp_path
-):
+def test_its_files_can_be_read_and_failures_keep_their_reason(small, tmp_path):
     drawn = draw_study(small, title(small))
     files = {".csv": small.loops, ".json": document(small), "picture.png": drawn}
     publish(tmp_path, "feedforward", files)

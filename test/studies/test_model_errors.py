@@ -23,7 +23,7 @@ REACH, EXAMPLE2 = load("reach"), load("example2_heavy")
         (EXAMPLE2, ["nominal", "friction unknown", "gravity missing"]),
     ],
 )
-def test_every_error_is_one_but_what_a_plant_has_not_cannot_be_unknown(plant, without):
+def test_every_error_is_one_but_of_what_the_plant_has_not(plant, without):
     errors = list(model_errors())
     assert [error.name for error in errors if not error.changes(plant)] == without
     assert len({error.name for error in errors}) == len(errors)
@@ -40,7 +40,7 @@ GAMMA, RATE = (0.7, 0.8, 0.9), (0.1, -0.2, 0.3)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 5])
-def test_commands_come_late_by_whole_samples_and_the_first_one_waits(delay):
+def test_commands_are_late_by_whole_samples_and_the_first_waits(delay):
     wire = ChannelState(ControlChannel(delay=delay), 0)
     assert wire.measure(GAMMA, RATE) == Measurement(GAMMA, RATE)
     came = [wire.transmit((float(k), 0.0, 0.0))[0] for k in range(10)]
@@ -110,7 +110,7 @@ def test_without_delay_the_limit_is_that_of_jury(damping):
 
 
 @pytest.mark.parametrize("delay", range(6))
-def test_every_bandwidth_below_the_limit_is_stable_and_none_above(delay):
+def test_bandwidths_below_the_limit_are_stable_and_none_above(delay):
     limit = stability_limit(1.0, delay)
     assert all(
         pole(share * limit, 1.0, delay) < 1.0

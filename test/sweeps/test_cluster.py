@@ -247,7 +247,7 @@ def test_without_a_worker_that_takes_chunks_the_study_ends(
 
 
 @pytest.mark.parametrize("allowed", [0, 2])
-def test_a_chunk_that_kills_its_workers_is_given_up_after_the_others(
+def test_a_chunk_that_kills_its_workers_is_given_up_at_last(
     processes, expected, tmp_path, allowed
 ):
     processes.stop()

@@ -159,7 +159,7 @@ def test_gains_vary_by_row():
     assert both["error_max_1"][0] > 1.5 * both["error_max_1"][2]
 
 
-def test_noise_is_normal_and_depends_on_row_counter_and_seed_alone():
+def test_noise_is_normal_and_depends_on_row_counter_and_seed():
     rows = np.arange(20_000)
     drawn = gaussian(3, rows, 5)
     assert stats.kstest(drawn, "norm").pvalue > 1e-3
@@ -176,7 +176,7 @@ def test_noise_is_normal_and_depends_on_row_counter_and_seed_alone():
         (0.1, "steps = 25: must be a multiple of 10, the control periods"),
     ],
 )
-def test_a_duration_or_steps_that_fit_no_whole_periods_are_refused(period, message):
+def test_a_duration_or_steps_of_no_whole_periods_are_refused(period, message):
     study = SweepStudy(
         SCENE, VARY, n=2, control={"period": period}, duration=1.0, steps=25
     )
@@ -185,7 +185,7 @@ def test_a_duration_or_steps_that_fit_no_whole_periods_are_refused(period, messa
 
 
 @pytest.mark.slow
-def test_the_time_at_which_a_controlled_run_leaves_does_not_depend_on_its_steps():
+def test_when_a_controlled_run_leaves_is_independent_of_steps():
     rates = [[rate, 0.0, 0.0] for rate in (0.0, 12.0, 20.0, -20.0)]
     control = {"mode": "gravity_pd", "bandwidth": 5.0, "period": 0.01, "delay": 1}
     coarse, fine = (

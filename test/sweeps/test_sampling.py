@@ -64,7 +64,7 @@ def test_sobol_points_fill_each_range_evenly():
     assert len(set(cells.clip(0, 1023))) >= 1023
 
 
-def test_a_grid_is_the_product_of_its_axes_and_the_last_varies_fastest():
+def test_a_grid_is_the_product_of_its_axes_the_last_is_fastest():
     vary = {KEY: [0.2, 0.3], "initial.gamma": [[0.7] * 3, [0.8] * 3, [0.9] * 3]}
     study = SweepStudy(SCENE, vary)
     assert study.rows == 6

@@ -126,7 +126,7 @@ def test_rows_that_make_no_scene_are_reported_and_stop_no_other():
     assert not found["reason"][~wrong].str.startswith("no scene").any()
 
 
-def test_a_table_is_checked_before_anything_runs_and_runs_row_by_row(table):
+def test_a_table_is_checked_before_it_runs_row_by_row(table):
     some = table.loc[[5, 200, 17], table.attrs["inputs"]]
     again = sst_ros.sweep(SCENE, some, steps=40)
     for name in ("gamma_1", "body_rate_z", "energy"):
@@ -139,7 +139,7 @@ def test_a_table_is_checked_before_anything_runs_and_runs_row_by_row(table):
         )
 
 
-def test_ends_of_ranges_that_make_no_scene_are_refused_before_anything_runs():
+def test_ends_of_ranges_that_make_no_scene_are_refused_first():
     with pytest.raises(
         InputError, match=r"makes no scene.*no principal moment may exceed"
     ):

@@ -85,7 +85,7 @@ def test_a_part_beyond_the_last_is_refused(copied):
         run_study(shorter, copied, resume=True)
 
 
-def test_a_cut_part_is_computed_again_and_not_left_out_of_the_table(copied, whole):
+def test_a_cut_part_is_computed_again_and_stays_in_the_table(copied, whole):
     part(copied, 2).write_bytes(part(copied, 2).read_bytes()[:500])
     with pytest.raises(InputError, match=r"part-0000002.parquet.* is not whole"):
         read_sweep(copied)

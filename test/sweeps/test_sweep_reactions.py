@@ -46,7 +46,7 @@ def test_peaks_and_rms_of_runs_are_those_of_each_alone():
 
 
 @pytest.mark.slow
-def test_motors_of_controlled_runs_give_the_torques_that_were_sent():
+def test_motors_of_controlled_runs_give_the_commanded_torques():
     """Without friction and springs the torque about an actuator's axis is that of its
     motor.
     """

@@ -114,7 +114,7 @@ def test_nobody_enters_without_the_token(server, query):
     assert status == 403 and b"token" in body
 
 
-def test_two_pages_take_two_ports_and_two_tokens_and_nothing_is_shared(server):
+def test_two_pages_share_neither_port_nor_token(server):
     second = PageServer(port=18280)
     try:
         assert re.fullmatch(
