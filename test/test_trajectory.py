@@ -99,7 +99,7 @@ class OldPickle:
 
     def __init__(self, motion):
         names = (
-            "scene", "t", "quaternion", "body_rate", "torque", "gaps", "law",
+            "scene", "t", "quaternion", "body_rate", "torque", "_joints", "gaps", "law",
             "status", "message", "method", "error_estimate", "evaluations", "step",
         )  # fmt: skip
         self.values = {name: getattr(motion, name) for name in names}
