@@ -17,7 +17,7 @@ from sst_ros.scene.loads import Actuators
 from sst_ros.scene.scene import load
 from sst_ros.scene.torque_profile import PolynomialTorque, TorqueTable
 from sst_ros.simulation.simulate import simulate
-from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.simulation.trajectory import RunRecord, Trajectory
 
 EXAMPLE2 = load("example2_heavy")
 ARRAYS = (
@@ -92,6 +92,45 @@ def test_a_copy_and_another_process_get_every_bit_of_the_samples():
         np.testing.assert_allclose(
             again.at(0.1234).gamma, run.at(0.1234).gamma, rtol=0, atol=1e-9
         )
+
+
+class OldPickle:
+    """A trajectory as versions pickled it in which nothing stood in a record."""
+
+    def __init__(self, motion):
+        names = (
+            "scene", "t", "quaternion", "body_rate", "torque", "_joints", "gaps", "law",
+            "status", "message", "method", "error_estimate", "evaluations", "step",
+        )  # fmt: skip
+        self.values = {name: getattr(motion, name) for name in names}
+        self.values["_residual"] = motion.energy_residual
+        self.values["_parameters"] = ()
+        self.values["dense"] = None
+
+    def __reduce__(self):
+        return object.__new__, (Trajectory,), self.values
+
+
+def test_a_pickle_of_a_version_without_records_is_read(run):
+    again = pickle.loads(pickle.dumps(OldPickle(run)))
+    for name in ("quaternion", "gamma", "torque", "energy"):
+        assert getattr(again, name).tobytes() == getattr(run, name).tobytes(), name
+    assert again.energy_residual == run.energy_residual and repr(again) == repr(run)
+    for name in ("status", "message", "method", "error_estimate", "evaluations"):
+        assert getattr(again, name) == getattr(run, name), name
+    np.testing.assert_allclose(again.at(0.1234).gamma, run.at(0.1234).gamma, atol=1e-12)
+    assert not again.quaternion.flags.writeable
+
+
+def test_a_slice_and_samples_at_other_times_share_the_record(run):
+    assert run[3:9].run is run.run and run.at(0.05).run is run.run
+    assert run[3:9].energy_residual == run.energy_residual
+
+
+def test_a_record_refuses_a_status_that_is_none():
+    for status in (3, True, 1.0, "0"):
+        with pytest.raises(InputError, match=r"status = .*: must be one of"):
+            RunRecord(status=status)
 
 
 def test_a_csv_is_the_table_and_other_suffixes_are_refused(run, tmp_path):

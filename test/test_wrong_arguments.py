@@ -18,6 +18,7 @@ import sst_ros
 from sst_ros import Batch, Simulation, SstError, Trajectory, load_scene, simulate
 from sst_ros.control.controller import Measurement
 from sst_ros.errors import Problem
+from sst_ros.simulation.trajectory import RunRecord
 
 LIST, DICT = [], {}
 LIST.append(LIST)
@@ -238,7 +239,8 @@ def calls():
         (lambda **given: Simulation(SCENE).steps(**given), push | {"count": 2}),
         (Simulation(SCENE).within, of(time_ns=0)),
         (Simulation(SCENE).acting, of(torque=REST)),
-        (Trajectory, rows | {"scene": SCENE, "joints": None, "status": 0, "law": None}),
+        (Trajectory, rows | {"scene": SCENE, "joints": None, "run": RunRecord()}),
+        (RunRecord, of(status=0, law=None)),
         (run.at, of(t=0.005)),
         (run.save, of(path="run.txt", overwrite=True)),
         (Trajectory.load, of(path="run.npz")),

@@ -31,8 +31,9 @@ from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
+from sst_ros.scene.torque_profile import FunctionTorque
 from sst_ros.scene.yaml_document import values_at
-from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.simulation.trajectory import RunRecord, Trajectory
 
 PIECE_PARTS = 16  # parts of a piece of the motion; even, for Simpson's rule
 SINGULAR_J2 = 1e-6  # det J2 within which a motion counts as singular
@@ -159,10 +160,11 @@ def examine_motion(
     star = np.array([(*at.quaternion, *at.body_rate) for at in desired])
     # ends of pieces may be equal up to rounding
     t, rows = np.unique(times, return_index=True)
+    law = FunctionTorque(lambda time: inverse.reference_torque(motion.at(time)))
+    record = RunRecord(message="planned", law=law, dense=states)
     trajectory = Trajectory(
-        scene, t, star[rows, :4], star[rows, 4:], samples[rows, :3], message="planned",
-        law=lambda time: inverse.reference_torque(motion.at(time)), dense=states,
-    )  # fmt: skip
+        scene, t, star[rows, :4], star[rows, 4:], samples[rows, :3], run=record
+    )
     peaks = {}
     for first, name in zip(range(0, 12, 3), DEMAND_UNITS, strict=True):
         floor = -math.inf if exact else limits.get(name, math.inf)

@@ -37,7 +37,7 @@ from sst_ros.scene import yaml_document
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.tables import write_table
-from sst_ros.simulation.trajectory import Trajectory
+from sst_ros.simulation.trajectory import RunRecord, Trajectory
 from sst_ros.state import NANOSECONDS, Explained, ReadOnly, cached_property, freeze
 
 if TYPE_CHECKING:
@@ -631,18 +631,21 @@ class Recording(Explained, ReadOnly):
             if all(inside)
             else None
         )
+        record = RunRecord(
+            status=1 if fault else 0,
+            message=fault or reported.get("phase", "recorded"),
+            method=reported.get("integrator", ""),
+            error_estimate=error_estimate,
+            law=law,
+        )
         return Trajectory(
             self.scene,
             self.seconds[known],
             self.quaternion[known],
             self.states[known, 4:7],
             self.effort[known],
+            run=record,
             joints=joints[known],
-            status=1 if fault else 0,
-            message=fault or reported.get("phase", "recorded"),
-            method=reported.get("integrator", ""),
-            error_estimate=error_estimate,
-            law=law,
             gaps=np.array(gaps) / NANOSECONDS,
         )
 

@@ -32,7 +32,7 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.simulation.simulation import INTEGRATORS, describe_conditioning
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
-from sst_ros.simulation.trajectory import Trajectory, check_error
+from sst_ros.simulation.trajectory import RunRecord, Trajectory, check_error
 from sst_ros.state import NANOSECONDS, Array, TimesLike
 
 _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
@@ -254,25 +254,28 @@ def _trajectory(
         )
     samples = motion.samples.table()
     changes = [f"{to} from {at:g} s ({why})" for at, to, why in point.changes]
-    energy = motion.stepper.dynamics.total_energy
+    law = task.torque
+    if motion.held:
+        law = TorqueTable(*zip(*motion.held, strict=True))
+    record = RunRecord(
+        status=status,
+        message=message,
+        method=", then ".join([motion.start.method.name, *changes]),
+        error_estimate=error,
+        evaluations=spent + motion.samples.evaluations,
+        step=motion.time / max(point.steps, 1),
+        law=law,
+        parameters=task.parameters,
+        ends=(tuple(motion.start.y), tuple(point.y)),
+    )
     return Trajectory(
         task.scene,
         samples.t,
         samples.quaternion,
         samples.body_rate,
         samples.torque,
+        run=record,
         joints=samples.joints,
-        status=status,
-        message=message,
-        method=", then ".join([motion.start.method.name, *changes]),
-        error_estimate=error,
-        energy_residual=lambda: energy(point.y) - energy(motion.start.y) - point.y[-1],
-        evaluations=spent + motion.samples.evaluations,
-        step=motion.time / max(point.steps, 1),
-        law=(
-            TorqueTable(*zip(*motion.held, strict=True)) if motion.held else task.torque
-        ),
-        parameters=task.parameters,
     )
 
 

@@ -11,7 +11,7 @@ import contextlib
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from sst_ros.dynamics.reactions import REACTION_UNITS, Reactions, reactions_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.dynamics.variational import Sensitivities, Sensitivity
 from sst_ros.errors import (
+    Check,
     Diverged,
     MissingDependency,
     check_kinds,
@@ -66,34 +67,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _KEY, _FORMAT = "sst_ros", 1
-_FIGURES = (
-    "status", "message", "method", "error_estimate", "energy_residual",
-    "evaluations", "step",
-)  # fmt: skip
-"""What a run says of itself, in its files and in xarray."""
-
-_TEXTS = ("message", "method")
-"""Those of the figures that are text; the others are numbers."""
-
 _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
-
-
-_STATUSES = (-1, 0, 1, 2)
-_UNMET = 2
-"""Status of a motion that reached its end, its error estimate above the tolerance."""
-
-
-def check_error(
-    error: float, tolerance: float, status: int, message: str
-) -> tuple[int, str]:
-    """Return status and message of a motion with an error estimate at its end [rad]."""
-    if not error > tolerance:
-        return status, message
-    unmet = (
-        f"the error estimate {error:.1e} rad exceeds the tolerance {tolerance:g} rad"
-    )
-    return status or _UNMET, f"{message}; {unmet}"
 
 
 _UNIT_DEVIATION = 1e-6
@@ -122,13 +97,116 @@ def _check_columns(path: str | Path, columns: dict[str, Array]) -> None:
         )
 
 
-def _check_figures(about: dict[str, Any]) -> None:
-    """Raise TypeError where what a run says of itself is of another kind."""
-    for name in _FIGURES:
-        value = about.get(name, "" if name in _TEXTS else 0)
-        fits = type(value) is str if name in _TEXTS else type(value) in (int, float)
-        if not fits:
+_STATUSES = (-1, 0, 1, 2)
+_UNMET = 2
+"""Status of a motion that reached its end, its error estimate above the tolerance."""
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What is known of a run as a whole.
+
+    Attributes:
+        status: 0 where the motion reached its end, 1 where a limit ended it, 2 where it
+            reached its end with an error estimate above the tolerance, -1 where no step
+            resolved it.
+        message: the same in words.
+        method: the integrator, and why it was chosen.
+        error_estimate: estimated error of the orientation at the end [rad], nan if
+            unknown.
+        energy_residual: energy at the end, less that at the start, less the work done
+            [J], nan if unknown; `ends` take its place where they are known.
+        evaluations: how often the derivative was evaluated.
+        step: mean length of the steps of the integrator [s], nan if unknown.
+        law: torques that act between the samples, for `Trajectory.at`, as `simulate`
+            takes them; by default each is held over the interval that ends at its
+            sample.
+        parameters: numbers of the scene, its start or its torques that
+            `Trajectory.sensitivities` are by.
+        ends: states at the start and at the end of the run, in each the work done until
+            then [J] as the last number.
+        dense: a function from times (m,) [s] to states (m, 7 or 10) that
+            `Trajectory.at` uses in place of the law. Copies do not have it.
+
+    Raises:
+        InputError: the status is none of these.
+
+    """
+
+    status: int = 0
+    message: str = ""
+    method: str = ""
+    error_estimate: float = float("nan")
+    energy_residual: float = float("nan")
+    evaluations: int = 0
+    step: float = float("nan")
+    law: TorqueProfile | None = None
+    parameters: tuple[str, ...] = ()
+    ends: tuple[Sequence[float], Sequence[float]] | None = None
+    dense: Callable[[Array], Array] | None = None
+
+    def __post_init__(self) -> None:
+        is_known = type(self.status) is int and self.status in _STATUSES
+        allowed = f"must be one of {_STATUSES}"
+        refuse_unless("trajectory", ("status", self.status, is_known, allowed))
+        if self.law is not None:
+            object.__setattr__(self, "law", profile_of(self.law))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or another process gets: not the function `dense`."""
+        return vars(self) | {"dense": None}
+
+
+UNKNOWN = RunRecord()
+"""Of a motion that comes from no run."""
+
+FIGURES = (
+    "status", "message", "method", "error_estimate", "energy_residual", "evaluations",
+    "step",
+)  # fmt: skip
+"""What a run says of itself in files and in xarray."""
+
+_TEXTS = ("message", "method")
+"""Those of the figures that are text; the others are numbers."""
+
+
+def read_figures(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a run that a document has.
+
+    Raises:
+        TypeError: one is of another kind.
+
+    """
+    figures = {name: document[name] for name in FIGURES if name in document}
+    for name, value in figures.items():
+        kinds = (str,) if name in _TEXTS else (int, float)
+        if type(value) not in kinds:
             raise TypeError(f"{name} = {value!r}")
+    return figures
+
+
+def record_of_pickle(values: dict[str, Any]) -> RunRecord:
+    """Return the record of a trajectory that version 0.2 or before has pickled.
+
+    There all that is known of the run stood among the arrays.
+    """
+    names = {field.name for field in fields(RunRecord)}
+    known = {name: value for name, value in values.items() if name in names}
+    known["energy_residual"] = values["_residual"]
+    known["parameters"] = values["_parameters"]
+    return RunRecord(**known)
+
+
+def check_error(
+    error: float, tolerance: float, status: int, message: str
+) -> tuple[int, str]:
+    """Return status and message of a motion with an error estimate at its end [rad]."""
+    if not error > tolerance:
+        return status, message
+    unmet = (
+        f"the error estimate {error:.1e} rad exceeds the tolerance {tolerance:g} rad"
+    )
+    return status or _UNMET, f"{message}; {unmet}"
 
 
 class Trajectory(MotionTable):
@@ -140,28 +218,11 @@ class Trajectory(MotionTable):
         quaternion: orientations (x, y, z, w) of {E} in {B}, shape (n, 4).
         body_rate: angular velocities of the star in {E} [rad/s], shape (n, 3).
         torque: torques that act at the actuators [N m], shape (n, 3), as in
-            `State.torque`. All three are computed by `dense` when they are first asked
-            for, where none is given.
+            `State.torque`.
+        run: what is known of the run; its fields are attributes of the motion, too.
         joints: angles and rates of the joints where they are known already, shape (n,
             18): gamma, mu, beta [rad], gamma_dot, mu_dot, beta_dot [rad/s]. By default
             they are computed.
-        status: 0 where the motion reached its end, 1 where a limit ended it, 2 where it
-            reached its end with an error estimate above the tolerance, -1 where no step
-            resolved it.
-        message: the same in words.
-        method: the integrator, and why it was chosen.
-        error_estimate: estimated error of the orientation at the end [rad], nan if
-            unknown.
-        energy_residual: energy at the end, less that at the start, less the work done
-            [J]; a number, or a function that computes it when it is asked for.
-        evaluations: how often the derivative was evaluated.
-        step: mean length of the steps of the integrator [s], nan if unknown.
-        law: torques that act between the samples, for `at`, as `simulate` takes them;
-            by default each is held over the interval that ends at its sample.
-        dense: a function from times (m,) [s] to states (m, 7 or 10) that `at` uses
-            instead.
-        parameters: numbers of the scene, its start or its torques that `sensitivities`
-            are by.
         gaps: spans of time [s] of which nothing is known, begin and end, shape (g, 2);
             `at` refuses times inside of them.
 
@@ -174,96 +235,98 @@ class Trajectory(MotionTable):
         self,
         scene: Scene,
         t: TimesLike,
-        quaternion: ArrayLike | None = None,
-        body_rate: ArrayLike | None = None,
-        torque: ArrayLike | None = None,
+        quaternion: ArrayLike,
+        body_rate: ArrayLike,
+        torque: ArrayLike,
         *,
+        run: RunRecord = UNKNOWN,
         joints: ArrayLike | None = None,
-        status: int = 0,
-        message: str = "",
-        method: str = "",
-        error_estimate: float = float("nan"),
-        energy_residual: float | Callable[[], float] = float("nan"),
-        evaluations: int = 0,
-        step: float = float("nan"),
-        law: Any = None,
-        dense: Callable[[Array], Array] | None = None,
-        parameters: Sequence[str] = (),
         gaps: ArrayLike = (),
     ) -> None:
-        self.scene, self.t = scene, _own("t", t)
+        self.scene = scene
+        self.run = run
+        self.t = _own("t", t)
+        self.quaternion = _own("quaternion", quaternion)
+        self.body_rate = _own("body_rate", body_rate)
+        self.torque = _own("torque", torque)
         self.gaps = _own("gaps", np.empty((0, 2)) if np.size(gaps) == 0 else gaps)
-        spans = (
+        sizes = {"quaternion": 4, "body_rate": 3, "torque": 3}
+        if joints is not None:
+            self._joints = _own("joints", joints)
+            sizes["_joints"] = 18
+        rising = (
             self.gaps.ndim == 2
             and self.gaps.shape[1] == 2
             and ascend(self.gaps.ravel())
         )
-        given: dict[str, Any] = {
-            "quaternion": quaternion,
-            "body_rate": body_rate,
-            "torque": torque,
-        }
-        given |= {} if joints is None else {"_joints": joints}
-        if dense is None or any(array is not None for array in given.values()):
-            vars(self).update(
-                {name: _own(name, array) for name, array in given.items()}
-            )
-        sizes = {"quaternion": 4, "body_rate": 3, "torque": 3, "_joints": 18}
-        shapes = {
-            name: (self.t.size, size)
-            for name, size in sizes.items()
-            if name in vars(self)
-        }
-        shaped = (
-            (name, vars(self)[name].shape, shape) for name, shape in shapes.items()
-        )
-        known = type(status) is int and status in _STATUSES
-        refuse_unless(
-            "trajectory",
+        checks: list[Check] = [
             ("scene", scene, isinstance(scene, Scene), "must be a Scene"),
-            ("status", status, known, f"must be one of {_STATUSES}"),
+            ("run", run, isinstance(run, RunRecord), "must be a RunRecord"),
             ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
-            ("gaps", gaps, spans, "must be rising pairs of times [s], shape (g, 2)"),
-            *(
-                (name.strip("_"), x, x == y, f"must have the shape {y}")
-                for name, x, y in shaped
+            (
+                "gaps",
+                gaps,
+                rising,
+                "must be rising pairs of times [s], shape (g, 2)",
             ),
-        )
-        self.status, self.message, self.method = status, message, method
-        self.error_estimate, self._residual = error_estimate, energy_residual
-        self.evaluations, self.step = evaluations, step
-        self.law: TorqueProfile | None = None if law is None else profile_of(law)
-        self.dense, self._parameters = dense, tuple(parameters)
+        ]
+        for name, size in sizes.items():
+            shape = vars(self)[name].shape
+            required = (self.t.size, size)
+            allowed = f"must have the shape {required}"
+            checks.append((name.strip("_"), shape, shape == required, allowed))
+        refuse_unless("trajectory", *checks)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy or another process gets.
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a copy or a pickle, also of a version without records."""
+        if "run" not in state:
+            arrays = (
+                "scene",
+                "t",
+                "quaternion",
+                "body_rate",
+                "torque",
+                "gaps",
+                "_joints",
+            )
+            kept = {name: state[name] for name in arrays if name in state}
+            state = {**kept, "run": record_of_pickle(state)}
+        super().__setstate__(state)
 
-        `at` integrates there from the samples.
-        """
-        arrays = {
-            name: getattr(self, name) for name in ("quaternion", "body_rate", "torque")
-        }
-        return vars(self) | arrays | {"dense": None, "_residual": self.energy_residual}
+    @property
+    def status(self) -> int:
+        """0 at the end, 1 at a limit, 2 above the tolerance, -1 where no step did."""
+        return self.run.status
 
-    @cached_property
-    def _states(self) -> Array:
-        """Rows of quaternion, body rate and torque at the samples, by `dense`."""
-        return freeze(_propagate(self, self.t))
+    @property
+    def message(self) -> str:
+        """The status in words."""
+        return self.run.message
 
-    @cached_property
-    def quaternion(self) -> Array:  # type: ignore[override]
-        """Orientations (x, y, z, w) of {E} in {B}, shape (n, 4)."""
-        return self._states[:, :4]
+    @property
+    def method(self) -> str:
+        """The integrator, and why it was chosen."""
+        return self.run.method
 
-    @cached_property
-    def body_rate(self) -> Array:  # type: ignore[override]
-        """Angular velocities of the star in {E} [rad/s], shape (n, 3)."""
-        return self._states[:, 4:7]
+    @property
+    def error_estimate(self) -> float:
+        """Estimated error of the orientation at the end [rad], nan if unknown."""
+        return self.run.error_estimate
 
-    @cached_property
-    def torque(self) -> Array:
-        """Torques that act at the actuators [N m], shape (n, 3)."""
-        return self._states[:, 7:10]
+    @property
+    def evaluations(self) -> int:
+        """How often the derivative was evaluated."""
+        return self.run.evaluations
+
+    @property
+    def step(self) -> float:
+        """Mean length of the steps of the integrator [s], nan if unknown."""
+        return self.run.step
+
+    @property
+    def law(self) -> TorqueProfile | None:
+        """Torques that act between the samples, None where each is held."""
+        return self.run.law
 
     @property
     def success(self) -> bool:
@@ -330,7 +393,11 @@ class Trajectory(MotionTable):
 
         Nan if unknown.
         """
-        return float(self._residual() if callable(self._residual) else self._residual)
+        if self.run.ends is None:
+            return self.run.energy_residual
+        start, end = self.run.ends
+        energy = self._dynamics.total_energy
+        return energy(end) - energy(start) - end[-1]
 
     @cached_property
     def closure_error(self) -> float:
@@ -350,9 +417,9 @@ class Trajectory(MotionTable):
         They are computed when they are first asked for. Raises InputError: no motion is
         found.
         """
-        if not self._parameters or self.law is None:
+        if not self.run.parameters or self.law is None:
             return {}
-        return Sensitivities(self.scene, self._parameters, self.law).at(self.t)
+        return Sensitivities(self.scene, self.run.parameters, self.law).at(self.t)
 
     @property
     def _dynamics(self) -> Dynamics:
@@ -393,8 +460,16 @@ class Trajectory(MotionTable):
             outside = not np.any((times > begin) & (times < end))
             allowed = f"nothing is known of the motion from {begin:g} to {end:g} s"
             refuse_unless("at", ("t", t, outside, allowed))
-        y = _propagate(self, times)
-        return self._sampled(times, y[:, :4], y[:, 4:7], y[:, 7:])
+        states = _propagate(self, times)
+        return Trajectory(
+            self.scene,
+            times,
+            states[:, :4],
+            states[:, 4:7],
+            states[:, 7:],
+            run=self.run,
+            gaps=self.gaps,
+        )
 
     def __getitem__(self, rows: slice) -> Trajectory:
         """Return the samples of a slice, as in `motion[::10]`.
@@ -405,20 +480,16 @@ class Trajectory(MotionTable):
         refuse_unless(
             "trajectory", ("rows", rows, bool(chosen), "must be a slice with samples")
         )
-        arrays = self.t, self.quaternion, self.body_rate, self.torque
-        return self._sampled(
-            *(array[rows] for array in arrays), joints=self._joints[rows]
-        )
-
-    def _sampled(self, *arrays: Array, joints: Array | None = None) -> Trajectory:
         return Trajectory(
-            self.scene, *arrays, joints=joints,
-            status=self.status, message=self.message, method=self.method,
-            error_estimate=self.error_estimate,
-            energy_residual=lambda: self.energy_residual,
-            evaluations=self.evaluations, step=self.step, law=self.law,
-            dense=self.dense, parameters=self._parameters, gaps=self.gaps,
-        )  # fmt: skip
+            self.scene,
+            self.t[rows],
+            self.quaternion[rows],
+            self.body_rate[rows],
+            self.torque[rows],
+            run=self.run,
+            joints=self._joints[rows],
+            gaps=self.gaps,
+        )
 
     def to_pandas(self, *, reactions: bool = False) -> pd.DataFrame:
         """Table with a row an instant, a column a number, units in its `attrs`.
@@ -508,20 +579,21 @@ class Trajectory(MotionTable):
             for name, (_, dimension) in QUANTITIES.items()
         }
         try:
-            _check_figures(about)
-            found = cls(
+            law = about["torque"] and profile_from(about["torque"])
+            motion = cls(
                 read(Scene, about["scene"], str(path)),
                 columns["t"],
-                *(arrays[name] for name in ("quaternion", "body_rate", "torque")),
+                arrays["quaternion"],
+                arrays["body_rate"],
+                arrays["torque"],
+                run=RunRecord(**read_figures(about), law=law),
                 joints=np.hstack([arrays[name] for name in JOINT_QUANTITIES]),
-                law=about["torque"] and profile_from(about["torque"]),
                 gaps=about.get("gaps", ()),
-                **{name: about[name] for name in _FIGURES if name in about},
             )
         except (TypeError, ValueError, LookupError, AttributeError) as error:
             reason = f" (its metadata: {type(error).__name__}: {error})"
             raise refusal("load", "path", str(path), allowed + reason) from None
-        lengths = np.linalg.norm(found.quaternion, axis=1)
+        lengths = np.linalg.norm(motion.quaternion, axis=1)
         off = float(np.abs(lengths - 1.0).max(initial=0.0))
         refuse_unless(
             "load",
@@ -533,15 +605,15 @@ class Trajectory(MotionTable):
             ),
             (
                 "quaternion",
-                found.closure_error,
-                found.closure_error <= _CLOSURE,
+                motion.closure_error,
+                motion.closure_error <= _CLOSURE,
                 f"must close the loops with gamma: abs(r_k . t_k) <= {_CLOSURE:g}",
             ),
         )
-        return found
+        return motion
 
     def _of_run(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in _FIGURES}
+        return {name: getattr(self, name) for name in FIGURES}
 
     def _torque_lines(self) -> tuple[Array, Array]:
         """Return torques [N m], shape (m, 3), and times [s] whose lines show them.
@@ -616,8 +688,8 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
 
     A state is the quaternion, the body rate and the acting torque.
     """
-    if trajectory.dense is not None:
-        states = trajectory.dense(times)
+    if trajectory.run.dense is not None:
+        states = trajectory.run.dense(times)
         if states.shape[1] > 7 or trajectory.law is None:
             return states
         limit = trajectory.scene.torque_limit or np.inf
