@@ -191,8 +191,9 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
     if dtype_kind == "c" or isinstance(value, complex):
         return "must be real numbers, not complex ones"
     if dtype_kind == "m":
-        unit = np.datetime_data(np.asarray(value).dtype)[0]
-        has_length = unit not in ("generic", "Y", "M")  # years and months have none
+        time_unit = np.datetime_data(np.asarray(value).dtype)[0]
+        # Years and months have no length.
+        has_length = time_unit not in ("generic", "Y", "M")
         return "" if seconds and has_length else "must be numbers, no durations"
     # a datetime and a pandas Timestamp are dates
     if dtype_kind == "M" or isinstance(value, date):
