@@ -96,10 +96,11 @@ _MODULES = {
 }
 
 if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all others
-    _WORDS = [
-        (module, word) for module, words in _MODULES.items() for word in words.split()
-    ]
-    _EXPORTS = {word.partition(":")[0]: (module, word) for module, word in _WORDS}
+    _EXPORTS = {}
+    for _module, _names in _MODULES.items():
+        for _export in _names.split():
+            _public_name, _, _name = _export.partition(":")
+            _EXPORTS[_public_name] = (_module, _name or _public_name)
     __all__ = sorted(_EXPORTS)
 
     def __getattr__(name: str) -> object:
@@ -108,9 +109,9 @@ if not TYPE_CHECKING:  # type checkers know the names above, and must refuse all
             if name in removed:
                 return _refuse_function(name, removed[name])
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        module, word = _EXPORTS[name]
-        found = importlib.import_module(f"sst_ros.{module}")
-        value: object = getattr(found, word.rpartition(":")[2])
+        module_name, name_there = _EXPORTS[name]
+        module = importlib.import_module(f"sst_ros.{module_name}")
+        value: object = getattr(module, name_there)
         globals()[name] = value
         return value
 

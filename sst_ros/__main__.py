@@ -16,11 +16,11 @@ def main(arguments: list[str] | None = None) -> int:
     process of a command at once and in silence: a KeyboardInterrupt there would come
     out of them as it is, or as an ImportError of numpy's.
     """
-    given = sys.argv[1:] if arguments is None else arguments
+    command_line = sys.argv[1:] if arguments is None else arguments
     try:
         from sst_ros.nodes import signals
 
-        if given and given[0] in NODES:
+        if command_line and command_line[0] in NODES:
             signals.handle()
         elif arguments is None:
             signals.interrupt(at_once=True)
@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
 
         if arguments is None:
             signals.interrupt(at_once=False)
-        status = run_command(given)
+        status = run_command(command_line)
         if arguments is None:
             signals.interrupt(at_once=True)
     except KeyboardInterrupt:  # just before `run_command`, or a second one within it

@@ -71,7 +71,7 @@ def _record(
     folder: Path,
     run: dict[str, object],
     command: str,
-    given: dict[str, object],
+    process_options: dict[str, object],
     most_s: float,
 ) -> Path:
     """Record a run of the simulator under the commands of a node.
@@ -85,18 +85,20 @@ def _record(
     with _node("recorder", _DEMO_END_S, output=str(bag), timeout=_READY_S) as recorder:
         with _node("simulator", _DEMO_END_S, sync="lockstep", **run):
             # One line when it receives all topics, none where it gives up, or is stuck.
-            said = recorder.stdout
+            output = recorder.stdout
             if not (
-                said
-                and select.select([said], [], [], 2.0 * _READY_S)[0]
-                and said.readline()
+                output
+                and select.select([output], [], [], 2.0 * _READY_S)[0]
+                and output.readline()
             ):
                 text = (
                     "the recorder received nothing from a simulator within"
                     f" {_READY_S:g} s"
                 )
                 raise SstError(text)
-            with _node(command, most_s, stamped=True, min_subscribers=2, **given):
+            with _node(
+                command, most_s, stamped=True, min_subscribers=2, **process_options
+            ):
                 pass
         recorder.send_signal(signal.SIGINT)
     return bag
@@ -104,13 +106,15 @@ def _record(
 
 @contextmanager
 def _node(
-    command: str, end_s: float, **given: object
+    command: str, end_s: float, **process_options: object
 ) -> Iterator[subprocess.Popen[str]]:
     """Run a node beside a block.
 
     After the block the node ends within a time [s], or an SstError is raised.
     """
-    with child_process.run_beside(command, given, stdout=subprocess.PIPE) as process:
+    with child_process.run_beside(
+        command, process_options, stdout=subprocess.PIPE
+    ) as process:
         yield process
         try:
             status = process.wait(end_s)

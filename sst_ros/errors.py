@@ -29,10 +29,8 @@ from sst_ros.removed import REMOVED_ARGUMENTS
 from sst_ros.state import Array, NotNumbers, TimesLike, real_numbers
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
-SHOWN_CHARACTERS, LONGEST_PATH = (
-    80,
-    4096,
-)  # characters of a value in a message, and of a path
+SHOWN_CHARACTERS = 80  # of a value in a message
+LONGEST_PATH = 4096  # characters of a path in a message: it is whole, to be copied
 
 
 class SstError(Exception):
@@ -54,19 +52,21 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
-        text, half = (
-            f"{type(self.value).__name__} without a text",
-            SHOWN_CHARACTERS // 2 - 2,
-        )
+        return f"{where}{self.key or 'document'} = {self._value_text()}: {self.allowed}"
+
+    def _value_text(self) -> str:
+        """Return the value as text, shortened in the middle."""
+        text = f"{type(self.value).__name__} without a text"
         if isinstance(self.value, int) and self.value:  # of 5,000 digits has no text
             text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
         with contextlib.suppress(Exception):
             text = repr(self.value)
-        # is whole: it can be copied
-        path = isinstance(self.value, str) and os.sep in text
-        if len(text) > (LONGEST_PATH if path else SHOWN_CHARACTERS):
-            text = f"{text[:half]}...{text[-half:]}"
-        return f"{where}{self.key or 'document'} = {text}: {self.allowed}"
+        is_path = isinstance(self.value, str) and os.sep in text
+        longest = LONGEST_PATH if is_path else SHOWN_CHARACTERS
+        if len(text) <= longest:
+            return text
+        half = SHOWN_CHARACTERS // 2 - 2
+        return f"{text[:half]}...{text[-half:]}"
 
 
 class InputError(SstError):
@@ -79,8 +79,8 @@ class InputError(SstError):
         self.origin = origin
         self.problems = tuple(problems)
         lines = [f"{origin}: {problem}" for problem in self.problems[:SHOWN_PROBLEMS]]
-        if more := len(self.problems) - len(lines):
-            lines.append(f"{origin}: ... and {more} more")
+        if hidden := len(self.problems) - len(lines):
+            lines.append(f"{origin}: ... and {hidden} more")
         super().__init__("\n".join(map(printable, lines)))
 
 
@@ -91,8 +91,8 @@ Check: TypeAlias = tuple[str, object, bool, str]
 def refuse_unless(origin: str, *checks: Check) -> None:
     """Raise InputError with each argument that is not good."""
     problems = [
-        Problem(name, value, allowed)
-        for name, value, good, allowed in checks
+        Problem(name, value, requirement)
+        for name, value, good, requirement in checks
         if not good
     ]
     if problems:
@@ -104,19 +104,19 @@ class Kind:
     """A kind of argument: whether a value is of it, and the words of a refusal."""
 
     accepts: Callable[[Any], Any]
-    allowed: str
+    requirement: str
 
     def find_fault(self, value: Any) -> str:
         """Return why a value is not of this kind; "" if it is."""
         try:
-            return "" if self.accepts(value) else self.allowed
+            return "" if self.accepts(value) else self.requirement
         except NotNumbers as error:
             return str(error)
         except (TypeError, ValueError, OverflowError, MemoryError):
-            return self.allowed
+            return self.requirement
 
 
-def _parts(hint: Any) -> frozenset[Any]:
+def _members(hint: Any) -> frozenset[Any]:
     """Return the types of an annotation, without None."""
     union = get_origin(hint) in (Union, UnionType)
     return frozenset(get_args(hint) if union else (hint,)) - {NoneType}
@@ -124,7 +124,7 @@ def _parts(hint: Any) -> frozenset[Any]:
 
 def _key(hint: Any) -> frozenset[Any]:
     """Return the types of an annotation, without None and without their parameters."""
-    return frozenset(get_origin(part) or part for part in _parts(hint))
+    return frozenset(get_origin(member) or member for member in _members(hint))
 
 
 def _is_whole(value: Any) -> bool:
@@ -148,41 +148,41 @@ def _all_text(values: Iterable[Any]) -> bool:
     return all(isinstance(value, str) for value in values)
 
 
+def _is_flag(value: Any) -> bool:
+    return isinstance(value, (bool, np.bool_))
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_array(value: Any) -> bool:
+    return real_numbers(value) is not None
+
+
+def _is_time(value: Any) -> bool:
+    return real_numbers(value, seconds=True) is not None
+
+
+def _is_mapping(value: Any) -> bool:
+    return isinstance(value, Mapping) and _all_text(value)
+
+
+def _is_list_of_text(value: Any) -> bool:
+    return isinstance(value, Collection) and _all_text(value)
+
+
 _ARGUMENT_KINDS = {
-    _key(hint): kind
-    for hint, kind in (
-        (
-            bool,
-            Kind(lambda x: isinstance(x, (bool, np.bool_)), "must be True or False"),
-        ),
-        (int, Kind(_is_whole, "must be a whole number")),
-        (float, Kind(_is_number, "must be a number")),
-        (str, Kind(lambda x: isinstance(x, str), "must be text")),
-        (str | Path, Kind(_is_path, "must be a path")),
-        (ArrayLike, Kind(lambda x: real_numbers(x) is not None, "must be numbers")),
-        (
-            TimesLike,
-            Kind(
-                lambda x: real_numbers(x, seconds=True) is not None,
-                "must be times [s]",
-            ),
-        ),
-        (
-            Mapping,
-            Kind(
-                lambda x: isinstance(x, Mapping) and _all_text(x),
-                "must be a mapping from text",
-            ),
-        ),
-        (
-            Collection,
-            Kind(
-                lambda x: isinstance(x, Collection) and _all_text(x),
-                "must be a list of text",
-            ),
-        ),
-        (Callable, Kind(callable, "must be a function")),
-    )
+    _key(bool): Kind(_is_flag, "must be True or False"),
+    _key(int): Kind(_is_whole, "must be a whole number"),
+    _key(float): Kind(_is_number, "must be a number"),
+    _key(str): Kind(_is_text, "must be text"),
+    _key(str | Path): Kind(_is_path, "must be a path"),
+    _key(ArrayLike): Kind(_is_array, "must be numbers"),
+    _key(TimesLike): Kind(_is_time, "must be times [s]"),
+    _key(Mapping): Kind(_is_mapping, "must be a mapping from text"),
+    _key(Collection): Kind(_is_list_of_text, "must be a list of text"),
+    _key(Callable): Kind(callable, "must be a function"),
 }
 """Kinds by the types of an annotation."""
 
@@ -195,11 +195,13 @@ def _kind_of(hint: Any) -> Kind | None:
     kind = _ARGUMENT_KINDS.get(_key(hint))
     if kind is not None:
         return kind
-    parts = list(_parts(hint))
-    wanted = parts[0]
-    plain = isinstance(wanted, type) and get_origin(wanted) is None
-    if len(parts) > 1 or wanted is Any or not plain:
+    members = list(_members(hint))
+    if len(members) > 1:
         return None  # several kinds, which the function itself distinguishes
+    wanted = members[0]
+    is_class = isinstance(wanted, type) and get_origin(wanted) is None
+    if wanted is Any or not is_class:
+        return None
     return Kind(lambda x: isinstance(x, wanted), f"must be a {wanted.__name__}")
 
 
@@ -267,14 +269,14 @@ def check_kinds_late(function: F) -> F:
     return check_kinds(function, late=True)
 
 
-def refusal(origin: object, key: str, value: object, allowed: str) -> InputError:
+def refusal(origin: object, key: str, value: object, requirement: str) -> InputError:
     """Return the error of one fault of an origin, which may be a path."""
-    return InputError(str(origin), [Problem(key, value, allowed)])
+    return InputError(str(origin), [Problem(key, value, requirement)])
 
 
 @contextlib.contextmanager
 def refuse_errors(
-    origin: str, key: str, value: object, allowed: str, *errors: type[Exception]
+    origin: str, key: str, value: object, requirement: str, *errors: type[Exception]
 ) -> Iterator[None]:
     """Raise InputError where a block raises one of the errors.
 
@@ -283,7 +285,7 @@ def refuse_errors(
     try:
         yield
     except errors as error:
-        raise refusal(origin, key, value, f"{allowed} ({error})") from None
+        raise refusal(origin, key, value, f"{requirement} ({error})") from None
 
 
 def check_regular(path: Path) -> None:
@@ -337,11 +339,11 @@ class AmbiguousAssembly(AssemblyError):
         listed = ", ".join(
             np.array2string(q, precision=6, separator=", ") for q in quaternions
         )
-        found = (
+        message = (
             f"{len(self.candidates)} admissible assemblies, with the orientations"
             f" {listed}"
         )
-        super().__init__(f"{found}: name one", gamma)
+        super().__init__(f"{message}: name one", gamma)
 
 
 class SingularConfiguration(SstError):
@@ -406,37 +408,47 @@ def printable(text: str) -> str:
     )
 
 
-def suggestion(word: str, known: Iterable[str]) -> str:
-    """Return "; did you mean NAME?" for the known name nearest to `word`.
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """Return "; did you mean NAME?" for the known name nearest to `name`.
 
     Where none is near, return "".
     """
-    near = difflib.get_close_matches(word, list(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    matches = difflib.get_close_matches(name, list(names), n=1)
+    return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
-EXTRAS = dict.fromkeys(
-    ("lz4", "mcap", "pandas", "pyarrow", "rosbags", "zstandard"), "record"
-)
-EXTRAS |= {"distributed": "cluster", "matplotlib": "plot", "pinocchio": "engines"}
-EXTRAS |= {
+EXTRAS = {
     "argcomplete": "all",
+    "casadi": "casadi",
     "control": "control",
+    "distributed": "cluster",
     "flint": "proof",
+    "jax": "jax",
     "llvmlite": "fast",
+    "lz4": "record",
+    "matplotlib": "plot",
+    "mcap": "record",
+    "mpmath": "mpmath",
+    "pandas": "record",
+    "pinocchio": "engines",
+    "pyarrow": "record",
+    "rosbags": "record",
+    "sympy": "sympy",
+    "trimesh": "view",
+    "viser": "view",
+    "websockets": "view",
+    "xarray": "all",
+    "zstandard": "record",
 }
-EXTRAS |= {**dict.fromkeys(("trimesh", "viser", "websockets"), "view"), "xarray": "all"}
-EXTRAS |= {"casadi": "casadi", "jax": "jax", "mpmath": "mpmath", "sympy": "sympy"}
 """Extra of this package that installs a module."""
 
 _APT = ("argcomplete", "llvmlite", "lz4", "matplotlib", "pandas", "xarray", "zstandard")
 _PIP = {
-    **dict.fromkeys(("mcap", "rosbags"), "mcap rosbags"),
     "distributed": "dask[distributed]",
-}
-_PIP |= {
     "flint": "python-flint",
+    "mcap": "mcap rosbags",
     "pinocchio": "pin",
+    "rosbags": "mcap rosbags",
     "trimesh": "viser",
     "websockets": "viser",
 }
@@ -476,21 +488,24 @@ def explanation(error: ModuleNotFoundError) -> str | None:
     module = (error.name or "").partition(".")[0]
     if module in _NO_WHEEL:
         return f"{module} is not installed: source a ROS 2 installation"
-    ros = module in _ROS or module.endswith(("_msgs", "_srvs"))
-    extra = "ros" if ros else EXTRAS.get(module)
-    how = (
+    is_ros = module in _ROS or module.endswith(("_msgs", "_srvs"))
+    extra = "ros" if is_ros else EXTRAS.get(module)
+    if not extra:
+        return None
+    ways = []
+    if is_ros:
+        ways.append("source a ROS 2 installation")
+    elif os.environ.get("ROS_DISTRO"):
+        # beside a ROS installation, of a workspace there
+        in_ubuntu = module in _APT
+        apt = f"apt install python3-{module}"
+        pip = f"pip install {_PIP.get(module, module)}"
+        ways.append(apt if in_ubuntu else pip)
+    ways.append(
         f"pip install 'sst_ros[{extra}]' (in the source folder: pip install"
         f" '.[{extra}]')"
     )
-    more = "source a ROS 2 installation, or " * ros
-    # beside a ROS installation, of a workspace there
-    if os.environ.get("ROS_DISTRO") and not ros:
-        apt, pip = (
-            f"apt install python3-{module}",
-            f"pip install {_PIP.get(module, module)}",
-        )
-        more = f"{apt if module in _APT else pip}, or "
-    return f"{module} is not installed: {more}{how}" if extra else None
+    return f"{module} is not installed: {', or '.join(ways)}"
 
 
 def explain_missing_ros(packages: Sequence[str]) -> str:

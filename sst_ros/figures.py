@@ -116,9 +116,9 @@ def break_lines(seconds: Array, values: Array, gaps: Array) -> tuple[Array, Arra
 
 def widen(axes: Axes, values: Array, least_span: float) -> None:
     """Show no less than `least_span` of the values, so that rounding is a flat line."""
-    known = values[np.isfinite(values)]
-    if len(known) and np.ptp(known) < least_span:
-        middle = 0.5 * float(known.min() + known.max())
+    limits = values[np.isfinite(values)]
+    if len(limits) and np.ptp(limits) < least_span:
+        middle = 0.5 * float(limits.min() + limits.max())
         axes.set_ylim(middle - 0.5 * least_span, middle + 0.5 * least_span)
 
 
@@ -169,22 +169,25 @@ def draw_panels(
     return figure
 
 
-def legend(axes: Axes, **given: Any) -> None:
+def legend(axes: Axes, **options: Any) -> None:
     """Put the legend above the panel, where no curve can be."""
-    place: Looks = {
+    defaults: Looks = {
         "loc": "lower right",
         "bbox_to_anchor": (1.0, 1.0),
         "borderaxespad": 0.1,
+        "ncol": 4,
+        "fontsize": 8,
+        "frameon": False,
     }
-    axes.legend(**{**place, "ncol": 4, "fontsize": 8, "frameon": False, **given})
+    axes.legend(**{**defaults, **options})
 
 
 def mark_ends(axes: Axes, *path: Array) -> None:
-    """Mark the first and the last known point of a path, shape (n,) a coordinate."""
-    known = np.flatnonzero(np.isfinite(path[0]))
-    ends = (known[:1], "o", GREEN, "start"), (known[-1:], "s", VERMILION, "end")
-    for at, marker, colour, name in ends:
-        place = [column[at] for column in path]
+    """Mark the first and the last finite point of a path, shape (n,) a coordinate."""
+    finite = np.flatnonzero(np.isfinite(path[0]))
+    ends = (finite[:1], "o", GREEN, "start"), (finite[-1:], "s", VERMILION, "end")
+    for index, marker, colour, name in ends:
+        place = [coordinate[index] for coordinate in path]
         axes.plot(
             *place, marker, color=colour, markersize=6, label=name, linestyle="none"
         )
@@ -192,7 +195,11 @@ def mark_ends(axes: Axes, *path: Array) -> None:
 
 def note(figure: Figure, text: str, width: int) -> None:
     """Write a note of `width` letters a line at the foot of a figure."""
-    lines = [part for line in text.splitlines() for part in textwrap.wrap(line, width)]
+    lines = [
+        sentence
+        for line in text.splitlines()
+        for sentence in textwrap.wrap(line, width)
+    ]
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=6.5, color="#555555")
 
 

@@ -24,33 +24,35 @@ A killed process may have left it.
 
 
 def require_free(
-    out: Path, origin: str, *, force: bool = False, option: str = "--out"
+    target: Path, origin: str, *, force: bool = False, option: str = "--out"
 ) -> Path:
-    """Return `out`, a file or a folder to be written, if nothing would be overwritten.
+    """Return the path `target` if writing there overwrites nothing.
 
-    An InputError names `origin`, the command that writes, and `option`, which gave
-    `out`: that is a file, or a folder that is not empty, and `force` is not set; or it
-    cannot be read.
+    Raises InputError of `origin`, the command that writes, and `option`, which gave the
+    path: where it is a file, or a folder that is not empty, and `force` is not set; and
+    where it cannot be read.
     """
     with refuse_errors(
-        origin, option, str(out), "must be a path that can be written", OSError
+        origin, option, str(target), "must be a path that can be written", OSError
     ):
-        taken = any(out.iterdir()) if out.is_dir() else out.exists()
-    allowed = f"exists already: choose another {option}, or overwrite it with --force"
-    refuse_unless(origin, (option, str(out), force or not taken, allowed))
-    return out
+        taken = any(target.iterdir()) if target.is_dir() else target.exists()
+    requirement = (
+        f"exists already: choose another {option}, or overwrite it with --force"
+    )
+    refuse_unless(origin, (option, str(target), force or not taken, requirement))
+    return target
 
 
 @contextmanager
-def write_into(out: Path, origin: str) -> Iterator[None]:
-    """Make the folder `out` for a block that writes into it.
+def write_into(target: Path, origin: str) -> Iterator[None]:
+    """Make the folder `target` for a block that writes into it.
 
     An InputError of `origin` is raised where it cannot be written.
     """
     with refuse_errors(
-        origin, "--out", str(out), "must be a folder that can be written", OSError
+        origin, "--out", str(target), "must be a folder that can be written", OSError
     ):
-        out.mkdir(parents=True, exist_ok=True)
+        target.mkdir(parents=True, exist_ok=True)
         yield
 
 

@@ -160,8 +160,8 @@ def description(
         values["namespace"] = make_namespace_absolute(namespace or "")
         if isinstance(values.get("output"), Default):
             # Each robot has a folder of its own.
-            words = [*values["namespace"].split("/"), values["output"]]
-            values["output"] = Default("_".join(filter(None, words)))
+            name_parts = [*values["namespace"].split("/"), values["output"]]
+            values["output"] = Default("_".join(filter(None, name_parts)))
         for name in declared.keys() - set_by_user:
             del configurations[name]  # an included file has defaults of its own
         values.actions = actions(values)
@@ -192,12 +192,14 @@ def _refuse_unknown_arguments(
 
     A file that is included takes no arguments of the command line.
     """
-    if not any(word.endswith(Path(file).name) for word in sys.argv):
+    if not any(argument.endswith(Path(file).name) for argument in sys.argv):
         return
-    for word in context.argv:
-        name, assignment, _ = word.partition(":=")
+    for argument in context.argv:
+        name, assignment, _ = argument.partition(":=")
         if assignment and name not in declared:
-            raise RuntimeError(f"{word}: no such argument{suggestion(name, declared)}")
+            raise RuntimeError(
+                f"{argument}: no such argument{suggestion(name, declared)}"
+            )
 
 
 def node(
@@ -435,7 +437,9 @@ def _exit_handler(
         if stopped or not (failed or ends):
             return None
         values.is_ending = True
-        others = [action for action in values.actions if action is not event.action]
-        return [EmitEvent(event=ShutdownProcess(process_matcher=others.__contains__))]
+        remaining = [action for action in values.actions if action is not event.action]
+        return [
+            EmitEvent(event=ShutdownProcess(process_matcher=remaining.__contains__))
+        ]
 
     return handle

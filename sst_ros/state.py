@@ -172,7 +172,11 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
     if isinstance(value, (list, tuple)):
         if depth == _DEEPEST_LIST:
             return "must be numbers, in rows of equal length"
-        suspects = tuple(kind for kind in set(map(type, value)) if not _is_plain(kind))
+        suspects = tuple(
+            dtype_kind
+            for dtype_kind in set(map(type, value))
+            if not _is_plain(dtype_kind)
+        )
         for each in value if suspects else ():
             if isinstance(each, suspects):
                 reason = find_lost_meaning(each, seconds=seconds, depth=depth + 1)
@@ -183,18 +187,16 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
         return "must be numbers without a mask: fill in what is masked, or leave it out"
     if isinstance(value, timedelta):
         return "" if seconds else "must be numbers, no durations"
-    kind = getattr(getattr(value, "dtype", None), "kind", "")
-    if kind == "c" or isinstance(value, complex):
+    dtype_kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if dtype_kind == "c" or isinstance(value, complex):
         return "must be real numbers, not complex ones"
-    if kind == "m":
-        is_measured = np.datetime_data(np.asarray(value).dtype)[0] not in (
-            "generic",
-            "Y",
-            "M",
-        )
-        return "" if seconds and is_measured else "must be numbers, no durations"
+    if dtype_kind == "m":
+        time_unit = np.datetime_data(np.asarray(value).dtype)[0]
+        # Years and months have no length.
+        has_length = time_unit not in ("generic", "Y", "M")
+        return "" if seconds and has_length else "must be numbers, no durations"
     # a datetime and a pandas Timestamp are dates
-    if kind == "M" or isinstance(value, date):
+    if dtype_kind == "M" or isinstance(value, date):
         return "must be numbers, no dates: give seconds since the start"
     unit = getattr(value, "units", None) or getattr(value, "unit", None)
     if unit is not None and not callable(unit) and str(unit) not in SI_UNITS:
@@ -212,11 +214,11 @@ def _is_masked(value: Any) -> bool:
     return bool(np.any(getattr(value, "mask", False)))
 
 
-def _is_plain(kind: type) -> bool:
+def _is_plain(number_type: type) -> bool:
     """Return whether a type is that of a number which is nothing more."""
-    if issubclass(kind, (bool, np.timedelta64)):
+    if issubclass(number_type, (bool, np.timedelta64)):
         return False
-    return issubclass(kind, (float, int, np.floating, np.integer))
+    return issubclass(number_type, (float, int, np.floating, np.integer))
 
 
 def clamp(torque: Vector3, limit: float | None) -> Vector3:
@@ -261,9 +263,9 @@ class Explained:
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        said = {name: _say(value) for name, value in self._facts().items()}
-        width = max(map(len, said))
-        lines = (f"  {name:<{width}}  {text}" for name, text in said.items())
+        texts = {name: _say(value) for name, value in self._facts().items()}
+        width = max(map(len, texts))
+        lines = (f"  {name:<{width}}  {text}" for name, text in texts.items())
         return "\n".join([type(self).__name__, *lines])
 
     def _repr_html_(self) -> str:
@@ -283,10 +285,8 @@ def _say(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, (tuple, list, np.ndarray)):
-        texts = [_say(each) for each in value]
-        return (
-            f"({', '.join(texts)})" if isinstance(value[0], float) else ", ".join(texts)
-        )
+        text = ", ".join(_say(entry) for entry in value)
+        return f"({text})" if isinstance(value[0], float) else text
     return textwrap.shorten(str(value), 200, placeholder=" ...")
 
 
@@ -341,8 +341,8 @@ class State(Explained):
             "quaternion": self.quaternion,
             "body_rate [rad/s]": self.body_rate,
             **{
-                f"{kind} [rad]": getattr(self.joints, kind)
-                for kind in ("gamma", "mu", "beta")
+                f"{angle} [rad]": getattr(self.joints, angle)
+                for angle in ("gamma", "mu", "beta")
             },
             "gamma_dot [rad/s]": self.joints.gamma_dot,
             "torque [N m]": self.torque,

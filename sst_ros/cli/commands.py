@@ -40,11 +40,11 @@ class Arg:
     """An argument for argparse, and `module:function` that completes it in a shell."""
 
     def __init__(
-        self, name: str, what: str = "", *, completer: str = "", **options: Any
+        self, name: str, description: str = "", *, completer: str = "", **options: Any
     ) -> None:
         self.name, self.options, self.completer = (
             name,
-            {**options, "help": what},
+            {**options, "help": description},
             completer,
         )
 
@@ -57,21 +57,21 @@ class Subcommand:
     """
 
     def __init__(
-        self, what: str, run: str, *args: Arg, needs: str = "", more: str = ""
+        self, description: str, run: str, *args: Arg, needs: str = "", details: str = ""
     ) -> None:
-        self.what, self.run, self.arguments = what, run, args
-        self.needs, self.more = needs.split(), more
+        self.what, self.run, self.arguments = description, run, args
+        self.needs, self.more = needs.split(), details
 
 
-def _number_of(kind: Callable[[str], Any], text: str) -> Any:
+def _number_of(convert: Callable[[str], Any], text: str) -> Any:
     """Read a number as scenes have it: Python would also take 1_0 and other digits."""
     if "_" in text or not text.isascii():
         raise argparse.ArgumentTypeError(f"must be a number, not {text!r}")
     try:
-        return kind(text)
+        return convert(text)
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f"invalid {kind.__name__} value: {text!r}"
+            f"invalid {convert.__name__} value: {text!r}"
         ) from None
 
 
@@ -83,22 +83,24 @@ _whole = partial(Arg, type=partial(_number_of, int))
 _scene = partial(Arg, completer="scene.scene:names")
 
 
-def _out(what: str, default: str) -> tuple[Arg, Arg]:
+def _out(description: str, default: str) -> tuple[Arg, Arg]:
     """Describe `--out` and `--force`, which `free_out` obeys."""
     force = _flag("--force", "overwrite earlier results in --out")
-    return _path("--out", f"{what}; default: {default}"), force
+    return _path("--out", f"{description}; default: {default}"), force
 
 
-def _count(name: str, most: int, what: str, least: int = 1, **options: Any) -> Arg:
+def _count(
+    name: str, most: int, description: str, least: int = 1, **options: Any
+) -> Arg:
     """Describe an option that is a whole number in a range."""
 
     def whole(text: str) -> int:
         if text.isascii() and text.isdecimal() and least <= int(text) <= most:
             return int(text)
-        allowed = f"must be a whole number from {least} to {most}, not {text!r}"
-        raise argparse.ArgumentTypeError(allowed)
+        requirement = f"must be a whole number from {least} to {most}, not {text!r}"
+        raise argparse.ArgumentTypeError(requirement)
 
-    return Arg(name, what, type=whole, metavar="N", **options)
+    return Arg(name, description, type=whole, metavar="N", **options)
 
 
 _INTEGRATORS = ("auto", "rk4", "dopri5", "dop853", "rodas5p")
@@ -125,7 +127,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
             "forces and moments at every joint: in FILE (.csv), as a picture",
         ),
         _flag("--force", "overwrite earlier results"),
-        more=(
+        details=(
             "Simulate a scene under its own torques. Exit status 1 if the motion ended "
             "before the duration, at a limit of the scene for example."
         ),
@@ -173,7 +175,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         _path("--out", "table, .csv", metavar="FILE"),
         _flag("--force", "overwrite the file of --out"),
         needs="flint",
-        more=(
+        details=(
             "Enclose the true motion of a scene under its own torques, with proof. Exit"
             " status 1 if it is not proven to its end, within the bound."
         ),
@@ -212,9 +214,9 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         _path("--out", "table of the boxes, .csv", metavar="FILE"),
         _flag("--force", "overwrite the files of --picture and --out"),
         needs="flint",
-        more="Prove where the manipulator has no singularity and is inside all limits, "
-        "whatever its geometry within the tolerances. Exit status 1 if not all of the "
-        "zone is proven.",
+        details="Prove where the manipulator has no singularity and is inside all "
+        "limits, whatever its geometry within the tolerances. Exit status 1 if not all "
+        "of the zone is proven.",
     ),
     "scene": "list, show and check scenes",
     "scene list": Subcommand("list the shipped scenes", "cli.scenes:list_all"),
@@ -286,7 +288,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         _scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
         Arg("--mode", "with feedforward: control modes", nargs="+", choices=_MODES),
         needs="rclpy rosbags matplotlib",
-        more=(
+        details=(
             "Run the paper's examples, or have the node inverse_dynamics follow a"
             " scene's motion."
         ),
@@ -307,7 +309,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         _count("--port", 65535, "port, or the next free one", 1024, default=8080),
         _flag("--open", "open it, where there is a desktop"),
         needs="viser",
-        more=(
+        details=(
             "Show a running simulator, one that is started for it (--scene), or a bag."
         ),
     ),
@@ -405,7 +407,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         ),
         _count("--workers", 1024, "threads; default: one a core"),
         _flag("--resume", "compute only the chunks that are missing in --out"),
-        more="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
+        details="Run a study of many runs. `sst-ros sweep plot DIR` draws its results.",
     ),
     "identify": Subcommand(
         "identify inertias, friction and more from a recorded run; design excitation"
@@ -451,7 +453,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         _whole("--seed", "of a designed motion; default: 0"),
         _path("--out", "write the scene", metavar="SCENE.yaml"),
         _flag("--force", "overwrite the file of --out"),
-        more=(
+        details=(
             "`identify BAG` fits the torques of a recorded run by weighted least"
             " squares: what the motion determines, with standard deviations, and the"
             " nearest scene whose bodies can exist. With --method simulation the motion"
@@ -483,18 +485,18 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage, the error and the nearest name; exit with status 2."""
-        more = ""
+        hint = ""
         if wrong := re.search(
             r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message
         ):
-            known = [
+            options = [
                 str(choice)
                 for action in self._actions
                 for choice in action.choices or ()
             ]
-            known += self._option_string_actions
-            more = suggestion(wrong[1] or wrong[2].partition("=")[0], known)
-        super().error(printable(message) + more)
+            options += self._option_string_actions
+            hint = suggestion(wrong[1] or wrong[2].partition("=")[0], options)
+        super().error(printable(message) + hint)
 
 
 def parser() -> Parser:
@@ -535,8 +537,8 @@ def parser() -> Parser:
             action: Any = command.add_argument(each.name, **each.options)
             if each.completer:
                 action.completer = lambda names=each.completer, **_: function(names)()
-    for name, what in NODE_HELP.items():
-        groups[""].add_parser(name, help=what, add_help=False)
+    for name, description in NODE_HELP.items():
+        groups[""].add_parser(name, help=description, add_help=False)
     return result
 
 
@@ -546,11 +548,11 @@ def function(name: str) -> Any:
     return getattr(importlib.import_module(f"sst_ros.{module}"), attribute)
 
 
-def results_folder(bag: Path, kind: str) -> Path:
+def results_folder(bag: Path, purpose: str) -> Path:
     """Return the default folder of the results of a recording, beside it: BAG_kind."""
     path = bag.resolve() if bag.name in ("", "..") else bag
     name = path.stem if path.suffix in _BAG_SUFFIXES else path.name
-    return path.with_name(f"{name}_{kind}")
+    return path.with_name(f"{name}_{purpose}")
 
 
 def free_out(options: argparse.Namespace, default: str | Path) -> Path:
@@ -558,20 +560,23 @@ def free_out(options: argparse.Namespace, default: str | Path) -> Path:
 
     Refuse to overwrite without `--force`.
     """
-    out = options.out or Path(default)
-    return require_free(out, options.command, force=getattr(options, "force", False))
+    target = options.out or Path(default)
+    return require_free(target, options.command, force=getattr(options, "force", False))
 
 
-def run_command(words: list[str]) -> int:
+def run_command(arguments: list[str]) -> int:
     """Run a command or a node; return the exit status.
 
     Errors are one line on stderr.
     """
-    end = words.index("--ros-args") if "--ros-args" in words else len(words)
-    debug = "--debug" in words[:end]  # wherever it is before the words of ROS
+    end = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    debug = "--debug" in arguments[:end]  # wherever it is before the words of ROS
     try:
         status = _run(
-            [*(word for word in words[:end] if word != "--debug"), *words[end:]]
+            [
+                *(argument for argument in arguments[:end] if argument != "--debug"),
+                *arguments[end:],
+            ]
         )
         # does nothing where stdout was closed before the start
         print(end="", flush=True)
@@ -589,15 +594,15 @@ def run_command(words: list[str]) -> int:
     return status
 
 
-def _run(words: list[str]) -> int:
+def _run(arguments: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:
         importlib.import_module("argcomplete").autocomplete(parser())
-    if words and words[0] in NODE_HELP:
-        return int(function("nodes.process:run")(words))
-    for word in words[:1]:
-        if word in REMOVED_COMMANDS:
-            raise refusal("command", word, "given", REMOVED_COMMANDS[word])
-    options, unknown = parser().parse_known_args(words)
+    if arguments and arguments[0] in NODE_HELP:
+        return int(function("nodes.process:run")(arguments))
+    for argument in arguments[:1]:
+        if argument in REMOVED_COMMANDS:
+            raise refusal("command", argument, "given", REMOVED_COMMANDS[argument])
+    options, unknown = parser().parse_known_args(arguments)
     if unknown:
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if options.command is None:
@@ -605,8 +610,8 @@ def _run(words: list[str]) -> int:
         return 0
     for module in options.entry.needs:
         require(module)
-    done: int | None = function(options.entry.run)(options)
-    return done or 0
+    status: int | None = function(options.entry.run)(options)
+    return status or 0
 
 
 def failure(error: BaseException) -> tuple[int, str]:
@@ -619,8 +624,8 @@ def failure(error: BaseException) -> tuple[int, str]:
             return 1, ""
         case SstError():
             return 1, str(error)
-        case ModuleNotFoundError() if said := explanation(error):
-            return 1, said
+        case ModuleNotFoundError() if advice := explanation(error):
+            return 1, advice
         case OSError():
             where = f"{error.filename}: " if error.filename is not None else ""
             return 1, f"{where}{error.strerror or error}"

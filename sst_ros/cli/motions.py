@@ -10,6 +10,8 @@ import math
 from sst_ros.cli.commands import free_out, function
 from sst_ros.control.plan import (
     DEMAND_UNITS,
+    MotionPlan,
+    TimeScaling,
     examine_motion,
     examine_reactions,
     plan_json,
@@ -23,7 +25,7 @@ from sst_ros.files import require_free, write_into
 from sst_ros.identification.excitation import ExcitingMotion, design
 from sst_ros.identification.identify import identify
 from sst_ros.identification.parameters import Identification
-from sst_ros.report.results import render
+from sst_ros.report.results import Finding, Severity, render
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import dump
 from sst_ros.sweeps.cluster import connect
@@ -35,11 +37,9 @@ PLOT, DESIGN = "plot", "design"  # words in place of a study, and of a bag
 
 def check_plan(options: argparse.Namespace) -> int:
     """Print what a reference motion requires; write the torques that follow it."""
-    valid, allowed = (
-        1e-9 <= options.period < math.inf,
-        "must be a finite number >= 1e-9 [s]",
-    )
-    refuse_unless("plan check", ("--period", options.period, valid, allowed))
+    is_period = 1e-9 <= options.period < math.inf
+    requirement = "must be a finite number >= 1e-9 [s]"
+    refuse_unless("plan check", ("--period", options.period, is_period, requirement))
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
     # needs rosbags
@@ -50,12 +50,64 @@ def check_plan(options: argparse.Namespace) -> int:
     if options.json:
         print(plan_json(plan, speeds))
     else:
-        reactions = examine_reactions(plan)
-        shown = {"plan": plan, "speeds": speeds, "units": DEMAND_UNITS}
-        print(render("plan.txt", **shown, reactions=reactions, sizes=SIZES), end="")
+        print(plan_text(plan, speeds), end="")
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)
     return 1 if plan.problems else 0
+
+
+def plan_text(plan: MotionPlan, speeds: TimeScaling) -> str:
+    """Write what a plan requires, what was found, and the speeds that are feasible."""
+    return render(
+        "plan.txt",
+        plan=plan,
+        units=DEMAND_UNITS,
+        reactions=examine_reactions(plan),
+        sizes=SIZES,
+        findings=find_plan_findings(plan),
+        verdict="not feasible" if plan.problems else "feasible",
+        speed_statements=describe_speeds(plan, speeds),
+    )
+
+
+def find_plan_findings(plan: MotionPlan) -> list[Finding]:
+    """Return why a plan is refused, then how its numbers are to be read."""
+    findings = []
+    for problem in plan.problems:
+        findings.append(Finding(Severity.WARNING, f"refused: {problem}"))
+    scene = plan.trajectory.scene
+    if scene.moment and scene.moment.topic:
+        text = "The external moment comes from a topic; it counts as zero here."
+        findings.append(Finding(Severity.NOTE, text))
+    if scene.lags:
+        text = "The actuators lag; commands that make up for it may exceed the torques."
+        findings.append(Finding(Severity.NOTE, text))
+    return findings
+
+
+def describe_speeds(plan: MotionPlan, speeds: TimeScaling) -> list[str]:
+    """Say at which speeds a plan is feasible, and which limit ends them."""
+    statements = []
+    held_limits = [distance for distance in plan.distances if distance.refused]
+    least = min((distance.least for distance in held_limits), default=math.inf)
+    if least < 0.0:
+        statements.append("At no speed: the path itself leaves what is allowed.")
+    elif speeds.highest is None:
+        statements.append("At no speed: the torque limit is too small for this path.")
+    elif not speeds.binding:
+        statements.append("At any speed: the scene has no limit that it could meet.")
+    else:
+        duration = plan.motion.duration / speeds.highest
+        statements.append(
+            f"Highest speed {speeds.highest:.9g} times as planned, in {duration:.9g} s;"
+            f" then the {speeds.binding} limit is met."
+        )
+    if speeds.highest is not None and speeds.lowest > 0.0:
+        statements.append(
+            f"Slower than {speeds.lowest:.9g} times as planned it is not feasible"
+            " either: the torque limit is too small to rest everywhere on this path."
+        )
+    return statements
 
 
 def run_sweep(options: argparse.Namespace) -> None:
@@ -79,18 +131,20 @@ def run_sweep(options: argparse.Namespace) -> None:
         options.parser.error(
             "--workers is for this machine; a scheduler has workers of its own"
         )
-    out = options.out or options.study.with_name(f"{options.study.stem}_sweep")
+    folder = options.out or options.study.with_name(f"{options.study.stem}_sweep")
     if not options.resume:
-        free_out(options, out)
+        free_out(options, folder)
     study = SweepStudy.read(options.study)
     workers, resume = options.workers or 0, options.resume
     with contextlib.ExitStack() as end:
         client = connect(options.scheduler) if options.scheduler else None
         if client is not None:
             end.callback(client.close, timeout=5)
-        found = run_study(study, out, client=client, workers=workers, resume=resume)
-    print(summarize(found), end="")
-    print(f"Results in {out}; `sst-ros sweep plot {out}` draws them.")
+        results = run_study(
+            study, folder, client=client, workers=workers, resume=resume
+        )
+    print(summarize(results), end="")
+    print(f"Results in {folder}; `sst-ros sweep plot {folder}` draws them.")
 
 
 def run_identification(options: argparse.Namespace) -> None:
@@ -118,15 +172,15 @@ def run_identification(options: argparse.Namespace) -> None:
     )
     if options.out is not None:
         free_out(options, options.out)
-    found: ExcitingMotion | Identification
+    result: ExcitingMotion | Identification
     if designing:
-        found = design(load(options.designed), options.parameters, **chosen)
+        result = design(load(options.designed), options.parameters, **chosen)
     else:
         namespace = chosen.pop("namespace", None)
         run = function("recording.recording:read")(options.bag, namespace=namespace)
-        found = identify(run, parameters=options.parameters, **chosen)
-    print(found.table(), end="")
+        result = identify(run, parameters=options.parameters, **chosen)
+    print(result.table(), end="")
     if options.out is not None:
         with write_into(options.out.parent, "identify"):
-            options.out.write_text(dump(found.scene), encoding="utf-8")
+            options.out.write_text(dump(result.scene), encoding="utf-8")
         print(f"wrote {options.out}")

@@ -18,25 +18,27 @@ from sst_ros.scene.scene import load, names
 
 def report_run(options: argparse.Namespace) -> None:
     """Evaluate a recorded run."""
-    out = free_out(options, results_folder(options.bag, "report"))
-    given = {"damaged": options.damaged, "namespace": options.namespace}
-    summary = function("report.run_page:write_run_report")(options.bag, out, **given)
+    folder = free_out(options, results_folder(options.bag, "report"))
+    choices = {"damaged": options.damaged, "namespace": options.namespace}
+    summary = function("report.run_page:write_run_report")(
+        options.bag, folder, **choices
+    )
     if options.verbose:
         print(function("report.run:summary_table")(summary))
-    print(function("report.run:summary_text")(summary, str(out)), end="")
+    print(function("report.run:summary_text")(summary, str(folder)), end="")
 
 
 def report_accuracy(options: argparse.Namespace) -> None:
     """Measure the error and the run time of every method."""
-    out = free_out(options, "accuracy_out")
-    function("report.accuracy:write_accuracy_report")(options.scenes or names(), out)
+    folder = free_out(options, "accuracy_out")
+    function("report.accuracy:write_accuracy_report")(options.scenes or names(), folder)
 
 
 def report_stability(options: argparse.Namespace) -> int:
     """Find the stable steps along a motion, and run the scene with other numbers."""
-    out = free_out(options, "stability_out")
+    folder = free_out(options, "stability_out")
     write = function("report.stability:write_stability_report")
-    return 0 if write(load(options.scene), out, options.only) else 1
+    return 0 if write(load(options.scene), folder, options.only) else 1
 
 
 def draw_pictures(options: argparse.Namespace) -> int:
@@ -56,21 +58,21 @@ def draw_pictures(options: argparse.Namespace) -> int:
         return compare_runs(options)
     if options.bag is None:
         options.parser.error("name a BAG")
-    out = free_out(options, results_folder(options.bag, "plots"))
+    folder = free_out(options, results_folder(options.bag, "plots"))
     run = read_signals(options.bag, namespace=options.namespace)
-    return _tell(*pictures.draw_run(run, out, options.only))
+    return _tell(*pictures.draw_run(run, folder, options.only))
 
 
 def compare_runs(options: argparse.Namespace) -> int:
     """Print and draw how recorded runs differ from the first."""
-    out = free_out(options, results_folder(options.bags[0], "compared"))
+    folder = free_out(options, results_folder(options.bags[0], "compared"))
     if options.csv is not None:
         require_free(options.csv, "compare", force=options.force)
     runs = [
         read_signals(bag, namespace=namespace)
         for bag, namespace in _pair(options.bags, options.namespace)
     ]
-    drawn = compare.draw_comparison(runs, out, options.only)
+    drawn = compare.draw_comparison(runs, folder, options.only)
     print(compare.difference_text(runs))
     if options.csv is not None:
         with replace_file(options.csv) as path:
@@ -90,9 +92,9 @@ def _pair(bags: list[Path], namespaces: list[str]) -> list[tuple[Path, str | Non
         bags = bags * len(namespaces)
     if len(namespaces) == 1:
         namespaces = namespaces * len(bags)
-    allowed = f"must be one, or one for each of {len(bags)} bags"
+    requirement = f"must be one, or one for each of {len(bags)} bags"
     fits = len(namespaces) == len(bags)
-    refuse_unless("compare", ("--namespace", namespaces, fits, allowed))
+    refuse_unless("compare", ("--namespace", namespaces, fits, requirement))
     return list(zip(bags, namespaces, strict=True))
 
 

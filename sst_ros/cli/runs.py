@@ -107,39 +107,44 @@ def implausible(scene: Scene) -> str:
 def map_workspace(options: argparse.Namespace) -> None:
     """Draw the workspace of a scene and print its singular poses."""
     scene = load(options.scene)
-    out = options.out or Path(f"{Path(options.scene).stem}_workspace.png")
-    allowed = f"must end in {' or '.join(PICTURE_SUFFIXES)}"
+    picture = options.out or Path(f"{Path(options.scene).stem}_workspace.png")
+    requirement = f"must end in {' or '.join(PICTURE_SUFFIXES)}"
     refuse_unless(
-        "workspace", ("--out", str(out), out.suffix in PICTURE_SUFFIXES, allowed)
+        "workspace",
+        ("--out", str(picture), picture.suffix in PICTURE_SUFFIXES, requirement),
     )
-    free_out(options, out)
+    free_out(options, picture)
     require("matplotlib")
     geometry = Geometry.of(scene)
     chart = workspace.workspace(geometry, divisions=60, turns=180, progress=True)
     print(workspace.report_singularities(geometry, chart))
     figure = function("plot.workspace:plot_workspace")(chart, titles=[scene.name])
-    function("figures:save_figure")(figure, out)
-    print(out)
+    function("figures:save_figure")(figure, picture)
+    print(picture)
 
 
 def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
-    out, pictures = options.out, list[tuple[Path, str]]()
+    target, pictures = options.out, list[tuple[Path, str]]()
     ends = f"must end in {' or '.join(SUFFIXES)}"
     refuse_unless(
-        "simulate", ("--out", str(out), out is None or out.suffix in SUFFIXES, ends)
+        "simulate",
+        ("--out", str(target), target is None or target.suffix in SUFFIXES, ends),
     )
-    written = out is None or out.suffix == ".csv"
-    shown = not options.reactions or (written and (out is not None or options.plot))
+    written = target is None or target.suffix == ".csv"
+    prints_motion = not options.reactions or (
+        written and (target is not None or options.plot)
+    )
     refuse_unless(
-        "simulate", ("--reactions", True, shown, "needs --plot, or --out FILE.csv")
+        "simulate",
+        ("--reactions", True, prints_motion, "needs --plot, or --out FILE.csv"),
     )
-    if out is not None:
-        free_out(options, out)
-        if library := {".parquet": "pyarrow", ".csv": "pandas"}.get(out.suffix):
+    if target is not None:
+        free_out(options, target)
+        if library := {".parquet": "pyarrow", ".csv": "pandas"}.get(target.suffix):
             require(library)
     if options.plot:
-        stem = (out or Path(Path(options.scene).name)).with_suffix("")
+        stem = (target or Path(Path(options.scene).name)).with_suffix("")
         pictures.append((stem.with_name(f"{stem.name}.png"), "motion"))
         if options.reactions:
             pictures.append((stem.with_name(f"{stem.name}_reactions.png"), "reactions"))
@@ -147,14 +152,18 @@ def run_simulation(options: argparse.Namespace) -> int:
             require_free(picture, "simulate", force=options.force)
         require("matplotlib")
     names = ("duration", "method", "tolerance", "samples")
-    given = {name: getattr(options, name) for name in names}
-    trajectory = simulate(options.scene, progress=True, **given)
+    choices = {name: getattr(options, name) for name in names}
+    trajectory = simulate(options.scene, progress=True, **choices)
     print(render("motion.txt", motion=trajectory), end="")
-    if out is not None:
-        trajectory.save(out, overwrite=options.force, reactions=options.reactions)
-        print(out)
-    for picture, shown in pictures:
-        figure = trajectory.plot() if shown == "motion" else trajectory.reactions.plot()
+    if target is not None:
+        trajectory.save(target, overwrite=options.force, reactions=options.reactions)
+        print(target)
+    for picture, prints_motion in pictures:
+        figure = (
+            trajectory.plot()
+            if prints_motion == "motion"
+            else trajectory.reactions.plot()
+        )
         function("figures:save_figure")(figure, picture)
         print(picture)
     return 0 if trajectory.success else 1
@@ -165,13 +174,13 @@ def certify_scene(options: argparse.Namespace) -> int:
     for path in (options.out, options.tracking):
         if path is not None:
             require_free(path, "certify", force=options.force)
-    given = {name: getattr(options, name) for name in ("duration", "bound")}
+    choices = {name: getattr(options, name) for name in ("duration", "bound")}
     ranges: dict[str, object] = dict.fromkeys(options.digits, "digits")
     for text in options.range:
         key, width = read_range(text)
         refuse_unless("certify", ("--range", text, key not in ranges, "names it twice"))
         ranges[key] = width
-    given |= {"ranges": ranges, "split": options.split or 1, "progress": True}
+    choices |= {"ranges": ranges, "split": options.split or 1, "progress": True}
     scene, torque = load(options.scene), None
     loop_options = (
         options.gain,
@@ -182,13 +191,16 @@ def certify_scene(options: argparse.Namespace) -> int:
     if options.control is not None:
         period = 1e-3 if options.control_period is None else options.control_period
         torque = _controller(scene, options, period)
-        given |= {"control_period": period, "noise": tuple(options.noise or (0.0, 0.0))}
+        choices |= {
+            "control_period": period,
+            "noise": tuple(options.noise or (0.0, 0.0)),
+        }
     else:
-        allowed = "are given with --control"
+        requirement = "are given with --control"
         is_free = not any(loop_options)
         names = "--gain, --noise, --control-period, --tracking"
-        refuse_unless("certify", (names, loop_options, is_free, allowed))
-    proven = function("proof.certify:certify")(scene, torque, **given)
+        refuse_unless("certify", (names, loop_options, is_free, requirement))
+    proven = function("proof.certify:certify")(scene, torque, **choices)
     print(proven)
     if options.out is not None:
         proven.to_pandas().to_csv(options.out, index=False)
@@ -202,13 +214,13 @@ def certify_scene(options: argparse.Namespace) -> int:
 
 def prove_zone(options: argparse.Namespace) -> int:
     """Print what is proven of a zone of the workspace; draw and write it."""
-    out, picture = options.out, options.picture
-    if out is not None:
-        free_out(options, out)
+    target, picture = options.out, options.picture
+    if target is not None:
+        free_out(options, target)
     if picture is not None:
         is_picture = picture.suffix in PICTURE_SUFFIXES
-        allowed = f"must end in {' or '.join(PICTURE_SUFFIXES)}"
-        refuse_unless("zone", ("--picture", str(picture), is_picture, allowed))
+        requirement = f"must end in {' or '.join(PICTURE_SUFFIXES)}"
+        refuse_unless("zone", ("--picture", str(picture), is_picture, requirement))
         require_free(picture, "zone", force=options.force, option="--picture")
         require("matplotlib")
     zone = function("proof.zones:certify_zone")(
@@ -223,9 +235,9 @@ def prove_zone(options: argparse.Namespace) -> int:
         figure = function("plot.workspace:plot_zone")(zone)
         function("figures:save_figure")(figure, picture)
         print(picture)
-    if out is not None:
-        zone.to_pandas().to_csv(out, index=False)
-        print(out)
+    if target is not None:
+        zone.to_pandas().to_csv(target, index=False)
+        print(target)
     return 0 if zone.success else 1
 
 
@@ -235,22 +247,22 @@ def _zone_limits(options: argparse.Namespace) -> dict[str, Any]:
     if options.gamma_box is not None:
         box = np.radians(options.gamma_box).reshape(3, 2)
         is_alone = options.tilt is None and options.torsion == half_turn
-        given = (options.tilt, options.torsion)
-        allowed = "are those of a cap: leave them out with --gamma-box"
-        refuse_unless("zone", ("--tilt, --torsion", given, is_alone, allowed))
+        cap_limits = (options.tilt, options.torsion)
+        requirement = "are those of a cap: leave them out with --gamma-box"
+        refuse_unless("zone", ("--tilt, --torsion", cap_limits, is_alone, requirement))
         return {"gamma_box": box}
     torsion = math.pi if options.torsion == half_turn else math.radians(options.torsion)
     tilt = None if options.tilt is None else math.radians(options.tilt)
     return {"tilt": tilt, "torsion": torsion}
 
 
-def _read_ranges(words: Sequence[str]) -> dict[str, float | str]:
+def _read_ranges(assignments: Sequence[str]) -> dict[str, float | str]:
     """Read KEY=WIDTH."""
     ranges: dict[str, float | str] = {}
-    for word in words:
-        key, _, width = word.partition("=")
-        allowed = "must be KEY=WIDTH, a half-width or the word digits"
-        with refuse_errors("zone", "--ranges", word, allowed, ValueError):
+    for assignment in assignments:
+        key, _, width = assignment.partition("=")
+        requirement = "must be KEY=WIDTH, a half-width or the word digits"
+        with refuse_errors("zone", "--ranges", assignment, requirement, ValueError):
             ranges[key] = width if width == "digits" else float(width)
     return ranges
 
@@ -263,8 +275,8 @@ def read_range(text: str) -> tuple[str, object]:
         return key, width
     numbers = [low, high] if dots else [width]
     is_read = bool(key) and all(NUMBER.fullmatch(number) for number in numbers)
-    allowed = "must be KEY=HALF_WIDTH, KEY=LOW..HIGH or KEY=digits"
-    refuse_unless("certify", ("--range", text, is_read, allowed))
+    requirement = "must be KEY=HALF_WIDTH, KEY=LOW..HIGH or KEY=digits"
+    refuse_unless("certify", ("--range", text, is_read, requirement))
     floats = tuple(map(float, numbers))
     return key, floats if dots else floats[0]
 
@@ -277,8 +289,8 @@ def _controller(scene: Scene, options: argparse.Namespace, period: float) -> obj
         name, _, number = text.partition("=")
         is_known = name in settings.SPECS and name != "mode"
         is_read = is_known and NUMBER.fullmatch(number) is not None
-        allowed = "must be a setting of a controller and a number, as bandwidth=40"
-        refuse_unless("certify", ("--gain", text, is_read, allowed))
+        requirement = "must be a setting of a controller and a number, as bandwidth=40"
+        refuse_unless("certify", ("--gain", text, is_read, requirement))
         gains[name] = float(number)
     motion = function("control.reference_motions:reference_motion")(scene)
     controller = function("control.controller:Controller")
@@ -304,13 +316,13 @@ def view(options: argparse.Namespace) -> int:
     require("rclpy")
     if options.scene is not None:
         load(options.scene)  # refused before a process of its own would be
-    given = {
+    parameters = {
         name: getattr(options, name) for name in ("simulator", "host", "port", "open")
     }
-    words = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace or '/'}"]
+    ros_arguments = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace or '/'}"]
     with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
         status: int = function("nodes.process:run")(
-            [*words, *child_process.words(given)]
+            [*ros_arguments, *child_process.words(parameters)]
         )
     return status
 
@@ -318,29 +330,27 @@ def view(options: argparse.Namespace) -> int:
 def write_equations(options: argparse.Namespace) -> None:
     """Write the equations of a scene for another program."""
     target = options.target
-    out = free_out(options, Path(f"{Path(options.scene).stem}_{target}"))
+    folder = free_out(options, Path(f"{Path(options.scene).stem}_{target}"))
     equations = function("code_generation.equations:equations")
-    given = {"parameters": options.parameters, "outputs": options.outputs}
-    written = equations(options.scene, target, **given)
-    for path in written.write(out, force=options.force):
+    choices = {"parameters": options.parameters, "outputs": options.outputs}
+    written = equations(options.scene, target, **choices)
+    for path in written.write(folder, force=options.force):
         print(path)
 
 
 def write_tables(options: argparse.Namespace) -> None:
     """Write the tables of a recorded run."""
-    out = free_out(options, results_folder(options.bag, "tables"))
+    folder = free_out(options, results_folder(options.bag, "tables"))
     export = function("recording.recording:export")
-    given = {"force": options.force, "namespace": options.namespace}
-    for path in export(options.bag, out, options.format, **given):
+    choices = {"force": options.force, "namespace": options.namespace}
+    for path in export(options.bag, folder, options.format, **choices):
         print(path)
 
 
 def write_recovered(options: argparse.Namespace) -> None:
     """Write what is intact in a recording as a new one."""
-    found = function("recording.bag_writer:recover")(options.bag, options.out)
-    print(
-        f"{found.messages} messages recovered into {found.bag}, {found.lost} known to"
-        " be lost"
-    )
-    for line in found.damage:
+    recovered = function("recording.bag_writer:recover")(options.bag, options.out)
+    messages = f"{recovered.messages} messages recovered into {recovered.bag}"
+    print(f"{messages}, {recovered.lost} known to be lost")
+    for line in recovered.damage:
         print(f"  {line}")

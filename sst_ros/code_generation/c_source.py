@@ -57,16 +57,16 @@ def c_files(equations: SceneEquations) -> dict[str, str]:
 def c_header(equations: SceneEquations) -> str:
     """Write the header."""
     name = identifier(equations)
-    word = name.upper()
+    guard = name.upper()
     lines = [
         *_comment([*equations.header, "", "Results may be where the arguments are."]),
-        f"#ifndef {word}_H",
-        f"#define {word}_H",
+        f"#ifndef {guard}_H",
+        f"#define {guard}_H",
         "",
-        f'#define {word}_SCENE_SHA256 "{equations.scene_hash}"',
+        f'#define {guard}_SCENE_SHA256 "{equations.scene_hash}"',
     ]
     for argument in (equations.state, *equations.acting, *equations.open):
-        lines.append(f"#define {word}_{argument.name.upper()}_SIZE {argument.size}")
+        lines.append(f"#define {guard}_{argument.name.upper()}_SIZE {argument.size}")
     lines += ["", "#ifdef __cplusplus", 'extern "C" {', "#endif"]
     lines += ["", f"extern const double {name}_initial_state[{equations.state.size}];"]
     for argument in equations.open:
@@ -75,7 +75,7 @@ def c_header(equations: SceneEquations) -> str:
         lines += ["", *_comment([f"The {named.description}.", *_shape_note(named)])]
         lines.append(f"{_signature(name, named)};")
     lines += ["", "#ifdef __cplusplus", "}", "#endif"]
-    lines += ["", f"#endif /* {word}_H */", ""]
+    lines += ["", f"#endif /* {guard}_H */", ""]
     return "\n".join(lines)
 
 
@@ -114,9 +114,11 @@ def _constant(name: str, values: tuple[float, ...]) -> Iterator[str]:
 
 
 def _signature(name: str, named: NamedProgram) -> str:
-    given = [f"const double {one.name}[{one.size}]" for one in named.arguments]
+    parameters = [
+        f"const double {argument.name}[{argument.size}]" for argument in named.arguments
+    ]
     size = len(named.program.outputs)
-    arguments = ", ".join([*given, f"double result[{size}]"])
+    arguments = ", ".join([*parameters, f"double result[{size}]"])
     return f"void {name}_{named.name}({arguments})"
 
 
@@ -147,16 +149,16 @@ def _body(named: NamedProgram) -> Iterator[str]:
         )
         first += argument.size
     yield from _statements(program)
-    words = _words(program)
+    names = _words(program)
     for i, output in enumerate(program.outputs):
-        yield f"    result[{i}] = {_word(output, words)};"
+        yield f"    result[{i}] = {_word(output, names)};"
 
 
 def _statements(program: Program) -> Iterator[str]:
-    words = _words(program)
+    names = _words(program)
     for i, (operation, operands) in enumerate(program.steps):
         assert isinstance(operation, str)  # equations call no routine
-        expression = _expression(operation, [_word(x, words) for x in operands])
+        expression = _expression(operation, [_word(x, names) for x in operands])
         yield f"    const double v{i} = {expression};"
 
 
@@ -171,9 +173,9 @@ def _reads(argument: Argument, used: list[int]) -> Iterator[str]:
         yield f"    const double {argument.symbols[i]} = {argument.name}[{i}];"
 
 
-def _word(operand: float | int, words: list[str]) -> str:
+def _word(operand: float | int, names: list[str]) -> str:
     if isinstance(operand, int):
-        return words[operand]
+        return names[operand]
     number = repr(float(operand))
     return f"({number})" if number.startswith("-") else number
 

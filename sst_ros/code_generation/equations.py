@@ -131,15 +131,15 @@ def equations(
         AssemblyError: the initial gamma has no unique admissible assembly.
 
     """
-    given = scene_of(scene)
-    whole = target in ("fmu", MJCF)
+    the_scene = scene_of(scene)
+    model_target = target in ("fmu", MJCF)
     refuse_unless(
         CALLER,
         ("target", target, target in TARGETS, f"must be one of {', '.join(TARGETS)}"),
         (
             "outputs",
             outputs,
-            not (whole and outputs),
+            not (model_target and outputs),
             f"are fixed for {target}: give none",
         ),
         (
@@ -149,12 +149,14 @@ def equations(
             "are not for mjcf: MuJoCo changes the numbers of its own model",
         ),
     )
-    asked = None if outputs is None else tuple(outputs)
-    traced = SceneEquations(given, tuple(parameters), () if whole else asked)
+    output_names = None if outputs is None else tuple(outputs)
+    traced = SceneEquations(
+        the_scene, tuple(parameters), () if model_target else output_names
+    )
     values = dict(zip(traced.parameters, traced.values, strict=True))
     name = identifier(traced)
     if target == MJCF:
-        files: Mapping[str, str | bytes] = {f"{name}.xml": mjcf(given)}
+        files: Mapping[str, str | bytes] = {f"{name}.xml": mjcf(the_scene)}
     elif target in LIBRARIES:
         text = python_module(traced, LIBRARIES[target])
         files = {f"{name}_{target}.py": text}

@@ -67,23 +67,24 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
     A RuntimeWarning says that there is no C compiler, and so no binary in it.
     """
     name = identifier(equations)
-    whole = SceneEquations(
+    scene = SceneEquations(
         equations.scene, equations.parameters, ("derivative", "joints", "energies")
     )
     templates = load_templates("code_generation")
     token = str(
         uuid.uuid5(
-            uuid.NAMESPACE_URL, f"{VERSION} {whole.scene_hash} {whole.parameters}"
+            uuid.NAMESPACE_URL,
+            f"{VERSION} {scene.scene_hash} {scene.parameters}",
         )
     )
-    sources = c_files(whole)
+    sources = c_files(scene)
     sources["fmi3.c"] = templates.get_template("fmi3.c").render(
         name=name,
         token=token,
-        states=whole.state.size,
-        inputs=sum(argument.size for argument in whole.acting),
-        parameters=whole.parameters,
-        torque_limit=whole.scene.torque_limit,
+        states=scene.state.size,
+        inputs=sum(argument.size for argument in scene.acting),
+        parameters=scene.parameters,
+        torque_limit=scene.scene.torque_limit,
         stages=len(DOP853.c),
         stage_rows=[[*row, *(0.0,) * (len(DOP853.c) - len(row))] for row in DOP853.a],
         weights=DOP853.b,
@@ -92,16 +93,16 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
     )
     description = templates.get_template("modelDescription.xml").render(
         name=name,
-        title=whole.scene.name,
+        title=scene.scene.name,
         token=token,
         description=(
-            f"{whole.scene.description} SHA-256 of the scene: {whole.scene_hash}"
+            f"{scene.scene.description} SHA-256 of the scene: {scene.scene_hash}"
         ),
         version=VERSION,
         units=FMU_UNITS,
-        duration=whole.scene.duration,
-        variables=[*_variables(whole)],
-        structure=[*_structure(whole)],
+        duration=scene.scene.duration,
+        variables=[*_variables(scene)],
+        structure=[*_structure(scene)],
     )
     build = templates.get_template("buildDescription.xml").render(name=name)
     files: dict[str, str | bytes] = {"modelDescription.xml": description}
@@ -181,8 +182,8 @@ def _binary(name: str, sources: dict[str, str]) -> dict[str, bytes]:
     compiler = shutil.which("cc")
     folder = PLATFORMS.get((platform.system(), platform.machine()))
     if compiler is None or folder is None:
-        what = "cc is not installed" if compiler is None else "not for this platform"
-        message = f"no binary in the unit ({what}): importers compile its sources"
+        reason = "cc is not installed" if compiler is None else "not for this platform"
+        message = f"no binary in the unit ({reason}): importers compile its sources"
         warnings.warn(message, RuntimeWarning, stacklevel=4)
         return {}
     with tempfile.TemporaryDirectory() as place:
@@ -190,14 +191,13 @@ def _binary(name: str, sources: dict[str, str]) -> dict[str, bytes]:
             (Path(place) / file).write_text(text, encoding="utf-8")
         units = [file for file in sources if file.endswith(".c")]
         command = [compiler, *FLAGS, "-o", f"{name}.so", *units, "-lm"]
-        done = subprocess.run(
+        compilation = subprocess.run(
             command, cwd=place, capture_output=True, text=True, check=False
         )
-        if done.returncode != 0:
-            said = done.stderr.strip().splitlines()
-            raise SstError(
-                f"the C compiler cc failed: {said[0] if said else done.returncode}"
-            )
+        if compilation.returncode != 0:
+            errors = compilation.stderr.strip().splitlines()
+            reason = errors[0] if errors else compilation.returncode
+            raise SstError(f"the C compiler cc failed: {reason}")
         return {
             f"binaries/{folder}/{name}.so": (Path(place) / f"{name}.so").read_bytes()
         }

@@ -114,14 +114,15 @@ class SceneEquations:
         self.parameters = _list_parameters(scene, parameters)
         self.values = tuple(_value_of(scene, key) for key in self.parameters)
         self.dynamics = Dynamics.of(scene)
-        known = [
+        outputs_known = [
             name for name in PROGRAM_OUTPUTS if self.parameters or name != BY_PARAMETERS
         ]
-        self.outputs = tuple(known if outputs is None else outputs)
+        self.outputs = tuple(outputs_known if outputs is None else outputs)
         for name in self.outputs:
-            if name not in known:
-                allowed = f"must be one of {', '.join(known)}{suggestion(name, known)}"
-                raise refusal(CALLER, "outputs", name, allowed)
+            if name not in outputs_known:
+                requirement = f"must be one of {', '.join(outputs_known)}"
+                requirement += suggestion(name, outputs_known)
+                raise refusal(CALLER, "outputs", name, requirement)
 
     @cached_property
     def programs(self) -> tuple[NamedProgram, ...]:
@@ -156,8 +157,8 @@ class SceneEquations:
     def acting(self) -> tuple[Argument, ...]:
         """What acts from outside: torques, and a moment if it comes from a topic."""
         legs = (1, 2, 3)
-        word = "command to" if self.scene.lags else "torque of"
-        torques = tuple(f"{word} actuator {leg} [N m]" for leg in legs)
+        meaning = "command to" if self.scene.lags else "torque of"
+        torques = tuple(f"{meaning} actuator {leg} [N m]" for leg in legs)
         symbols = self.dynamics.drive
         torque = Argument(TORQUES, symbols[:3], torques)
         if not self.dynamics.has_moment_topic:
@@ -277,11 +278,11 @@ def _jacobian(equations: SceneEquations, by: Argument) -> NamedProgram:
     It has a row for each number of the state.
     """
     arguments = (equations.state, *equations.acting, *equations.open)
-    whole = trace(equations.derivative, _symbols(arguments), by.symbols)
+    derivative = trace(equations.derivative, _symbols(arguments), by.symbols)
     rows = equations.state.size
-    columns = np.arange(rows, len(whole.outputs)).reshape(by.size, rows)
-    entries = [whole.outputs[i] for i in columns.T.ravel()]
-    program = whole.prune(entries)
+    columns = np.arange(rows, len(derivative.outputs)).reshape(by.size, rows)
+    entries = [derivative.outputs[i] for i in columns.T.ravel()]
+    program = derivative.prune(entries)
     name = f"derivative_by_{by.name}"
     description = (
         f"Jacobian of the derivative by {by.name}: a row a number of the state"
@@ -311,12 +312,12 @@ def _list_parameters(scene: Scene, parameters: Sequence[str]) -> tuple[str, ...]
     refuse_other_numbers(scene, keys, CALLER)
     for key in keys:
         if key.startswith("initial"):
-            allowed = "is a number of the initial state, not of the equations"
-            raise refusal(CALLER, PARAMETERS, key, allowed)
+            requirement = "is a number of the initial state, not of the equations"
+            raise refusal(CALLER, PARAMETERS, key, requirement)
         if key in REBOUND:
-            allowed = "acts through the damping of the stops: give the scene"
-            allowed += " stroke.damping in its place, and name that"
-            raise refusal(CALLER, PARAMETERS, key, allowed)
+            requirement = "acts through the damping of the stops: give the scene"
+            requirement += " stroke.damping in its place, and name that"
+            raise refusal(CALLER, PARAMETERS, key, requirement)
         if keys.count(key) > 1:
             raise refusal(CALLER, PARAMETERS, key, "must be named once")
     return tuple(keys)

@@ -142,7 +142,7 @@ def python_module(equations: SceneEquations, library: Library) -> str:
     """Write the module."""
     head = "\n".join([*equations.header, "", library.about])
     values = dict(zip(equations.parameters, equations.values, strict=True))
-    parts = [
+    sections = [
         f'"""{head}\n"""',
         library.imports,
         f"INITIAL_STATE = {equations.initial!r}",
@@ -150,8 +150,8 @@ def python_module(equations: SceneEquations, library: Library) -> str:
         library.collect.strip("\n"),
     ]
     for named in equations.programs:
-        parts.append("\n".join(["", *_function(named, library)]))
-    return "\n\n".join(parts) + "\n"
+        sections.append("\n".join(["", *_function(named, library)]))
+    return "\n\n".join(sections) + "\n"
 
 
 def _function(named: NamedProgram, library: Library) -> Iterator[str]:
@@ -176,11 +176,11 @@ def _write_operations(
 ) -> tuple[list[str], list[str]]:
     """Return a line for each step, v0 = .., v1 = .., and the names of the outputs."""
     program = named.program
-    words = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
+    names = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
 
     def word(operand: float | int) -> str:
         if isinstance(operand, int):
-            return words[operand]
+            return names[operand]
         number = repr(float(operand))
         return f"({number})" if number.startswith("-") else number
 

@@ -120,56 +120,62 @@ def _sites(scene: Scene, geometry: Geometry) -> dict[str, list[tuple[str, Array]
     """Return the points that the ties connect, by link: along e_k, and at the end E."""
     radius = scene.star.radius
     end = np.array([0.0, 0.0, radius])
-    found: dict[str, list[tuple[str, Array]]] = {STAR_LINK: []}
+    sites: dict[str, list[tuple[str, Array]]] = {STAR_LINK: []}
     for leg in LEGS[1:]:
         along = radius * geometry.e[leg - 1]
-        found[STAR_LINK] += [
+        sites[STAR_LINK] += [
             (f"{STAR_LINK}_e{leg}", along),
             (f"{STAR_LINK}_t{leg}", end),
         ]
         name = STARS[leg - 1]
-        found[name] = [(f"{name}_e", along), (f"{name}_t", end)]
-    return found
+        sites[name] = [(f"{name}_e", along), (f"{name}_t", end)]
+    return sites
 
 
 def _joint_attributes(scene: Scene, geometry: Geometry) -> dict[str, dict[str, Any]]:
     """Return springs, friction, range and rotor of each joint, as MuJoCo names them."""
     model = model_of(scene)
     ranges = {joint: ends for joint, *ends in ranges_of([*limits_of(scene, geometry)])}
-    found: dict[str, dict[str, Any]] = {}
+    by_joint: dict[str, dict[str, Any]] = {}
     for number, name in enumerate(JOINTS):
-        kind, leg = divmod(number, 3)
-        given: dict[str, Any] = {}
-        if (spring := model.legs[leg].springs[kind]) is not None:
-            given["stiffness"] = [spring.stiffness]
-            given["springref"] = [spring.rest]
-        if (friction := model.legs[leg].friction[kind]) is not None:
-            given["damping"] = [friction.viscous]
-            given["frictionloss"] = [friction.coulomb]
-        if JOINT_KINDS[kind] != "mu" and np.isfinite(ranges.get(number, np.inf)).all():
-            given["range"] = ranges[number]
+        angle, leg = divmod(number, 3)
+        attributes: dict[str, Any] = {}
+        if (spring := model.legs[leg].springs[angle]) is not None:
+            attributes["stiffness"] = [spring.stiffness]
+            attributes["springref"] = [spring.rest]
+        if (friction := model.legs[leg].friction[angle]) is not None:
+            attributes["damping"] = [friction.viscous]
+            attributes["frictionloss"] = [friction.coulomb]
+        if JOINT_KINDS[angle] != "mu" and np.isfinite(ranges.get(number, np.inf)).all():
+            attributes["range"] = ranges[number]
         motor = scene.actuators
-        if JOINT_KINDS[kind] == "gamma" and motor is not None and motor.rotor_inertia:
-            given["armature"] = [motor.gear_ratio**2 * motor.rotor_inertia]
-        found[name] = given
-    return found
+        if JOINT_KINDS[angle] == "gamma" and motor is not None and motor.rotor_inertia:
+            attributes["armature"] = [motor.gear_ratio**2 * motor.rotor_inertia]
+        by_joint[name] = attributes
+    return by_joint
 
 
 def _motor(scene: Scene) -> dict[str, object]:
     """Return torque limit and lag of the actuators, as MuJoCo names them."""
-    found: dict[str, object] = {}
+    attributes: dict[str, object] = {}
     if scene.torque_limit is not None:
-        found["ctrlrange"] = f"{-scene.torque_limit!r} {scene.torque_limit!r}"
+        attributes["ctrlrange"] = f"{-scene.torque_limit!r} {scene.torque_limit!r}"
     if scene.actuators is not None and scene.actuators.time_constant is not None:
-        found |= {"dyntype": "filter", "dynprm": repr(scene.actuators.time_constant)}
-    return found
+        attributes |= {
+            "dyntype": "filter",
+            "dynprm": repr(scene.actuators.time_constant),
+        }
+    return attributes
 
 
 def _left_out(scene: Scene) -> Iterator[str]:
     """Say what the scene has and MuJoCo has not, or has otherwise."""
-    kinds = [getattr(scene.friction, kind, None) for kind in JOINT_KINDS]
-    if any(one is not None and (one.coulomb or one.static) for one in kinds):
-        yield "Dry friction is MuJoCo's own, without breakaway torque and smoothing."
+    frictions = [getattr(scene.friction, angle, None) for angle in JOINT_KINDS]
+    for friction in frictions:
+        if friction is not None and (friction.coulomb or friction.static):
+            lacks = "without breakaway torque and smoothing"
+            yield f"Dry friction is MuJoCo's own, {lacks}."
+            break
     if scene.stroke.at_end == "elastic":
         yield "Elastic stops are left out: MuJoCo's are of another kind."
     if scene.moment is not None:
@@ -187,14 +193,14 @@ def _full_inertia(body: Body) -> Array:
     return np.asarray(body.tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
 
 
-def _geom(kind: str, sizes: Any, at: Any, turn: Any, rgba: Any) -> str:
+def _geom(primitive: str, sizes: Any, position: Any, turn: Any, rgba: Any) -> str:
     """Write a shape of `robot.solids` as a geom; lengths of MuJoCo are halves."""
-    if kind == "box":
+    if primitive == "box":
         size = [0.5 * side for side in sizes["size"]]
-    elif kind == "cylinder":
+    elif primitive == "cylinder":
         size = [sizes["radius"][0], 0.5 * sizes["length"][0]]
     else:
         size = sizes["radius"]
-    parts = {"size": size, "pos": at, "euler": turn, "rgba": rgba}
-    words = (f'{key}="{short(values)}"' for key, values in parts.items())
-    return f'<geom type="{kind}" {" ".join(words)} />'
+    attributes = {"size": size, "pos": position, "euler": turn, "rgba": rgba}
+    texts = (f'{key}="{short(values)}"' for key, values in attributes.items())
+    return f'<geom type="{primitive}" {" ".join(texts)} />'

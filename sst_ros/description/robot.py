@@ -40,7 +40,9 @@ from sst_ros.scene.loads import JOINTS, Friction
 from sst_ros.scene.scene import Scene
 from sst_ros.state import BASE_FRAME, Vector3
 
-BASE, STAR_LINK, PAYLOAD = BASE_FRAME, "star", "payload"
+BASE = BASE_FRAME
+STAR_LINK = "star"
+PAYLOAD = "payload"
 LEGS = (1, 2, 3)
 STARS = (STAR_LINK, "star_from_2", "star_from_3")  # {E} as seen from legs 1, 2 and 3
 ACTUATED_LINKS = ("actuated_1", "actuated_2", "actuated_3")
@@ -70,7 +72,8 @@ COLLISION_STEP = np.radians(15.0)
 CARRIAGE = 3.0 * np.array([1.0, 1.3, 1.3])
 """Sides of a carriage on an arm of the star, in radii of a drawn bar."""
 
-SERVO_TORQUE, SERVO_RATE = 10.6, np.pi
+SERVO_TORQUE = 10.6
+SERVO_RATE = np.pi
 """Limits of an actuator whose scene has none [N m], [rad/s]: stall torque and speed
 without load (30 rev/min) of a geared servo for arms of this size, ROBOTIS XM540-W270 at
 12 V.
@@ -81,7 +84,8 @@ LOCKSTEP_PLUGIN = "sst_ros_hardware/LockstepSystem"
 TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
 """Of commands and states, by which ros2_control drives a simulator."""
 
-NEGLIGIBLE_MASS, NEGLIGIBLE_INERTIA = 1e-12, 2e-14
+NEGLIGIBLE_MASS = 1e-12
+NEGLIGIBLE_INERTIA = 2e-14
 """Mass and inertia of a moving link that has none in the scene [kg, kg m^2].
 
 MuJoCo refuses less than 1e-14. Beside the star's inertia, some 1e-2 kg m^2, they are
@@ -107,42 +111,40 @@ class Joint(NamedTuple):
 
 
 def joints_of(geometry: Geometry) -> list[Joint]:
-    """All nine joints, parents before children; signs are those of Eqs. 50 to 52."""
-    z, found = np.array([0.0, 0.0, 1.0]), []
-    legs = zip(
-        LEGS,
-        geometry.v,
-        geometry.w,
-        geometry.e,
-        ACTUATED_LINKS,
-        INTERMEDIATE,
-        STARS,
-        strict=True,
-    )
-    for leg, v, w, e, actuated, intermediate, star in legs:
+    """Return all nine joints, parents before children; signs as in Eqs. 50 to 52."""
+    z = np.array([0.0, 0.0, 1.0])
+    joints = []
+    for k, leg in enumerate(LEGS):
+        v = geometry.v[k]
+        w = geometry.w[k]
+        e = geometry.e[k]
         at_rest = np.stack([v, np.cross(w, v), w], axis=1)  # 0kR at gamma = 0
         # At beta = 0 the arc's end s lies at r: in {E} the vectors of {2k} are z, e x z
         # and e.
         folded = np.stack([z, np.cross(e, z), e], axis=1).T
         back = (-float(e[0]), -float(e[1]), -float(e[2]))
-        found += [
+        actuated = ACTUATED_LINKS[k]
+        intermediate = INTERMEDIATE[k]
+        joints += [
             Joint(f"gamma_{leg}", BASE, actuated, at_rest, (0.0, 0.0, 1.0)),
             Joint(f"mu_{leg}", actuated, intermediate, np.eye(3), (-1.0, 0.0, 0.0)),
-            Joint(f"beta_{leg}", intermediate, star, folded, back),
+            Joint(f"beta_{leg}", intermediate, STARS[k], folded, back),
         ]
-    return found
+    return joints
 
 
 def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str, Array]:
     """Return each link's rotation in {B}, shape (3, 3), by the joint angles [rad]."""
-    found: dict[str, Array] = {BASE: np.eye(3)}
+    frames: dict[str, Array] = {BASE: np.eye(3)}
     for joint in joints:
-        angle, across = angles[joint.name], np.cross(np.eye(3), np.array(joint.axis))
+        angle = angles[joint.name]
+        # Rodrigues' formula; `across` is the cross product with the axis.
+        across = np.cross(np.eye(3), np.array(joint.axis))
         turn = (
             np.eye(3) + np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
         )
-        found[joint.child] = found[joint.parent] @ (joint.origin @ turn)
-    return found
+        frames[joint.child] = frames[joint.parent] @ (joint.origin @ turn)
+    return frames
 
 
 class Arc(NamedTuple):
@@ -255,21 +257,21 @@ def collision_shapes(scene: Scene) -> dict[str, list[Shape]]:
     x = np.array([1.0, 0.0, 0.0])  # from O to the carriage
     # Around the drawn bearings, but below the carriages and the arms of the star.
     ball = max(bar, min(scene.base.radius + 4.0 * bar, star - 3.0 * bar))
-    parts: dict[str, list[Shape]] = {BASE: [Ball(np.zeros(3), ball, GLOBE)]}
-    parts[STAR_LINK] = []
+    enclosing: dict[str, list[Shape]] = {BASE: [Ball(np.zeros(3), ball, GLOBE)]}
+    enclosing[STAR_LINK] = []
     for shape in shapes(scene)[STAR_LINK]:
         if isinstance(shape, Arc):
             # A chord lies below its arc, by less than this share of the radius.
             sag = 1.0 - np.cos(COLLISION_STEP / 2.0)
-            parts[STAR_LINK].append(shape._replace(thickness=bar + sag * star))
+            enclosing[STAR_LINK].append(shape._replace(thickness=bar + sag * star))
         else:
-            parts[STAR_LINK].append(shape)
+            enclosing[STAR_LINK].append(shape)
     for intermediate in INTERMEDIATE:
-        parts[intermediate] = [
+        enclosing[intermediate] = [
             Rod(x * (ball + 0.5 * bar), x * star, 0.9 * bar, STEEL),
             Box(star * x, bar * CARRIAGE, STEEL),
         ]
-    return parts
+    return enclosing
 
 
 def _bar_radius(scene: Scene) -> float:
@@ -369,8 +371,8 @@ def _limited_joints(
     # The passive joints have no motor; their rates are of the order of the actuators'.
     highest_rate = max(SERVO_RATE, *map(abs, scene.initial.gamma_dot))
     for joint in joints:
-        kind = joint.name.split("_")[0]
-        driven = kind == "gamma"
+        angle = joint.name.split("_")[0]
+        driven = angle == "gamma"
         limits = {}
         lower, upper = ranges.get(JOINTS.index(joint.name), (-np.inf, np.inf))
         if np.isfinite([lower, upper]).all():
@@ -380,7 +382,7 @@ def _limited_joints(
         limits["velocity"] = highest_rate
         if driven and rate_limit:
             limits["velocity"] = rate_limit
-        yield joint, limits, getattr(scene.friction, kind, None)
+        yield joint, limits, getattr(scene.friction, angle, None)
 
 
 def load_description_templates() -> Any:
@@ -505,10 +507,10 @@ def solids_of_links(
     links: Mapping[str, Iterable[Shape]], step: float = ARC_STEP
 ) -> dict[str, list[Solid]]:
     """Return the primitives of each link's shapes; arcs are chords of `step` [rad]."""
-    found = {}
+    by_link = {}
     for link, drawn in links.items():
-        found[link] = [solid for shape in drawn for solid in solids(shape, step)]
-    return found
+        by_link[link] = [solid for shape in drawn for solid in solids(shape, step)]
+    return by_link
 
 
 def solids(shape: Shape, step: float = ARC_STEP) -> Iterator[Solid]:

@@ -25,7 +25,7 @@ from sst_ros.figures import (
     legend,
     styled,
 )
-from sst_ros.mechanism.geometry import angle_between
+from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.plot import pictures, workspace
 from sst_ros.plot.pictures import (
     JOINT_LETTERS,
@@ -58,24 +58,26 @@ def _overlay(
             for run, name, look in runs
         ]
         below = f"largest difference\nfrom the first {label.partition(' ')[2]}"
-        figure, first = draw_legs(label, legs, below), runs[0][0]
+        figure = draw_legs(label, legs, below)
         axes = figure.axes[-1]
         axes.set_yticks([])  # none until a run differs
+        first = runs[0][0]
         for run, name, look in runs[1:]:
-            here, there = _common(first, run)
-            apart = scale * np.abs(
-                run.legs(quantity)[there] - first.legs(quantity)[here]
+            rows_of_first, rows = _common(first, run)
+            distance = scale * np.abs(
+                run.legs(quantity)[rows] - first.legs(quantity)[rows_of_first]
             )
-            largest = hide_zeros(apart.max(axis=1, initial=0.0))
-            if differs := bool(np.isfinite(largest).any()):
+            largest = hide_zeros(distance.max(axis=1, initial=0.0))
+            remark = ""
+            if np.isfinite(largest).any():
                 axes.set_yscale("log")
-            same = len(there) and bool((apart <= SMALLEST_SHOWN).all())
-            result = ""
-            if not differs:
-                result = ": no difference" if same else ": no samples in common"
-            times = run.seconds()[there]
+            elif len(rows) and (distance <= SMALLEST_SHOWN).all():
+                remark = ": no difference"
+            else:
+                remark = ": no samples in common"
+            times = run.seconds()[rows]
             times, largest = break_lines(times, largest, run.gaps())
-            axes.plot(times, largest, label=name + result, **look)
+            axes.plot(times, largest, label=name + remark, **look)
         legend(axes)
         return figure
 
@@ -94,12 +96,10 @@ def _sphere(runs: Drawn) -> Figure:
     return workspace.draw_paths(scene, paths)
 
 
-JOINT_STATES_KEY, ERROR_KEY, TICKS, TURN_KEY = (
-    "joint_states",
-    "tracking_error",
-    "applied_torques",
-    "orientation",
-)
+JOINT_STATES_KEY = "joint_states"
+ERROR_KEY = "tracking_error"
+TICKS = "applied_torques"
+TURN_KEY = "orientation"
 COMPARISON_PICTURES = {
     "gamma": Picture(
         "Actuator angles", (JOINT_STATES_KEY,), _overlay("gamma", "γ [deg]", DEGREES)
@@ -121,26 +121,33 @@ COMPARISON_PICTURES = {
 
 @styled
 def draw_comparison(
-    runs: Sequence[Signals], out: Path, only: Sequence[str] = ()
+    runs: Sequence[Signals], folder: Path, only: Sequence[str] = ()
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write pictures of several runs into `out`, as `pictures.draw_run` does of one.
+    """Write pictures of several runs into `folder`, as `pictures.draw_run` does of one.
 
     Raises InputError where there are too many runs, too.
     """
-    allowed = f"must be 2 to {len(LINES)} bags, which can be distinguished"
-    refuse_unless("compare", ("bags", len(runs), 2 <= len(runs) <= len(LINES), allowed))
+    requirement = f"must be 2 to {len(LINES)} bags, which can be distinguished"
+    refuse_unless(
+        "compare", ("bags", len(runs), 2 <= len(runs) <= len(LINES), requirement)
+    )
+    all_runs = list(zip(runs, labels(runs), LINES, strict=False))
     paths: list[Path] = []
     missing: dict[str, str] = {}
-    for name in pictures.known(only, COMPARISON_PICTURES):
+    for name in pictures.chosen_names(only, COMPARISON_PICTURES):
         title, needs, make = COMPARISON_PICTURES[name]
-        all_runs = list(zip(runs, labels(runs), LINES, strict=False))
-        drawn = [each for each in all_runs if not set(needs) & set(each[0].missing)]
-        if left := [
-            label for run, label, _ in all_runs if set(needs) & set(run.missing)
-        ]:
-            missing[name] = f"without {', '.join(left)}: no {' or '.join(needs)} there"
+        drawn = []
+        incomplete = []
+        for run, label, look in all_runs:
+            if set(needs) & set(run.missing):
+                incomplete.append(label)
+            else:
+                drawn.append((run, label, look))
+        if incomplete:
+            labels_text = ", ".join(incomplete)
+            missing[name] = f"without {labels_text}: no {' or '.join(needs)} there"
         if len(drawn) > 1 and drawn[0][0] is runs[0]:
-            paths += pictures.save(make(drawn), title, out, f"compare_{name}")
+            paths += pictures.save(make(drawn), title, folder, f"compare_{name}")
         else:
             missing[name] = f"not drawn: {missing[name]}"
     return paths, missing
@@ -154,44 +161,54 @@ def differences(runs: Sequence[Signals]) -> DataFrame:
     its mean square [rad], and the same of the rate [rad/s]; samples in common, of how
     many. What cannot be compared is nan.
     """
+    from pandas import concat
+
+    tables = {}
+    for run, label in zip(runs[1:], labels(runs)[1:], strict=True):
+        tables[label] = _difference_table(runs[0], run)
+    return concat(tables, names=["run", "joint"])
+
+
+def _difference_table(first: Signals, run: Signals) -> DataFrame:
+    """Compare one run with the first, a row a joint; see `differences`."""
     from pandas import DataFrame, Series, concat
 
-    first, tables = runs[0], {}
-    joints = [f"{kind}_{leg}" for kind in JOINT_LETTERS for leg in (1, 2, 3)]
-    rated = [f"{kind}_dot_{leg}" for kind in JOINT_LETTERS for leg in (1, 2, 3)]
-    for run, label in zip(runs[1:], labels(runs)[1:], strict=True):
-        here, there = _common(first, run)
-        absent = {*first.missing, *run.missing}
-        angles, rates = (DataFrame(columns=joints, dtype=float) for _ in range(2))
-        if JOINT_STATES_KEY not in absent:
-            angles, rates = (
-                DataFrame(
-                    run.take(*names)[there] - first.take(*names)[here], columns=joints
-                )
-                for names in (joints, rated)
-            )
-        turn = Series(dtype=float)
-        if TURN_KEY not in absent:
-            one, other = (
-                each.take(*pictures.QUATERNION_COLUMNS) for each in (first, run)
-            )
-            turn = Series(angle_between(one[here], other[there]))
-        angles = concat([angles, turn.rename("star")], axis=1)
-        table = DataFrame(index=angles.columns)
-        for name, apart in ("max_rad", angles), ("rate_max_rad_per_s", rates):
-            table[name] = apart.abs().max()
-            table[name.replace("max", "rms")] = (apart**2).mean() ** 0.5
-        of = len(run.tables["samples"]) if "samples" in run.tables else 0
-        tables[label] = table.assign(samples=len(here), of=of)
-    return concat(tables, names=["run", "joint"])
+    names = [f"{angle}_{leg}" for angle in JOINT_LETTERS for leg in (1, 2, 3)]
+    rate_names = [f"{angle}_dot_{leg}" for angle in JOINT_LETTERS for leg in (1, 2, 3)]
+    rows_of_first, rows = _common(first, run)
+    absent = {*first.missing, *run.missing}
+
+    def difference(columns: Sequence[str]) -> Array:
+        return run.take(*columns)[rows] - first.take(*columns)[rows_of_first]
+
+    angles = DataFrame(columns=names, dtype=float)
+    rates = DataFrame(columns=names, dtype=float)
+    if JOINT_STATES_KEY not in absent:
+        angles = DataFrame(difference(names), columns=names)
+        rates = DataFrame(difference(rate_names), columns=names)
+    turn = Series(dtype=float)
+    if TURN_KEY not in absent:
+        of_first = first.take(*pictures.QUATERNION_COLUMNS)[rows_of_first]
+        of_run = run.take(*pictures.QUATERNION_COLUMNS)[rows]
+        turn = Series(angle_between(of_first, of_run))
+    angles = concat([angles, turn.rename("star")], axis=1)
+    table = DataFrame(index=angles.columns)
+    table["max_rad"] = angles.abs().max()
+    table["rms_rad"] = (angles**2).mean() ** 0.5
+    table["rate_max_rad_per_s"] = rates.abs().max()
+    table["rate_rms_rad_per_s"] = (rates**2).mean() ** 0.5
+    count = len(run.tables["samples"]) if "samples" in run.tables else 0
+    return table.assign(samples=len(rows), of=count)
 
 
 def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Places of the samples that two runs have at the same time since their starts."""
     if "samples" not in first.tables or "samples" not in run.tables:
         return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
-    both = np.intersect1d(first.time_ns("samples"), run.time_ns("samples"), True, True)
-    return both[1], both[2]
+    common = np.intersect1d(
+        first.time_ns("samples"), run.time_ns("samples"), True, True
+    )
+    return common[1], common[2]
 
 
 def labels(runs: Sequence[Signals]) -> list[str]:
@@ -210,13 +227,14 @@ def labels(runs: Sequence[Signals]) -> list[str]:
 
 def difference_text(runs: Sequence[Signals]) -> str:
     """Write the differences as text, a table for each run."""
-    said = [
+    paragraphs = [
         f"Differences from {labels(runs)[0]}, at samples that both have at the same"
         " time since the start of each run\n(whole nanoseconds, nothing interpolated)"
     ]
     for label, table in differences(runs).groupby(level="run", sort=False):
-        samples, of = table.pop("samples").iloc[0], table.pop("of").iloc[0]
-        shown = table.droplevel("run").rename_axis(None)
-        text = shown.to_string(na_rep="-", float_format="{:.3e}".format)
-        said.append(f"{label}: {samples} of {of} samples\n{text}")
-    return "\n\n".join(said) + "\n"
+        samples = table.pop("samples").iloc[0]
+        of = table.pop("of").iloc[0]
+        rows = table.droplevel("run").rename_axis(None)
+        text = rows.to_string(na_rep="-", float_format="{:.3e}".format)
+        paragraphs.append(f"{label}: {samples} of {of} samples\n{text}")
+    return "\n\n".join(paragraphs) + "\n"

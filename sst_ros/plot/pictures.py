@@ -53,9 +53,11 @@ FIGURE_NUMBERS = {
 }
 """Number of a picture in the paper, by the name of the scene."""
 ASSUMPTION = "assumed inertias: the paper's are lost"
-LEAST_POSITION_M, LEAST_ANGLE_DEG = 0.05, 1.0
+LEAST_POSITION_M = 0.05
+LEAST_ANGLE_DEG = 1.0
 """An axis never shows less than this, so that rounding is a flat line."""
-POSITION, ZYZ = "position of E in {B} [m]", "θφψ"
+POSITION = "position of E in {B} [m]"
+ZYZ = "θφψ"
 
 
 class Picture(NamedTuple):
@@ -172,11 +174,11 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
     )
 
 
-def zyz_degrees(quaternion: Array, which: int) -> Array:
+def zyz_degrees(quaternion: Array, place: int) -> Array:
     """Return a ZYZ angle (0 theta, 1 phi, 2 psi) without jumps [deg], shape (n, 1)."""
-    angle = zyz_angles(rotation_matrix(quaternion))[:, which : which + 1]
-    known = np.isfinite(angle)
-    angle[known] = np.unwrap(angle[known])  # over lost samples too
+    angle = zyz_angles(rotation_matrix(quaternion))[:, place : place + 1]
+    finite = np.isfinite(angle)
+    angle[finite] = np.unwrap(angle[finite])  # over lost samples too
     return np.degrees(angle)
 
 
@@ -188,10 +190,10 @@ def _position(run: Signals, scene: Scene) -> Figure:
     return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
 
 
-def _angle(run: Signals, _: Scene | None, which: int) -> Figure:
+def _angle(run: Signals, _: Scene | None, place: int) -> Figure:
     """Draw one of the ZYZ angles over time."""
-    degrees = zyz_degrees(run.take(*QUATERNION_COLUMNS), which)
-    panel = Panel(f"{ZYZ[which]} [deg]", ZYZ[which], degrees)
+    degrees = zyz_degrees(run.take(*QUATERNION_COLUMNS), place)
+    panel = Panel(f"{ZYZ[place]} [deg]", ZYZ[place], degrees)
     looks: figures.Looks = {"least_span": LEAST_ANGLE_DEG, "gaps": run.gaps()}
     return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
 
@@ -221,10 +223,17 @@ def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
     inside = geometry.v + 0.22 * (middle - geometry.v)
     for name, point in zip(leg_names("P"), base * inside, strict=True):
         axes.text(*point, name, ha="center", va="center")
-    drawn = [position_of_e(scene, each).T for each in paths.values()]
-    for name, path, looks in zip(paths, drawn, LINES, strict=False):
+    positions = [position_of_e(scene, quaternion).T for quaternion in paths.values()]
+    for name, path, looks in zip(paths, positions, LINES, strict=False):
         axes.plot(*path, label=name, **looks)
-    figures.mark_ends(axes, *drawn[0])
+    figures.mark_ends(axes, *positions[0])
+    _look_at_middle(axes, middle)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncol=3, fontsize=9)
+    return figure
+
+
+def _look_at_middle(axes: Any, middle: Array) -> None:
+    """Label the axes of a sphere and look at it from outside, over the middle."""
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.zaxis.set_rotate_label(False)  # by itself it stands on its head
     axes.set_zlabel("z [m]", rotation=90.0)
@@ -232,15 +241,11 @@ def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
         np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
     )
     x, y, z = middle
-    height, azimuth = (
-        np.degrees(np.arctan2(z, np.hypot(x, y))),
-        np.degrees(np.arctan2(y, x)),
-    )
+    height = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    azimuth = np.degrees(np.arctan2(y, x))
     axes.view_init(elev=height - 8.0, azim=azimuth + 8.0)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], prune="both"))
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncol=3, fontsize=9)
-    return figure
 
 
 def _path(run: Signals, scene: Scene) -> Figure:
@@ -274,12 +279,12 @@ def _torques(run: Signals, _: Scene) -> Figure:
     seconds, torque = tick_torques(run)
     line = {"color": BLUE, "linewidth": 3.0}
     series = [LegCurves("applied", seconds, torque, line)]
-    table = next(
-        (name for name in ("commands_stamped", "commands") if name in run.tables), None
-    )
-    if table is not None:
-        at, values = run.seconds(table), run.legs("tau", table)
-        inside = (at >= seconds[0]) & (at <= seconds[-1])
+    for table in ("commands_stamped", "commands"):
+        if table not in run.tables:
+            continue
+        command_times = run.seconds(table)
+        commands = run.legs("tau", table)
+        inside = (command_times >= seconds[0]) & (command_times <= seconds[-1])
         dots = {
             "color": VERMILION,
             "linestyle": "none",
@@ -287,7 +292,10 @@ def _torques(run: Signals, _: Scene) -> Figure:
             "markersize": 1.5,
         }
         if inside.any():
-            series.append(LegCurves("commanded", at[inside], values[inside], dots))
+            series.append(
+                LegCurves("commanded", command_times[inside], commands[inside], dots)
+            )
+        break  # stamped ones replace those without a stamp
     return draw_legs("τ [N m]", series)
 
 
@@ -333,22 +341,21 @@ def work(run: Signals) -> Array:
     ends of ticks between samples are those of the cubic through angles and rates of
     both; where ticks are lost the work is nan from there on.
     """
-    time, gamma, rate = (
-        run.time_ns("samples"),
-        *map(run.true_legs, ("gamma", "gamma_dot")),
-    )
+    time = run.time_ns("samples")
+    gamma = run.true_legs("gamma")
+    rate = run.true_legs("gamma_dot")
     start, end, torque = _ticks(run)
-    known = np.isfinite(gamma).all(axis=1) & np.isfinite(rate).all(axis=1)
-    if np.count_nonzero(known) < 2:
+    finite = np.isfinite(gamma).all(axis=1) & np.isfinite(rate).all(axis=1)
+    if np.count_nonzero(finite) < 2:
         return np.full(gamma.shape, np.nan)
-    angles = CubicHermiteSpline(time[known] / NANOSECONDS, gamma[known], rate[known])
+    angles = CubicHermiteSpline(time[finite] / NANOSECONDS, gamma[finite], rate[finite])
     steps = torque * (angles(end / NANOSECONDS) - angles(start / NANOSECONDS))
     steps[1:][start[1:] != end[:-1]] = np.nan
     steps[start < time[0]] = 0.0
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    done = np.searchsorted(end, time, side="right")
-    whole = (time == time[0]) | np.isin(time, end)
-    return np.asarray(np.where(whole[:, None], total[done], np.nan))
+    ended_ticks = np.searchsorted(end, time, side="right")
+    at_tick_end = (time == time[0]) | np.isin(time, end)
+    return np.asarray(np.where(at_tick_end[:, None], total[ended_ticks], np.nan))
 
 
 def _energy(run: Signals, scene: Scene) -> Figure:
@@ -359,18 +366,16 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     kinetic, potential = energies(run, scene)
     first = np.flatnonzero(np.isfinite(kinetic))[:1]
     raised = potential - potential[first].sum()
-    done = work(run).sum(axis=1)
+    actuator_work = work(run).sum(axis=1)
     gained = kinetic - kinetic[first].sum() + raised
-    shown = {
-        "kinetic": kinetic,
-        "potential, gained": raised,
-        "work of the actuators": done,
-    }
-    if not np.nanmax(np.abs(raised), initial=0.0):
-        del shown["potential, gained"]  # no gravity, no springs
+    series = {"kinetic": kinetic}
+    if np.nanmax(np.abs(raised), initial=0.0):  # there is gravity, or a spring
+        series["potential, gained"] = raised
+    series["work of the actuators"] = actuator_work
+    residual = (gained - actuator_work)[:, None]
     panels = (
-        Panel("energy [J]", list(shown), np.stack([*shown.values()], axis=1)),
-        Panel("energy gained − work [J]", ["residual"], (gained - done)[:, None]),
+        Panel("energy [J]", list(series), np.stack([*series.values()], axis=1)),
+        Panel("energy gained − work [J]", ["residual"], residual),
     )
     figure = figures.draw_panels(run.seconds(), panels, 2.8, gaps=run.gaps())
     figure.axes[1].axhline(0.0, color=GREY, linewidth=0.8)
@@ -415,13 +420,12 @@ def _power(run: Signals) -> Array:
     return run.true_legs("tau") * run.true_legs("gamma_dot")
 
 
-JOINT_STATES_KEY, ORIENTATION, TICKS, SCENE_KEY = (
-    "joint_states",
-    "orientation",
-    "applied_torques",
-    SCENE_TOPIC.key,
-)
-ERROR_KEY, REFERENCE = "tracking_error", "reference"
+JOINT_STATES_KEY = "joint_states"
+ORIENTATION = "orientation"
+TICKS = "applied_torques"
+SCENE_KEY = SCENE_TOPIC.key
+ERROR_KEY = "tracking_error"
+REFERENCE = "reference"
 JOINT_LETTERS = {"gamma": "γ", "mu": "μ", "beta": "β"}
 _ERROR_CURVES = curves(  # as the controller received them
     legs("γ desired − γ [rad]", "gamma_error", "γ"),
@@ -445,12 +449,9 @@ RUN_PICTURES = {
     "position_of_E": Picture(
         "Position of point E", (ORIENTATION, SCENE_KEY), _position
     ),
-    **{
-        name: Picture(f"The angle {letter}", (ORIENTATION,), partial(_angle, which=k))
-        for k, (name, letter) in enumerate(
-            zip(("theta", "phi", "psi"), ZYZ, strict=True)
-        )
-    },
+    "theta": Picture("The angle θ", (ORIENTATION,), partial(_angle, place=0)),
+    "phi": Picture("The angle φ", (ORIENTATION,), partial(_angle, place=1)),
+    "psi": Picture("The angle ψ", (ORIENTATION,), partial(_angle, place=2)),
     "tracking": Picture(
         "Desired and measured angles", (JOINT_STATES_KEY, REFERENCE), _tracking
     ),
@@ -475,43 +476,54 @@ RUN_PICTURES = {
 
 @figures.styled
 def draw_run(
-    run: Signals, out: Path, only: Sequence[str] = (), formats: Sequence[str] = FORMATS
+    run: Signals,
+    folder: Path,
+    only: Sequence[str] = (),
+    formats: Sequence[str] = FORMATS,
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the pictures of a run, all or those `only` names, into the folder `out`.
+    """Write the pictures of a run, all or those `only` names, into a folder.
 
     Returns the paths written, and for each picture that could not be drawn what is
-    missing. Raises InputError where a name is none of RUN_PICTURES, or `out` cannot be
-    written.
+    missing. Raises InputError where a name is none of RUN_PICTURES, or the folder
+    cannot be written.
     """
     paths: list[Path] = []
     missing: dict[str, str] = {}
-    for name in known(only, RUN_PICTURES):
+    for name in chosen_names(only, RUN_PICTURES):
         picture = RUN_PICTURES[name]
         if absent := [key for key in picture.needs if key in run.missing]:
             missing[name] = "the bag has no " + ", no ".join(absent)
             continue
         scene = run.scene.name if run.scene else None
         stem, title = caption(name, picture.title, scene)
-        paths += save(picture.make(run, run.scene), title, out, stem, formats)
+        paths += save(picture.make(run, run.scene), title, folder, stem, formats)
     return paths, missing
 
 
 def save(
-    figure: Figure, title: str, out: Path, stem: str, formats: Sequence[str] = FORMATS
+    figure: Figure,
+    title: str,
+    folder: Path,
+    stem: str,
+    formats: Sequence[str] = FORMATS,
 ) -> list[Path]:
-    """Write a figure under a title; raises InputError where `out` cannot be written."""
+    """Write a figure under a title.
+
+    Raises InputError where the folder cannot be written.
+    """
     figure.suptitle(title, fontsize=11)
-    paths = [out / f"{stem}.{form}" for form in formats]
-    with write_into(out, "plot"):
+    paths = [folder / f"{stem}.{form}" for form in formats]
+    with write_into(folder, "plot"):
         figures.save_figure(figure, *paths)
     return paths
 
 
-def known(only: Sequence[str], names: Iterable[str]) -> list[str]:
+def chosen_names(only: Sequence[str], names: Iterable[str]) -> list[str]:
     """Return the names that are asked for, all where none is.
 
     Raises InputError for another.
     """
-    allowed = "must be one of " + ", ".join(names)
-    refuse_unless("plot", *(("only", name, name in names, allowed) for name in only))
+    requirement = "must be one of " + ", ".join(names)
+    checks = [("only", name, name in names, requirement) for name in only]
+    refuse_unless("plot", *checks)
     return list(only or names)

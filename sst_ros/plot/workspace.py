@@ -51,49 +51,52 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
 
     Each map is a row of pictures, with a title if there are any.
     """
-    fits = all(isinstance(one, OrientationMap) for one in charts) and isinstance(
-        titles, Sequence
-    )
-    fits = fits and len(charts) > 0 and len(titles) in (0, len(charts))
-    allowed = "must be maps of `workspace`, and a title for each or none"
-    refuse_unless(
-        "plot_workspace", ("charts, titles", (*charts, titles), fits, allowed)
-    )
+    are_maps = all(isinstance(chart, OrientationMap) for chart in charts)
+    fits = are_maps and len(charts) > 0 and isinstance(titles, Sequence)
+    fits = fits and len(titles) in (0, len(charts))
+    requirement = "must be maps of `workspace`, and a title for each or none"
+    arguments = (*charts, titles)
+    refuse_unless("plot_workspace", ("charts, titles", arguments, fits, requirement))
     figure = Figure(figsize=(13.5, 4.3 * len(charts)))
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
     names = titles or ["E on the base triangle"] * len(charts)
     for row, chart, title in zip(rows, charts, names, strict=True):
-        poses, faces = workspace.parallel_singularities(chart), triangles(chart)
-        a, b, c = (chart.s[faces[:, i]] for i in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        reach = np.average((chart.turn > 0.0)[faces].mean(axis=1), weights=area)
-        share = f"E reaches {100 * reach:.0f} % of the triangle"
-        worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
-        least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
-        row.suptitle(
-            f"{title}: {share}; {least}", fontsize=12, fontweight="bold", color=INK
-        )
-        turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
-        margin = np.degrees(chart.best_margin)
-        left, axes, right = row.subplots(1, 3)
-        for panel, name, values in (
-            (left, "Free turn of the star about OE", turn),
-            (axes, "Best condition of J over that turn", chart.best_cond_j),
-            (right, "Distance to the nearest limit, best turn", margin),
-        ):
-            _panel(panel, chart, faces, values, condition=panel is axes)
-            panel.set_title(name, fontsize=10.5, color=INK, loc="center")
-        ends = workspace.serial_singularities(chart.geometry)
-        for found, marker, size, colour, label in (
-            (poses, ".", 2.2, _ALARM, "det J2 = 0 at some turn"),
-            (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
-        ):
-            if len(found):
-                x, y = project(chart.geometry, found.rotation[:, :, 2])
-                axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
-                axes.plot([], [], "o", markersize=4, color=colour, label=label)
-                axes.legend(loc="upper right", fontsize=8, frameon=False)
+        _draw_row(row, chart, title)
     return figure
+
+
+def _draw_row(row: Any, chart: OrientationMap, title: str) -> None:
+    """Draw the three pictures of a map, and the singularities in each."""
+    faces = triangles(chart)
+    a, b, c = (chart.s[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    reach = np.average((chart.turn > 0.0)[faces].mean(axis=1), weights=area)
+    share = f"E reaches {100 * reach:.0f} % of the triangle"
+    worst = chart.measures.cond_j[chart.measures.admissible].max(initial=1.0)
+    least = f"cond J up to {worst:.2f}" if worst < 100 else "singular poses inside"
+    heading = f"{title}: {share}; {least}"
+    row.suptitle(heading, fontsize=12, fontweight="bold", color=INK)
+    turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
+    margin = np.degrees(chart.best_margin)
+    turn_axes, condition_axes, margin_axes = row.subplots(1, 3)
+    for axes, name, values in (
+        (turn_axes, "Free turn of the star about OE", turn),
+        (condition_axes, "Best condition of J over that turn", chart.best_cond_j),
+        (margin_axes, "Distance to the nearest limit, best turn", margin),
+    ):
+        _panel(axes, chart, faces, values, condition=axes is condition_axes)
+        axes.set_title(name, fontsize=10.5, color=INK, loc="center")
+    poses = workspace.parallel_singularities(chart)
+    ends = workspace.serial_singularities(chart.geometry)
+    for singular, marker, size, colour, label in (
+        (poses, ".", 2.2, _ALARM, "det J2 = 0 at some turn"),
+        (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
+    ):
+        if len(singular):
+            x, y = project(chart.geometry, singular.rotation[:, :, 2])
+            condition_axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
+            condition_axes.plot([], [], "o", markersize=4, color=colour, label=label)
+            condition_axes.legend(loc="upper right", fontsize=8, frameon=False)
 
 
 @styled
@@ -167,8 +170,8 @@ def _panel(
     """
     x, y = project(chart.geometry, chart.s)
     axes.tripcolor(Triangulation(x, y, faces), 0.0 * x, cmap="Greys", vmin=-0.5, vmax=5)
-    known = np.isfinite(values)
-    inside = known[faces].all(axis=1)
+    finite = np.isfinite(values)
+    inside = finite[faces].all(axis=1)
     if inside.any():
         goal = float(np.nanmin(values) if condition else np.nanmax(values))
         levels: Any = (
@@ -182,15 +185,15 @@ def _panel(
                 "extend": "max",
             }
         mesh = Triangulation(x, y, faces, mask=~inside)
-        filled = axes.tricontourf(mesh, np.where(known, values, goal), **looks)
+        filled = axes.tricontourf(mesh, np.where(finite, values, goal), **looks)
         bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, ticks=levels)
         bar.set_label("cond J" if condition else "deg", fontsize=9)
         bar.ax.tick_params(labelsize=8)
         bar.ax.set_yticklabels([f"{level:g}" for level in levels])
         bar.ax.minorticks_off()
         # On a plateau the place that is farthest from the limits.
-        near = np.abs(values - goal) <= 0.01 * abs(goal)
-        best = int(np.nanargmax(np.where(near, chart.best_margin, np.nan)))
+        plateau = np.abs(values - goal) <= 0.01 * abs(goal)
+        best = int(np.nanargmax(np.where(plateau, chart.best_margin, np.nan)))
         axes.plot(
             x[best], y[best], "*", markersize=13, color="white", markeredgecolor=INK
         )
@@ -240,11 +243,11 @@ def draw_triangle(axes: Axes, geometry: Geometry) -> None:
 def project(geometry: Geometry, s: Array) -> tuple[Array, Array]:
     """Project unit vectors (..., 3) about the base triangle's middle, P_1 upward."""
     middle = geometry.v.sum(axis=0)
-    out = middle / np.linalg.norm(middle)
-    up = geometry.v[0] - out * (out @ geometry.v[0])
+    outward = middle / np.linalg.norm(middle)
+    up = geometry.v[0] - outward * (outward @ geometry.v[0])
     up = up / np.linalg.norm(up)
-    scale = np.sqrt(2.0 / (1.0 + s @ out))
-    return scale * (s @ np.cross(up, out)), scale * (s @ up)
+    scale = np.sqrt(2.0 / (1.0 + s @ outward))
+    return scale * (s @ np.cross(up, outward)), scale * (s @ up)
 
 
 @lru_cache(maxsize=4)

@@ -125,8 +125,8 @@ class WorkPrecision:
                 ~(group[ERROR_COLUMN].astype(float).to_numpy() <= target)
             )
             good += group.index[bad[-1] + 1 if len(bad) else 0 : -1].tolist()
-        found = self.rows.loc[good].sort_values("wall_min_s", kind="stable")
-        return None if found.empty else found.iloc[0]
+        sorted_rows = self.rows.loc[good].sort_values("wall_min_s", kind="stable")
+        return None if sorted_rows.empty else sorted_rows.iloc[0]
 
     @cached_property
     def fastest(self) -> dict[float, Series[Any]]:
@@ -134,24 +134,24 @@ class WorkPrecision:
 
         Targets below the floor are left out.
         """
-        found = {
+        fastest = {
             target: self.best(target)
             for target in ERROR_TARGETS
             if target >= self.floor
         }
-        return {target: row for target, row in found.items() if row is not None}
+        return {target: row for target, row in fastest.items() if row is not None}
 
 
-def study_scene(scene: Scene, *, shown: bool = False) -> WorkPrecision:
+def study_scene(scene: Scene, *, visible: bool = False) -> WorkPrecision:
     """Solve a scene with every method and setting and compare with the reference.
 
-    Progress is `shown` on the terminal. Raises what the problem and its reference do.
+    Progress is `visible` on the terminal. Raises what the problem and its reference do.
     """
     problem = InitialValueProblem(scene)
     grid, truth = list(list_settings(problem)), solve_reference(problem)
     refine = partial(_refine, problem=problem, truth=truth)
     # One after another: computing times are those of a core that is free.
-    results = run_many(refine, grid, label=f"{scene.name:<16}" * shown)
+    results = run_many(refine, grid, label=f"{scene.name:<16}" * visible)
     rows = [row for _, refined in results for row in refined]
     motion, measured = (
         simulate(scene, duration=problem.seconds, t_eval=problem.times),
@@ -172,7 +172,7 @@ def study_scene(scene: Scene, *, shown: bool = False) -> WorkPrecision:
     )
 
 
-def proven_error(*given: Any, **options: Any) -> str:
+def proven_error(*arguments: Any, **options: Any) -> str:
     """Return the proven bound of the error of `simulate` as a cell of a table.
 
     It takes what `certify` takes. Where the proof ends early the time is named, where
@@ -183,7 +183,7 @@ def proven_error(*given: Any, **options: Any) -> str:
         from sst_ros.proof.balls import write_down, write_up
         from sst_ros.proof.certify import certify
 
-        proven = certify(*given, **options)
+        proven = certify(*arguments, **options)
     except SstError as refused:
         return f"-: {str(refused).splitlines()[0]}"
     if math.isinf(proven.error):
@@ -282,20 +282,20 @@ def _measure(
     return row
 
 
-def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision]:
+def write_accuracy_report(names: Sequence[str], folder: Path) -> list[WorkPrecision]:
     """Study scenes one after another.
 
-    Print each, and write all finished results into `out`.
+    Print each, and write all finished results into `folder`.
 
     Files: accuracy.csv, .json, .md, and accuracy_SCENE.png. Raises SstError where a
-    scene is refused or cannot start, or `out` cannot be written.
+    scene is refused or cannot start, or `folder` cannot be written.
     """
     studies: list[WorkPrecision] = []
     for each in [scenes.load(name) for name in names]:
-        study = study_scene(each, shown=True)
+        study = study_scene(each, visible=True)
         studies.append(study)
         print(accuracy_text(study), flush=True)
-        rows = [row for one in studies for row in records(one.rows)]
+        rows = [row for result in studies for row in records(result.rows)]
         files = {
             ".csv": data_frame(rows),
             ".json": {"rows": rows},
@@ -304,7 +304,7 @@ def write_accuracy_report(names: Sequence[str], out: Path) -> list[WorkPrecision
         drawn = (
             {} if study.rests else {f"accuracy_{each.name}.png": draw_accuracy(study)}
         )
-        publish(out, "accuracy", {**files, **drawn})
+        publish(folder, "accuracy", {**files, **drawn})
     return studies
 
 
@@ -336,20 +336,20 @@ def _setting(row: Series[Any]) -> str:
 
 def accuracy_text(study: WorkPrecision) -> str:
     """Format a study for the terminal: its part of the page, and the grid."""
-    shown = study.rows.drop(
+    columns = study.rows.drop(
         columns=["scene", "final_gamma_rad", "final_gamma_dot_rad_per_s"]
     )
-    shown["failure"] = [
+    columns["failure"] = [
         f"FAILED: {why[:40]}" if why else "" for why in study.rows.failure
     ]
-    grid = shown.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
-    return accuracy_page([study], whole=False) + f"\n{grid}\n"
+    grid = columns.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
+    return accuracy_page([study], full=False) + f"\n{grid}\n"
 
 
-def accuracy_page(studies: Sequence[WorkPrecision], *, whole: bool = True) -> str:
+def accuracy_page(studies: Sequence[WorkPrecision], *, full: bool = True) -> str:
     """Write studies as one Markdown page, or without its introduction and summary."""
-    given = {"targets": ERROR_TARGETS, "fastest": name_fastest, "setting": _setting}
-    return render("accuracy.md", whole=whole, studies=studies, **given)
+    values = {"targets": ERROR_TARGETS, "fastest": name_fastest, "setting": _setting}
+    return render("accuracy.md", whole=full, studies=studies, **values)
 
 
 @styled

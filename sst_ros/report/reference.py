@@ -36,7 +36,7 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque
 from sst_ros.state import NANOSECONDS
 
-Held: TypeAlias = tuple[Integers, Integers, Array]
+Ticks: TypeAlias = tuple[Integers, Integers, Array]
 """Ticks: when each begins and ends, from the start of the run on [ns], shape (m,), and
 what is held over it: torques, and a moment on the star in {B} where the scene takes one
 [N m], (m, 3 or 6).
@@ -68,7 +68,7 @@ class TickStepper(Stepper):
             scene, DOP853.name, TICK_TOLERANCE, budget=budget, limits=False
         )
 
-    def follow(self, ticks: Held, start: Array) -> Array:
+    def follow(self, ticks: Ticks, start: Array) -> Array:
         """Advance through m ticks from a state (quaternion, body rate, lagged torques).
 
         Returns solution and second solution at the end of each tick, with the work
@@ -76,28 +76,30 @@ class TickStepper(Stepper):
         resolves the next one.
         """
         ends: list[tuple[list[float], list[float]]] = []
-        at = self.begin(start.tolist())
+        point = self.begin(start.tolist())
         with suppress(CannotStep), np.errstate(all="ignore"):
             for start_ns, end_ns, drive in zip(*ticks, strict=True):
-                at = self._follow_tick(at, int(start_ns), int(end_ns), drive.tolist())
-                ends.append((at.y, at.z))
+                point = self._follow_tick(
+                    point, int(start_ns), int(end_ns), drive.tolist()
+                )
+                ends.append((point.y, point.z))
         return np.array(ends).reshape(len(ends), 2, len(self.ode.state))
 
     def _follow_tick(
-        self, at: Point, start_ns: int, end_ns: int, drive: Sequence[float]
+        self, point: Point, start_ns: int, end_ns: int, drive: Sequence[float]
     ) -> Point:
         """Advance through one tick; a long one is divided."""
         torque: Torque = self._sine or (drive[0], drive[1], drive[2])
-        acting, moment = self.torque.acting(torque), tuple(drive[3:])
+        acting = self.torque.acting(torque)
         if self._sine is not None:  # the limit of the actuators is part of the program
             acting = self._sine
-        parts = max(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
-        length = (end_ns - start_ns) / NANOSECONDS / parts
-        for part in range(parts):
-            at = self.advance(
-                at, start_ns / NANOSECONDS + length * part, length, acting, moment
-            )
-        return at
+        moment = tuple(drive[3:])
+        count = max(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
+        begin = start_ns / NANOSECONDS
+        length = (end_ns - start_ns) / NANOSECONDS / count
+        for index in range(count):
+            point = self.advance(point, begin + length * index, length, acting, moment)
+        return point
 
 
 def begins(recording: Recording) -> bool:
@@ -173,16 +175,17 @@ def integration(recording: Recording) -> Comparison:
     restarts is not compared, and neither are samples between lost torques and the next
     restart; none where the moment is not recorded.
     """
-    ticks, moment = recording.ticks, recording.scene.moment
+    ticks = recording.ticks
+    moment = recording.scene.moment
     drives = ticks.torque
     if moment is not None and moment.topic:
-        drives = (
-            np.empty((0, 6))
-            if ticks.moment is None
-            else np.hstack([drives, ticks.moment])
-        )
-    held = ticks.start_ns[: len(drives)], ticks.end_ns[: len(drives)], drives
-    return _compare(recording, None, held, known=begins(recording))
+        if ticks.moment is None:
+            drives = np.empty((0, 6))
+        else:
+            drives = np.hstack([drives, ticks.moment])
+    count = len(drives)
+    held_torques = ticks.start_ns[:count], ticks.end_ns[:count], drives
+    return _compare(recording, None, held_torques, known_start=begins(recording))
 
 
 def ideal(recording: Recording) -> Comparison | None:
@@ -191,87 +194,132 @@ def ideal(recording: Recording) -> Comparison | None:
     The difference is the effect of hold and transport. None where the scene has no
     torques, its moment comes from a topic, or the recording lacks the start of the run.
     """
-    scene, time = recording.scene, recording.time_ns
+    scene = recording.scene
+    time_ns = recording.time_ns
     pushed = scene.moment is not None and scene.moment.topic
     if scene.torque is None or pushed or not begins(recording):
         return None
-    held = time[:-1], time[1:], np.empty((len(time) - 1, 0))
-    return _compare(recording, scene.torque, held, known=True)
+    no_drives = np.empty((len(time_ns) - 1, 0))
+    intervals = time_ns[:-1], time_ns[1:], no_drives
+    return _compare(recording, scene.torque, intervals, known_start=True)
+
+
+class _Distances:
+    """How far a run is from the reference, by sample; nan where it is not compared."""
+
+    def __init__(self, run: Recording, model: kernel.Model) -> None:
+        count = len(run.time_ns)
+        self._run = run
+        self._model = model
+        self.samples = _true_samples(run)
+        self.exact = run.motion is not None  # else rates and energies are not known
+        self.error = np.full((count, 3), np.nan)
+        self.own_error = np.full((count, 3), np.nan)
+        self.energy = np.full(count, np.nan)
+
+    def enter_start(self) -> None:
+        """Enter by what the first sample is off the start that the scene asks for."""
+        start = self._run.scene.initial
+        quaternion = self.samples[0]
+        begin = quaternion[:1], np.array([start.gamma]), np.array([start.gamma_dot])
+        self.error[:1] = _measure([values[:1] for values in self.samples], begin)
+        self.own_error[0] = 0.0
+
+    def enter(self, rows: Integers, reached: Array, expected_energy: float) -> None:
+        """Enter samples, by their rows, at which the reference has arrived.
+
+        `reached` has solution and second solution, shape (n, 2, 8 or 11), each with the
+        work [J] since a time at which the energy was `expected_energy` [J].
+        """
+        first = _joints(self._model, reached[:, 0])
+        second = _joints(self._model, reached[:, 1])
+        self.error[rows] = _measure([values[rows] for values in self.samples], first)
+        self.own_error[rows] = _measure(second, first)
+        if self.exact:
+            energy = _energy(self._model, self._run.states[rows])
+            self.energy[rows] = energy - expected_energy - reached[:, 0, -1]
+
+    def last_residual(self, rows: Integers) -> float | None:
+        """Return the last energy of some rows that is known [J]."""
+        energy = self.energy[rows]
+        finite = energy[np.isfinite(energy)]
+        return float(finite[-1]) if len(finite) else None
 
 
 def _compare(
-    run: Recording, torque: SineTorque | None, held: Held, *, known: bool
+    run: Recording, torque: SineTorque | None, ticks: Ticks, *, known_start: bool
 ) -> Comparison:
     """Propagate a run with a second solution, and compare both at its samples.
 
-    Its start is `known` or not. Under recorded torques, which may have gaps, the
-    reference begins again at a sample after each, and after a tick that no step
-    resolves.
+    Under recorded torques, which may have gaps, the reference begins again at a sample
+    after each gap, and after a tick that no step resolves. It goes through at most
+    CHUNK ticks at a time, and to the next gap.
     """
-    time = run.time_ns
-    samples, exact = _true_samples(run), run.motion is not None
-    distances, energy = np.full((2, len(time), 3), np.nan), np.full(len(time), np.nan)
-    start_ns, end_ns, drives = held
-    motion, count = TickStepper(run.scene, torque), len(start_ns)
+    start_ns, end_ns, drives = ticks
+    count = len(start_ns)
+    motion = TickStepper(run.scene, torque)
     model = motion.dynamics.model
+    distances = _Distances(run, model)
     state = _first_state(run)
-    known = known and bool(count and np.isfinite(state[0]))
-    if known:  # by what the first sample is off, the simulator was
-        start = run.scene.initial
-        asked = samples[0][:1], np.array([start.gamma]), np.array([start.gamma_dot])
-        distances[:, 0] = 0.0
-        distances[0, :1] = _measure([values[:1] for values in samples], asked)
+    known_start = known_start and bool(count and np.isfinite(state[0]))
+    if known_start:
+        distances.enter_start()
     # Ticks at which it can begin again: no sample is on the motion under continuous
     # torques.
-    sample = places(time, start_ns)
-    restarts = torque is None and exact
-    usable = np.flatnonzero(
-        (sample >= 0) & np.isfinite(samples[0][sample, 0]) & restarts
-    )
-    known = known and start_ns[0] == 0
-    lost = np.append(not known, start_ns[1:] != end_ns[:-1])[:count]  # before each tick
-    stops = np.append(np.flatnonzero(lost), count)
-    begun, bar = list[int](), Bar("reference", count > CHUNK)
-    k, failed, residual, done = 0, 0, 0.0, 0.0
-    if known:
-        energy[0], done = 0.0 if exact else np.nan, _energy(model, state[None])[0]
-    while k < count and failed < UNRESOLVED:
-        if not known:
-            after = usable[np.searchsorted(usable, k) :]
-            if not len(after):
+    sample = places(run.time_ns, start_ns)
+    has_sample = (sample >= 0) & np.isfinite(distances.samples[0][sample, 0])
+    can_restart = torque is None and distances.exact
+    usable = np.flatnonzero(has_sample & can_restart)
+    on_reference = known_start and start_ns[0] == 0  # `state` begins the next tick
+    lost_before = np.append(not on_reference, start_ns[1:] != end_ns[:-1])[:count]
+    stops = np.append(np.flatnonzero(lost_before), count)
+    restarts_ns: list[int] = []
+    bar = Bar("reference", count > CHUNK)
+    k = 0  # the next tick
+    unresolved = 0
+    residual = 0.0  # of the energy, at the last sample where it is known [J]
+    expected_energy = 0.0  # at the beginning of tick k [J]
+    if on_reference:
+        distances.energy[0] = 0.0 if distances.exact else np.nan
+        expected_energy = _energy(model, state[None])[0]
+    while k < count and unresolved < UNRESOLVED:
+        if not on_reference:
+            later = usable[np.searchsorted(usable, k) :]
+            if not len(later):
                 break
-            if lost[k : after[0] + 1].any():
-                begun.append(int(start_ns[after[0]]))
-            k = int(after[0])
+            restart = int(later[0])
+            if lost_before[k : restart + 1].any():
+                restarts_ns.append(int(start_ns[restart]))
+            k = restart
             state = run.states[sample[k]]
-            energy[sample[k]], done = (
-                residual,
-                _energy(model, state[None])[0] - residual,
-            )
-        end = min(int(stops[np.searchsorted(stops, k, side="right")]), k + CHUNK)
+            distances.energy[sample[k]] = residual
+            expected_energy = _energy(model, state[None])[0] - residual
+        next_stop = int(stops[np.searchsorted(stops, k, side="right")])
+        end = min(next_stop, k + CHUNK)
         reached = motion.follow((start_ns[k:end], end_ns[k:end], drives[k:end]), state)
-        rows = places(time, end_ns[k : k + len(reached)])
-        found, rows = reached[rows >= 0], rows[rows >= 0]
-        first, second = (
-            _joints(model, states) for states in (found[:, 0], found[:, 1])
-        )
-        distances[0, rows] = _measure([values[rows] for values in samples], first)
-        distances[1, rows] = _measure(second, first)
-        if exact:
-            energy[rows] = _energy(model, run.states[rows]) - done - found[:, 0, -1]
-        residual = next(
-            (x for x in energy[rows][::-1].tolist() if np.isfinite(x)), residual
-        )
+        rows = places(run.time_ns, end_ns[k : k + len(reached)])
+        at_sample = rows >= 0
+        distances.enter(rows[at_sample], reached[at_sample], expected_energy)
+        known_residual = distances.last_residual(rows[at_sample])
+        if known_residual is not None:
+            residual = known_residual
         k += len(reached)
-        known = k == end and k not in stops
-        if known:
-            state, done = reached[-1, 0, :-1], done + reached[-1, 0, -1]
-        elif k < end:
-            failed, k = failed + 1, k + 1
+        on_reference = k == end and k not in stops
+        if on_reference:
+            state = reached[-1, 0, :-1]
+            expected_energy += reached[-1, 0, -1]
+        elif k < end:  # no step resolves this tick
+            unresolved += 1
+            k += 1
         bar.draw(k / count)
-    error, own = (pd.DataFrame(each, columns=[*COMPARED_UNITS]) for each in distances)
-    steps = -(-run.ticks.period_ns // LONGEST_TICK_NS)
-    return Comparison(error, own, energy, tuple(begun), steps)
+    columns = [*COMPARED_UNITS]
+    return Comparison(
+        error=pd.DataFrame(distances.error, columns=columns),
+        own=pd.DataFrame(distances.own_error, columns=columns),
+        energy=distances.energy,
+        restarts_ns=tuple(restarts_ns),
+        steps=-(-run.ticks.period_ns // LONGEST_TICK_NS),
+    )
 
 
 def _joints(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
@@ -279,9 +327,13 @@ def _joints(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
 
     States have the shape (n, 7 or more).
     """
-    unit = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
-    found = kernel.joints(model, tuple(states[:, :7].T))
-    return unit, np.stack(found.gamma, axis=1), np.stack(found.gamma_dot, axis=1)
+    quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
+    joints = kernel.joints(model, tuple(states[:, :7].T))
+    return (
+        quaternion,
+        np.stack(joints.gamma, axis=1),
+        np.stack(joints.gamma_dot, axis=1),
+    )
 
 
 def _energy(model: kernel.Model, states: Array) -> Array:
@@ -291,13 +343,16 @@ def _energy(model: kernel.Model, states: Array) -> Array:
     return np.asarray(kinetic + kernel.potential_energy(model, columns))
 
 
-def _measure(one: Sequence[Array], other: Sequence[Array]) -> Array:
+def _measure(motion: Sequence[Array], reference: Sequence[Array]) -> Array:
     """Return distances of quaternions, gamma and gamma_dot, shape (n, 3).
 
     The columns are COMPARED_UNITS.
     """
+    quaternion, gamma, gamma_dot = motion
+    quaternion_0, gamma_0, gamma_dot_0 = reference
     # Recorded angles may count whole turns, computed ones do not.
-    turn, difference = 2.0 * np.pi, one[1] - other[1]
-    gamma = np.abs(difference - turn * np.round(difference / turn)).max(axis=1)
-    rate = np.abs(one[2] - other[2]).max(axis=1)
-    return np.stack([gamma, rate, angle_between(one[0], other[0])], axis=1)
+    turn = 2.0 * np.pi
+    difference = gamma - gamma_0
+    angle = np.abs(difference - turn * np.round(difference / turn)).max(axis=1)
+    rate = np.abs(gamma_dot - gamma_dot_0).max(axis=1)
+    return np.stack([angle, rate, angle_between(quaternion, quaternion_0)], axis=1)

@@ -94,10 +94,10 @@ class InitialValueProblem:
         # before the duration
         self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
         lasts = whole * NANOSECONDS >= 1000 * INTERVALS
-        allowed = (
+        requirement = (
             f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
         )
-        refuse_unless(scene.name, ("initial", whole, lasts, allowed))
+        refuse_unless(scene.name, ("initial", whole, lasts, requirement))
         # Instants of comparison lie 1, 2 or 5 times a power of ten apart.
         # may be a little less than it is called
         whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)
@@ -120,9 +120,9 @@ class InitialValueProblem:
         """
         angle = angle_between(solution[:, :4], reference[:, :4]).astype(float)
         joints = np.abs(self.joints(solution) - self.joints(reference)).max(axis=1)
-        found = np.vstack([angle, joints])
-        return StateError(*found[:, -1].tolist()), StateError(
-            *found.max(axis=1).tolist()
+        distances = np.vstack([angle, joints])
+        return StateError(*distances[:, -1].tolist()), StateError(
+            *distances.max(axis=1).tolist()
         )
 
     def joints(self, solution: Array | LongArray) -> Array:
@@ -131,10 +131,10 @@ class InitialValueProblem:
         States have the shape (m, 7 or more).
         """
         with np.errstate(all="ignore"):
-            found = kernel.joints(
+            joints = kernel.joints(
                 self.dynamics.model, tuple(solution[:, :7].astype(float).T)
             )
-        return np.array([found.gamma, found.gamma_dot])
+        return np.array([joints.gamma, joints.gamma_dot])
 
     def run_steps(self, method: MethodSteps, steps: int) -> Run:
         """Run with `steps` steps an interval; nan after the last finite state."""
@@ -180,9 +180,9 @@ def solve_reference(problem: InitialValueProblem) -> ReferenceSolution:
 
     Raises RunStopped where no step resolves it.
     """
-    found = None if problem.kinked else _halve_steps(problem)
-    if found is not None:
-        rough, fine, steps = found
+    solution = None if problem.kinked else _halve_steps(problem)
+    if solution is not None:
+        rough, fine, steps = solution
         numbers = f"{np.finfo(np.longdouble).precision}-digit floats"
         how = f"DOP853, {problem.interval / steps:.3g} s steps, {numbers}"
     else:

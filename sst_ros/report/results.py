@@ -65,8 +65,10 @@ def data_frame(
     listed, names = list(rows), names and list(names)
     frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
     for name in frame.columns:  # whole numbers with gaps stay whole numbers
-        known = [row[name] for row in listed if row.get(name) is not None]
-        if 0 < len(known) < len(listed) and all(type(value) is int for value in known):
+        present = [row[name] for row in listed if row.get(name) is not None]
+        if 0 < len(present) < len(listed) and all(
+            type(value) is int for value in present
+        ):
             frame[name] = frame[name].astype("Int64")
     return frame
 
@@ -100,22 +102,22 @@ def render(template: str | Path, **values: Any) -> str:
     No line ends with blanks, and no two lines that follow each other are empty.
     """
     if isinstance(template, Path):
-        found = _templates.from_string(template.read_text(encoding="utf-8"))
+        jinja = _templates.from_string(template.read_text(encoding="utf-8"))
     else:
-        found = _templates.get_template(template)
-    lines = "".join(f"{line.rstrip()}\n" for line in found.render(values).splitlines())
+        jinja = _templates.get_template(template)
+    lines = "".join(f"{line.rstrip()}\n" for line in jinja.render(values).splitlines())
     return re.sub("\n{3,}", "\n\n", lines.lstrip("\n"))
 
 
-def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
-    """Write files of a report into `out`: tables, documents (JSON), pages and figures.
+def publish(folder: Path, name: str, files: Mapping[str, Any]) -> None:
+    """Write files of a report into a folder: tables, JSON documents, pages, figures.
 
     The name of a file that begins with a point follows that of the report. Raises
-    InputError, which names the report, where `out` cannot be written.
+    InputError, which names the report, where `folder` cannot be written.
     """
-    with write_into(out, name):
+    with write_into(folder, name):
         for file, content in files.items():
-            path = out / (f"{name}{file}" if file.startswith(".") else file)
+            path = folder / (f"{name}{file}" if file.startswith(".") else file)
             if hasattr(content, "to_csv"):
                 content.to_csv(path, index=False)
             elif hasattr(content, "savefig"):
@@ -124,22 +126,24 @@ def publish(out: Path, name: str, files: Mapping[str, Any]) -> None:
                 save_figure(content, path)
             else:
                 if isinstance(content, Mapping):
-                    whole = {**content, "report": content.get("report") or made_on()}
-                    content = json.dumps(whole, indent=2, allow_nan=False) + "\n"
+                    document = {**content, "report": content.get("report") or made_on()}
+                    content = json.dumps(document, indent=2, allow_nan=False) + "\n"
                 path.write_text(content, encoding="utf-8")
 
 
-def provenance(made: Mapping[str, Any] | None = None) -> str:
+def provenance(origin: Mapping[str, Any] | None = None) -> str:
     """Return versions, machine and date of a report in one line.
 
     They are those of `made_on`, by default of now.
     """
-    made = made or made_on()
-    compiler = f"llvmlite {made['llvmlite']}" if made["llvmlite"] else "plain Python"
+    origin = origin or made_on()
+    compiler = (
+        f"llvmlite {origin['llvmlite']}" if origin["llvmlite"] else "plain Python"
+    )
     return (
-        f"sst_ros {made['sst_ros']}, Python {made['python']}, {compiler}, NumPy"
-        f" {made['numpy']}, {made['processor']}, {made['processors']} cores,"
-        f" {made['platform']}, {made['date']}"
+        f"sst_ros {origin['sst_ros']}, Python {origin['python']}, {compiler}, NumPy"
+        f" {origin['numpy']}, {origin['processor']}, {origin['processors']} cores,"
+        f" {origin['platform']}, {origin['date']}"
     )
 
 
@@ -161,11 +165,11 @@ def made_on() -> dict[str, Any]:
 
 def processor() -> str:
     """Return the name of the processor."""
-    said = ""
+    text = ""
     with contextlib.suppress(OSError):
-        said = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    named = re.search(r"^model name\s*: *(.*\S)", said, re.MULTILINE)
-    return named[1] if named else platform.machine()
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    line = re.search(r"^model name\s*: *(.*\S)", text, re.MULTILINE)
+    return line[1] if line else platform.machine()
 
 
 _templates = load_templates("report")

@@ -100,14 +100,17 @@ class RunEvaluation(NamedTuple):
 
 def evaluate_run(run: Recording) -> RunEvaluation:
     """Evaluate a recorded run."""
-    measured = measure_timing(run)
+    timing = measure_timing(run)
     # Compiled loops release the interpreter lock: the two comparisons run in parallel.
     with ThreadPoolExecutor(1) as pool:
-        beside = pool.submit(reference.ideal, run)
-        integration, ideal = reference.integration(run), beside.result()
-    numbers = (
-        _count(run, measured) | summarise(run, integration, ideal) | measured.numbers
-    )
+        ideal_comparison = pool.submit(reference.ideal, run)
+        integration = reference.integration(run)
+        ideal = ideal_comparison.result()
+    numbers = {
+        **_count(run, timing),
+        **summarise(run, integration, ideal),
+        **timing.numbers,
+    }
     findings = find_findings(run, integration, ideal, numbers)
     summary = {
         "verdict": verdict_of(findings),
@@ -115,7 +118,7 @@ def evaluate_run(run: Recording) -> RunEvaluation:
         "notes": texts_of(findings, Severity.NOTE),
         **numbers,
     }
-    return RunEvaluation(measured, integration, ideal, summary)
+    return RunEvaluation(timing, integration, ideal, summary)
 
 
 def summary_text(summary: dict[str, Any], folder: str) -> str:
@@ -135,43 +138,78 @@ def summarise(
 
     These are errors, energy, tracking and efforts.
     """
-    tracked = tracking.of(run)
-    found, off = tracked and tracked.metrics, largest(run.effort_difference)
-    measured = run.motion is not run.measured
-    apart = run.measured_error if measured else np.full((1, 3), np.nan)
-    compared = {
-        "integration_error": integration.error,
-        "integration_reference_error": integration.own,
-    }
-    if ideal:
-        compared |= {
-            "ideal_difference": ideal.error,
-            "ideal_reference_error": ideal.own,
-        }
     return {
         "torque_peak_N_m": np.abs(run.ticks.torque).max(axis=0).tolist(),
-        "tracking_error_rms_rad": found and found.rms.tolist(),
-        "tracking_error_max_rad": found and found.largest.tolist(),
-        "settling_time_s": found and found.settling,
-        "motion_of": "joint_states"
-        if not measured
-        else run.motion and "true_joint_states",
-        "measurement_error_max_rad": largest(apart),
-        "measurement_error_rms_rad": largest(np.sqrt(np.nanmean(apart**2, axis=0)))
-        if np.isfinite(apart).any()
-        else None,
-        **{
-            f"{name}_{key}_{unit}": largest(table[key])
-            for name, table in compared.items()
-            for key, unit in COMPARED_UNITS.items()
-        },
+        **_summarise_tracking(run),
+        **_summarise_measurement(run),
+        **_summarise_errors(integration, ideal),
         "reference_steps_per_tick": integration.steps,
         "samples_compared": integration.compared,
         "restarts_at_s": [time / NANOSECONDS for time in integration.restarts_ns],
         "energy_residual_max_J": largest(np.abs(integration.energy)),
-        "effort_difference_max_N_m": off,
-        "effort_difference_largest_at_s": off
-        and float(run.seconds[np.nanargmax(run.effort_difference)]),
+        **_summarise_efforts(run),
+    }
+
+
+def _summarise_tracking(run: Recording) -> dict[str, Any]:
+    """Return how closely the run followed its reference, if it had one."""
+    tracked = tracking.of(run)
+    if tracked is None:
+        names = "tracking_error_rms_rad", "tracking_error_max_rad", "settling_time_s"
+        return dict.fromkeys(names)
+    return {
+        "tracking_error_rms_rad": tracked.metrics.rms.tolist(),
+        "tracking_error_max_rad": tracked.metrics.largest.tolist(),
+        "settling_time_s": tracked.metrics.settling,
+    }
+
+
+def _summarise_measurement(run: Recording) -> dict[str, Any]:
+    """Return which motion is evaluated, and what the measured one is off it."""
+    if run.motion is run.measured:
+        return {
+            "motion_of": "joint_states",
+            "measurement_error_max_rad": None,
+            "measurement_error_rms_rad": None,
+        }
+    error = run.measured_error
+    rms = None
+    if np.isfinite(error).any():
+        rms = largest(np.sqrt(np.nanmean(error**2, axis=0)))
+    return {
+        "motion_of": None if run.motion is None else "true_joint_states",
+        "measurement_error_max_rad": largest(error),
+        "measurement_error_rms_rad": rms,
+    }
+
+
+def _summarise_errors(
+    integration: Comparison, ideal: Comparison | None
+) -> dict[str, float | None]:
+    """Return the largest errors of each comparison, by quantity."""
+    tables = {
+        "integration_error": integration.error,
+        "integration_reference_error": integration.own,
+    }
+    if ideal:
+        tables["ideal_difference"] = ideal.error
+        tables["ideal_reference_error"] = ideal.own
+    numbers = {}
+    for name, table in tables.items():
+        for quantity, unit in COMPARED_UNITS.items():
+            numbers[f"{name}_{quantity}_{unit}"] = largest(table[quantity])
+    return numbers
+
+
+def _summarise_efforts(run: Recording) -> dict[str, float | None]:
+    """Return how far recorded efforts are from the applied torques, and when."""
+    difference = largest(run.effort_difference)
+    time = None if difference is None else 0.0
+    if difference:
+        time = float(run.seconds[np.nanargmax(run.effort_difference)])
+    return {
+        "effort_difference_max_N_m": difference,
+        "effort_difference_largest_at_s": time,
     }
 
 
@@ -181,13 +219,13 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
     These are the last diagnostics of the simulator, samples, ticks and losses.
     """
     period, recorded, spacing = run.period_ns, len(run.time_ns), np.diff(run.time_ns)
-    said = pd.to_numeric(pd.Series(run.diagnostics, dtype=object), errors="coerce")
-    numbers = {key: value for key, value in said.items() if np.isfinite(value)}
+    reported = pd.to_numeric(pd.Series(run.diagnostics, dtype=object), errors="coerce")
+    numbers = {key: value for key, value in reported.items() if np.isfinite(value)}
     counts = {key: round(value) for key, value in numbers.items()}
     between, published = len(measured.lost_s), counts.get("samples_published")
     # Diagnostics that end before the run does know of fewer samples than the bag holds.
     lost = max(between, (published or 0) - recorded)
-    whole = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
+    whole_numbers = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
     times = (
         "simulated_time_s",
         "wall_time_s",
@@ -199,7 +237,7 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "scene": run.scene.name,
         "bag": str(run.path),
         **{key: run.diagnostics.get(key) for key in ("phase", "fault", "integrator")},
-        **{key: counts.get(key) for key in whole},
+        **{key: counts.get(key) for key in whole_numbers},
         **{key: numbers.get(key) for key in times},
         "simulator_error_estimate": numbers.get("error_estimate"),
         "error_limit_rad": numbers.get("tolerance") or ERROR_LIMIT_RAD,
@@ -259,11 +297,9 @@ def measure_timing(recording: Recording) -> Timing:
     first = int(received_ns[0])
     reports = [values for _, values in recording.reports]
     reported = pd.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
-    at, since = (
-        [when_ns - first for when_ns, _ in recording.reports],
-        received_ns - first,
-    )
-    reported.insert(0, "time_s", np.interp(at, since.astype(float), recording.seconds))
+    reported_ns = [when_ns - first for when_ns, _ in recording.reports]
+    since_ns = (received_ns - first).astype(float)
+    reported.insert(0, "time_s", np.interp(reported_ns, since_ns, recording.seconds))
     delays = {
         "period": pd.Series(period_us, dtype=float),
         "command_latency": commands.received_us,
@@ -276,7 +312,8 @@ def measure_timing(recording: Recording) -> Timing:
     for name, values in delays.items():
         described = values.describe([0.99, 0.999]).dropna()
         numbers |= {
-            f"{name}_{word}_us": described.get(key) for key, word in STATISTICS.items()
+            f"{name}_{statistic}_us": described.get(key)
+            for key, statistic in STATISTICS.items()
         }
     return Timing(
         period_us=period_us,
@@ -299,28 +336,28 @@ def pair_commands(recording: Recording) -> DataFrame:
     legs, commands, ticks = ["1", "2", "3"], recording.commands, recording.ticks
     limit = recording.scene.torque_limit
     most = np.inf if limit is None else limit
-    asked, applied = (
+    commanded, applied = (
         np.clip(each.torque, -most, most) + 0.0 for each in (commands, ticks)
     )
-    new, changed = _changes(asked), _changes(applied)
+    new, changed = _changes(commanded), _changes(applied)
     # When the steps of ticks began, interpolated between the receptions of samples.
     first = recording.received_ns[0]
     since = (recording.received_ns - first).astype(float)
     step_ns = first + np.interp(ticks.end_ns, recording.time_ns, since).astype(np.int64)
-    left = pd.DataFrame(asked[new], columns=legs)
+    left = pd.DataFrame(commanded[new], columns=legs)
     left = left.assign(command=new, ns=commands.received_ns[new] - ticks.period_ns)
     right = pd.DataFrame(applied[changed], columns=legs)
     right = right.assign(tick=changed, ns=step_ns[changed])
     left, right = (table.sort_values("ns", kind="stable") for table in (left, right))
-    found = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
+    pairs = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
     # Commands are in order of reception: the last of those that share a tick is the one
     # it took.
-    found = (
-        found.dropna(subset="tick")
+    pairs = (
+        pairs.dropna(subset="tick")
         .sort_values("command")
         .drop_duplicates("tick", keep="last")
     )
-    command, tick = (found[name].to_numpy(dtype=int) for name in ("command", "tick"))
+    command, tick = (pairs[name].to_numpy(dtype=int) for name in ("command", "tick"))
     stamps, begins = commands.stamp_ns[command], ticks.start_ns[tick]
     age = (begins + recording.start_ns - stamps) / 1e3
     received = (step_ns[tick] - commands.received_ns[command]) / 1e3
@@ -350,20 +387,20 @@ def _measure_answers(
     share = age = None
     # a torque that is commanded once and for all answers no samples
     if len(paired) > 1:
-        seen = recording.measured  # what a controller receives
+        samples = recording.measured  # what a controller receives
         if commands.stamp_ns.any():
-            answered = np.isin(seen.time_ns + recording.start_ns, commands.stamp_ns)
+            answered = np.isin(samples.time_ns + recording.start_ns, commands.stamp_ns)
         else:
             counts = np.searchsorted(
-                commands.received_ns, seen.received_ns, side="left"
+                commands.received_ns, samples.received_ns, side="left"
             )
             answered = np.append(np.diff(counts), 0) > 0
         # The last sample is the end of the run, which nothing answers.
         share = 100.0 * float(np.mean(answered[:-1]))
         begins = np.sort(start_ns[paired.tick])
         tick = np.searchsorted(begins, start_ns, side="right") - 1
-        held = start_ns[tick >= 0] - begins[tick[tick >= 0]]
-        age = float(held.mean() / NANOSECONDS) if len(held) else 0.0
+        ages = start_ns[tick >= 0] - begins[tick[tick >= 0]]
+        age = float(ages.mean() / NANOSECONDS) if len(ages) else 0.0
     return {"samples_answered_percent": share, "command_age_mean_s": age}
 
 

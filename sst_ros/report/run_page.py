@@ -28,40 +28,48 @@ PAGE, HTML = "page.png", "page.html"
 
 
 def write_run_report(
-    bag: Path, out: Path, *, damaged: bool = False, namespace: str | None = None
+    bag: Path, folder: Path, *, damaged: bool = False, namespace: str | None = None
 ) -> dict[str, Any]:
     """Evaluate a recorded run.
 
-    Write summary.json, the page and the pictures into `out`.
+    Write summary.json, the page and the pictures into `folder`.
 
     Of a `damaged` recording what is intact is evaluated; the `namespace` is that of
     `read_bag`. The summary is returned; `summary_text` makes a short text of it,
     `summary_table` the whole. Raises InputError where the bag is no whole recording of
-    a run, or `out` cannot be written.
+    a run, or `folder` cannot be written.
     """
     run = recording.read(bag, damaged=damaged, namespace=namespace)
-    with write_into(out, "report"):
-        found = evaluate_run(run)
-        drawn, _ = pictures.draw_run(run.signals, out, RUN_DRAWN, ["png"])
+    with write_into(folder, "report"):
+        evaluation = evaluate_run(run)
+        drawn, _ = pictures.draw_run(run.signals, folder, RUN_DRAWN, ["png"])
         title = f"Error against run time, {run.scene.name}"
-        drawn += pictures.save(draw_errors(run, found), title, out, "error", ["png"])
-        figures.save_figure(draw_overview(run, found), out / PAGE)
-        result = found.summary | {
+        drawn += pictures.save(
+            draw_errors(run, evaluation), title, folder, "error", ["png"]
+        )
+        figures.save_figure(draw_overview(run, evaluation), folder / PAGE)
+        result = evaluation.summary | {
             "pictures": [path.name for path in drawn],
             "page": [PAGE, HTML],
         }
-        given = {"s": result, "table": summary_table(result), "overview": out / PAGE}
-        page = render("run.html", pictures=drawn, **given)
-        publish(out, "report", {HTML: page, "summary.json": result})
+        values = {
+            "s": result,
+            "table": summary_table(result),
+            "overview": folder / PAGE,
+        }
+        page = render("run.html", pictures=drawn, **values)
+        publish(folder, "report", {HTML: page, "summary.json": result})
     return result
 
 
 @figures.styled
-def draw_errors(run: Recording, found: RunEvaluation) -> Figure:
+def draw_errors(run: Recording, evaluation: RunEvaluation) -> Figure:
     """Draw errors over run time, a panel for each comparison, on logarithmic axes."""
-    panels = {"(a) integration error, against the same torques": found.integration}
-    if found.ideal is not None:
-        panels["(b) sample-and-hold error, against continuous torques"] = found.ideal
+    panels = {"(a) integration error, against the same torques": evaluation.integration}
+    if evaluation.ideal is not None:
+        panels["(b) sample-and-hold error, against continuous torques"] = (
+            evaluation.ideal
+        )
     figure, grid = figures.stack(["largest difference"] * len(panels), 3.1)
     for axes, (title, comparison) in zip(grid, panels.items(), strict=True):
         _draw_comparison(axes, run, comparison)
@@ -99,9 +107,13 @@ def _draw_comparison(axes: Axes, run: Recording, comparison: Comparison) -> None
 
 
 @figures.styled
-def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
+def draw_overview(run: Recording, evaluation: RunEvaluation) -> Figure:
     """Draw a run on one page; a panel without data says that it has none."""
-    seconds, measured, reported = run.seconds, found.timing, found.timing.reported
+    seconds, measured, reported = (
+        run.seconds,
+        evaluation.timing,
+        evaluation.timing.reported,
+    )
     figure = Figure(figsize=(12.0, 10.4))
     grid = iter(figure.subplots(3, 2).ravel())
 
@@ -114,13 +126,15 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
             axes.text(0.5, 0.5, "not recorded", transform=axes.transAxes, ha="center")
         return axes
 
-    errors = found.integration.error
+    errors = evaluation.integration.error
     axes = panel(
         "Integration error, against the same torques", errors, "largest difference"
     )
-    _draw_comparison(axes, run, found.integration)
-    axes = panel("Energy residual", found.integration.energy, "energy residual [J]")
-    energy = found.integration.energy
+    _draw_comparison(axes, run, evaluation.integration)
+    axes = panel(
+        "Energy residual", evaluation.integration.energy, "energy residual [J]"
+    )
+    energy = evaluation.integration.energy
     broken = figures.break_lines(seconds, energy, run.signals.gaps())
     axes.plot(*broken, color=BLUE, linewidth=1.4)
     axes.yaxis.set_major_formatter("{x:.1e}")
@@ -156,10 +170,13 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     used = (1e-6 * reported.ticks * reported.step_mean_us).to_numpy()
     # Reports come once a second: between them, and from the start, the steps cost the
     # same.
-    at = np.interp(seconds, [0.0, *reported.time_s], [0.0, *used])
+    computing_time = np.interp(seconds, [0.0, *reported.time_s], [0.0, *used])
     so_far = np.fmax.accumulate(errors.orientation.to_numpy())
     curves = {
-        "integration error": (at if len(used) else np.full(len(at), np.nan), so_far)
+        "integration error": (
+            computing_time if len(used) else np.full(len(computing_time), np.nan),
+            so_far,
+        )
     }
     for name, column in (
         ("its estimate by the simulator", "error_estimate"),
@@ -178,5 +195,5 @@ def draw_overview(run: Recording, found: RunEvaluation) -> Figure:
     figure.suptitle(
         f"Run of {run.scene.name}: {seconds[-1]:g} s, {len(seconds)} samples"
     )
-    figures.note(figure, provenance(found.summary["report"]), 200)
+    figures.note(figure, provenance(evaluation.summary["report"]), 200)
     return figure

@@ -63,13 +63,13 @@ def without(scene: Scene, term: str) -> Scene:
     Gravity goes with the last links that it acts on.
     """
     key, links = SCENE_TERMS[term], term.endswith("links")
-    whole: dict[str, Any] = {key.partition(".")[0]: [{}] if links else None}
-    for change in (whole if links else {key: None}, whole):
+    removal: dict[str, Any] = {key.partition(".")[0]: [{}] if links else None}
+    for change in (removal if links else {key: None}, removal):
         # a kind of stops without its own, or gravity
         with contextlib.suppress(InputError):
             document = replace_values(scene, change)
             return build(Scene, drop_idle(Scene, document), scene.name)
-    return scene.with_values({**whole, "gravity": None})
+    return scene.with_values({**removal, "gravity": None})
 
 
 def operations(scene: Scene) -> int:
@@ -183,15 +183,17 @@ def stability_function(
 ) -> NDArray[np.complex128]:
     """Evaluate R(z) of a method from its coefficients, for any shape of z."""
     stages: list[Any] = []
-    one = np.ones_like(z)
+    identity = np.ones_like(z)
     if isinstance(method, Rosenbrock):
         for a, c in zip(method.a, method.c, strict=True):
-            at = one + _combine(a, stages)
-            stages.append((z * at + _combine(c, stages)) / (1.0 / method.gamma - z))
-        return np.asarray(at + stages[-1])
+            stage_value = identity + _combine(a, stages)
+            stages.append(
+                (z * stage_value + _combine(c, stages)) / (1.0 / method.gamma - z)
+            )
+        return np.asarray(stage_value + stages[-1])
     for row in method.a:
-        stages.append(one + z * _combine(row, stages))
-    return np.asarray(one + z * _combine(method.b, stages))
+        stages.append(identity + z * _combine(row, stages))
+    return np.asarray(identity + z * _combine(method.b, stages))
 
 
 def _combine(weights: tuple[float, ...], stages: list[Any]) -> Any:

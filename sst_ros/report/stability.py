@@ -90,43 +90,50 @@ class StabilityReport(NamedTuple):
         return False not in self.runs.passed.tolist()
 
 
-def write_stability_report(scene: Scene, out: Path, only: Sequence[str] = ()) -> bool:
-    """Examine a scene, print the report and write its files into `out`.
+def write_stability_report(
+    scene: Scene, folder: Path, only: Sequence[str] = ()
+) -> bool:
+    """Examine a scene, print the report and write its files into `folder`.
 
     The files are stability.csv, .json, .md and .png. `only` names rows of CHANGED_RUNS;
     by default all. Returns whether no run failed. Raises InputError where a name is
-    unknown or `out` cannot be written, SstError where the scene cannot start.
+    unknown or `folder` cannot be written, SstError where the scene cannot start.
     """
-    found = examine_stability(scene, only, shown=True)
-    said = stability_page(found)
-    print(said)
-    steps, runs = records(found.steps.replace(math.inf, None)), records(found.runs)
+    report = examine_stability(scene, only, visible=True)
+    page = stability_page(report)
+    print(page)
+    steps, runs = records(report.steps.replace(math.inf, None)), records(report.runs)
     document = {
-        "scene": found.scene,
-        "advice": found.advice,
+        "scene": report.scene,
+        "advice": report.advice,
         "steps": steps,
         "runs": runs,
     }
     files = {
-        ".csv": found.runs,
+        ".csv": report.runs,
         ".json": document,
-        ".md": said,
-        ".png": draw_stability(found),
+        ".md": page,
+        ".png": draw_stability(report),
     }
-    publish(out, "stability", files)
-    return found.passed
+    publish(folder, "stability", files)
+    return report.passed
 
 
 def examine_stability(
-    scene: Scene, only: Sequence[str] = (), *, shown: bool = False
+    scene: Scene, only: Sequence[str] = (), *, visible: bool = False
 ) -> StabilityReport:
     """Find the stable steps along the motion of a scene.
 
     Also run the scene with other numbers.
     """
-    known = f"must be one of {', '.join(CHANGED_RUNS)}"
+    requirement = f"must be one of {', '.join(CHANGED_RUNS)}"
     wrong = (
-        ("--only", name, name in CHANGED_RUNS, known + suggestion(name, CHANGED_RUNS))
+        (
+            "--only",
+            name,
+            name in CHANGED_RUNS,
+            requirement + suggestion(name, CHANGED_RUNS),
+        )
         for name in only
     )
     refuse_unless("report stability", *wrong)
@@ -134,7 +141,7 @@ def examine_stability(
     seconds = min(scene.duration or WHOLE_RUN_S, advised.LONGEST_S)
     began = time.perf_counter()
     motion = simulate(scene, duration=seconds, tolerance=advised.ADVICE_TOLERANCE)
-    if shown:
+    if visible:
         about = max(1.0, 2.0 * (time.perf_counter() - began)) * len(chosen)
         print(
             f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about"
@@ -152,17 +159,23 @@ def examine_stability(
             "oscillation": abs(values.imag).max(),
         }
         longest = {
-            name: advised.largest_stable_step(one, values)
-            for name, one in METHODS.items()
+            name: advised.largest_stable_step(method, values)
+            for name, method in METHODS.items()
         }
         steps.append({"t_s": t, **fastest, **longest})
 
     def run(name: str) -> dict[str, Any]:
-        what, change = CHANGED_RUNS[name]
-        return {"name": name, "change": what, **_run(change(scene, motion), seconds)}
+        description, change = CHANGED_RUNS[name]
+        return {
+            "name": name,
+            "change": description,
+            **_run(change(scene, motion), seconds),
+        }
 
     # One after another: computing times are those of a core that is free.
-    runs = [row for _, row in run_many(run, chosen, label=f"{scene.name:<16}" * shown)]
+    runs = [
+        row for _, row in run_many(run, chosen, label=f"{scene.name:<16}" * visible)
+    ]
     advice = advised.step_advice(scene).text
     return StabilityReport(scene.name, data_frame(steps), advice, data_frame(runs))
 
@@ -215,10 +228,10 @@ def _scale(factor: float, keys: str, absent: str) -> Change:
 
     def change(scene: Scene, _: Trajectory) -> Scene | str:
         numbers = {key_of(place): value for place, value in leaves(scene).items()}
-        found = {
+        scaled = {
             key: factor * x for key, x in numbers.items() if re.fullmatch(keys, key)
         }
-        return scene.with_values(found) if found else f"the scene has no {absent}"
+        return scene.with_values(scaled) if scaled else f"the scene has no {absent}"
 
     return change
 
@@ -240,9 +253,9 @@ def _turn_to(*names: str, spin: float = 0.0, before: float = 0.0) -> Change:
     """
 
     def change(scene: Scene, motion: Trajectory) -> Scene | str:
-        found = [_first_zeros(scene, motion, name, before) for name in names]
+        zeros = [_first_zeros(scene, motion, name, before) for name in names]
         axes, angles, poses = (
-            np.concatenate(parts) for parts in zip(*found, strict=True)
+            np.concatenate(columns) for columns in zip(*zeros, strict=True)
         )
         if not len(angles):
             return "no turn of the star meets it"
@@ -331,23 +344,23 @@ CHANGED_RUNS: dict[str, tuple[str, Change]] = {
 """Rows by the name that `--only` takes: what differs from the scene, and its maker."""
 
 
-def stability_page(found: StabilityReport) -> str:
+def stability_page(report: StabilityReport) -> str:
     """Write the report as Markdown."""
-    given = {
+    values = {
         "factor": FACTOR,
         "rounding": PASSING_ROUNDING,
         "methods": METHODS,
         "inf": math.inf,
     }
-    return render("stability.md", found=found, **given)
+    return render("stability.md", found=report, **values)
 
 
 @styled
-def draw_stability(found: StabilityReport) -> Figure:
+def draw_stability(report: StabilityReport) -> Figure:
     """Draw eigenvalues and stable steps along the motion."""
     figure = Figure(figsize=(11.0, 4.6))
     left, right = figure.subplots(1, 2)
-    steps = found.steps.set_index("t_s").replace([math.inf, 0.0], math.nan)
+    steps = report.steps.set_index("t_s").replace([math.inf, 0.0], math.nan)
     looks = {"logy": True, "linewidth": 1.8, "xlabel": "time t [s]"}
     rates, label = (
         steps[["decay", "oscillation"]],
@@ -366,6 +379,6 @@ def draw_stability(found: StabilityReport) -> Figure:
     right.plot([], [], " ", label=f"{free}: every step")
     legend(left)
     legend(right)
-    figure.suptitle(f"Stability of {found.scene}", fontsize=12)
+    figure.suptitle(f"Stability of {report.scene}", fontsize=12)
     note(figure, provenance(), 185)
     return figure

@@ -86,12 +86,12 @@ def read_tracking(path: Path) -> TrackedRun:
     missing = run.signals.absent
     if absent := [missing[key] for key in TRACKING_TOPICS if key in missing]:
         raise InputError(str(path), absent)
-    found = of(run)
-    if found is None:
+    tracked = of(run)
+    if tracked is None:
         raise refusal(
             path, TRACKING_TOPICS[0], 0, "two samples or more must have a reference"
         )
-    return found
+    return tracked
 
 
 def of(run: Recording) -> TrackedRun | None:
@@ -100,14 +100,17 @@ def of(run: Recording) -> TrackedRun | None:
     None where fewer than two samples have one.
     """
     series = [run.signals.topic_series[key] for key in TRACKING_TOPICS]
-    at = [places(one.stamp_ns, run.time_ns + run.start_ns) for one in series]
-    rows = np.flatnonzero(np.min(at, axis=0) >= 0)
+    stamps = run.time_ns + run.start_ns
+    series_rows = [places(topic.stamp_ns, stamps) for topic in series]
+    rows = np.flatnonzero(np.min(series_rows, axis=0) >= 0)
     if len(rows) < 2:
         return None
     reference, error = (
-        one.values[place[rows]] for one, place in zip(series, at, strict=True)
+        topic.values[row[rows]] for topic, row in zip(series, series_rows, strict=True)
     )
-    feedforward, feedback, times = reference[:, 6:], error[:, 6:], run.time_ns[rows]
+    feedforward = reference[:, 6:]
+    feedback = error[:, 6:]
+    times = run.time_ns[rows]
     # The torque of the tick that begins at a sample; what was lost is what was
     # requested. A sample after the last tick has none.
     tick = places(run.ticks.start_ns, times)
@@ -120,16 +123,16 @@ def of(run: Recording) -> TrackedRun | None:
     return TrackedRun(run, track_of(np.hstack(columns)), rows)
 
 
-def write_tracking_report(bag: Path, out: Path) -> str:
+def write_tracking_report(bag: Path, folder: Path) -> str:
     """Evaluate how a recorded run followed its reference.
 
-    Table and pictures are written into `out`. The table is returned. Raises InputError
-    as `read_tracking`, or where `out` cannot be written.
+    Table and pictures are written into a folder. The table is returned. Raises
+    InputError as `read_tracking`, or where the folder cannot be written.
     """
     tracked = read_tracking(bag)
     title = f"Tracking of {tracked.recording.scene.name}, from {bag}"
     given = {"found": tracked.metrics, "turned": largest(tracked.orientation_error)}
     text = render("tracking.txt", title=title, **given)
-    publish(out, "report", {"tracking.txt": text})
-    pictures.draw_run(tracked.recording.signals, out, TRACKING_DRAWN, ["png"])
+    publish(folder, "report", {"tracking.txt": text})
+    pictures.draw_run(tracked.recording.signals, folder, TRACKING_DRAWN, ["png"])
     return text

@@ -26,7 +26,11 @@ RELATIVE_ROUNDING = 1e-9
 SMALLEST_SIDE = 4e-5
 """Side [rad] of an equilateral base whose volume is lost in RELATIVE_ROUNDING."""
 
-ABOUT_O, ABOUT_CENTRE = "O", "centre_of_mass"
+SHORTEST_DIRECTION = 1e-6
+"""Length of a direction `v` below which it counts as zero."""
+
+ABOUT_O = "O"
+ABOUT_CENTRE = "centre_of_mass"
 
 SMALLEST_MOMENT = 1e-18
 """Moment of inertia [kg m^2] of a microgram at a millimetre.
@@ -57,15 +61,15 @@ class Inertia(Section):
     def rules(self) -> Rules:
         """Refuse what no rigid body has."""
         tensor = entries_of(self)
-        largest = (
-            (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * sum(tensor[:3])
-        )
+        trace = sum(tensor[:3])
+        # A moment that equals the sum of the other two is half the trace.
+        largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * trace
         definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
-        fits = _is_positive([-part for part in tensor], largest)
+        fits = _is_positive([-entry for entry in tensor], largest)
         least = f"> 0 (positive definite), at least {SMALLEST_MOMENT:g} kg m^2"
         yield ~definite, "", tensor, f"principal moments of inertia must be {least}"
-        allowed = "no principal moment may exceed the sum of the other two"
-        yield definite & ~fits, "", tensor, allowed
+        requirement = "no principal moment may exceed the sum of the other two"
+        yield definite & ~fits, "", tensor, requirement
 
 
 class Base(Section):
@@ -91,16 +95,18 @@ class Base(Section):
 
     def settle(self) -> Iterator[Problem]:
         """Replace arcs by directions; refuse those that close no triangle."""
-        if (arcs := self.arcs_deg) is not None and self.v is None:
-            if 2.0 * max(arcs) < sum(arcs) < 360.0:
-                v = _directions_of(*np.radians(arcs).tolist())
-                vars(self).update(v=v, arcs_deg=None)
-            else:
-                allowed = (
-                    "must close: each less than the sum of the others, their sum less"
-                    " than"
-                )
-                yield Problem("arcs_deg", arcs, f"{allowed} 360 deg")
+        arcs = self.arcs_deg
+        if arcs is None or self.v is not None:
+            return
+        if 2.0 * max(arcs) < sum(arcs) < 360.0:
+            v = _directions_of(*np.radians(arcs).tolist())
+            vars(self).update(v=v, arcs_deg=None)
+            return
+        requirement = (
+            "must close: each less than the sum of the others, their sum less than"
+            " 360 deg"
+        )
+        yield Problem("arcs_deg", arcs, requirement)
 
     def rules(self) -> Rules:
         """Refuse triangles without area and left-handed ones."""
@@ -109,16 +115,13 @@ class Base(Section):
         v = np.moveaxis(np.asarray(self.v), (0, 1), (-2, -1))
         lengths = np.linalg.norm(v, axis=-1)
         volume = np.linalg.det(v / lengths[..., None])
-        flat = (lengths.min(axis=-1) < 1e-6) | ~(abs(volume) >= RELATIVE_ROUNDING)
-        allowed = (
-            f"must lie {SMALLEST_SIDE:g} rad apart or more, and not on one great circle"
+        without_direction = lengths.min(axis=-1) < SHORTEST_DIRECTION
+        flat = without_direction | ~(abs(volume) >= RELATIVE_ROUNDING)
+        apart = (
+            f"P1, P2, P3 must lie {SMALLEST_SIDE:g} rad apart or more, and not on one"
+            " great circle; no direction may be zero (degenerate)"
         )
-        yield (
-            flat,
-            "v",
-            self.v,
-            f"P1, P2, P3 {allowed}; no direction may be zero (degenerate)",
-        )
+        yield flat, "v", self.v, apart
         handed = "must be right-handed, v1 . (v2 x v3) > 0: exchange two of the points"
         yield ~flat & (volume < 0.0), "v", self.v, handed
 
@@ -137,15 +140,15 @@ def _directions_of(
         * math.sin(half - a23)
         * math.sin(half - a31)
     )
-    sine, (c12, c23, c31) = (
-        math.sin(a12),
-        (math.sin(0.5 * math.pi - a) for a in (a12, a23, a31)),
-    )
-    return (
-        (1.0, 0.0, 0.0),
-        (c12, sine, 0.0),
-        (c31, (c23 - c31 * c12) / sine, 2.0 * math.sqrt(max(product, 0.0)) / sine),
-    )
+    # Cosines by sines, which keep short arcs.
+    c12 = math.sin(0.5 * math.pi - a12)
+    c23 = math.sin(0.5 * math.pi - a23)
+    c31 = math.sin(0.5 * math.pi - a31)
+    s12 = math.sin(a12)
+    v1 = (1.0, 0.0, 0.0)
+    v2 = (c12, s12, 0.0)
+    v3 = (c31, (c23 - c31 * c12) / s12, 2.0 * math.sqrt(max(product, 0.0)) / s12)
+    return v1, v2, v3
 
 
 class Link(Section):
@@ -175,37 +178,33 @@ class Link(Section):
 
     def settle(self) -> Iterator[Problem]:
         """Replace an inertia about the centre of mass by that about O."""
-        if self.inertia_about == ABOUT_CENTRE:
-            if self.mass == 0.0 or self.inertia is None:
-                yield Problem(
-                    "inertia_about", ABOUT_CENTRE, "needs an inertia and mass > 0 [kg]"
-                )
-                return
-            shifted = _inertia_of(shift_inertia(self.inertia, self.mass, self.centre))
-            vars(self).update(inertia=shifted, inertia_about=ABOUT_O)
+        if self.inertia_about != ABOUT_CENTRE:
+            return
+        if self.mass == 0.0 or self.inertia is None:
+            requirement = "needs an inertia and mass > 0 [kg]"
+            yield Problem("inertia_about", ABOUT_CENTRE, requirement)
+            return
+        shifted = _inertia_of(shift_inertia(self.inertia, self.mass, self.centre))
+        vars(self).update(inertia=shifted, inertia_about=ABOUT_O)
 
     def rules(self) -> Rules:
         """Refuse centres and inertias that contradict the mass."""
-        mass, (x, y, z), own = (
-            self.mass,
-            self.centre,
-            shift_inertia(self.inertia, -self.mass, self.centre),
-        )
-        scale = mass * (x * x + y * y + z * z)
-        for part in entries_of(self.inertia):
-            scale = np.maximum(scale, abs(part))
+        x, y, z = self.centre
+        scale = self.mass * (x * x + y * y + z * z)
+        for moment in entries_of(self.inertia):
+            scale = np.maximum(scale, abs(moment))
         # Moments about the centre of mass: none exceeds half their sum, but for
         # rounding.
-        fits = _is_positive(
-            [-part for part in own], 0.5 * sum(own[:3]) + 0.5e-6 * scale
-        )
-        given = np.greater(mass, 0.0) & np.greater(scale, 0.0)
-        allowed = (
+        about_centre = shift_inertia(self.inertia, -self.mass, self.centre)
+        largest = 0.5 * sum(about_centre[:3]) + 0.5e-6 * scale
+        fits = _is_positive([-moment for moment in about_centre], largest)
+        has_mass = np.greater(self.mass, 0.0) & np.greater(scale, 0.0)
+        requirement = (
             "must fit the inertia about O, which leaves moments about this centre that"
             f" no body has (inertia_about: {ABOUT_CENTRE} takes one about the centre of"
             " mass)"
         )
-        yield given & ~fits, "centre", self.centre, allowed
+        yield has_mass & ~fits, "centre", self.centre, requirement
 
 
 class Star(Link):
@@ -224,12 +223,8 @@ class Star(Link):
         """
         total = sum(self.alpha_deg)
         open_ = np.greater(abs(total - 360.0), 360.0 * RELATIVE_ROUNDING)
-        yield (
-            open_,
-            "alpha_deg",
-            self.alpha_deg,
-            f"must sum to 360 deg; the sum is {total}",
-        )
+        requirement = f"must sum to 360 deg; the sum is {total}"
+        yield open_, "alpha_deg", self.alpha_deg, requirement
         yield from super().rules()
 
 
@@ -282,25 +277,18 @@ class Stroke(Section):
 
         A kind without its own coefficients is refused, too.
         """
-        elastic, damped = self.at_end == "elastic", np.not_equal(self.damping, 0.0)
+        elastic = self.at_end == "elastic"
+        damped = np.not_equal(self.damping, 0.0)
         bounces = self.restitution is not None
         only = "is given with at_end: elastic, and only there"
         yield (self.stiffness is not None) != elastic, "stiffness", self.stiffness, only
         yield bounces and not elastic, "restitution", self.restitution, only
-        both = bounces == (self.impact_rate is not None)
-        yield (
-            not both,
-            "impact_rate",
-            self.impact_rate,
-            "is given with restitution, both or none",
-        )
+        alone = bounces != (self.impact_rate is not None)
+        paired = "is given with restitution, both or none"
+        yield alone, "impact_rate", self.impact_rate, paired
         yield damped & (not elastic), "damping", self.damping, only
-        yield (
-            damped & bounces,
-            "damping",
-            self.damping,
-            "give either damping or restitution",
-        )
+        either = "give either damping or restitution"
+        yield damped & bounces, "damping", self.damping, either
 
 
 class Workspace(Section):
@@ -326,7 +314,9 @@ def entries_of(inertia: Inertia | None) -> list[Any]:
 
     They may be columns or symbols.
     """
-    return [0.0] * 6 if inertia is None else [*vars(inertia).values()]
+    if inertia is None:
+        return [0.0] * len(PLACES)
+    return [*vars(inertia).values()]
 
 
 def shift_inertia(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
@@ -335,8 +325,11 @@ def shift_inertia(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
     They are shifted by parallel axes. They may be columns.
     """
     square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
-    point = [mass * (square * float(i == j) - centre[i] * centre[j]) for i, j in PLACES]
-    return [own + part for own, part in zip(entries_of(inertia), point, strict=True)]
+    shifted = []
+    for moment, (i, j) in zip(entries_of(inertia), PLACES, strict=True):
+        point_mass = mass * (square * float(i == j) - centre[i] * centre[j])
+        shifted.append(moment + point_mass)
+    return shifted
 
 
 def _matrix_of(entries: Iterable[Any]) -> Array:
@@ -348,15 +341,16 @@ def _inertia_of(entries: Iterable[float]) -> Inertia:
     return Inertia(**dict(zip(Inertia.SPECS, entries, strict=True)))
 
 
-def _is_positive(entries: Sequence[Any], more: Any) -> Any:
-    """Return whether a symmetric matrix + more 1 is positive definite.
+def _is_positive(entries: Sequence[Any], shift: Any) -> Any:
+    """Return whether a symmetric matrix + shift 1 is positive definite.
 
     The pivots of its L D L^T are positive then.
     """
     xx, yy, zz, xy, xz, yz = map(np.asarray, entries)
-    first, second = xx + more, yy + more - xy * xy / (xx + more)
+    first = xx + shift
+    second = yy + shift - xy * xy / (xx + shift)
     off = yz - xy * xz / first
-    third = zz + more - xz * xz / first - off * off / second
+    third = zz + shift - xz * xz / first - off * off / second
     return np.asarray((first > 0.0) & (second > 0.0) & (third > 0.0))
 
 
@@ -364,17 +358,19 @@ def _is_positive(entries: Sequence[Any], more: Any) -> Any:
 def arc_inertia(
     mass: float, radius: float, begin: ArrayLike, end: ArrayLike
 ) -> Inertia:
-    """Inertia about O of a thin, uniform arc of a great circle.
+    """Return the inertia about O of a thin, uniform arc of a great circle.
 
     Inertias of several arcs add up.
 
     Mass [kg] and radius [m] are those of the arc; `begin` and `end` are directions from
-    O, shape (3,), of any length and less than pi apart. InputError is raised where mass
-    or radius is not positive, or the directions span no arc.
+    O, shape (3,), of any length and less than pi apart. Raises InputError where mass or
+    radius is not positive, or the directions span no arc.
     """
-    first, last = np.asarray(begin, dtype=float), np.asarray(end, dtype=float)
-    fits = first.shape == last.shape == (3,)
-    normal = float(np.linalg.norm(np.cross(first, last))) if fits else math.nan
+    first = np.asarray(begin, dtype=float)
+    last = np.asarray(end, dtype=float)
+    normal = math.nan
+    if first.shape == last.shape == (3,):
+        normal = float(np.linalg.norm(np.cross(first, last)))
     spans = normal > 1e-9 * float(np.linalg.norm(first) * np.linalg.norm(last))
     directions = "must be two directions, shape (3,), neither parallel nor opposite"
     refuse_unless(
@@ -383,7 +379,8 @@ def arc_inertia(
         ("radius", radius, 0.0 < radius < math.inf, "must be > 0 and finite [m]"),
         ("begin, end", (begin, end), spans, directions),
     )
-    u, v = first / np.linalg.norm(first), last / np.linalg.norm(last)
+    u = first / np.linalg.norm(first)
+    v = last / np.linalg.norm(last)
     half = 0.5 * math.atan2(normal, float(first @ last))
     # Mean of r r^T over the arc: angles from -half to half about its middle.
     ratio = math.sin(2.0 * half) / (2.0 * half)

@@ -16,7 +16,9 @@ import numpy as np
 from sst_ros.scene.schema import Rules, Section, amount, angles, coefficient, entry
 from sst_ros.state import ZERO, Quaternion, Vector3
 
-JOINTS = tuple(f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3))
+JOINTS = tuple(
+    f"{angle}_{leg}" for angle in ("gamma", "mu", "beta") for leg in (1, 2, 3)
+)
 MOMENTS = ("moment_x", "moment_y", "moment_z")  # beside the torques of a tick
 NANOSECOND = 1e-9  # resolution of time [s]
 _duration = partial(entry, "time that it takes", "s", least=NANOSECOND)
@@ -183,8 +185,8 @@ class Sweep(Section):
     def rules(self) -> Rules:
         """Refuse to fade for longer than there is time."""
         most = 0.5 * self.duration
-        allowed = f"must not exceed half the duration, {most} s"
-        yield np.greater(self.fade, most), "fade", self.fade, allowed
+        requirement = f"must not exceed half the duration, {most} s"
+        yield np.greater(self.fade, most), "fade", self.fade, requirement
 
 
 class Spiral(Section):
@@ -242,7 +244,7 @@ class DesiredMotion(Section):
 
     def rules(self) -> Rules:
         """Refuse points whose times do not rise."""
-        for index, (before, here) in enumerate(pairwise(self.waypoints), start=1):
-            early = np.less(here.time, before.time + NANOSECOND)
-            allowed = f"must be > {before.time} s, that of the point before, by 1e-9 s"
-            yield early, f"waypoints[{index}].time", here.time, allowed
+        for index, (before, point) in enumerate(pairwise(self.waypoints), start=1):
+            early = np.less(point.time, before.time + NANOSECOND)
+            earliest = f"must be > {before.time} s, that of the point before, by 1e-9 s"
+            yield early, f"waypoints[{index}].time", point.time, earliest

@@ -21,7 +21,7 @@ ROTATION = tuple(f"R{i}{j}" for i in "123" for j in "123")
 """Entries of R, the orientation of {E} in {B}: R13, R23, R33 is the direction of E."""
 
 ANGLE_NAMES = tuple(
-    f"{kind}_{leg}" for kind in ("gamma", "mu", "beta") for leg in (1, 2, 3)
+    f"{angle}_{leg}" for angle in ("gamma", "mu", "beta") for leg in (1, 2, 3)
 )
 OMEGA = tuple(
     f"omega_{axis}" for axis in "xyz"
@@ -102,28 +102,24 @@ class FormulaLoad(Section):
         """Refuse what is no formula, and names that are not there."""
         count = len(self.moment)
         yield count not in (0, 3), "moment", self.moment, "must be three formulas"
-        known = set(STATE_NAMES if self.moment else POSE_NAMES)
+        usable_names = set(STATE_NAMES if self.moment else POSE_NAMES)
         for parameter in self.parameters:
-            twice = parameter.name in known
-            yield twice, "parameters", parameter.name, "is given twice"
-            known.add(parameter.name)
-        parts = 0
+            repeated = parameter.name in usable_names
+            yield repeated, "parameters", parameter.name, "is given twice"
+            usable_names.add(parameter.name)
+        size = 0
         for key, text in self.texts.items():
-            fault = find_fault(text, frozenset(known))
+            fault = find_fault(text, frozenset(usable_names))
             yield bool(fault), key, text, fault
             if not fault:
-                parts += sum(1 for _ in ast.walk(parse(text)))
+                size += sum(1 for _ in ast.walk(parse(text)))
             name = key.removeprefix("terms.")
             if name != key:
-                strange = _is_strange(name) or name in known
+                strange = _is_strange(name) or name in usable_names
                 yield strange, key, name, f"{_describe_name()}, and given once"
-                known.add(name)
-        yield (
-            parts > MOST_FORMULA_PARTS,
-            "",
-            parts,
-            f"must have at most {MOST_FORMULA_PARTS} parts",
-        )
+                usable_names.add(name)
+        requirement = f"must have at most {MOST_FORMULA_PARTS} parts"
+        yield size > MOST_FORMULA_PARTS, "", size, requirement
 
 
 @lru_cache(maxsize=256)
@@ -138,10 +134,10 @@ def parse(text: str) -> ast.expr:
 
 
 @lru_cache(maxsize=256)
-def find_fault(text: str, known: frozenset[str]) -> str:
-    """Say what a formula must be that a text is not.
+def find_fault(text: str, usable_names: frozenset[str]) -> str:
+    """Say what a formula must be that a text is not; "" where it is a formula.
 
-    "" where it is one of the known names.
+    Its names must be among `usable_names`.
     """
     try:
         tree = parse(text)
@@ -149,23 +145,28 @@ def find_fault(text: str, known: frozenset[str]) -> str:
         return str(error)
     if _measure_depth(tree) > DEEPEST_FORMULA:
         return f"must have at most {DEEPEST_FORMULA} levels: write parts of it as terms"
-    called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
-    faults = (
-        _fault_of(node, known) for node in ast.walk(tree) if id(node) not in called
-    )
-    return next(filter(None, faults), "")
+    nodes = list(ast.walk(tree))
+    function_names = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
+    for node in nodes:
+        if id(node) in function_names:
+            continue
+        fault = _fault_of(node, usable_names)
+        if fault:
+            return fault
+    return ""
 
 
 def _measure_depth(tree: ast.AST) -> int:
     """Count the levels of a formula."""
-    depth, level = 0, [tree]
+    depth = 0
+    level = [tree]
     while level:
         depth += 1
         level = [child for node in level for child in ast.iter_child_nodes(node)]
     return depth
 
 
-def _fault_of(node: ast.AST, known: frozenset[str]) -> str:
+def _fault_of(node: ast.AST, usable_names: frozenset[str]) -> str:
     """Say what is wrong with one part of a formula; "" for nothing."""
     if isinstance(node, (*FORMULA_OPERATORS, *SIGNS, ast.Load)):
         return ""
@@ -176,19 +177,20 @@ def _fault_of(node: ast.AST, known: frozenset[str]) -> str:
     if isinstance(node, ast.Constant):
         return "" if is_finite(node.value) else "must have finite numbers only"
     if isinstance(node, ast.Name):
-        if node.id in known or node.id == "pi":
-            return ""
-        if node.id in STATE_NAMES:
-            return f"must be of the pose alone: {node.id} is a rate"
-        if node.id in FORMULA_FUNCTIONS:
-            return f"must give {node.id} its arguments in brackets"
-        return (
-            f"must have known names only: {node.id} is neither state, parameter nor"
-            " term"
-        )
+        return _fault_of_name(node.id, usable_names)
     if isinstance(node, ast.Call):
         return _fault_of_call(node)
     return f"must be arithmetic: {type(node).__name__} is not allowed"
+
+
+def _fault_of_name(name: str, usable_names: frozenset[str]) -> str:
+    if name in usable_names or name == "pi":
+        return ""
+    if name in STATE_NAMES:
+        return f"must be of the pose alone: {name} is a rate"
+    if name in FORMULA_FUNCTIONS:
+        return f"must give {name} its arguments in brackets"
+    return f"must have known names only: {name} is neither state, parameter nor term"
 
 
 def _fault_of_operation(node: ast.BinOp) -> str:
@@ -230,21 +232,26 @@ def power_of(node: ast.BinOp) -> int | None:
 
     None where it is not allowed.
     """
-    exponent, sign = node.right, 1
+    exponent = node.right
+    sign = 1
     if isinstance(exponent, ast.UnaryOp) and isinstance(exponent.op, ast.USub):
-        exponent, sign = exponent.operand, -1
+        exponent = exponent.operand
+        sign = -1
     if not isinstance(exponent, ast.Constant) or type(exponent.value) is not int:
         return None
-    return sign * exponent.value if 1 <= exponent.value <= LARGEST_POWER else None
+    if not 1 <= exponent.value <= LARGEST_POWER:
+        return None
+    return sign * exponent.value
 
 
 def names_in(texts: Iterator[str]) -> set[str]:
-    """Names that formulas use, those of functions left out."""
-    trees = [parse(text) for text in texts]
-    found = (node for tree in trees for node in ast.walk(tree))
-    return {
-        node.id for node in found if isinstance(node, ast.Name)
-    } - FORMULA_FUNCTIONS.keys()
+    """Return the names that formulas use, those of functions left out."""
+    names = set()
+    for text in texts:
+        for node in ast.walk(parse(text)):
+            if isinstance(node, ast.Name):
+                names.add(node.id)
+    return names - FORMULA_FUNCTIONS.keys()
 
 
 def _is_strange(name: str) -> bool:

@@ -102,8 +102,9 @@ class Scene(Explained, Section):
                 self.name, [Problem("", values, "must not hold itself")]
             ) from None
         except KeyError as error:
-            key, allowed = error.args[0], "names nothing in this scene"
-            raise refusal(self.name, str(key), values[key], allowed) from None
+            key = error.args[0]
+            requirement = "names nothing in this scene"
+            raise refusal(self.name, str(key), values[key], requirement) from None
         scene = schema.build(Scene, changed, self.name)
         schema.keep_texts(self, scene)
         return scene
@@ -120,12 +121,12 @@ class Scene(Explained, Section):
 
     def _facts(self) -> dict[str, object]:
         present = terms(self)
+        absent = [term for term in SCENE_TERMS if term not in present]
         return {
             "name": self.name,
             "description": self.description,
             "has": present or "nothing but the star",
-            "has not": [term for term in SCENE_TERMS if term not in present]
-            or "all terms are there",
+            "has not": absent or "all terms are there",
             "gamma(0) [rad]": self.initial.gamma,
             "gamma_dot(0) [rad/s]": self.initial.gamma_dot,
             "torque": "sines" if self.torque else "none of its own",
@@ -139,15 +140,14 @@ class Scene(Explained, Section):
         Refused are centres of mass far from the bodies, gravity without a mass, and
         provenance of what no scene has.
         """
-        allowed = f"must not exceed {LARGEST_NUMBER:g} in size: use m, kg, s, rad, N"
+        most = f"must not exceed {LARGEST_NUMBER:g} in size: use m, kg, s, rad, N"
         for place, value in schema.leaves(self).items():
-            yield abs(value) > LARGEST_NUMBER, key_of(place), value, allowed
-        reach = np.maximum(self.base.radius, self.star.radius)
+            yield abs(value) > LARGEST_NUMBER, key_of(place), value, most
         bodies = {"star": self.star}
         for name in LINKS:
-            bodies |= {
-                f"{name}[{k}]": link for k, link in enumerate(getattr(self, name))
-            }
+            for k, link in enumerate(getattr(self, name)):
+                bodies[f"{name}[{k}]"] = link
+        reach = np.maximum(self.base.radius, self.star.radius)
         mass: Any = 0.0 if self.payload is None else self.payload.mass
         for name, body in bodies.items():
             mass = mass + body.mass
@@ -155,8 +155,8 @@ class Scene(Explained, Section):
             far = np.sqrt(x * x + y * y + z * z) > reach
             yield far, f"{name}.centre", body.centre, f"must lie within {reach} m of O"
         if self.gravity is not None:
-            allowed = "acts on nothing: no body has a mass"
-            yield np.equal(mass, 0.0), "gravity", self.gravity.acceleration, allowed
+            idle = "acts on nothing: no body has a mass"
+            yield np.equal(mass, 0.0), "gravity", self.gravity.acceleration, idle
         for key, note in self.provenance:
             strange = not _has_key(Scene, key)
             yield strange, f"provenance.{key}", note, "is about a key that no scene has"
@@ -183,20 +183,22 @@ SCENE_TERMS = {
 
 def terms(scene: Scene) -> list[str]:
     """Return those of SCENE_TERMS that a scene has."""
-    return [
-        term
-        for term, key in SCENE_TERMS.items()
-        if schema.has_effect(values_at(scene, key))
-    ]
+    present = []
+    for term, key in SCENE_TERMS.items():
+        if schema.has_effect(values_at(scene, key)):
+            present.append(term)
+    return present
 
 
 def _has_key(cls: type[Section], key: str) -> bool:
     """Return whether documents of a class may have a key without indices."""
-    name, _, rest = key.partition(".")
+    name, _, inner_key = key.partition(".")
     spec = cls.SPECS.get(name)
-    if spec is None or not rest:
-        return spec is not None
-    return spec.section is not None and _has_key(spec.section, rest)
+    if spec is None:
+        return False
+    if not inner_key:
+        return True
+    return spec.section is not None and _has_key(spec.section, inner_key)
 
 
 SceneInput: TypeAlias = Scene | Mapping[str, Any] | str | Path
@@ -216,28 +218,27 @@ def scene_of(scene: SceneInput) -> Scene:
         return schema.build(Scene, scene, "scene")
     if isinstance(scene, (str, Path)):
         return load(scene)
-    allowed = "must be a Scene, the name or path of one, or its document as a dict"
-    raise refusal("scene", "scene", scene, allowed)
+    requirement = "must be a Scene, the name or path of one, or its document as a dict"
+    raise refusal("scene", "scene", scene, requirement)
 
 
 def with_initial(scene: Scene, initial: Any) -> Scene:
     """Return the scene with another initial state.
 
-    It is (gamma, gamma_dot), a mapping or `Initial`. InputError is raised where it is
-    none of these, or its numbers are refused.
+    It is (gamma, gamma_dot), a mapping or `Initial`. Raises InputError where it is none
+    of these, or its numbers are refused.
     """
     if initial is None:
         return scene
     if isinstance(initial, Mapping):
-        initial = {
-            key: x for key, x in initial.items() if x is not None
-        }  # as in `Initial`
+        # None stands for a key that is left out, as in `Initial`.
+        initial = {key: value for key, value in initial.items() if value is not None}
     elif not isinstance(initial, loads.Initial):
         try:
             gamma, gamma_dot = initial
         except (TypeError, ValueError):
-            allowed = "must be (gamma, gamma_dot), a mapping or Initial"
-            raise refusal("initial", "initial", initial, allowed) from None
+            requirement = "must be (gamma, gamma_dot), a mapping or Initial"
+            raise refusal("initial", "initial", initial, requirement) from None
         initial = {"gamma": gamma, "gamma_dot": gamma_dot}
     return replace(scene, initial=initial)
 
@@ -266,16 +267,19 @@ def text_of(name_or_path: str | Path) -> tuple[str, str]:
     The scene is found as by `load`.
     """
     path = Path(name_or_path)
-    if is_name := path.suffix not in (".yaml", ".yml"):
+    is_name = path.suffix not in (".yaml", ".yml")
+    if is_name:
         path = share_directory() / "config" / "scenes" / f"{name_or_path}.yaml"
     try:
         return yaml_document.read_file(path), str(path)
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        allowed = f"must be a readable .yaml file or one of {', '.join(names())}"
-        # without the path, which is said
-        reason = getattr(error, "strerror", None) or error
-        allowed += suggestion(str(name_or_path), names()) if is_name else f" ({reason})"
-        raise refusal("scene", "scene", str(name_or_path), allowed) from None
+        requirement = f"must be a readable .yaml file or one of {', '.join(names())}"
+        if is_name:
+            requirement += suggestion(str(name_or_path), names())
+        else:
+            # `strerror` is the reason without the path, which the message has already.
+            requirement += f" ({getattr(error, 'strerror', None) or error})"
+        raise refusal("scene", "scene", str(name_or_path), requirement) from None
 
 
 def names() -> list[str]:
@@ -335,35 +339,37 @@ class Scenarios:
         return Scenarios, (self.document, self.rows)
 
     def _rows_of(self, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+        """Return the values of one key, a row a scenario, each of a shape."""
         rows = freeze(real_numbers(value))
-        if rows.shape != (self.count or max(1, len(np.atleast_1d(rows))), *shape):
-            words = ", ".join(map(str, (self.count or "N", *shape))) + (
-                "" if shape else ","
-            )
-            allowed = f"must have the shape ({words}), a row a scenario"
-            raise ValueError(f"{allowed}; it has {rows.shape}")
-        return rows
+        count = self.count or max(1, len(np.atleast_1d(rows)))
+        if rows.shape == (count, *shape):
+            return rows
+        sizes = ", ".join(map(str, (self.count or "N", *shape)))
+        if not shape:
+            sizes += ","
+        requirement = f"must have the shape ({sizes}), a row a scenario"
+        raise ValueError(f"{requirement}; it has {rows.shape}")
 
     def scene(self, row: int) -> Scene:
         """Build the scene of a row; InputError names the numbers that make none."""
         numbers = {key: rows[row].tolist() for key, rows in self.rows.items()}
-        faults = [
-            Problem(key, numbers[key], spec.refuse())
-            for key, spec in self._specs.items()
-            if schema.has_effect(numbers[key])
-            and not np.all(spec.allows(self.rows[key][row]))
-        ]
+        problems = []
+        for key, spec in self._specs.items():
+            in_bounds = np.all(spec.allows(self.rows[key][row]))
+            if schema.has_effect(numbers[key]) and not in_bounds:
+                problems.append(Problem(key, numbers[key], spec.refuse()))
         try:
-            if faults:  # though the section that they are in may be left out
-                raise InputError("", faults)
+            if problems:  # though the section that they are in may be left out
+                raise InputError("", problems)
             values = {place: numbers[key] for place, key in self._places.items()}
             document = plain(schema.rebuild(self.document, values))
             return schema.build(Scene, schema.drop_idle(Scene, document))
         except InputError as error:
-            faults = [
-                replace(one, key=f"scenario {row}: {one.key}") for one in error.problems
+            problems = [
+                replace(problem, key=f"scenario {row}: {problem.key}")
+                for problem in error.problems
             ]
-            raise InputError(self.document.name, faults) from None
+            raise InputError(self.document.name, problems) from None
 
     def columns(self) -> Any:
         """Return the scene, unchecked; numbers that vary are columns, shape (N,)."""
@@ -385,25 +391,28 @@ class Scenarios:
         return faults
 
     def _doubtful(self) -> NDArray[np.bool_]:
-        """Rows whose scene may be refused.
+        """Return the rows whose scene may be refused.
 
         A zero may refuse a number, or leave its section out.
         """
         doubtful: Any = np.zeros(self.count or 0, dtype=bool)
         for key, spec in self._specs.items():
-            allowed = spec.allows(self.rows[key])
-            doubtful = doubtful | ~allowed.reshape(len(allowed), -1).all(axis=1)
+            in_bounds = spec.allows(self.rows[key])
+            doubtful = doubtful | ~in_bounds.reshape(len(in_bounds), -1).all(axis=1)
         with np.errstate(all="ignore"):
-            for _, part in schema.walk(self.columns()):
-                for broken, *_ in part.rules() if isinstance(part, Section) else ():
+            for _, section in schema.walk(self.columns()):
+                if not isinstance(section, Section):
+                    continue
+                for broken, *_ in section.rules():
                     doubtful = doubtful | broken
         return np.asarray(doubtful)
 
     def check(self) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
-        if problems := [
-            one for error in self.faults().values() for one in error.problems
-        ]:
+        problems: list[Problem] = []
+        for error in self.faults().values():
+            problems += error.problems
+        if problems:
             raise InputError(self.document.name, problems[:10])
 
 

@@ -81,55 +81,75 @@ class Spec:
         A nan does not.
         """
         within = (x > self.above) & (x >= self.least) & (x <= self.most)
-        return (
-            within & np.any(x * x, axis=-1, keepdims=True) if self.nonzero else within
-        )
+        if self.nonzero:
+            within = within & np.any(x * x, axis=-1, keepdims=True)
+        return within
 
     def refuse(self) -> str:
         """Describe the values that are allowed, and what may be wrong with others."""
-        return self.describe() + ": in rad?" * (self.most == FULL_TURN)
+        if self.most == FULL_TURN:
+            return f"{self.describe()}: in rad?"
+        return self.describe()
 
     def describe(self) -> str:
         """Describe the values that are allowed."""
         unit = f" [{self.unit}]" if self.unit else ""
-        size = " x ".join(map(str, self.shape))
-        what = f"{size} finite numbers" if size else "a finite number"
-        ends = (">", self.above), (">=", self.least), ("<=", self.most)
-        bounds = " and".join(
-            f" {sign} {end:g}" for sign, end in ends if math.isfinite(end)
-        )
-        row = ", ".join(map(str, ("n", *self.shape))) + "," * (not self.shape)
-        counts = " or ".join(map(str, self.lengths)) + " " if self.lengths else ""
-        keys = ", ".join(self.section.SPECS) if self.section else ""
-        return {
-            "number": f"must be {what}{bounds}{unit}" + ", not all zero" * self.nonzero,
-            "samples": f"must be finite numbers, shape ({row}){unit}",
-            "integer": f"must be a whole number from {self.least} to {self.most}{unit}",
-            "flag": "must be true or false",
-            "text": "must be text without control characters",
-            "texts": "must be a list of text",
-            "choice": "must be one of " + ", ".join(self.choices),
-            "section": f"must be a mapping with the keys {keys}",
-            "sections": f"must be a list of {counts}mappings",
-            "notes": "must be a mapping from keys to text",
-            "anything": "",
-        }[self.kind]
+        match self.kind:
+            case "number":
+                nonzero = ", not all zero" if self.nonzero else ""
+                return self._describe_numbers() + unit + nonzero
+            case "samples":
+                shape = ", ".join(map(str, ("n", *self.shape)))
+                if not self.shape:
+                    shape = "n,"
+                return f"must be finite numbers, shape ({shape}){unit}"
+            case "integer":
+                return f"must be a whole number from {self.least} to {self.most}{unit}"
+            case "flag":
+                return "must be true or false"
+            case "text":
+                return "must be text without control characters"
+            case "texts":
+                return "must be a list of text"
+            case "choice":
+                return "must be one of " + ", ".join(self.choices)
+            case "section":
+                keys = ", ".join(self.section.SPECS) if self.section else ""
+                return f"must be a mapping with the keys {keys}"
+            case "sections" if self.lengths:
+                counts = " or ".join(map(str, self.lengths))
+                return f"must be a list of {counts} mappings"
+            case "sections":
+                return "must be a list of mappings"
+            case "notes":
+                return "must be a mapping from keys to text"
+        return ""
+
+    def _describe_numbers(self) -> str:
+        """Describe numbers by how many there are and their bounds."""
+        text = "must be a finite number"
+        if self.shape:
+            text = f"must be {' x '.join(map(str, self.shape))} finite numbers"
+        ends = {">": self.above, ">=": self.least, "<=": self.most}
+        bounds = [
+            f" {sign} {end:g}" for sign, end in ends.items() if math.isfinite(end)
+        ]
+        return text + " and".join(bounds)
 
 
 def entry(doc: str, unit: str = "", default: Any = REQUIRED, **rules: Any) -> Any:
     """Declare a field of a section, whose type says what it may hold.
 
-    None in it is its default.
-
-    It may be float, a tuple of as many, or of such; int, bool, str, a section, a tuple
-    of any number of them, or of three, for which one may stand; tuple[tuple[str, str],
-    ...] is a mapping to text, Array has a row of some `shape` for each sample. `rules`
-    has more of what `Spec` says.
+    The type may be float, a tuple of floats, or a tuple of such tuples; int, bool, str,
+    a section, a tuple of any number of sections, or of three, for which one may stand.
+    tuple[tuple[str, str], ...] is a mapping to text; an Array has a row of some `shape`
+    for each sample. With `| None` the default is None. `rules` are further fields of
+    `Spec`.
     """
-    given = MISSING if default is REQUIRED else default
-    return field(
-        default=given, metadata={"spec": Spec("", doc, unit, **rules)}, kw_only=True
-    )
+    spec = Spec("", doc, unit, **rules)
+    if default is REQUIRED:
+        return field(metadata={"spec": spec}, kw_only=True)
+    return field(default=default, metadata={"spec": spec}, kw_only=True)
 
 
 angles = partial(entry, unit="rad", least=-FULL_TURN, most=FULL_TURN)
@@ -143,9 +163,9 @@ A smaller one is a slip of units, and powers leave double precision.
 coefficient = partial(entry, least=0.0, default=0.0)
 
 
-def choice(doc: str, words: tuple[str, ...]) -> Any:
+def choice(doc: str, choices: tuple[str, ...]) -> Any:
     """Declare a field that is one of some words, by default the first."""
-    return entry(doc, choices=words, default=words[0])
+    return entry(doc, choices=choices, default=choices[0])
 
 
 def anything(doc: str, **default: Any) -> Any:
@@ -189,33 +209,43 @@ class Section:
     def __init_subclass__(cls) -> None:
         for name, hint in cls.__annotations__.items():
             declared = vars(cls).get(name)
-            if isinstance(declared, Field) and str(hint).endswith("| None"):
-                declared.default = (
-                    None if declared.default is MISSING else declared.default
-                )
+            if not isinstance(declared, Field) or declared.default is not MISSING:
+                continue
+            if str(hint).endswith("| None"):
+                declared.default = None
         dataclass(frozen=True, repr=not issubclass(cls, Explained))(cls)
-        hints, specs = typing.get_type_hints(cls), {}
-        for one in fields(cls):
-            spec: Spec = one.metadata["spec"]
+        hints = typing.get_type_hints(cls)
+        specs = {}
+        for declared in fields(cls):
+            spec: Spec = declared.metadata["spec"]
             if not spec.kind:
-                default = REQUIRED if one.default is MISSING else one.default
-                spec = replace(spec, **_read_type(hints[one.name]), default=default)
-            specs[one.name] = replace(spec, kind="choice") if spec.choices else spec
+                has_default = declared.default is not MISSING
+                default = declared.default if has_default else REQUIRED
+                spec = replace(
+                    spec, **_read_type(hints[declared.name]), default=default
+                )
+            if spec.choices:
+                spec = replace(spec, kind="choice")
+            specs[declared.name] = spec
         cls.SPECS = specs
 
     def __post_init__(self) -> None:
-        given = ((name, spec, getattr(self, name)) for name, spec in self.SPECS.items())
-        kept = (
-            one for one in given if one[2] is not None or one[1].default is not None
-        )
+        values = []
+        for name, spec in self.SPECS.items():
+            value = getattr(self, name)
+            if value is not None or spec.default is not None:
+                values.append((name, spec, value))
         try:
-            vars(self).update(_freeze_all(kept))
+            vars(self).update(_freeze_all(values))
             before = dict(vars(self))
-            problems = [*self.settle()] or [*self._find_idle(), *self._find_broken()]
-            changed = {
-                name: x for name, x in before.items() if vars(self)[name] is not x
-            }
-            self._remember({}, changed)
+            problems = [*self.settle()]
+            if not problems:
+                problems = [*self._find_idle(), *self._find_broken()]
+            converted = {}
+            for name, value in before.items():
+                if vars(self)[name] is not value:
+                    converted[name] = value
+            self._remember({}, converted)
         except InputError as error:
             problems = [*error.problems]
         if problems:
@@ -270,7 +300,9 @@ class Section:
     def _find_broken(self) -> Iterator[Problem]:
         """Yield the rules that are broken."""
         with np.errstate(all="ignore"):
-            yield from (Problem(*found) for broken, *found in self.rules() if broken)
+            for broken, key, value, requirement in self.rules():
+                if broken:
+                    yield Problem(key, value, requirement)
 
     def rules(self) -> Rules:
         """Yield the rules that no single field shows.
@@ -293,15 +325,17 @@ def _read_type(hint: Any) -> dict[str, Any]:
     """Return what the type of a field says of its `Spec`."""
     if typing.get_origin(hint) is UnionType:
         hint = typing.get_args(hint)[0]
-    if kind := _ENTRY_KINDS.get(hint):
-        return {"kind": kind}
-    if not (parts := typing.get_args(hint)):
+    if hint in _ENTRY_KINDS:
+        return {"kind": _ENTRY_KINDS[hint]}
+    components = typing.get_args(hint)
+    if not components:
         return {"kind": "section", "section": hint}
-    inner = _read_type(parts[0])
+    inner = _read_type(components[0])
     if inner["kind"] == "section":
-        lengths = () if parts[1] is Ellipsis else (1, len(parts))
+        any_number = components[1] is Ellipsis
+        lengths = () if any_number else (1, len(components))
         return inner | {"kind": "sections", "lengths": lengths}
-    return inner | {"shape": (len(parts), *inner.get("shape", ()))}
+    return inner | {"shape": (len(components), *inner.get("shape", ()))}
 
 
 # From what is given to what is kept.
@@ -312,36 +346,34 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
 
     Messages are headed by `origin`; InputError lists every fault.
     """
-    known = cls.SPECS
+    specs = cls.SPECS
     if not isinstance(values, Mapping):
-        allowed = Spec("section", "", section=cls).describe()
-        raise refusal(origin, "", values, allowed)
+        requirement = Spec("section", "", section=cls).describe()
+        raise refusal(origin, "", values, requirement)
     problems = []
-    for name in [name for name in values if name not in known]:
-        allowed = (
-            f"unknown key; allowed are {', '.join(known)}{suggestion(str(name), known)}"
-        )
-        problems.append(Problem(str(name), values[name], allowed))
-    for name, spec in known.items():
+    fields_given = {}
+    for name, value in values.items():
+        if name not in specs:
+            keys = f"unknown key; allowed are {', '.join(specs)}"
+            requirement = keys + suggestion(str(name), specs)
+            problems.append(Problem(str(name), value, requirement))
+        elif specs[name].kind == "text" and isinstance(value, (int, float)):
+            fields_given[name] = str(value)  # as in a YAML file
+        else:
+            fields_given[name] = value
+    for name, spec in specs.items():
         if spec.default is REQUIRED and name not in values:
             problems.append(Problem(name, None, "is missing; " + spec.describe()))
-    given = {name: value for name, value in values.items() if name in known}
-    for name, value in given.items():
-        # as in a YAML file
-        if known[name].kind == "text" and isinstance(value, (int, float)):
-            given[name] = str(value)
     try:
         frozen = _freeze_all(
-            (name, known[name], value) for name, value in given.items()
+            (name, specs[name], value) for name, value in fields_given.items()
         )
         if not problems:
             section = cls(**frozen)
-            numbers = {
-                name: x for name, x in given.items() if known[name].kind == "number"
-            }
-            texts_of(section).update(
-                (name, x) for name, x in numbers.items() if _has_text(x)
-            )
+            texts = texts_of(section)
+            for name, value in fields_given.items():
+                if specs[name].kind == "number" and _has_text(value):
+                    texts[name] = value
             return section
     except InputError as error:
         problems += error.problems
@@ -354,17 +386,14 @@ def build(cls: type[S], values: Any, origin: str = "") -> S:
 def texts_of(section: Section) -> dict[str, Any]:
     """Return the numbers of a section that were given as text, by field.
 
-    Lists where they were.
+    A field of several numbers has a list.
     """
     texts: dict[str, Any] = getattr(section, "_texts", {})
     return texts
 
 
 def converted_of(section: Section) -> dict[str, Any]:
-    """Return the fields that were converted when the section was read.
-
-    They are returned as they were given.
-    """
+    """Return the fields that `settle` converted, as they were given."""
     converted: dict[str, Any] = getattr(section, "_converted", {})
     return converted
 
@@ -389,113 +418,132 @@ def keep_texts(old: Any, new: Any) -> None:
             keep_texts(before, after)
     if not isinstance(old, Section) or type(old) is not type(new):
         return
+    old_values = vars(old)
+    new_values = vars(new)
     for name, text in texts_of(old).items():
-        if vars(old)[name] == vars(new)[name]:
+        if old_values[name] == new_values[name]:
             texts_of(new).setdefault(name, text)
-    if all(
-        vars(old)[name] == vars(new)[name] for name in old.CONVERTED
-    ) and not converted_of(new):
+    unchanged = all(old_values[name] == new_values[name] for name in old.CONVERTED)
+    if unchanged and not converted_of(new):
         converted_of(new).update(converted_of(old))
-    for name, part in vars(old).items():
-        keep_texts(part, vars(new)[name])
+    for name, subtree in old_values.items():
+        keep_texts(subtree, new_values[name])
 
 
-def _freeze_all(given: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:
-    """Accept values by their keys.
+def _freeze_all(values: Iterable[tuple[str, Spec, Any]]) -> dict[str, Any]:
+    """Return values in their frozen form, by key.
 
-    InputError lists what is refused, and what in it is.
+    InputError lists what is refused, also inside of the values.
     """
-    found: dict[str, Any] = {}
+    frozen: dict[str, Any] = {}
     problems = []
-    for key, spec, value in given:
+    for key, spec, value in values:
         try:
-            found[key] = accept(spec, value)
+            frozen[key] = accept(spec, value)
         except LostMeaning as error:
             problems.append(Problem(key, value, f"{spec.refuse()} ({error})"))
         except (ValueError, TypeError, OverflowError, MemoryError):
             problems.append(Problem(key, value, spec.refuse()))
         except InputError as error:
-            for one in error.problems:
-                dot = "." if one.key and one.key[0] != "[" else ""
-                problems.append(replace(one, key=f"{key}{dot}{one.key}"))
+            for problem in error.problems:
+                needs_dot = problem.key and problem.key[0] != "["
+                inner_key = f".{problem.key}" if needs_dot else problem.key
+                problems.append(replace(problem, key=f"{key}{inner_key}"))
     if problems:
         raise InputError("", problems)
-    return found
+    return frozen
 
 
 def accept(spec: Spec, value: Any) -> Any:
     """Return a value in its frozen form.
 
-    ValueError, TypeError or OverflowError is raised where it is refused, InputError
+    Raises ValueError, TypeError or OverflowError where the value is refused, InputError
     where parts of it are, with their keys.
     """
-    kind, section = spec.kind, spec.section or Section
-    if kind == "samples":
+    if spec.kind == "samples":
         return _freeze_samples(spec, value)
     if isinstance(value, (np.ndarray, np.generic)):
         if reason := find_lost_meaning(value):
             raise LostMeaning(reason)
         value = value.tolist()
-    if kind == "number":
+    if spec.kind == "number":
         return _freeze_numbers(spec, value, spec.shape)
-    if kind == "text":
+    if spec.kind == "text":
         return _freeze_text(value)
-    if kind == "notes" and isinstance(value, (Mapping, tuple)):
+    if spec.kind == "notes" and isinstance(value, (Mapping, tuple)):
         note = Spec("text", "")
-        each = ((_freeze_text(name), note, x) for name, x in dict(value).items())
-        return tuple(_freeze_all(each).items())
-    if kind == "section" and isinstance(value, Mapping):
-        return build(section, value)
-    if isinstance(value, (list, tuple)):
-        if kind == "texts":
-            return tuple(map(_freeze_text, value))
-        if kind == "sections" and len(value) in (spec.lengths or [len(value)]):
-            entry = replace(spec, kind="section")
-            parts = _freeze_all((f"[{i}]", entry, x) for i, x in enumerate(value))
-            times = max(spec.lengths) if spec.lengths and len(value) == 1 else 1
-            return (*parts.values(),) * times
-    if kind == "flag" and isinstance(value, str):
-        value = {"true": True, "false": False}.get(value.lower())
-    elif (
-        kind == "integer"
-        and isinstance(value, str)
-        and re.fullmatch("[-+]?[0-9]+", value)
-    ):
-        value = int(value)
+        notes = ((_freeze_text(key), note, text) for key, text in dict(value).items())
+        return tuple(_freeze_all(notes).items())
+    if spec.kind == "section" and isinstance(value, Mapping):
+        return build(spec.section or Section, value)
+    if spec.kind == "texts" and isinstance(value, (list, tuple)):
+        return tuple(map(_freeze_text, value))
+    if spec.kind == "sections" and isinstance(value, (list, tuple)):
+        return _freeze_sections(spec, value)
+    value = _read_word(spec, value)
     fits = {
         "anything": True,
         "flag": isinstance(value, bool),
         "integer": type(value) is int and spec.least <= value <= spec.most,
         "choice": value in spec.choices,
-        "section": isinstance(value, section),
+        "section": isinstance(value, spec.section or Section),
     }
-    if not fits.get(kind):
+    if not fits.get(spec.kind):
         raise ValueError
     return value
 
 
+def _freeze_sections(
+    spec: Spec, values: list[Any] | tuple[Any, ...]
+) -> tuple[Section, ...]:
+    """Return a list of sections; one stands for all where the number is fixed."""
+    if spec.lengths and len(values) not in spec.lengths:
+        raise ValueError
+    section = replace(spec, kind="section")
+    sections = _freeze_all((f"[{i}]", section, x) for i, x in enumerate(values))
+    frozen = tuple(sections.values())
+    if spec.lengths and len(frozen) == 1:
+        return frozen * max(spec.lengths)
+    return frozen
+
+
+def _read_word(spec: Spec, value: Any) -> Any:
+    """Return a flag or a whole number that was given as text, else the value."""
+    if not isinstance(value, str):
+        return value
+    if spec.kind == "flag":
+        return {"true": True, "false": False}.get(value.lower())
+    if spec.kind == "integer" and re.fullmatch("[-+]?[0-9]+", value):
+        return int(value)
+    return value
+
+
 def _freeze_numbers(spec: Spec, value: Any, shape: tuple[int, ...]) -> Any:
-    if shape:
-        if isinstance(value, (str, dict, set)) or len(value) != shape[0]:
-            raise ValueError
-        if not isinstance(value, (list, tuple)) and (
-            reason := find_lost_meaning(value)
-        ):
-            raise LostMeaning(reason)
-        each = replace(spec, nonzero=False)
-        found = tuple(_freeze_numbers(each, entry, shape[1:]) for entry in value)
-        if spec.nonzero and not any(x * x for x in found):
-            raise ValueError
-        return found
+    """Return finite numbers that the field allows: a float, or tuples of a shape."""
+    if not shape:
+        return _freeze_number(spec, value)
+    if isinstance(value, (str, dict, set)) or len(value) != shape[0]:
+        raise ValueError
+    if not isinstance(value, (list, tuple)) and (reason := find_lost_meaning(value)):
+        raise LostMeaning(reason)
+    component = replace(spec, nonzero=False)
+    numbers = tuple(_freeze_numbers(component, entry, shape[1:]) for entry in value)
+    if spec.nonzero and not any(x * x for x in numbers):
+        raise ValueError
+    return numbers
+
+
+def _freeze_number(spec: Spec, value: Any) -> float:
     if type(value) is not float and (reason := find_lost_meaning(value)):
         raise LostMeaning(reason)
-    text = isinstance(value, str) and not NUMBER.fullmatch(value)
-    if text or isinstance(value, (bool, np.bool_)):
+    if isinstance(value, (bool, np.bool_)):
         raise ValueError
-    result = float(value)
-    if not (math.isfinite(result) and spec.allows(result)):
+    if isinstance(value, str) and not NUMBER.fullmatch(value):
         raise ValueError
-    return result
+    number = float(value)
+    if not (math.isfinite(number) and spec.allows(number)):
+        raise ValueError
+    return number
 
 
 def _freeze_samples(spec: Spec, value: Any) -> Array:
@@ -516,9 +564,9 @@ def _freeze_text(value: Any) -> str:
 
 def has_effect(value: Any) -> bool:
     """Return whether a value, or any in a list, is given and not zero."""
-    return (
-        any(map(has_effect, value)) if isinstance(value, (list, tuple)) else bool(value)
-    )
+    if isinstance(value, (list, tuple)):
+        return any(map(has_effect, value))
+    return bool(value)
 
 
 def _acts(values: Mapping[str, Any], names: tuple[str, ...]) -> bool:
@@ -529,24 +577,23 @@ def _acts(values: Mapping[str, Any], names: tuple[str, ...]) -> bool:
 def drop_idle(cls: type[Section] | None, value: Any) -> Any:
     """Return a document of a section without what has no effect in it.
 
-    None if nothing has.
-
-    A document that says such things is refused, as a friction whose coefficients are
-    zero.
+    None if nothing has. Such things are refused when a section is built, as a friction
+    whose coefficients are zero.
     """
     if isinstance(value, list):
-        return [
-            part
-            for part in (drop_idle(cls, entry) for entry in value)
-            if part is not None
-        ]
+        entries = [drop_idle(cls, entry) for entry in value]
+        return [entry for entry in entries if entry is not None]
     if cls is None:
         return value
-    known = cls.SPECS
-    given = {name: drop_idle(known[name].section, x) for name, x in value.items()}
-    of = {name: known[name].acts_on for name, x in given.items() if x is not None}
-    kept = {name: given[name] for name, others in of.items() if _acts(given, others)}
-    return kept if _acts(given, cls.EFFECTS) else None
+    specs = cls.SPECS
+    fields_left = {name: drop_idle(specs[name].section, x) for name, x in value.items()}
+    if not _acts(fields_left, cls.EFFECTS):
+        return None
+    document = {}
+    for name, entry in fields_left.items():
+        if entry is not None and _acts(fields_left, specs[name].acts_on):
+            document[name] = entry
+    return document
 
 
 # The tree: sections and tuples, whose leaves are numbers or columns, words and None.
@@ -555,35 +602,38 @@ def drop_idle(cls: type[Section] | None, value: Any) -> Any:
 def build_unchecked(cls: type[Section] | None, value: Any) -> Any:
     """Build a section from nested dicts and lists of any values, which are not checked.
 
-    They may be columns or symbols. A number that a section must have and these values
-    have not is zero.
+    They may be columns or symbols. A number that a section must have and that is not
+    given is zero.
     """
     if isinstance(value, list):
         return tuple(build_unchecked(cls, entry) for entry in value)
     if cls is None or not isinstance(value, dict):
         return value
-    found = object.__new__(cls)
+    section = object.__new__(cls)
     for name, spec in cls.SPECS.items():
         default = 0.0 if spec.default is REQUIRED else spec.default
-        vars(found)[name] = build_unchecked(spec.section, value.get(name, default))
-    return found
+        vars(section)[name] = build_unchecked(spec.section, value.get(name, default))
+    return section
 
 
 def walk(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
     """Yield the place of a tree and the tree, then those of all that is in it."""
     yield place, tree
-    for name, part in _parts_of(tree):
-        yield from walk(part, (*place, name))
+    for name, subtree in _children_of(tree):
+        yield from walk(subtree, (*place, name))
 
 
-def _parts_of(tree: Any) -> list[tuple[Any, Any]]:
-    """List the parts of a section or tuple by name or index.
+def _children_of(tree: Any) -> list[tuple[Any, Any]]:
+    """List what a section or tuple holds, by name or index.
 
-    There are none of anything else.
+    Anything else holds nothing.
     """
     if isinstance(tree, tuple):
-        return list(zip(getattr(tree, "_fields", range(len(tree))), tree, strict=True))
-    return list(vars(tree).items()) if isinstance(tree, Section) else []
+        names = getattr(tree, "_fields", range(len(tree)))
+        return list(zip(names, tree, strict=True))
+    if isinstance(tree, Section):
+        return list(vars(tree).items())
+    return []
 
 
 def leaves(tree: Any) -> dict[Place, Any]:
@@ -595,16 +645,15 @@ def rebuild(tree: Any, values: Mapping[Place, Any], place: Place = ()) -> Any:
     """Return a tree with other values at some places; its sections are not checked."""
     if place in values:
         return values[place]
-    parts = {
-        name: rebuild(part, values, (*place, name)) for name, part in _parts_of(tree)
+    children = {
+        name: rebuild(subtree, values, (*place, name))
+        for name, subtree in _children_of(tree)
     }
-    if isinstance(tree, tuple):
-        return (
-            type(tree)(*parts.values())
-            if hasattr(tree, "_fields")
-            else tuple(parts.values())
-        )
-    return build_unchecked(type(tree), parts) if parts else tree
+    if not isinstance(tree, tuple):
+        return build_unchecked(type(tree), children) if children else tree
+    if hasattr(tree, "_fields"):
+        return type(tree)(*children.values())
+    return tuple(children.values())
 
 
 def key_of(place: Place) -> str:

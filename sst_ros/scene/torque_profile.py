@@ -47,9 +47,9 @@ _MOST_CROSSINGS = 1e5
 
 def ascend(times: Array) -> bool:
     """Return whether times are finite and ascending, shape (n,)."""
-    return times.ndim == 1 and bool(
-        np.isfinite(times).all() and (np.diff(times) > 0.0).all()
-    )
+    if times.ndim != 1:
+        return False
+    return bool(np.isfinite(times).all() and (np.diff(times) > 0.0).all())
 
 
 class TorqueProfile(ReadOnly):
@@ -134,25 +134,23 @@ class SineTorque(TorqueProfile, Section):
 
     def kinks(self, limit: float | None = None, end: float = math.inf) -> Array:
         """See `TorqueProfile`."""
-        found: list[Array] = []
-        for amplitude, f, phase in zip(
-            self.amplitude, self.frequency, self.phase, strict=True
-        ):
+        crossings: list[Array] = []
+        legs = zip(self.amplitude, self.frequency, self.phase, strict=True)
+        for amplitude, f, phase in legs:
+            if limit is None or abs(amplitude) <= limit:
+                continue
             # The step control has to find those of a sine that is too fast.
-            if (
-                limit is None
-                or abs(amplitude) <= limit
-                or not 0.0 < f * end <= _MOST_CROSSINGS
-            ):
+            if not 0.0 < f * end <= _MOST_CROSSINGS:
                 continue
             angle = np.arcsin(limit / amplitude)
-            turns = np.arange(
-                np.floor(phase / np.pi) - 1, np.ceil((phase + f * end) / np.pi) + 2
-            )
-            found += [(np.pi * turns + shift - phase) / f for shift in (angle, -angle)]
-        if not found:
+            first_turn = np.floor(phase / np.pi) - 1
+            last_turn = np.ceil((phase + f * end) / np.pi) + 2
+            turns = np.arange(first_turn, last_turn)
+            for crossing in (angle, -angle):
+                crossings.append((np.pi * turns + crossing - phase) / f)
+        if not crossings:
             return np.empty(0)
-        times = np.unique(np.concatenate(found))
+        times = np.unique(np.concatenate(crossings))
         return np.asarray(times[(times > 0.0) & (times < end)])
 
 
@@ -178,18 +176,16 @@ class PolynomialTorque(TorqueProfile):
         self.x = freeze(
             read_numbers("torque", "breakpoints", breakpoints, seconds=True)
         )
-        good, pieces = self.x.size > 1 and ascend(self.x), max(self.x.size - 1, 1)
-        size, shape = self.c.shape, f"must have the shape (order + 1, {pieces}, 3)"
+        ascending = self.x.size > 1 and ascend(self.x)
+        count = max(self.x.size - 1, 1)
+        size = self.c.shape
+        shape = f"must have the shape (order + 1, {count}, 3)"
         finite = bool(np.all(np.isfinite(self.c)))
+        times = "must be two or more ascending times [s]"
         refuse_unless(
             "torque",
-            (
-                "breakpoints",
-                breakpoints,
-                good,
-                "must be two or more ascending times [s]",
-            ),
-            ("coefficients", size, size[1:] == (pieces, 3), shape),
+            ("breakpoints", breakpoints, ascending, times),
+            ("coefficients", size, size[1:] == (count, 3), shape),
             ("coefficients", "not finite", finite, "must be finite"),
         )
 
@@ -207,24 +203,27 @@ class PolynomialTorque(TorqueProfile):
 
         # SciPy 1.11 finds no roots where the arrays are read-only.
         breaks = self.x.copy()
-        legs = [PPoly(c.copy(), breaks) for c in np.moveaxis(self.c, 2, 0)]
-        bounds = () if limit is None else (limit, -limit)
-        roots = [
-            leg.solve(bound, extrapolate=False) for leg in legs for bound in bounds
-        ]
-        return np.unique(
-            [x for x in np.concatenate([self.x, *roots]) if np.isfinite(x)]
-        )
+        times = [self.x]
+        for coefficients in np.moveaxis(self.c, 2, 0):
+            leg = PPoly(coefficients.copy(), breaks)
+            if limit is not None:
+                times.append(leg.solve(limit, extrapolate=False))
+                times.append(leg.solve(-limit, extrapolate=False))
+        candidates = np.concatenate(times)
+        return np.unique(candidates[np.isfinite(candidates)])
 
     def acting(self, begin: float, end: float) -> Vector3 | TorqueFunction:
         """See `TorqueProfile`."""
-        piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
-        if not 0 <= piece < self.c.shape[1]:
+        index = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
+        if not 0 <= index < self.c.shape[1]:
             return ZERO
-        start, rows = float(self.x[piece]), self.c[:, piece].tolist()
+        start = float(self.x[index])
+        rows = self.c[:, index].tolist()
 
         def torque(t: float) -> Vector3:
-            x, total = t - start, ZERO
+            """Evaluate the polynomials of the three actuators by Horner's rule."""
+            x = t - start
+            total = ZERO
             for a, b, c in rows:
                 total = total[0] * x + a, total[1] * x + b, total[2] * x + c
             return total
@@ -258,20 +257,26 @@ class FunctionTorque(TorqueProfile):
 
 def _three(value: Any, name: str) -> Vector3:
     """Return three finite numbers as floats, or refuse them."""
-    if (vector := finite_vector(value)) is not None:
+    vector = finite_vector(value)
+    if vector is not None:
         return vector
-    allowed = (
+    requirement = (
         "must be three finite numbers [N m], a profile, or a function f(t) or f(t,"
         " state)"
     )
-    raise refusal("simulate", name, value, allowed)
+    raise refusal("simulate", name, value, requirement)
 
 
 def count_arguments(function: Callable[..., Any]) -> int:
-    """Positional arguments that a function must be given, 1 or 2, or refuse it."""
-    allowed = "must be a function f(t) or f(t, state), in this order"
+    """Return how many arguments a function must be given, 1 or 2, or refuse it."""
+    refused = refusal(
+        "simulate",
+        "torque",
+        function,
+        "must be a function f(t) or f(t, state), in this order",
+    )
     if isinstance(function, type):
-        raise refusal("simulate", "torque", function, allowed)
+        raise refused
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
@@ -279,11 +284,13 @@ def count_arguments(function: Callable[..., Any]) -> int:
     for count in (1, 2):
         with contextlib.suppress(TypeError):
             signature.bind(*range(count))
-            named = [*signature.parameters][:count]
-            if named[0] != "state" and (count == 1 or named[-1] not in ("t", "time")):
-                return count
-            break
-    raise refusal("simulate", "torque", function, allowed)
+            names = [*signature.parameters][:count]
+            state_first = names[0] == "state"
+            time_last = count == 2 and names[-1] in ("t", "time")
+            if state_first or time_last:
+                raise refused
+            return count
+    raise refused
 
 
 _TORQUE_COLUMNS = ("time", "tau_1", "tau_2", "tau_3")
@@ -310,6 +317,42 @@ def open_table(path: Path) -> TextIO:
     return path.open(newline="", encoding="utf-8-sig")
 
 
+def _read_rows(
+    origin: str, header: list[str], lines: list[tuple[int, list[str]]]
+) -> tuple[Array, Array]:
+    """Return times [s], shape (n,), and torques [N m], shape (n, 3), of a table's rows.
+
+    `lines` are the rows with the number of their line; blank ones at the end are left
+    out. InputError lists every bad row.
+    """
+    while lines and not any(map(str.strip, lines[-1][1])):
+        lines.pop()
+    problems = []
+    if not lines:
+        problems.append(Problem("rows", 0, "must be one or more"))
+    places = [header.index(column) for column in _TORQUE_COLUMNS]
+    times = [-math.inf]
+    torques = []
+    for line, row in lines:
+        numbers = None
+        if len(row) == len(header):
+            numbers = _read_numbers(row, places)
+        if numbers is None:
+            requirement = "must be four finite numbers"
+            problems.append(Problem("row", row, requirement, line))
+            continue
+        time, *torque = numbers
+        if time <= times[-1]:
+            requirement = f"must be > {times[-1]:g} s, the last"
+            problems.append(Problem("time", time, requirement, line))
+            continue
+        times.append(time)
+        torques.append(torque)
+    if problems:
+        raise InputError(origin, problems)
+    return np.array(times[1:]), np.array(torques)
+
+
 class TorqueTable(TorqueProfile):
     """Held torques [N m], shape (n, 3): each row acts from its time until the next.
 
@@ -321,13 +364,15 @@ class TorqueTable(TorqueProfile):
     def __init__(self, times: TimesLike, torques: ArrayLike) -> None:
         self.times = freeze(read_numbers("torque table", "times", times, seconds=True))
         self.torques = freeze(read_numbers("torque table", "torques", torques))
-        good = self.times.size > 0 and ascend(self.times)
-        found, shape = self.torques.shape, (self.times.size, 3)
+        ascending = self.times.size > 0 and ascend(self.times)
+        size = self.torques.shape
+        shape = (self.times.size, 3)
         finite = bool(np.all(np.isfinite(self.torques)))
+        order = "must be finite, ascending times [s], shape (n,)"
         refuse_unless(
             "torque table",
-            ("times", times, good, "must be finite, ascending times [s], shape (n,)"),
-            ("torques", found, found == shape, f"must have the shape {shape} [N m]"),
+            ("times", times, ascending, order),
+            ("torques", size, size == shape, f"must have the shape {shape} [N m]"),
             ("torques", "not finite", finite, "must be finite numbers [N m]"),
         )
 
@@ -346,32 +391,15 @@ class TorqueTable(TorqueProfile):
             open_table(Path(path)) as file,
         ):
             reader = csv.reader(file)
-            names = [name.strip() for name in next(reader, [])]
+            header = [name.strip() for name in next(reader, [])]
             lines = [(reader.line_num, row) for row in reader]
-        while lines and not any(map(str.strip, lines[-1][1])):
-            lines.pop()
-        if any(names.count(column) != 1 for column in _TORQUE_COLUMNS):
-            allowed = "must be " + ", ".join(_TORQUE_COLUMNS)
-            raise InputError(origin, [Problem("header", names or None, allowed, 1)])
-        problems = [] if lines else [Problem("rows", 0, "must be one or more")]
-        places = [names.index(column) for column in _TORQUE_COLUMNS]
-        last, rows = -math.inf, []
-        for line, row in lines:
-            numbers = _read_numbers(row, places) if len(row) == len(names) else None
-            if numbers is None:
-                problems.append(
-                    Problem("row", row, "must be four finite numbers", line)
-                )
-            elif numbers[0] <= last:
-                allowed = f"must be > {last:g} s, the last"
-                problems.append(Problem("time", numbers[0], allowed, line))
-            else:
-                last = numbers[0]
-                rows.append(numbers)
-        if problems:
-            raise InputError(origin, problems)
-        table = np.array(rows)
-        return cls(table[:, 0], table[:, 1:])
+        if any(header.count(column) != 1 for column in _TORQUE_COLUMNS):
+            requirement = "must be " + ", ".join(_TORQUE_COLUMNS)
+            raise InputError(
+                origin, [Problem("header", header or None, requirement, 1)]
+            )
+        times, torques = _read_rows(origin, header, lines)
+        return cls(times, torques)
 
     __call__ = _at
 
@@ -393,27 +421,29 @@ Torque = Vector3 | SineTorque | TorqueFunction
 """A function is called with the time [s], and the `State` if `feedback` is true."""
 
 
-def torque_at(torque: Any, *given: Any) -> Any:
+def torque_at(torque: Any, *time_and_state: Any) -> Any:
     """Return the torques [N m] of numbers, a sine or a function.
 
-    Given are the time [s] and what it asks for.
+    `time_and_state` are the time [s] and, where a function asks for it, the `State`.
     """
     if isinstance(torque, SineTorque):
-        return torque.at(*given)
-    return torque(*given) if callable(torque) else torque
+        return torque.at(*time_and_state)
+    return torque(*time_and_state) if callable(torque) else torque
 
 
 def profile_of(torque: Any) -> TorqueProfile:
     """Turn what a user gives into a profile.
 
-    InputError: it is nothing that `simulate` allows.
+    Raises InputError for anything that `simulate` does not allow.
     """
     if isinstance(torque, TorqueProfile):
         return torque
     if hasattr(torque, "c") and hasattr(torque, "x") and callable(torque):
         # scipy.interpolate.PPoly, CubicSpline
         return PolynomialTorque(torque.c, torque.x)
-    return FunctionTorque(torque) if callable(torque) else ConstantTorque(torque)
+    if callable(torque):
+        return FunctionTorque(torque)
+    return ConstantTorque(torque)
 
 
 _PROFILE_KINDS = {
@@ -427,18 +457,26 @@ def record_of(profile: TorqueProfile) -> dict[str, Any]:
 
     `profile_from` builds it again from these.
     """
-    kind = next(
-        kind
-        for kind, profiles in _PROFILE_KINDS.items()
-        if isinstance(profile, profiles)
-    )
-    given = {} if kind == "function" else vars(profile)
-    return {"kind": kind, **{name: np.asarray(x).tolist() for name, x in given.items()}}
+    record: dict[str, Any] = {"kind": _kind_of(profile)}
+    if record["kind"] != "function":
+        for name, numbers in vars(profile).items():
+            record[name] = np.asarray(numbers).tolist()
+    return record
+
+
+def _kind_of(profile: TorqueProfile) -> str:
+    for kind, profile_class in _PROFILE_KINDS.items():
+        if isinstance(profile, profile_class):
+            return kind
+    return "function"
 
 
 def profile_from(record: dict[str, Any]) -> TorqueProfile:
     """Build the profile that `record_of` has described."""
     kind, *numbers = record.values()
+    if kind == "function":
+        return LostTorque()
     if kind == "sine":
         return SineTorque(**dict(zip(SineTorque.SPECS, numbers, strict=True)))
-    return LostTorque() if kind == "function" else _PROFILE_KINDS[kind](*numbers)
+    profile: TorqueProfile = _PROFILE_KINDS[kind](*numbers)
+    return profile

@@ -29,7 +29,9 @@ NO_NUMBER = "must name a number, as star.mass does"
 _WHOLE = re.compile("[-+]?[0-9]{1,18}")  # longer ones are doubles
 _INFINITE = re.compile(r"[-+]?\.inf")
 
-LONGEST_DOCUMENT, MOST_NODES, DEEPEST_DOCUMENT = 1_000_000, 20_000, 20
+LONGEST_DOCUMENT = 1_000_000  # characters
+MOST_NODES = 20_000
+DEEPEST_DOCUMENT = 20
 LIMITS_TEXT = (
     f"no more than {LONGEST_DOCUMENT} characters, {MOST_NODES} values and"
     f" {DEEPEST_DOCUMENT} levels are allowed, and no aliases"
@@ -49,14 +51,19 @@ class _Loader(yaml.SafeLoader):
 
     def get_event(self) -> yaml.Event:
         event: yaml.Event = super().get_event()  # type: ignore[no-untyped-call]
-        self.depth += isinstance(event, yaml.CollectionStartEvent)
-        self.depth -= isinstance(event, yaml.CollectionEndEvent)
-        self.nodes += isinstance(event, yaml.NodeEvent)
-        alias = f"*{event.anchor}" if isinstance(event, yaml.AliasEvent) else ""
-        if alias or self.depth > DEEPEST_DOCUMENT or self.nodes > MOST_NODES:
-            raise InputError(
-                "", [Problem("", alias or "more", LIMITS_TEXT, _line(event))]
-            )
+        if isinstance(event, yaml.CollectionStartEvent):
+            self.depth += 1
+        if isinstance(event, yaml.CollectionEndEvent):
+            self.depth -= 1
+        if isinstance(event, yaml.NodeEvent):
+            self.nodes += 1
+        excess = ""
+        if self.depth > DEEPEST_DOCUMENT or self.nodes > MOST_NODES:
+            excess = "more"
+        if isinstance(event, yaml.AliasEvent):
+            excess = f"*{event.anchor}"
+        if excess:
+            raise InputError("", [Problem("", excess, LIMITS_TEXT, _line(event))])
         return event
 
 
@@ -68,12 +75,12 @@ def read(cls: type[S], source: str, origin: str) -> S:
         values = _parse(source, lines, problems)
         result = build(cls, values, origin)
     except InputError as refused:
-        for one in refused.problems:
-            problems.append(replace(one, line=one.line or _line_at(lines, one.key)))
+        for problem in refused.problems:
+            line = problem.line or _line_at(lines, problem.key)
+            problems.append(replace(problem, line=line))
     if problems:
-        raise InputError(
-            origin, sorted(problems, key=lambda problem: problem.line or 0)
-        )
+        problems.sort(key=lambda problem: problem.line or 0)
+        raise InputError(origin, problems)
     return result
 
 
@@ -158,31 +165,32 @@ def _values(
 ) -> Any:
     """Return a node as dicts, lists and text.
 
-    Note the lines of keys, and keys that come again.
-
+    Enter the line of each key in `lines`, and keys that are given twice in `problems`.
     Numbers stay text: YAML 1.1, which PyYAML reads, has others.
     """
     if node is not None:
         lines.setdefault(path, _line(node))
     if isinstance(node, yaml.ScalarNode):
-        return None if node.tag.endswith(":null") else node.value
+        if node.tag.endswith(":null"):
+            return None
+        return node.value
     if isinstance(node, yaml.SequenceNode):
         entries = enumerate(node.value)
         return [_values(entry, f"{path}[{i}]", lines, problems) for i, entry in entries]
     if not isinstance(node, yaml.MappingNode):
         return None
-    found: dict[str, Any] = {}
+    mapping: dict[str, Any] = {}
     for key_node, value_node in node.value:
         name = str(_values(key_node, "", {}, []))
         key = f"{path}.{name}" if path else name
-        line = lines.setdefault(key, _line(key_node))
+        first_line = lines.setdefault(key, _line(key_node))
         value = _values(value_node, key, lines, problems)
-        if name in found:
-            allowed = f"is given twice, first on line {line}"
-            problems.append(Problem(key, value, allowed, _line(key_node)))
+        if name in mapping:
+            requirement = f"is given twice, first on line {first_line}"
+            problems.append(Problem(key, value, requirement, _line(key_node)))
         else:
-            found[name] = value
-    return found
+            mapping[name] = value
+    return mapping
 
 
 def _line(node: yaml.Node | yaml.Event) -> int:
@@ -191,13 +199,18 @@ def _line(node: yaml.Node | yaml.Event) -> int:
 
 def _line_at(lines: Mapping[str, int], key: str) -> int | None:
     """Return the line of a key, or of the deepest part of it that has one."""
-    # One entry may stand for all.
-    key = re.sub(
-        r"\[\d+\]", lambda at: at[0] if key[: at.end()] in lines else "[0]", key
-    )
-    while key and key not in lines:
-        key = key[: max(key.rfind("."), key.rfind("["), 0)]
-    return lines.get(key)
+
+    def written_index(index: re.Match[str]) -> str:
+        """Return an index, or that of the first entry, which may stand for all."""
+        if key[: index.end()] in lines:
+            return index.group()
+        return "[0]"
+
+    nearest = re.sub(r"\[\d+\]", written_index, key)
+    while nearest and nearest not in lines:
+        end = max(nearest.rfind("."), nearest.rfind("["), 0)
+        nearest = nearest[:end]
+    return lines.get(nearest)
 
 
 def plain(value: Any) -> Any:
@@ -206,63 +219,67 @@ def plain(value: Any) -> Any:
     Raises LostMeaning where an array means more than its numbers, as a masked one does.
     """
     if isinstance(value, Section):
-        given = {
-            name: x for name, x in vars(value).items() if x is not None and x != ()
-        }
-        notes = (name for name, spec in value.SPECS.items() if spec.kind == "notes")
-        return plain(
-            given | {name: dict(given[name]) for name in notes if name in given}
-        )
+        document = {}
+        for name, field in vars(value).items():
+            if field is None or field == ():
+                continue
+            notes = value.SPECS[name].kind == "notes"
+            document[name] = plain(dict(field) if notes else field)
+        return document
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if hasattr(value, "tolist"):  # arrays and numbers of NumPy, series of pandas
         if reason := find_lost_meaning(value):
             raise LostMeaning(reason)
         return value.tolist()
-    return (
-        [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
-    )
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return value
 
 
 def replace_values(document: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested dicts and lists with other values by key.
 
-    A single one fills a list.
-
-    A section that the document does not have is made; None takes a value or a section
-    away. The argument of KeyError is a key that does not fit the document.
+    A single value fills a list. A section that the document does not have is made; None
+    removes a value or a section. The argument of KeyError is a key that does not fit
+    the document.
     """
     changed: dict[str, Any] = plain(document)
     for key, value in values.items():
         try:
-            _set(changed, *_split(str(key)), value=value)
+            _set(changed, _split(str(key)), value)
         except (AttributeError, LookupError, TypeError, ValueError):
             raise KeyError(key) from None
     return changed
 
 
-def _set(tree: Any, name: str | int, *rest: str | int, value: Any) -> None:
-    """Set a value below a tree; a name of an entry means that of each in a list."""
-    for part in tree if isinstance(tree, list) and isinstance(name, str) else [tree]:
-        if rest:
-            below = part.setdefault(name, {}) if isinstance(name, str) else part[name]
-            _set(below, *rest, value=value)
-        elif value is None and isinstance(name, str):
-            part.pop(name, None)
+def _set(tree: Any, place: Place, value: Any) -> None:
+    """Set a value at a place of a tree; a name in a list means that of each entry."""
+    name = place[0]
+    below = place[1:]
+    if isinstance(tree, list) and isinstance(name, str):
+        for entry in tree:
+            _set(entry, place, value)
+    elif below:
+        subtree = tree.setdefault(name, {}) if isinstance(name, str) else tree[name]
+        _set(subtree, below, value)
+    elif value is None and isinstance(name, str):
+        tree.pop(name, None)
+    else:
+        current = tree.get(name) if isinstance(name, str) else tree[name]
+        single = not isinstance(value, (str, list, tuple, Mapping))
+        if isinstance(current, list) and single:
+            tree[name] = [value] * len(current)
         else:
-            known = part.get(name) if isinstance(name, str) else part[name]
-            single = not isinstance(value, (str, list, tuple, Mapping))
-            part[name] = (
-                [value] * len(known) if isinstance(known, list) and single else value
-            )
+            tree[name] = value
 
 
 def _split(key: str) -> Place:
     """Return a key as a place; ValueError says that it is none."""
     if not re.fullmatch(r"\w+(\[\d+\])*(\.\w+(\[\d+\])*)*", key, re.A):
         raise ValueError(NO_NUMBER)
-    words = re.sub(r"\[(\d+)\]", r".\1", key).split(".")
-    return tuple(int(word) if word.isdecimal() else word for word in words)
+    steps = re.sub(r"\[(\d+)\]", r".\1", key).split(".")
+    return tuple(int(step) if step.isdecimal() else step for step in steps)
 
 
 def find_fields(
@@ -274,103 +291,125 @@ def find_fields(
     the tree in a larger one. ValueError says why there is no such field, or not in this
     scene.
     """
-    found = [(place, tree, Spec("section", ""))]
-    for word in _split(key):
-        found = [one for part in found for one in _below(*part, word, components)]
-    yield from found
+    fields = [(place, tree, Spec("section", ""))]
+    for step in _split(key):
+        deeper: list[tuple[Place, Any, Spec]] = []
+        for field in fields:
+            deeper += _below(*field, step, components)
+        fields = deeper
+    yield from fields
 
 
 def find_number(tree: Section, key: str) -> float | None:
     """Return a number by its key, the first of a list; None where there is none."""
-    found = values_at(tree, key, "number")
-    return float(np.ravel(found[0])[0]) if found else None
+    numbers = values_at(tree, key, "number")
+    if not numbers:
+        return None
+    return float(np.ravel(numbers[0])[0])
 
 
-def values_at(tree: Section, key: str, kind: str = "") -> list[Any]:
-    """List the values that a key names, of a kind where it is given.
+def values_at(tree: Section, key: str, field_kind: str = "") -> list[Any]:
+    """List the values that a key names, those of one kind of field if it is given.
 
-    None where there is none.
+    The list is empty where there are none.
     """
     try:
-        found = [*find_fields(tree, key, components=True)]
+        fields = [*find_fields(tree, key, components=True)]
     except ValueError:
         return []
-    return [
-        x for _, x, spec in found if x is not None and spec.kind in (kind or spec.kind,)
-    ]
+    values = []
+    for _, value, spec in fields:
+        if value is not None and field_kind in ("", spec.kind):
+            values.append(value)
+    return values
 
 
 def _below(
-    place: Place, value: Any, spec: Spec, word: str | int, components: bool
+    place: Place, value: Any, spec: Spec, step: str | int, components: bool
 ) -> Iterator[tuple[Place, Any, Spec]]:
-    """Yield what the next word of a key names in a field.
+    """Yield what the next step of a key names in a field.
 
-    A name in a list is that of each.
+    A name in a list is that of each entry.
     """
     if value is None:
         raise ValueError(f"the scene has no {place[-1]}")
     if spec.kind == "sections":
-        chosen = [word] if isinstance(word, int) else range(len(value))
-        if not chosen or chosen[-1] >= len(value):
+        indices = [step] if isinstance(step, int) else range(len(value))
+        if not indices or indices[-1] >= len(value):
             raise ValueError(f"the scene has {len(value)} {place[-1]}")
-        for i in chosen:
+        for i in indices:
             entry = (*place, i), value[i], replace(spec, kind="section")
-            yield from [entry] if i == word else _below(*entry, word, components)
-    elif spec.kind == "section" and isinstance(word, str):
-        known = value.SPECS
-        if word not in known:
-            raise ValueError("unknown key; allowed are " + ", ".join(known))
-        yield (*place, word), getattr(value, word), known[word]
-    elif components and spec.shape and isinstance(word, int) and word < len(value):
-        yield (*place, word), value[word], replace(spec, shape=spec.shape[1:])
+            if i == step:
+                yield entry
+            else:
+                yield from _below(*entry, step, components)
+    elif spec.kind == "section" and isinstance(step, str):
+        specs = value.SPECS
+        if step not in specs:
+            raise ValueError("unknown key; allowed are " + ", ".join(specs))
+        yield (*place, step), getattr(value, step), specs[step]
+    elif components and spec.shape and isinstance(step, int) and step < len(value):
+        yield (*place, step), value[step], replace(spec, shape=spec.shape[1:])
     else:
         raise ValueError(NO_NUMBER)
 
 
 def json_schema(cls: type[Section]) -> dict[str, Any]:
     """Describe the documents that `read(cls, ...)` accepts, by draft 2020-12."""
-    described = {"description": (cls.__doc__ or "").partition("\n")[0]}
-    any_of = (
-        {"anyOf": [{"required": [name]} for name in cls.ONE_OF]} if cls.ONE_OF else {}
-    )
-    properties = {name: _property_schema(spec) for name, spec in cls.SPECS.items()}
-    required = [name for name, spec in cls.SPECS.items() if spec.default is REQUIRED]
-    given = {
-        "additionalProperties": False,
-        "properties": properties,
-        "required": required,
+    schema: dict[str, Any] = {
+        "type": "object",
+        "description": (cls.__doc__ or "").partition("\n")[0],
     }
-    return {"type": "object", **described, **any_of, **given}
+    if cls.ONE_OF:
+        schema["anyOf"] = [{"required": [name]} for name in cls.ONE_OF]
+    schema["additionalProperties"] = False
+    schema["properties"] = {
+        name: _property_schema(spec) for name, spec in cls.SPECS.items()
+    }
+    schema["required"] = [
+        name for name, spec in cls.SPECS.items() if spec.default is REQUIRED
+    ]
+    return schema
+
+
+_TEXT_SCHEMA = {"type": "string", "pattern": "\\S"}
 
 
 def _property_schema(spec: Spec) -> dict[str, Any]:
-    described: dict[str, Any] = {
-        "description": spec.doc + (f" [{spec.unit}]" if spec.unit else "")
-    }
-    if isinstance(spec.default, (bool, int, float, str)):
-        described["default"] = spec.default
+    """Describe the values that a field accepts, its unit and its default."""
+    schema = _value_schema(spec)
     bounds = {
         "exclusiveMinimum": spec.above,
         "minimum": spec.least,
         "maximum": spec.most,
     }
-    text = {"type": "string", "pattern": "\\S"}
-    known: dict[str, dict[str, Any]] = {
+    for keyword, bound in bounds.items():
+        if math.isfinite(bound):
+            schema[keyword] = bound
+    for size in reversed(spec.shape):
+        schema = {"type": "array", "items": schema, "minItems": size, "maxItems": size}
+    if spec.kind == "sections":
+        schema = {"type": "array", "items": schema}
+    if spec.lengths:
+        schema["anyOf"] = [
+            {"minItems": length, "maxItems": length} for length in spec.lengths
+        ]
+    schema["description"] = spec.doc + (f" [{spec.unit}]" if spec.unit else "")
+    if isinstance(spec.default, (bool, int, float, str)):
+        schema["default"] = spec.default
+    return schema
+
+
+def _value_schema(spec: Spec) -> dict[str, Any]:
+    """Describe one value of a field, without its bounds."""
+    if spec.section:
+        return json_schema(spec.section)
+    schemas: dict[str, dict[str, Any]] = {
         "number": {"type": "number"},
         "integer": {"type": "integer"},
         "choice": {"enum": list(spec.choices)},
-        "notes": {"type": "object", "additionalProperties": text},
-        "texts": {"type": "array", "items": text},
+        "notes": {"type": "object", "additionalProperties": _TEXT_SCHEMA},
+        "texts": {"type": "array", "items": _TEXT_SCHEMA},
         "flag": {"type": "boolean"},
     }
-    own = json_schema(spec.section) if spec.section else known.get(spec.kind, text)
-    own = own | {name: bound for name, bound in bounds.items() if math.isfinite(bound)}
-    for size in reversed(spec.shape):
-        own = {"type": "array", "items": own, "minItems": size, "maxItems": size}
-    if spec.kind == "sections":
-        own = {"type": "array", "items": own}
-    if spec.lengths:
-        own["anyOf"] = [
-            {"minItems": length, "maxItems": length} for length in spec.lengths
-        ]
-    return own | described
+    return dict(schemas.get(spec.kind, _TEXT_SCHEMA))

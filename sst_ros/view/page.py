@@ -172,18 +172,18 @@ class Page:
     def _show_numbers(self) -> None:
         """Show name, phase, time, numbers of the state, and what is possible now."""
         state, status = self._state, self._source.status()
-        phase, at = (
+        phase, time = (
             status.phase or "no simulator",
             None if state is None else state.time,
         )
         colour = _LEVELS[2 if phase.startswith("fault") else status.level]
-        shown = "–" if at is None else f"{at:.2f} s"
-        self._head.content = str(_PANEL.head(self._scene, phase, colour, shown))
+        time_text = "–" if time is None else f"{time:.2f} s"
+        self._head.content = str(_PANEL.head(self._scene, phase, colour, time_text))
         if state is not None:
             self._joints.content = str(_PANEL.joints(_COLOURS, state))
-            found = _PANEL.status(_LEVELS[status.level], status.message, status.values)
-            self._status.content = str(found)
-        self._show_controls(phase, at)
+            panel = _PANEL.status(_LEVELS[status.level], status.message, status.values)
+            self._status.content = str(panel)
+        self._show_controls(phase, time)
 
 
 def _plot(
@@ -231,10 +231,10 @@ def _add_run_controls(server: PageServer, scene: Scene, run: RunControl) -> Show
         if event.target is reset and any(slider.value for slider in sliders):
             release(event)
         name = event.target.label.lower()
-        done, message = run.ask(name)
-        if not done and event.client is not None:
-            given: Any = {"auto_close_seconds": _REFUSAL_S, "color": "red"}
-            event.client.add_notification(f"{name} refused", message, **given)
+        accepted, message = run.ask(name)
+        if not accepted and event.client is not None:
+            look: Any = {"auto_close_seconds": _REFUSAL_S, "color": "red"}
+            event.client.add_notification(f"{name} refused", message, **look)
 
     def apply(event: Any) -> None:
         if event.client is not None:
@@ -282,12 +282,12 @@ def _add_replay_controls(server: PageServer, replay: Replay) -> Show:
         if event.client is not None:
             replay.seek(float(slider.value))
 
-    def show(_: str, at: float | None) -> None:
+    def show(_: str, time: float | None) -> None:
         before, playing = play.label == "Pause", replay.playing
         if playing != before:
             _name(play, "Pause" if playing else "Play")
-        if (playing or before) and at is not None:
-            _move(slider, round(min(at, replay.length), 6))
+        if (playing or before) and time is not None:
+            _move(slider, round(min(time, replay.length), 6))
 
     play.on_click(lambda _: replay.play(not replay.playing))
     slider.on_update(seek)
@@ -375,10 +375,10 @@ class SceneDrawing:
 
     def show(self, angles: Mapping[str, float], torque: Sequence[float]) -> None:
         """Move everything to joint angles [rad], and show torques [N m], shape (3,)."""
-        found = robot.rotations(self._joints, angles)
+        rotations = robot.rotations(self._joints, angles)
         for link, frame in self._frames.items():
-            frame.wxyz = wxyz(found[link])
-        end = self._scene.star.radius * found[robot.STAR_LINK][:, 2]
+            frame.wxyz = wxyz(rotations[link])
+        end = self._scene.star.radius * rotations[robot.STAR_LINK][:, 2]
         points = np.array([*(point for _, point in self._points), end])[-PATH_POINTS:]
         points = np.concatenate(
             [np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points]
@@ -428,14 +428,14 @@ class SceneDrawing:
         points = self._scene.base.radius * (v + 0.13 * outwards)
         end = self._scene.star.radius * np.array([0.0, 0.0, 1.36])
         places = [
-            (f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", at)
-            for k, at in enumerate(points, 1)
+            (f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", position)
+            for k, position in enumerate(points, 1)
         ]
-        for name, text, at in (*places, (f"{robot.STAR_LINK}/E", "E", end)):
+        for name, text, position in (*places, (f"{robot.STAR_LINK}/E", "E", end)):
             self._server.scene.add_label(
                 f"{ROOT}/{name}",
                 text,
-                position=at,
+                position=position,
                 anchor="center-center",
                 font_screen_scale=2.0,
             )

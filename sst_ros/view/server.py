@@ -87,11 +87,12 @@ class AccessCheck:
         cookies = http.cookies.SimpleCookie()
         with contextlib.suppress(http.cookies.CookieError):
             cookies.load("; ".join(request.headers.get_all("Cookie")))
-        given = parse_qs(urlsplit(request.path).query).get("token", [])
+        tokens = parse_qs(urlsplit(request.path).query).get("token", [])
         if (morsel := cookies.get(COOKIE.format(local[1]))) is not None:
-            given.append(morsel.value)
+            tokens.append(morsel.value)
         if not any(
-            secrets.compare_digest(one.encode(), self.token.encode()) for one in given
+            secrets.compare_digest(token.encode(), self.token.encode())
+            for token in tokens
         ):
             return (
                 "Open the address that `view` has printed: it contains the access"
@@ -130,8 +131,8 @@ class PageServer(ViserServer):
             raise SstError(
                 "this release of viser cannot be guarded: pip install 'viser>=1.1,<2'"
             )
-        shown = f"[{host}]" if ":" in host else host
-        self.url = f"http://{shown}:{self.get_port()}/?token={check.token}"
+        url_host = f"[{host}]" if ":" in host else host
+        self.url = f"http://{url_host}:{self.get_port()}/?token={check.token}"
 
     def stop(self) -> None:
         """Stop serving."""
@@ -170,8 +171,8 @@ def _free_port(host: str, port: int) -> int:
 
     Viser would look without end, or stop with a traceback.
     """
-    allowed = f"must be between {_PORTS[0]} and {_PORTS[1]}"
-    refuse_unless("view", ("port", port, _PORTS[0] <= port <= _PORTS[1], allowed))
+    requirement = f"must be between {_PORTS[0]} and {_PORTS[1]}"
+    refuse_unless("view", ("port", port, _PORTS[0] <= port <= _PORTS[1], requirement))
     known = "host", host, "must be an address of this machine"
     with refuse_errors("view", *known, OSError, ValueError):
         # An empty name would be every address: getaddrinfo knows none of it.

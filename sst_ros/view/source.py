@@ -114,16 +114,18 @@ class Replay:
     def states(self) -> Sequence[ViewState]:
         """Return the states up to now, from the beginning after a jump back."""
         with self._advance():
-            now = self._now
-        at = max(int(np.searchsorted(self._seconds, now + 1e-9, side="right")) - 1, 0)
-        first = self._shown + 1 if at >= self._shown else 0
-        self._shown = at
-        run, rows = self._run, slice(first, at + 1)
+            time = self._now
+        row = max(int(np.searchsorted(self._seconds, time + 1e-9, side="right")) - 1, 0)
+        first = self._shown + 1 if row >= self._shown else 0
+        self._shown = row
+        run, rows = self._run, slice(first, row + 1)
         columns = (run.gamma, run.mu, run.beta, run.gamma_dot, run.effort)
-        parts = zip(
-            self._seconds[rows].tolist(), *(one[rows] for one in columns), strict=True
+        series = zip(
+            self._seconds[rows].tolist(),
+            *(column[rows] for column in columns),
+            strict=True,
         )
-        return [ViewState(*part) for part in parts]
+        return [ViewState(*sample) for sample in series]
 
     def status(self) -> RunStatus:
         """Return the last diagnostics of the recording."""
@@ -136,13 +138,13 @@ class Replay:
     def _advance(self) -> Iterator[None]:
         """Hold the lock, with the time of the recording at what it is now."""
         with self._lock:
-            now = time.monotonic()
+            clock = time.monotonic()
             if self.playing:
                 self._now = min(
-                    self._now + (now - self._since) * self._factor, self.length
+                    self._now + (clock - self._since) * self._factor, self.length
                 )
                 self.playing = self._now < self.length
-            self._since = now
+            self._since = clock
             yield
 
 
@@ -150,5 +152,9 @@ def run_simulator(
     scene: str, speed: float = 1.0
 ) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run a simulator of a scene to look at; `speed` is simulated time per time."""
-    given = {"scene": scene, "publish_rate": _PUBLISH_RATE, "real_time_factor": speed}
-    return child_process.run_beside("simulator", given, stdout=subprocess.DEVNULL)
+    parameters = {
+        "scene": scene,
+        "publish_rate": _PUBLISH_RATE,
+        "real_time_factor": speed,
+    }
+    return child_process.run_beside("simulator", parameters, stdout=subprocess.DEVNULL)
