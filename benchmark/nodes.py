@@ -20,6 +20,7 @@ from unittest.mock import patch
 from sst_ros.runtime import child_process
 
 EXECUTABLES = Path(__file__).parents[1] / "executables"
+_DISCOVERY_S = 60.0  # of a service, on a machine with many busy processes
 _TICK = os.sysconf("SC_CLK_TCK")
 
 
@@ -152,6 +153,7 @@ class Client:
         # its own.
         self.qos = QoSProfile(depth=1000)
         self.values: dict[str, dict[str, str]] = {}
+        self._clients: dict[str, Any] = {}
         self._rclpy, self._context = rclpy, rclpy.Context()
         rclpy.init(context=self._context, domain_id=number)
         self.node = rclpy.create_node("benchmark", context=self._context)
@@ -213,15 +215,25 @@ class Client:
         self, kind: Any, name: str, timeout: float = 10.0, **fields: Any
     ) -> tuple[Any, float]:
         """Call a service; return the reply, or None, and how long it took [s]."""
-        client: Any = self.node.create_client(kind, name, qos_profile=self.qos)
-        try:
-            if not self.until(client.service_is_ready):
-                return None, math.inf
-            future, began = client.call_async(kind.Request(**fields)), time.monotonic()
-            done = self.until(future.done, timeout)
-            return (future.result() if done else None), time.monotonic() - began
-        finally:
-            self.node.destroy_client(client)
+        client = self.client(kind, name)
+        if client is None:
+            return None, math.inf
+        future, began = client.call_async(kind.Request(**fields)), time.monotonic()
+        done = self.until(future.done, timeout)
+        return (future.result() if done else None), time.monotonic() - began
+
+    def client(self, kind: Any, name: str) -> Any:
+        """Return a client whose service is ready, or None.
+
+        It stays: a server may answer before it has discovered who receives its replies,
+        and each new client would run that race again.
+        """
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(
+                kind, name, qos_profile=self.qos
+            )
+        client = self._clients[name]
+        return client if self.until(client.service_is_ready, _DISCOVERY_S) else None
 
 
 class Account:

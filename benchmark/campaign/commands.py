@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmark.campaign.ledger import Ledger
+from benchmark.campaign.processor import communicate
 from benchmark.nodes import own_domain
 
 COMMAND_BOUND_S = 30.0
@@ -32,7 +33,7 @@ def sst_ros(
     bound: float = COMMAND_BOUND_S,
     fails: bool | None = None,
     user: int | None = None,
-) -> subprocess.CompletedProcess[str] | None:
+) -> None:
     """Run the command line.
 
     Count a hang, a traceback, a long message or a wrong exit status.
@@ -40,32 +41,33 @@ def sst_ros(
     ledger.tried += 1
     name, began = " ".join(words)[:120], time.perf_counter()
     try:
-        done = subprocess.run(
+        process = subprocess.Popen(
             [sys.executable, "-m", "sst_ros", *words],
             cwd=folder,
             env={**os.environ, **(env or {})},
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
             errors="backslashreplace",
-            timeout=bound * ledger.patience,
             user=user,
             stdin=subprocess.DEVNULL,
         )
+        _, said = communicate(process, bound * ledger.patience)
     except subprocess.TimeoutExpired:
         ledger.found("hangs", f"{name}: no end within its bound")
-        return None
+        return
     except (ValueError, OSError) as error:  # words that no process can be given
         ledger.tried -= 1
         ledger.notes.append(f"not started: {name!r}: {error}")
-        return None
+        return
     ledger.time(time.perf_counter() - began, math.inf, name)
-    if "Traceback (most recent call last)" in done.stderr:
-        ledger.found("tracebacks", f"{name}: {done.stderr.strip().splitlines()[-1]}")
-    elif fails is not None and fails == (done.returncode == 0):
-        ledger.found("silent", f"{name}: exit status {done.returncode}")
-    elif done.returncode < 0:
-        ledger.found("tracebacks", f"{name}: ended by signal {-done.returncode}")
-    return done
+    status = process.returncode
+    if "Traceback (most recent call last)" in said:
+        ledger.found("tracebacks", f"{name}: {said.strip().splitlines()[-1]}")
+    elif fails is not None and fails == (status == 0):
+        ledger.found("silent", f"{name}: exit status {status}")
+    elif status < 0:
+        ledger.found("tracebacks", f"{name}: ended by signal {-status}")
 
 
 VERBS = "compile demo describe export plan plot report recover scene study view".split()  # noqa: SIM905

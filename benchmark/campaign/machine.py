@@ -23,6 +23,7 @@ import numpy as np
 import sst_ros
 from benchmark import long_bag
 from benchmark.campaign.ledger import Ledger
+from benchmark.campaign.processor import communicate
 from sst_ros import Trajectory, simulate
 from sst_ros.recording import recording
 
@@ -179,10 +180,8 @@ def interrupts(ledger: Ledger) -> None:
             label = f"{number}: {words[-3:]}, signal {sent}, closed {closed}"
             began = time.monotonic()
             try:
-                _, said = process.communicate(timeout=60.0 * ledger.patience)
+                _, said = communicate(process, 60.0 * ledger.patience)
             except subprocess.TimeoutExpired:
-                process.kill()
-                process.communicate()
                 ledger.found("hangs", label)
                 continue
             ledger.time(time.monotonic() - began, math.inf, label)

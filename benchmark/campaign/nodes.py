@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmark.campaign.ledger import Ledger
+from benchmark.campaign.processor import OwnTime, wait_for_end
 from benchmark.campaign.scenes import needle
 from benchmark.nodes import Client, Process, own_domain
 from sst_ros.errors import SstError
@@ -31,7 +32,11 @@ from sst_ros.state import IDLE_FRAME_ID
 SAMPLE_NS = 2_000_000
 FAULT_S, REPLY_S, CLOSE_S = 1.0, 0.5, 2.0
 """Within this time a step beyond its budget is a fault, a node answers a service, and
-it ends.
+it ends, its waits for a processor not counted.
+"""
+LOST_S, HUNG_S = 60.0, 120.0
+"""A reply that has not come by then is lost, and a node that has not ended is killed,
+however busy the machine is.
 """
 
 NODE = "/sst_simulator"
@@ -63,7 +68,7 @@ def is_alive(ledger: Ledger, process: Process, client: Client, after: str) -> bo
         said = process.end(0, 20.0)[1][-300:]
         ledger.found("tracebacks", f"the node ended after {after}: {said}")
         return False
-    reply, took = client.call(SetBool, f"{NODE}/pause", data=False)
+    reply, took = call(process, client, SetBool, f"{NODE}/pause", data=False)
     if reply is None:
         ledger.found("lost", f"no reply after {after}")
     else:
@@ -71,12 +76,28 @@ def is_alive(ledger: Ledger, process: Process, client: Client, after: str) -> bo
     return True
 
 
-def stop(ledger: Ledger, process: Process, number: int = signal.SIGINT) -> None:
-    began = time.monotonic()
-    status, text = process.end(number, 20.0)
-    if time.monotonic() - began > CLOSE_S * ledger.patience:
-        ledger.found("hangs", f"it took {time.monotonic() - began:.1f} s to close")
-    if status not in (0, 1):
+def call(
+    process: Process, client: Client, kind: Any, name: str, **fields: Any
+) -> tuple[Any, float]:
+    """Call a service of a node; return the reply, or None, and the own time [s]."""
+    client.client(kind, name)  # with the time of its discovery, which is not the node's
+    own_time = OwnTime(process.pid, os.getpid())
+    reply, _ = client.call(kind, name, LOST_S, **fields)
+    return reply, own_time.seconds()
+
+
+def stop(
+    ledger: Ledger,
+    process: Process,
+    number: int = signal.SIGINT,
+    statuses: tuple[int, ...] = (0, 1),
+) -> None:
+    """Send a signal; count an end that is late, in disorder or with a traceback."""
+    if process.poll() is None:
+        process.send_signal(number)
+    ledger.time(wait_for_end(process, HUNG_S), CLOSE_S, "the end")
+    status, text = process.end(signal.SIGKILL)
+    if status not in statuses:
         ledger.found("tracebacks", f"exit status {status}: {text[-300:]}")
     elif "Traceback" in text:
         ledger.found("tracebacks", text[-300:])
@@ -163,7 +184,8 @@ def parameters(ledger: Ledger) -> None:
     ]
     values += ["", "x", [1.0], ["a"], []]
     with running() as (process, client):
-        reply, _ = client.call(ListParameters, f"{NODE}/list_parameters")
+        names_of = f"{NODE}/list_parameters"
+        reply, _ = call(process, client, ListParameters, names_of)
         if reply is None:
             ledger.found("lost", "no list of parameters")
             return
@@ -173,8 +195,12 @@ def parameters(ledger: Ledger) -> None:
                 message = Parameter(name, value=value).to_parameter_msg()
             except (TypeError, AssertionError, OverflowError):
                 continue
-            done, took = client.call(
-                SetParameters, f"{NODE}/set_parameters", parameters=[message]
+            done, took = call(
+                process,
+                client,
+                SetParameters,
+                f"{NODE}/set_parameters",
+                parameters=[message],
             )
             ledger.time(took, math.inf, name)
             if done is None:
@@ -212,6 +238,10 @@ def node_kills(ledger: Ledger) -> None:
             stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
 
 
+BEGIN_S = 30.0
+"""Within this time a recording has begun, see `OwnTime`."""
+
+
 def recorder_kills(ledger: Ledger) -> None:
     """Kill the recorder at random moments: all but the last chunk comes back."""
     for number in ledger.cases(34):
@@ -220,8 +250,9 @@ def recorder_kills(ledger: Ledger) -> None:
             recorder = start("recorder", output=bag)
             simulator = start("simulator", scene="swing", duration=0.0)
             try:
-                deadline = time.monotonic() + 30 * ledger.patience
-                while time.monotonic() < deadline and _size(bag) < 50_000:
+                own_time = OwnTime(recorder.pid, simulator.pid)
+                bound_s = BEGIN_S * ledger.patience
+                while _size(bag) < 50_000 and own_time.seconds() < bound_s:
                     time.sleep(0.01)
                 if (size := _size(bag)) < 50_000:
                     states = f"simulator {simulator.poll()}, recorder {recorder.poll()}"
@@ -259,11 +290,11 @@ def stuck(ledger: Ledger) -> None:
             path = Path(folder) / "needle.yaml"
             path.write_text(needle())
             with running(scene=path, wait_for_command=True) as (process, client):
-                _time_fault(ledger, client)
+                _time_fault(ledger, process, client)
                 stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
 
 
-def _time_fault(ledger: Ledger, client: Client) -> None:
+def _time_fault(ledger: Ledger, process: Process, client: Client) -> None:
     """Start the run; measure the time to the fault and to the replies after it."""
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from std_msgs.msg import Float64MultiArray, String
@@ -275,13 +306,25 @@ def _time_fault(ledger: Ledger, client: Client) -> None:
         String, f"{NODE}/phase", lambda message: phases.append(message.data), latched
     )
     commands = client.node.create_publisher(Float64MultiArray, f"{NODE}/commands", 10)
-    client.until(lambda: phases and commands.get_subscription_count())
+    ready = lambda: phases and commands.get_subscription_count()  # noqa: E731
+    if not client.until(ready, LOST_S):
+        ledger.found("lost", "no phase, or no subscription of commands")
+        return
     commands.publish(Float64MultiArray(data=[0.01, 0.0, 0.0]))
-    began = time.monotonic()
-    client.until(lambda: phases[-1].startswith("fault"))
-    ledger.time(time.monotonic() - began, FAULT_S, "the fault")
-    ledger.time(client.call(SetBool, f"{NODE}/pause", data=True)[1], REPLY_S, "pause")
-    ledger.time(client.call(Trigger, f"{NODE}/reset")[1], REPLY_S, "reset")
+    own_time = OwnTime(process.pid, os.getpid())
+    if not client.until(lambda: phases[-1].startswith("fault"), LOST_S):
+        ledger.found("lost", f"no fault, the phase is {phases[-1:]}")
+        return
+    ledger.time(own_time.seconds(), FAULT_S, "the fault")
+    for kind, name, fields in (
+        (SetBool, "pause", {"data": True}),
+        (Trigger, "reset", {}),
+    ):
+        reply, took = call(process, client, kind, f"{NODE}/{name}", **fields)
+        if reply is None:
+            ledger.found("lost", f"no reply of {name}")
+        else:
+            ledger.time(took, REPLY_S, name)
 
 
 def starts(ledger: Ledger) -> None:
@@ -300,11 +343,8 @@ def starts(ledger: Ledger) -> None:
             # The wait is the experiment: the moment of the signal is random.
             time.sleep(rng.uniform(0.0, 2.0))
             number_sent = rng.choice((signal.SIGINT, signal.SIGTERM))
-            status, text = process.end(number_sent, 10.0 * ledger.patience)
-            if status == 255:
-                ledger.found("hangs", f"{kind} did not end within 10 s")
-            if "Traceback" in text:
-                ledger.found("tracebacks", f"{kind}: {text[-300:]}")
+            # Before the first line of the package a SIGTERM is the kernel's.
+            stop(ledger, process, number_sent, (0, 1, -signal.SIGTERM))
     left = _shared_memory() - before
     if len(left) > 4:
         ledger.found(

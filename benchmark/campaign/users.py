@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmark.campaign.ledger import Ledger
+from benchmark.campaign.processor import communicate
 from sst_ros import Simulation, TorqueTable, Trajectory, identify, load_scene, simulate
 from sst_ros.identification.identify import TorqueFit
 from sst_ros.scene.scene import load, text_of
@@ -48,22 +49,23 @@ def cold_threads(ledger: Ledger) -> None:
         name = COLD_SCENES[number % len(COLD_SCENES)]
         ledger.tried += 1
         began = time.monotonic()
+        process = subprocess.Popen(
+            [sys.executable, "-c", COLD, name],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         try:
-            done = subprocess.run(
-                [sys.executable, "-c", COLD, name],
-                capture_output=True,
-                text=True,
-                timeout=COLD_S * ledger.patience,
-            )
+            out, said = communicate(process, COLD_S * ledger.patience)
         except subprocess.TimeoutExpired:
             ledger.found("hangs", f"cold process of {name}")
             continue
         ledger.time(time.monotonic() - began, math.inf, name)
         alone = simulate(name, duration=0.05).quaternion[-1].tobytes().hex()
-        if done.returncode:
-            error = done.stderr.strip().splitlines()[-1:]
+        if process.returncode:
+            error = said.strip().splitlines()[-1:]
             ledger.found("tracebacks", f"cold process of {name}: {error}")
-        elif done.stdout.split() != [alone]:
+        elif out.split() != [alone]:
             ledger.found("silent", f"threads of a cold process of {name}: other bits")
 
 

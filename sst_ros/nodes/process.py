@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import faulthandler
@@ -415,6 +416,26 @@ def run(words: Sequence[str]) -> int:
     close. Words are a key of `settings.NODE_COMMANDS` and the arguments behind it. The
     exit status is 0, 1 for a failure, 2 for arguments that are refused.
     """
+    status = _run(words)
+    atexit.register(_leave_compilation, status)
+    return status
+
+
+def _leave_compilation(status: int) -> None:
+    """End the process now where a thread compiles what nobody waits for any more.
+
+    LLVM can neither be interrupted nor taken down below that thread; by now the node
+    has left and its files are closed.
+    """
+    llvm = sys.modules.get("sst_ros.programs.llvm")
+    if llvm is not None and llvm.is_compiling():
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(AttributeError, OSError, ValueError):  # closed
+                stream.flush()
+        os._exit(status)
+
+
+def _run(words: Sequence[str]) -> int:
     signals.handle()
     command, *given = words
     if {"-h", "--help"} & set(given):

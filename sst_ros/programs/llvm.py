@@ -652,6 +652,14 @@ os.register_at_fork(
 atexit.register(_ENGINE_LOCK.acquire)
 
 
+def is_compiling() -> bool:
+    """Return whether another thread of this process is inside LLVM."""
+    if _ENGINE_LOCK.acquire(blocking=False):
+        _ENGINE_LOCK.release()
+        return False
+    return True
+
+
 def _close(
     engine: Any, lock: Any = _ENGINE_LOCK, ends: Callable[[], bool] = sys.is_finalizing
 ) -> None:

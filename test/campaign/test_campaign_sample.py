@@ -4,9 +4,15 @@
 The whole is run by hand.
 """
 
+import signal
+import sys
+import time
+from subprocess import Popen, TimeoutExpired
+
 import pytest
 
 from benchmark.campaign.ledger import PARTS, Ledger, run_part
+from benchmark.campaign.processor import communicate, wait_for_end
 from sst_ros.errors import EXTRAS, SstError
 
 ROS = {part for part, (room, _) in PARTS.items() if room == "nodes"}
@@ -50,3 +56,22 @@ def test_a_finding_is_counted_and_named():
         raise SstError
     assert (ledger.tried, ledger.tracebacks, ledger.sound) == (2, 1, False)
     assert "a wrong error" in ledger.notes[0]
+
+
+def test_waits_for_a_processor_are_no_hang():
+    """A process that waits for its turn is not late, one that sleeps is."""
+    turns = """if True:
+        import os, time
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        while time.thread_time() < 0.3:
+            pass
+        """
+    crowd = [Popen([sys.executable, "-c", turns], text=True) for _ in range(8)]
+    began = time.monotonic()
+    assert wait_for_end(crowd[0], 600.0) < 0.5 * (time.monotonic() - began)
+    for process in crowd:
+        process.wait()
+    sleeper = Popen([sys.executable, "-c", "import time; time.sleep(3600)"])
+    with pytest.raises(TimeoutExpired):
+        communicate(sleeper, 1.0)
+    assert sleeper.returncode == -signal.SIGKILL

@@ -190,3 +190,26 @@ print(bool(signals.came))
 
 def test_a_signal_within_the_handler_of_another_does_not_block():
     assert python(AMID, timeout=30).stdout == "True\n"
+
+
+BESIDE_A_COMPILATION = """if True:
+    import signal, sys, threading, time
+    from sst_ros.nodes import process, signals
+    from sst_ros.programs import llvm
+
+    def compile_for_ever():
+        with llvm._ENGINE_LOCK:
+            begun.set()
+            time.sleep(3600.0)
+
+    begun = threading.Event()
+    threading.Thread(target=compile_for_ever, daemon=True).start()
+    begun.wait()
+    signals.came.add(signal.SIGTERM)
+    print("last words", end="")
+    sys.exit(process.run(["simulator"]))
+    """
+
+
+def test_a_node_that_is_told_to_end_does_not_wait_for_a_compilation():
+    assert python(BESIDE_A_COMPILATION).stdout == "last words"
