@@ -103,8 +103,9 @@ def plan(
     """Return the motion from a reference, which may be moving, through points.
 
     Points that lie before, and one at time 0 where the reference moves, are passed
-    already. The motion is checked. Efforts are interpolated linearly; they are no part
-    of the check, as commands are limited.
+    already. The motion is checked. Efforts are interpolated linearly, without any in
+    the points to zero at the first one; they are no part of the check, as commands are
+    limited.
 
     Args:
         model: the scene of the controller.
@@ -131,10 +132,12 @@ def plan(
         (begin.gamma_dot, begin.gamma_ddot),
     )
     check_motion(motion, model)
-    if not points.efforts:
+    if not points.efforts and not any(effort):
         return motion
     times = points.times
     efforts = [_fill_in(row, points.legs, ZERO) for row in points.efforts]
+    if not efforts:  # what is added until now ends without a step
+        efforts = [list(ZERO) for _ in times]
     if times[0] > 0.0:
         times = [0.0, *times]
         efforts = [list(effort), *efforts]

@@ -23,6 +23,7 @@ NEEDS = {
     "invariants": ("flint",),
     "messages": ("flint",),
     "saves": ("mcap", "rosbags"),
+    "sweep_parts": ("pyarrow",),
 }
 """Optional packages of a part."""
 QUICK = {"messages", *(PARTS.keys() - ROS - LONG)}

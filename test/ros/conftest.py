@@ -37,6 +37,9 @@ NODE = "/sst_simulator"
 STDERR = os.dup(2)  # pytest captures the other one
 COMMANDS, STAMPED = f"{NODE}/commands", f"{NODE}/commands_stamped"
 NAMES = ["gamma_1", "gamma_2", "gamma_3"]
+WAIT_S = 100.0
+"""Longest wait for what a node does in a second: on a machine with thirty busy
+processes its start alone has taken 40 s."""
 
 # A shell has its background jobs ignore SIGINT, and the nodes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -121,19 +124,19 @@ class Nodes:
         self.running.append(ForkedNode(words, dict(os.environ)))
         return self.running[-1]
 
-    def line(self, process, timeout=40):
+    def line(self, process, timeout=WAIT_S):
         assert select.select([process.stdout], [], [], timeout)[0], (
             f"no output in {timeout} s"
         )
         return process.stdout.readline()
 
-    def ended(self, process, timeout=40):
+    def ended(self, process, timeout=WAIT_S):
         """Status, stdout and stderr of a process that ends by itself."""
         out, err = process.communicate(timeout=timeout)
         assert "Traceback" not in err
         return process.returncode, out, err
 
-    def stop(self, process, number=signal.SIGINT, timeout=40):
+    def stop(self, process, number=signal.SIGINT, timeout=WAIT_S):
         process.send_signal(number)
         return self.ended(process, timeout)
 
@@ -227,7 +230,7 @@ class Observer:
     def command(self, *numbers, readers=1):
         self.publisher(Float64MultiArray, COMMANDS, readers).publish(torques(*numbers))
 
-    def until(self, condition, what, timeout=40.0):
+    def until(self, condition, what, timeout=WAIT_S):
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, f"no {what} within {timeout} s"
@@ -258,7 +261,7 @@ class Observer:
         )
         return self.phases[-1]
 
-    def result(self, future, what, timeout=40.0):
+    def result(self, future, what, timeout=WAIT_S):
         self.until(future.done, what, timeout)
         return future.result()
 
@@ -306,7 +309,7 @@ class Observer:
         """
         return [status[key] for status in self.diagnostics() if key in status]
 
-    def told(self, key, value, timeout=40.0):
+    def told(self, key, value, timeout=WAIT_S):
         """Wait until the last status with this key says so.
 
         Return all that it says then.

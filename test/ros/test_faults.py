@@ -128,6 +128,15 @@ def test_a_moment_is_taken_in_a_scene_without_one_when_asked(nodes, observer):
     assert read(Scene, scenes[-1].data, "scene").moment.topic  # for who reads the run
 
 
+def test_a_moment_beside_a_constant_one_is_refused(run_here, tmp_path):
+    path = tmp_path / "loaded.yaml"
+    path.write_text(dump(load_scene("example2")) + "moment: {value: [0, 0, 1]}\n")
+    status, out, err = run_here("simulator", scene=path, external_moment=True)
+    assert (status, out) == (1, "")
+    assert "external_moment = True: must be false" in err
+    assert "has a constant moment" in err
+
+
 def test_two_publishers_are_told_and_moments_not_taken(nodes, observer):
     process = nodes.run("simulator")
     observer.publisher(Float64MultiArray, COMMANDS)

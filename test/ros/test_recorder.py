@@ -261,7 +261,7 @@ def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path)
     ended = simulator.poll  # on a busy machine the run may have ended before
     observer.until(lambda: len(states) > heard + 200 or ended() is not None, "samples")
     recorder.send_signal(signal.SIGCONT)
-    assert simulator.wait(timeout=40) == 0
+    assert simulator.wait(timeout=60) == 0
     assert nodes.stop(recorder)[0] == 0
 
 

@@ -358,6 +358,29 @@ def test_efforts_go_on_from_those_of_the_trajectory_before(monkeypatch):
     assert first[-1] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_a_trajectory_without_efforts_ends_those_before(monkeypatch):
+    stream = Stream(monkeypatch, 0, stamped=True, mode="pd")
+    stream.send_points((0.1, (0.0,) * 3, (1.0, 0.0, 0.0)))
+    stream.samples(51)  # all of it is there
+    stream.send_points((0.1, (0.0,) * 3), (0.2, (0.0,) * 3))
+    stream.samples(100)
+    first = np.array([one.torque[0] for one in stream.commands])
+    # the second one begins with the sample after that at which it came
+    expected = np.interp(np.arange(151), (0, 50, 51, 101), (0.0, 1.0, 1.0, 0.0))
+    np.testing.assert_allclose(first, expected, atol=1e-9)
+
+
+def test_efforts_are_limited_with_the_command(monkeypatch):
+    """A limit below the effort of the last point."""
+    stream = Stream(monkeypatch, 0, stamped=True, mode="pd", torque_limit=0.5)
+    stream.send_points((0.1, (0.0,) * 3, (1.0, 0.0, 0.0)))
+    stream.samples(51)
+    torques = [one.torque[0] for one in stream.commands]
+    expected = np.minimum(np.arange(51) / 50, 0.5)
+    np.testing.assert_allclose(torques, expected, atol=1e-9)
+    assert stream.follower.limited == 25
+
+
 @pytest.mark.parametrize("efforts", [((1.0,) * 3, ()), ((1.0,) * 2, (1.0,) * 2),
                                      ((math.nan,) * 3, (0.0,) * 3)])  # fmt: skip
 def test_efforts_of_some_points_or_joints_are_refused(monkeypatch, efforts):
