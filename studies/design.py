@@ -8,45 +8,41 @@ betters in workspace, torque and accuracy at once is the Pareto front.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from functools import cache
 
 import numpy as np
 from matplotlib.figure import Figure
+from pandas import DataFrame
+from scipy.constants import g as G_0
 from scipy.stats import qmc
 
+from sst_ros.control.plan import check_motion, examine_reactions
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.reactions import reactions_of
 from sst_ros.errors import SstError
 from sst_ros.figures import BLUE, GREY, VERMILION, styled
 from sst_ros.mechanism import kinematics, rates, workspace
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.report.results import data_frame, publish, render
-from sst_ros.scene.bodies import Inertia, arc_inertia
+from sst_ros.report.results import publish, render
+from sst_ros.scene.bodies import Inertia, Link, arc_inertia
 from sst_ros.scene.scene import Scene, load
 from sst_ros.state import ZERO
 from studies import DOCS, PAGES, run
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 COUNT = 1024  # a power of two
 LOW = (70.0, 70.0, 70.0, 100.0, 100.0, 0.7)
 HIGH = (110.0, 110.0, 110.0, 140.0, 140.0, 1.4)
 """Arcs [deg], first two star angles [deg], and size over that of the shipped scene."""
-DIVISIONS, TURNS = 14, 48  # of the map of a workspace
-SAMPLES = 201  # of the motion
-# kg/m: the printed mass on three arcs of 90 deg
-STAR_DENSITY = 2.6 / (3 * 0.4 * np.pi / 2)
-LINK_DENSITY = 0.3 / (0.35 * np.pi / 2)
-SLIDER, PAYLOAD = 0.06, 0.8  # kg
+SHIPPED = load("gravity_payload")
+ORIENTATIONS = 2**16  # evenly over all, for integrals over the workspace
 MOTION = {"spiral": {"phi": 0.25, "theta": 6.0, "psi": 0.2, "duration": 1.0}}  # rad, s
-# standard deviation of places on the spheres, of parts and assembly [m]
-PART_ERROR = 5e-5
+PAYLOAD = 0.8  # kg, at E
+PART_ERROR = 5e-5  # standard deviation of places of parts on the spheres [m]
 ENCODER_ERROR = np.radians(0.005)  # standard deviation [rad]
-# of torques at rest: in the corners of the workspace they grow without bound
-PERCENTILE = 95.0
+PERCENTILE = 95.0  # of torques at rest, which grow without bound in the corners
+SHOWN = 10  # designs of the front on the page
 
 
 @dataclass(frozen=True)
@@ -58,56 +54,35 @@ class Design:
     arc_31: float
     alpha_1: float  # deg
     alpha_2: float
-    size: float  # of the radii over 0.35 m and 0.4 m
+    size: float  # of the radii over those of the shipped scene
 
     def scene(self) -> Scene:
         """Make the manipulator of thin arcs whose mass grows with their length."""
-        base, star = 0.35 * self.size, 0.4 * self.size
-        turns = np.radians([0.0, self.alpha_1, self.alpha_1 + self.alpha_2])
-        ends = np.stack([np.cos(turns), np.sin(turns), np.zeros(3)], axis=1)
-        mass = STAR_DENSITY * star * np.pi / 2
-        tensor = np.sum(
-            [arc_inertia(mass, star, [0, 0, 1], end).matrix for end in ends], axis=0
-        )
-        middle = np.add(ends, [0.0, 0.0, 1.0]).mean(axis=0) * 2.0 * star / np.pi
-        link = LINK_DENSITY * base * np.pi / 2
-        centre = 2.0 * base / np.pi
-        slider, own = SLIDER * star**2, 9e-6 * self.size**2
         arcs = [self.arc_12, self.arc_23, self.arc_31]
         alpha = [self.alpha_1, self.alpha_2, 360.0 - self.alpha_1 - self.alpha_2]
-        shape = load("gravity_payload").with_values(
-            {"base": {"arcs_deg": arcs, "radius": base}}
-        )
-        middle_of_base = Geometry.of(shape).v.sum(axis=0)
-        down = -9.80665 * middle_of_base / np.linalg.norm(middle_of_base)
+        radius = self.size * SHIPPED.star.radius
+        turns = np.cumsum([0.0, *np.radians(alpha[:2])])
+        ends = np.stack([np.cos(turns), np.sin(turns), np.zeros(3)], axis=1)
+        middles = 2.0 * radius / np.pi * np.add(ends, [0.0, 0.0, 1.0])
+        mass = self.size * SHIPPED.star.mass
+        inertias = [arc_inertia(mass / 3.0, radius, [0, 0, 1], end) for end in ends]
+        base = {"arcs_deg": arcs, "radius": self.size * SHIPPED.base.radius}
+        shape = SHIPPED.with_values({"base": base})
+        axis = Geometry.of(shape).v.sum(axis=0)  # of the base triangle
+        down = -G_0 * axis / np.linalg.norm(axis)
+        actuated_link = SHIPPED.actuated_links[0]
+        intermediate_link = SHIPPED.intermediate_links[0]
         return shape.with_values(
             {
-                "name": "design",
+                "star.alpha_deg": alpha,
+                "star.radius": radius,
+                "star.mass": mass,
+                "star.centre": middles.mean(axis=0).tolist(),
+                "star.inertia": add_inertias(inertias),
+                "actuated_links": [scale_link(actuated_link, self.size, self.size)],
+                "intermediate_links": [scale_link(intermediate_link, self.size, 1.0)],
+                "payload": {"mass": PAYLOAD, "centre": [0.0, 0.0, radius]},
                 "gravity.acceleration": down.tolist(),
-                "star": {
-                    "alpha_deg": alpha,
-                    "radius": star,
-                    "inertia": _inertia(tensor),
-                    "mass": 3.0 * mass,
-                    "centre": middle.tolist(),
-                },
-                "actuated_links": [
-                    {
-                        "inertia": _inertia(
-                            arc_inertia(link, base, [1, 0, 0], [0, 0, 1]).matrix
-                        ),
-                        "mass": link,
-                        "centre": [centre, 0.0, centre],
-                    }
-                ],
-                "intermediate_links": [
-                    {
-                        "inertia": {"xx": own, "yy": slider + own, "zz": slider + own},
-                        "mass": SLIDER,
-                        "centre": [star, 0.0, 0.0],
-                    }
-                ],
-                "payload": {"mass": PAYLOAD, "centre": [0.0, 0.0, star]},
                 "springs": None,
                 "initial": {"gamma": (np.radians(arcs) / 2.0).tolist()},
                 "motion": MOTION,
@@ -127,85 +102,68 @@ class Indices:
     error: float  # root mean square of the orientation error [mrad]
 
 
-def _inertia(tensor: Array) -> dict[str, float]:
-    places = {
-        "xx": (0, 0),
-        "yy": (1, 1),
-        "zz": (2, 2),
-        "xy": (0, 1),
-        "xz": (0, 2),
-        "yz": (1, 2),
+def add_inertias(parts: Sequence[Inertia]) -> dict[str, float]:
+    """Return the entries of the sum of inertias [kg m^2]."""
+    return {name: sum(getattr(x, name) for x in parts) for name in Inertia.SPECS}
+
+
+def scale_link(link: Link, size: float, mass: float) -> dict[str, object]:
+    """Return a link of `size` times the lengths and `mass` times the mass."""
+    inertia = {
+        name: mass * size**2 * getattr(link.inertia, name) for name in Inertia.SPECS
     }
-    return {
-        name: float(tensor[place])
-        for name, place in places.items()
-        if name in Inertia.SPECS
-    }
+    centre = [size * place for place in link.centre]
+    return {"inertia": inertia, "mass": mass * link.mass, "centre": centre}
 
 
 def draw_designs(count: int = COUNT) -> list[Design]:
     """Draw designs: first the isotropic one, then Sobol points of the range."""
-    points = qmc.scale(
-        qmc.Sobol(6, seed=np.random.default_rng(1)).random(count), LOW, HIGH
-    )
-    return [
-        Design(90.0, 90.0, 90.0, 120.0, 120.0, 1.0),
-        *(Design(*row) for row in points.tolist()),
-    ]
+    sampler = qmc.Sobol(len(LOW), seed=np.random.default_rng(1))
+    points = qmc.scale(sampler.random(count), LOW, HIGH)
+    isotropic = Design(90.0, 90.0, 90.0, 120.0, 120.0, 1.0)
+    return [isotropic, *(Design(*point) for point in points.tolist())]
+
+
+@cache
+def all_orientations() -> Array:
+    """Return rotations evenly over all (Shoemake 1992), shape (n, 3, 3)."""
+    height, first, second = qmc.Sobol(3, seed=2).random(ORIENTATIONS).T
+    inner = np.sqrt(1.0 - height) * np.exp(2j * np.pi * first)
+    outer = np.sqrt(height) * np.exp(2j * np.pi * second)
+    quaternions = np.stack([inner.real, inner.imag, outer.real, outer.imag], axis=1)
+    return rotation_matrix(quaternions)
 
 
 def evaluate(design: Design) -> Indices | None:
     """Measure a design; None where it cannot do the motion."""
     try:
         scene = design.scene()
-        geometry = Geometry.of(scene)
-        peak_torque, bending = follow(scene, geometry)
+        plan = check_motion(reference_motion(scene), scene)
     except SstError:
         return None
-    directions, faces = workspace.triangle_directions(geometry, DIVISIONS)
-    chart = workspace.over_orientations(geometry, directions, TURNS)
-    weights = np.zeros(len(directions))  # solid angle of each direction
-    corners = directions[faces]
-    sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    areas = 0.5 * np.linalg.norm(np.cross(*sides), axis=1)
-    for corner in faces.T:
-        np.add.at(weights, corner, areas / 3.0)
-    inside = chart.measures.admissible
-    density = np.where(inside, weights[:, None] * 2.0 * np.pi / TURNS, 0.0)
-    volume = float((weights * chart.turn).sum())
-    conditioning = float((density / chart.measures.cond_j).sum() / density.sum())
-    poses = workspace.orientations(directions[:, None], chart.psi)[inside]
-    q = tuple(quaternion_of(poses).T)
-    with np.errstate(all="ignore"):
-        held, _ = kernel.actuator_torque(kernel.model_of(scene), q, ZERO, ZERO)
-    static = np.percentile(np.abs(held).max(axis=0), PERCENTILE)
-    error = orientation_error(design, geometry, poses)
-    rms = float(np.sqrt(np.average(error**2, weights=density[inside])))
-    share = 100.0 * volume / (8.0 * np.pi**2)
-    return Indices(share, conditioning, float(static), peak_torque, bending, 1e3 * rms)
-
-
-def follow(scene: Scene, geometry: Geometry) -> tuple[float, float]:
-    """Return peak torque and bending moment [N m], or refuse a motion that leaves."""
-    motion = reference_motion(scene)
-    t = np.linspace(0.0, motion.duration, SAMPLES)
-    desired = [motion.at(time) for time in t.tolist()]
-    q, rate, acceleration = (
-        np.array([getattr(at, name) for at in desired])
-        for name in ("quaternion", "body_rate", "body_acceleration")
-    )
-    rotation = rotation_matrix(q)
+    peak_torque = max(abs(peak.value) for peak in plan.peaks["torque"])
+    bending = examine_reactions(plan)["prismatic"]["bending_moment"].peak.max()
+    geometry = Geometry.of(scene)
+    rotation = all_orientations()
+    # An admissible E lies on the base triangle.
+    rotation = rotation[np.all(rotation[:, :, 2] @ geometry.w.T > 0.0, axis=1)]
     gamma = kinematics.inverse(geometry, rotation)[0]
     measured = workspace.measures(geometry, gamma, rotation)
-    if not measured.admissible.all():
-        raise SstError("the motion leaves the workspace")
+    poses = rotation[measured.admissible]
+    quaternion = tuple(quaternion_of(poses).T)
     model = kernel.model_of(scene)
-    rows, _ = kernel.actuator_torque(
-        model, tuple(q.T), tuple(rate.T), tuple(acceleration.T)
+    with np.errstate(all="ignore"):
+        weight_torque, _ = kernel.actuator_torque(model, quaternion, ZERO, ZERO)
+    error = orientation_error(design, geometry, poses)
+    static_torque = np.percentile(np.abs(weight_torque).max(axis=0), PERCENTILE)
+    return Indices(
+        workspace=100.0 * len(poses) / ORIENTATIONS,
+        conditioning=float((1.0 / measured.cond_j[measured.admissible]).mean()),
+        static_torque=float(static_torque),
+        peak_torque=peak_torque,
+        peak_bending=float(bending),
+        error=1e3 * float(np.sqrt(np.mean(error**2))),
     )
-    torque = np.stack(rows, axis=1)
-    found = reactions_of(scene, t, q, rate, torque)
-    return float(np.abs(torque).max()), float(found.prismatic.bending_moment.max())
 
 
 def orientation_error(design: Design, geometry: Geometry, poses: Array) -> Array:
@@ -214,10 +172,8 @@ def orientation_error(design: Design, geometry: Geometry, poses: Array) -> Array
     Orientations have the shape (n, 3, 3), the result (n,).
     """
     by = rates.orientation_sensitivity(geometry, poses)
-    on_base, on_star = (
-        PART_ERROR / (0.35 * design.size),
-        PART_ERROR / (0.4 * design.size),
-    )
+    on_base = PART_ERROR / (SHIPPED.base.radius * design.size)
+    on_star = PART_ERROR / (SHIPPED.star.radius * design.size)
     variance = ENCODER_ERROR**2 * np.sum(by.gamma**2, axis=(1, 2))
     # v moves across itself: what is along it changes no direction.
     variance += on_base**2 * np.sum(by.v**2, axis=(1, 2, 3))
@@ -232,84 +188,62 @@ def find_front(costs: Array) -> Array:
     return np.asarray(~better.any(axis=0))
 
 
-def isotropy() -> list[tuple[float, float]]:
-    """Return arcs [deg] of symmetric designs, and 1/cond(J) in their middle."""
-    found = []
+def isotropy() -> dict[float, float]:
+    """Return 1/cond(J) in the middle of symmetric designs, by their arcs [deg]."""
+    indices = {}
     for arc in np.arange(60.0, 115.0, 5.0).tolist():
         geometry = Geometry.of(Design(arc, arc, arc, 120.0, 120.0, 1.0).scene())
         gamma = geometry.arc / 2.0
         rotation = kinematics.admissible(geometry, gamma).rotation
-        found.append(
-            (arc, 1.0 / float(workspace.measures(geometry, gamma, rotation).cond_j))
-        )
-    return found
+        indices[arc] = 1.0 / float(workspace.measures(geometry, gamma, rotation).cond_j)
+    return indices
 
 
 @styled
-def draw(table: DataFrame, front: Array) -> Figure:
-    """Draw error and workspace of the designs over the peak torque.
-
-    The first design and the front are marked.
-    """
+def draw(frame: DataFrame) -> Figure:
+    """Draw error and workspace of the designs over the peak torque."""
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
-    labels = {
-        "error": "orientation error (RMS) [mrad]",
-        "workspace": "orientations reached [%]",
-    }
-    looks = (("design", ".", GREY, 4), ("on the front", "o", BLUE, 4),
-             ("isotropic, shipped size", "*", VERMILION, 14))  # fmt: skip
-    rows = np.arange(len(table)) >= 0, front, np.arange(len(table)) == 0
-    for axes, (name, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
-        for (word, marker, colour, size), chosen in zip(looks, rows, strict=True):
-            part = table[chosen]
-            given = {"color": colour, "markersize": size, "label": word}
-            axes.plot(part["peak_torque"], part[name], marker, **given)
-        axes.set(xlabel="peak torque of the motion [N m]", ylabel=label)
+    left, right = figure.subplots(1, 2)
+    looks = (
+        ("design", frame, ".", GREY, 4),
+        ("on the front", frame[frame["front"]], "o", BLUE, 4),
+        ("isotropic, shipped size", frame[:1], "*", VERMILION, 14),
+    )
+    for axes, name in (left, "error"), (right, "workspace"):
+        for label, rows, marker, colour, size in looks:
+            axes.plot(
+                "peak_torque", name, marker, data=rows, c=colour, ms=size, label=label
+            )
+        axes.set_xlabel("peak torque of the motion [N m]")
         axes.legend(fontsize=8)
+    left.set_ylabel("orientation error (RMS) [mrad]")
+    right.set_ylabel("orientations reached [%]")
     return figure
 
 
-def page(frame: DataFrame, designs: int, symmetric: list[tuple[float, float]]) -> str:
-    """Write the page, with ten designs of the front from least to largest torque."""
+def report(options: argparse.Namespace) -> bool:
+    """Write page, table and picture; true where front and isotropy are found."""
+    rows = []
+    for design in draw_designs():
+        indices = evaluate(design)
+        if indices is not None:
+            rows.append(asdict(design) | asdict(indices))
+    frame = DataFrame(rows)
+    costs = [-frame["workspace"], frame["peak_torque"], frame["error"]]
+    frame["front"] = find_front(np.stack(costs, axis=1))
     front = frame[frame["front"]].sort_values("peak_torque")
-    shown = front.iloc[np.unique(np.linspace(0, len(front) - 1, 10).astype(int))]
-    values = shown.drop(columns="front").map(lambda x: f"{x:.3g}")
-    return render(
+    chosen = np.unique(np.linspace(0, len(front) - 1, SHOWN).astype(int))
+    symmetric = isotropy()
+    page = render(
         PAGES / "design.md",
         frame=frame,
-        designs=designs,
-        symmetric=symmetric,
         front=front,
-        shown=values,
-        first=frame.iloc[0],
-        low=LOW,
-        high=HIGH,
-        motion=MOTION["spiral"],
-        part=PART_ERROR,
-        percentile=PERCENTILE,
-        payload=PAYLOAD,
+        shown=front.iloc[chosen].drop(columns="front").map("{:.3g}".format),
+        symmetric=symmetric,
+        study=globals(),
     )
-
-
-def report(options: argparse.Namespace) -> bool:
-    """Write the page, its table and picture.
-
-    True where the front and isotropy are found.
-    """
-    designs = draw_designs()
-    results = [evaluate(one) for one in designs]
-    kept = [(one, found) for one, found in zip(designs, results, strict=True) if found]
-    frame = data_frame(asdict(one) | asdict(found) for one, found in kept)
-    costs = np.stack(
-        [-frame["workspace"], frame["peak_torque"], frame["error"]], axis=1
-    )
-    frame["front"] = front = find_front(costs)
-    text = page(frame, len(designs), symmetric := isotropy())
-    publish(
-        options.out, "design", {".csv": frame, ".md": text, ".png": draw(frame, front)}
-    )
-    print(text)
-    return bool(front.any()) and max(symmetric, key=lambda row: row[1])[0] == 90.0
+    publish(options.out, "design", {".csv": frame, ".md": page, ".png": draw(frame)})
+    return len(front) > 0 and max(symmetric, key=symmetric.__getitem__) == 90.0
 
 
 if __name__ == "__main__":

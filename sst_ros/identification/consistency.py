@@ -4,7 +4,10 @@
 The variance of the noise differs between actuators; it is estimated from the residuals
 of an unweighted fit, over the equations of the actuator less the unknowns that they
 determine (their leverage), and the equations are then divided by it (Gautier 1997;
-Swevers, Verdonck and De Schutter, IEEE Control Systems 27 (2007) no. 5, 58-71).
+Swevers, Verdonck and De Schutter, IEEE Control Systems 27 (2007) no. 5, 58-71). Where
+equations are components of a frequency, noise of the angles makes it grow with the
+frequency: weights by it would gain 2 % of the deviations and lose more by their own
+uncertainty, but the covariance of the estimates has it (`estimate_variances`).
 
 A body has mass m, first moment h and inertia I about O if and only if its
 pseudo-inertia
@@ -30,6 +33,7 @@ rounding.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -39,6 +43,11 @@ from sst_ros.mechanism.geometry import Array
 
 # noise over RMS terms that is assumed at least: simulations have no other
 LEAST_NOISE = 1e-12
+VARIANCE_STEPS = 2  # fits by which the noise is estimated: unweighted, and weighted
+# of the variance from rest to the highest frequency, looked through: none, and from
+# what nobody sees to angles alone
+GROWTHS = np.append(0.0, np.geomspace(0.05, 500.0, 41))
+SMALLEST_VARIANCE = 1e-300  # of residuals that are zero
 INTERIOR = 1e-3  # share of its size by which a parameter is lifted at the start
 BARRIERS = tuple(
     10.0**-k for k in range(0, 11)
@@ -62,39 +71,102 @@ for _row, (_i, _j) in enumerate(
         _PSEUDO[_row, :3, :3] += 0.5 * np.eye(3)
 
 
+class LinearFit(NamedTuple):
+    """A weighted fit of b unknowns: R^T R, of its root R, is their covariance^-1."""
+
+    estimate: Array  # shape (b,)
+    root: Array  # shape (b, b), upper triangular
+    noise: Array  # standard deviations of the torques [N m], shape (3,)
+
+
 def fit_weighted(
     columns: Array,
     torque: Array,
     noise: Sequence[float] | None = None,
     *,
     terms: float = 0.0,
-) -> tuple[Array, Array, Array]:
+    frequencies: Array | None = None,
+) -> LinearFit:
     """Fit torque = columns estimate, with b independent columns, shape (m, 3, b).
 
     Torques are measured less known ones [N m], shape (m, 3), and the noise their
     standard deviations, three, by default estimated: at least LEAST_NOISE of the
     torques, and of the RMS of the `terms` that sum up to them [N m], which cancel in a
-    free motion. Returns the estimates, shape (b,), R of the weighted regressor, R^T R =
-    covariance^-1, shape (b, b), and the noise, (3,).
+    free motion. Equations may be components of given frequencies, over the highest,
+    shape (m,): then the noise is the RMS over the components, and the covariance is
+    that of a noise which grows with the frequency, see `estimate_variances`.
     """
-    if noise is not None:
-        given = np.array(noise)
-        return (*_solve(columns, torque, given)[:2], given)
     floor = LEAST_NOISE * max(float(np.sqrt(np.mean(torque**2))), terms) + 1e-300
-    found = np.ones(3)
-    for _ in range(2):
-        estimate, _, leverage = _solve(columns, torque, found)
-        squares = np.sum((torque - columns @ estimate) ** 2, axis=0)
-        free = np.maximum(len(torque) - leverage, 1.0)
-        found = np.maximum(np.sqrt(squares / free), floor)
-    return (*_solve(columns, torque, found)[:2], found)
+    deviations = np.ones(3)
+    for _ in range(VARIANCE_STEPS):
+        solution = _solve(columns, torque, deviations)
+        residuals = torque - columns @ solution.estimate
+        variances = estimate_variances(residuals, solution.leverage, frequencies)
+        mean_variance = np.maximum(variances.mean(axis=0), SMALLEST_VARIANCE)
+        deviations = np.maximum(np.sqrt(mean_variance), floor)
+    if noise is not None:
+        deviations = np.array(noise)
+    solution = _solve(columns, torque, deviations)
+    root = solution.root
+    if frequencies is not None:
+        root = _spread_root(solution, variances / mean_variance)
+    return LinearFit(solution.estimate, root, deviations)
 
 
-def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, Array]:
-    """Return the estimate, R of the weighted regressor, and the leverage.
+def estimate_variances(
+    residuals: Array, leverage: Array, frequencies: Array | None
+) -> Array:
+    """Estimate the variance of the noise of each equation [(N m)^2], shape (m, 3).
 
-    The leverage of an actuator is how many unknowns it determines.
+    Residuals [N m] and leverages have the shape (m, 3). Without frequencies the noise
+    of an actuator is white. With them, shape (m,), its variance is s^2 (1 + g f^4):
+    noise of the torques, and noise of the angles in the accelerations. The growth g
+    minimises the pseudo-likelihood
+
+        sum over i of (1 - h_i) ln v_i + r_i^2 / v_i
+
+    of variances v, residuals r and leverages h (Davidian and Carroll, J. American
+    Statistical Association 82 (1987) 1079-1091).
+
+    Of n degrees of freedom, the sum of 1 - h_i, the level is divided by n - 2 and not
+    by n, and by n - 3 where g is estimated too: an estimate over its true deviation is
+    normally distributed, but over an estimated one by Student's distribution, whose
+    variance is n / (n - 2).
     """
+    free = 1.0 - leverage
+    freedom = np.maximum(free.sum(axis=0), 1.0)
+    if frequencies is None:
+        level = np.sum(residuals**2, axis=0) / np.maximum(freedom - 2.0, 1.0)
+        return np.broadcast_to(level, residuals.shape)
+    growths = 1.0 + np.outer(GROWTHS, frequencies**4)
+    variances = np.empty_like(residuals)
+    for k in range(3):
+        sums = (residuals[:, k] ** 2 / growths).sum(axis=1)
+        levels = np.maximum(sums / freedom[k], SMALLEST_VARIANCE)
+        costs = freedom[k] * np.log(levels) + np.log(growths) @ free[:, k]
+        best = int(np.argmin(costs))
+        variances[:, k] = sums[best] / max(freedom[k] - 3.0, 1.0) * growths[best]
+    return variances
+
+
+class _Solution(NamedTuple):
+    """A fit with given weights: W X = Q R of the weighted regressor."""
+
+    estimate: Array  # shape (b,)
+    orthogonal: Array  # Q, shape (3 m, b)
+    root: Array  # R, shape (b, b)
+
+    @property
+    def leverage(self) -> Array:
+        """Leverage of each equation, shape (m, 3).
+
+        Those of an actuator sum up to how many unknowns it determines.
+        """
+        return np.asarray(np.sum(self.orthogonal**2, axis=1).reshape(-1, 3))
+
+
+def _solve(columns: Array, torque: Array, noise: Array) -> _Solution:
+    """Solve the weighted least-squares problem with the noise [N m], shape (3,)."""
     matrix = (columns / noise[:, None]).reshape(-1, columns.shape[-1])
     right = (torque / noise).ravel()
     lengths = np.linalg.norm(matrix, axis=0)
@@ -104,8 +176,23 @@ def _solve(columns: Array, torque: Array, noise: Array) -> tuple[Array, Array, A
     estimate = estimate + solve_triangular(
         r, q.T @ (right - matrix / lengths @ estimate)
     )
-    leverage = np.sum((q**2).reshape(-1, 3, len(r)), axis=(0, 2))
-    return estimate / lengths, r * lengths, leverage
+    return _Solution(estimate / lengths, q, r * lengths)
+
+
+def _spread_root(solution: _Solution, growth: Array) -> Array:
+    """Return the root of the inverse covariance where variances are not alike.
+
+    They are `growth` times those of the weights, shape (m, 3). The covariance of the
+    estimate is R^-1 Q^T V Q R^-T then, the sandwich (White, Econometrica 48 (1980)
+    817-838), with the V of the model of the noise. V^1/2 Q = P T makes the root T^-T R,
+    which is turned into a triangle.
+    """
+    scaled = np.sqrt(growth).reshape(-1, 1) * solution.orthogonal
+    triangle: Any = np.linalg.qr(scaled, mode="r")
+    root: Any = np.linalg.qr(
+        solve_triangular(triangle, solution.root, trans="T"), mode="r"
+    )
+    return np.asarray(root)
 
 
 def find_consistent_values(

@@ -435,7 +435,8 @@ class RegressionEquations:
         given = parameters.values(self.regressor.scene, names)
         terms = float(np.sqrt(np.mean((np.abs(columns) @ np.abs(given)) ** 2)))
         chosen = columns[..., base.chosen]
-        estimate, root, spread = fit_weighted(chosen, torque, noise, terms=terms)
+        weighting: Any = {"terms": terms, "frequencies": formed.frequencies}
+        estimate, root, spread = fit_weighted(chosen, torque, noise, **weighting)
         found = WeightedFit(
             base, estimate, root, spread, formed.samples, delay, None, formed.notes
         )
@@ -450,7 +451,7 @@ class RegressionEquations:
             # The delay comes first: what is below its row of the root is what it leaves
             # to the others.
             both = np.concatenate([-slope[..., None], chosen], axis=2)
-            together, whole, spread = fit_weighted(both, torque, noise, terms=terms)
+            together, whole, spread = fit_weighted(both, torque, noise, **weighting)
             estimate = together[1:]
         inverse = solve_triangular(whole, np.eye(len(whole)))
         return found._replace(
@@ -539,6 +540,7 @@ class RegressionEquations:
             np.inf if scene.torque_limit is None else scene.torque_limit * (1.0 - 1e-9)
         )
         rows = list[tuple[Array, Array, Array]]()
+        frequencies = list[Array]()
         samples = cut = total = 0
         for path in self._paths:
             known, part, torque = path.evaluate(self.regressor, delay, longest)
@@ -548,12 +550,14 @@ class RegressionEquations:
             torque, known, part = torque[sound], known[sound], part[sound]
             samples += len(torque)
             if path.band is not None:
+                half_cycles = 2.0 * path.period * (len(torque) + 1)  # Hz^-1, of sine 1
                 count = int(np.ceil(2.0 * path.band * path.period * len(torque)))
                 count = max(count, len(names) if len(self._paths) == 1 else 0)
                 torque, known, part = (
                     np.asarray(dst(one, type=1, norm="ortho", axis=0)[:count])
                     for one in (torque, known, part)
                 )
+                frequencies.append(np.arange(1, len(torque) + 1) / half_cycles)
             rows.append((torque, known, part))
         allowed = (
             f"must leave more than {len(names)} samples for {len(names)} parameters"
@@ -566,8 +570,12 @@ class RegressionEquations:
         torque, known, columns = (
             np.concatenate(each) for each in zip(*rows, strict=True)
         )
+        relative = None
+        if frequencies:
+            relative = np.concatenate(frequencies)
+            relative = relative / relative.max()
         return FormedEquations(
-            torque, known, columns, samples, notes=(warning,) if cut else ()
+            torque, known, columns, relative, samples, notes=(warning,) if cut else ()
         )
 
 
@@ -577,6 +585,8 @@ class FormedEquations(NamedTuple):
     torque: Array  # measured [N m], shape (m, 3)
     known: Array  # of the scene without the parameters [N m], shape (m, 3)
     columns: Array  # shape (m, 3, p)
+    # of components, over the highest, shape (m,); None of samples
+    frequencies: Array | None
     samples: int  # that were taken
     notes: tuple[str, ...]
 

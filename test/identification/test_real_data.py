@@ -4,108 +4,87 @@ noisy.
 """
 
 import dataclasses
-from functools import cache
 
 import numpy as np
 import pytest
 from identification import manipulators
 
-from sst_ros import load_scene, read_bag, reference_motion
+from sst_ros import read_bag
 from sst_ros.dynamics.kernel import joints, model_of
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
 from sst_ros.identification.identify import identify
 from sst_ros.scene import scene
 from sst_ros.state import nanoseconds
-
-PERIOD, DELAY = 2e-3, 3.7e-3
-NOISE, TORQUE_NOISE = 1e-4, 0.01
-NORMAL_95 = 1.96
-FRICTION = {
-    "friction.gamma.viscous": 0.2,
-    "friction.gamma.coulomb": 0.2,
-    "friction.gamma.smoothing": 0.1,
-}
-
-
-class Plant:
-    """Six seconds of chirps of `reach` with friction: exact angles and torques at any
-    time.
-    """
-
-    def __init__(self):
-        rubbing = load_scene("reach").with_values(FRICTION)
-        self.scene = manipulators.sweeping(rubbing, 6.0, speed=1.0)
-        changed = {"friction.gamma.viscous": 0.1, "friction.gamma.coulomb": 0.1}
-        self.model = manipulators.wrong(self.scene).with_values(changed)
-        self.motion = reference_motion(self.scene)
-
-    def gamma(self, times):
-        last = self.motion.duration
-        return np.array(
-            [self.motion.at(min(max(t, 0.0), last)).gamma for t in times.tolist()]
-        )
-
-    def torque(self, times):
-        return manipulators.torques(
-            self.scene, *manipulators.states(self.motion, times)
-        )
-
-    def errors(self, found):
-        """Estimates less truth, in standard deviations."""
-        true = found.base.transform @ parameters.values(self.scene, found.names)
-        return (found.estimate - true) / found.deviation
-
-
-@cache
-def plant():
-    return Plant()
-
-
-@cache
-def exact():
-    """Times, late angles and torques without noise."""
-    t = np.arange(0.0, plant().motion.duration - PERIOD, PERIOD)
-    return t, plant().gamma(t - DELAY), plant().torque(t)
-
-
-def measured(seed, t=None):
-    """One measurement: angles with noise and delay, torques with noise.
-
-    At other times too.
-    """
-    random = np.random.default_rng(seed)
-    if t is None:
-        t, gamma, torque = exact()
-    else:
-        gamma, torque = plant().gamma(t - DELAY), plant().torque(t)
-    peak = np.abs(torque).max(axis=0)
-    return {
-        "t": t,
-        "gamma": gamma + NOISE * random.normal(size=gamma.shape),
-        "torque": torque + TORQUE_NOISE * peak * random.normal(size=torque.shape),
-    }
+from studies import DOCS
+from studies.coverage import (
+    ANGLE_NOISE,
+    DELAY,
+    NORMAL_95,
+    exact,
+    extend_table,
+    measure,
+    plant,
+)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_95_percent_intervals_cover_93_to_97_percent_of_truths():
+def test_95_percent_intervals_cover_93_to_97_percent_of_truths(tmp_path):
     """200 data sets with noise, delay, friction: all base parameters and the delay."""
-    rows, delays = [], []
-    for seed in range(200):
-        found = identify(measured(seed), plant().model)
-        rows.append(plant().errors(found))
-        delays.append((found.delay - DELAY) / found.delay_deviation)
-    covered = np.abs(np.array(rows)) < NORMAL_95
-    assert covered.shape == (200, 21)
+    frame = extend_table(tmp_path / "coverage.csv", range(200))
+    covered = np.abs(frame.drop(columns="seed").to_numpy()) < NORMAL_95
+    assert covered.shape == (200, 22)
     assert 0.93 <= covered.mean() <= 0.97
     # Of one parameter 200 data sets tell the coverage to 1.5 %.
     assert covered.mean(axis=0).min() >= 0.90
-    assert 0.90 <= np.mean(np.abs(delays) < NORMAL_95) <= 0.99
+    delay = frame.columns.get_loc("delay") - 1
+    assert 0.90 <= covered[:, delay].mean() <= 0.99
+
+
+def test_the_study_of_the_page_covers_93_to_97_percent(tmp_path):
+    """The stored sets, of which two are computed again, and what the page says."""
+    pandas = pytest.importorskip("pandas")
+    stored = pandas.read_csv(DOCS / "coverage.csv")
+    assert len(stored) >= 200 and stored["seed"].is_unique
+    scores = stored.drop(columns="seed")
+    covered = np.abs(scores.to_numpy()) < NORMAL_95
+    assert 0.93 <= covered.mean() <= 0.97
+    page = (DOCS / "howto" / "identify.md").read_text(encoding="utf-8")
+    parameters_covered = scores.drop(columns="delay").abs() < NORMAL_95
+    shares = 100.0 * parameters_covered.mean()
+    pooled = 100.0 * parameters_covered.to_numpy().mean()
+    delay = 100.0 * (scores["delay"].abs() < NORMAL_95).mean()
+    for words in (
+        f"In {len(stored)} simulated data sets",
+        f"{pooled:.1f} % of the true base",
+        f"each parameter in {shares.min():.1f} to {shares.max():.1f} %",
+        f"the delay in {delay:.1f} %",
+    ):
+        assert words in " ".join(page.split())
+    chosen = stored["seed"].tolist()[:2]
+    again = extend_table(tmp_path / "coverage.csv", chosen)
+    assert again["seed"].tolist() == chosen
+    assert np.abs(again - stored[again.columns][:2]).to_numpy().max() < 1e-3
+
+
+def test_an_interrupted_study_goes_on(tmp_path, monkeypatch):
+    computed = []
+
+    def score(seed):
+        computed.append(seed)
+        return {"seed": seed, "delay": 0.5}
+
+    monkeypatch.setattr("studies.coverage.score", score)
+    path = tmp_path / "coverage.csv"
+    extend_table(path, range(3))
+    frame = extend_table(path, range(5))
+    assert computed == [0, 1, 2, 3, 4]
+    assert frame["seed"].tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_delay_is_estimated_and_told():
-    found = identify(measured(1), plant().model)
+    found = identify(measure(1), plant().model)
     assert abs(found.delay - DELAY) < 4.0 * found.delay_deviation < 1e-3
     assert np.abs(plant().errors(found)).max() < 4.0
     assert (
@@ -114,8 +93,8 @@ def test_a_delay_is_estimated_and_told():
 
 
 def test_a_delay_that_is_left_out_or_given():
-    late = identify(measured(1), plant().model, delay=0.0)
-    given = identify(measured(1), plant().model, delay=DELAY)
+    late = identify(measure(1), plant().model, delay=0.0)
+    given = identify(measure(1), plant().model, delay=DELAY)
     # In the deviations that the data have: without the delay the residuals seem to be
     # noise.
     wrong = plant().errors(late) * late.deviation / given.deviation
@@ -123,16 +102,16 @@ def test_a_delay_that_is_left_out_or_given():
     assert np.abs(plant().errors(given)).max() < 4.0
     assert "delay of the angles 3.7 ms, as given" in given.table()
     with pytest.raises(InputError, match=r"delay = 1.0: must be from -0.2 to 0.2 s"):
-        identify(measured(1), plant().model, delay=1.0)
+        identify(measure(1), plant().model, delay=1.0)
     with pytest.raises(InputError, match="takes no cutoff, noise or delay"):
-        identify(measured(1), plant().model, ["star.mass"], "simulation", delay=DELAY)
+        identify(measure(1), plant().model, ["star.mass"], "simulation", delay=DELAY)
 
 
 @pytest.mark.parametrize("delay", [-0.03, 0.05])
 def test_delays_of_many_periods_are_found(delay):
     t, _, torque = exact()
     gamma = plant().gamma(t - delay)
-    gamma += NOISE * np.random.default_rng(2).normal(size=gamma.shape)
+    gamma += ANGLE_NOISE * np.random.default_rng(2).normal(size=gamma.shape)
     found = identify({"t": t, "gamma": gamma, "torque": torque}, plant().model)
     assert found.delay == pytest.approx(delay, abs=2e-4)
 
@@ -142,14 +121,14 @@ def test_uneven_stamps_are_sampled_again_with_a_word():
     t = exact()[0]
     t = (t + 4e-4 * random.uniform(-1.0, 1.0, len(t)))[random.random(len(t)) > 0.2]
     t = np.sort(t[t >= 0.0])
-    found = identify(measured(4, t), plant().model)
+    found = identify(measure(4, t), plant().model)
     assert "stamps are uneven" in found.warnings[0] and len(found.warnings) == 1
     assert np.abs(plant().errors(found)).max() < 5.0
     assert found.delay == pytest.approx(DELAY, abs=4.0 * found.delay_deviation)
 
 
 def test_a_motion_with_gaps_is_cut_into_segments_with_a_word():
-    data = measured(5)
+    data = measure(5)
     t = data["t"]
     kept = ~(((t > 1.9) & (t < 2.1)) | ((t > 4.0) & (t < 4.3)))
     found = identify({name: rows[kept] for name, rows in data.items()}, plant().model)
@@ -158,7 +137,7 @@ def test_a_motion_with_gaps_is_cut_into_segments_with_a_word():
 
 
 def test_seconds_since_the_epoch_and_wraps_are_taken_with_a_word():
-    data = measured(6)
+    data = measure(6)
     expected = identify(data, plant().model)
     since = identify(data | {"t": data["t"] + 1_764_000_000.0}, plant().model)
     assert since.warnings == ()
