@@ -30,6 +30,7 @@ from sst_ros.programs.expression import (
     mark_present,
     number_constants,
     trace,
+    trace_along,
 )
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import Place, leaves, rebuild
@@ -137,6 +138,25 @@ class Dynamics:
         x has gamma, gamma_dot, and the lagged torques if any. The inputs are the state
         and the drive.
         """
+        return compile_program(self._actuator_motion_program)
+
+    @cached_property
+    def coordinates_by_state(self) -> Function:
+        """Derivatives of the coordinates x by each number of the state.
+
+        The inputs are those of `actuator_motion`, of whose results they are a part.
+        """
+        program = self._actuator_motion_program
+        size = len(self.state)
+        numbers = 2 * (size - 1)  # x and its rates: a quaternion is three coordinates
+        by_number = [
+            program.outputs[numbers * k : numbers * (k + 1)] for k in range(1, size + 1)
+        ]
+        coordinates = [output for row in by_number for output in row[: size - 1]]
+        return compile_program(program.prune(coordinates))
+
+    @cached_property
+    def _actuator_motion_program(self) -> Program:
         size = len(self.state)
 
         def motion(*inputs: Any) -> tuple[Any, ...]:
@@ -154,7 +174,7 @@ class Dynamics:
             return (*x, *joints.gamma_dot, *gamma_ddot, *slope[STATE_SIZE:])
 
         inputs = (*self.state, *self.drive)
-        return compile_program(trace(motion, inputs, (*self.state, *TORQUE_SYMBOLS)))
+        return trace(motion, inputs, (*self.state, *TORQUE_SYMBOLS))
 
     @cached_property
     def energies(self) -> Function:
@@ -259,6 +279,17 @@ class ODE:
             self._of_numbers, self._inputs, ("t", *self.state, *TORQUE_SYMBOLS)
         )
         return compile_functions({"linearised": program}, ("linearised",))["linearised"]
+
+    @cached_property
+    def tangent(self) -> Program:
+        """The derivative, and how it changes where state and torques change.
+
+        After the inputs of `program` come the rates of change of the state and of the
+        drive's torques.
+        """
+        return trace_along(
+            self._of_numbers, self._inputs, (*self.state, *TORQUE_SYMBOLS)
+        )
 
     def derivative(
         self, time: Any, *inputs: Any, numbered: bool = False
