@@ -217,7 +217,7 @@ def _find_limit(
     scene: Scene, dynamics: Dynamics, flow: HeldFlow, torque: Vector3, length: float
 ) -> str:
     """Say which limit a motion passes that it began inside of, "" if none."""
-    inside: Array = np.arange(1, _CHECKS) * (length / _CHECKS)
+    inside = np.arange(1.0, _CHECKS) * (length / _CHECKS)
     states = [
         flow.states[0],
         *states_inside(recent_ode(dynamics), flow, torque, inside),
@@ -283,8 +283,7 @@ def _coordinates_by_state(
     if not by_gamma:
         return _turns(y)[1]
     columns = dynamics.coordinates_by_state(*y.tolist(), *_drive(dynamics, torque))
-    by_number: Array = np.array(columns).reshape(len(y), -1)
-    return by_number.T
+    return np.asarray(np.array(columns).reshape(len(y), -1).T)
 
 
 def _drive(dynamics: Dynamics, torque: Sequence[float]) -> tuple[float, ...]:
