@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +30,7 @@ from sst_ros.errors import (
     refuse_unless,
 )
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.generic_math import axpy, symmetric_rows, triple
+from sst_ros.mechanism.generic_math import axpy, triple
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene, SceneInput, scene_of, terms
 from sst_ros.state import (
@@ -47,6 +47,13 @@ from sst_ros.state import (
 SINGULAR_MASS = 1e-10
 
 
+Pose: TypeAlias = "State | Sequence[float]"
+"""A state, or angles gamma [rad], or a quaternion of {E} in {B}."""
+
+Poses: TypeAlias = "Array | Sequence[Sequence[float]]"
+"""Rows of angles or quaternions."""
+
+
 class InverseDynamics(Explained):
     """Torques at the joints of a scene, all its terms included.
 
@@ -58,12 +65,9 @@ class InverseDynamics(Explained):
     @check_kinds
     def __init__(self, scene: SceneInput) -> None:
         self.scene = scene_of(scene)
-        dynamics = Dynamics.of(self.scene)
-        self._has_moment_topic, self._program = (
-            dynamics.has_moment_topic,
-            dynamics.inverse,
-        )
-        self._model = dynamics.model
+        self._dynamics = Dynamics.of(self.scene)
+        self._has_moment_topic = self._dynamics.has_moment_topic
+        self._program = self._dynamics.inverse
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the scene."""
@@ -111,27 +115,56 @@ class InverseDynamics(Explained):
             reference.quaternion, reference.body_rate, reference.body_acceleration
         )
 
-    def gravity_torque(self, at: State | Sequence[float]) -> Vector3:
+    @overload
+    def gravity_torque(self, at: State | Sequence[float]) -> Vector3: ...
+
+    @overload
+    def gravity_torque(self, at: Array | Sequence[Sequence[float]]) -> Any: ...
+
+    def gravity_torque(self, at: Pose | Poses) -> Vector3 | Array:
         """Return the torques [N m] that hold the manipulator at rest.
 
-        They hold it against gravity, springs and the like. The manipulator is in a
-        state of a simulation; or in the admissible assembly at gamma [rad], shape (3,);
-        or at the quaternion (x, y, z, w) of {E} in {B}, shape (4,). Raises as `torque`,
-        and AssemblyError where gamma has no unique admissible assembly.
-        """
-        return self.torque(self._orientation(at), ZERO, ZERO)
+        They hold it against gravity, springs and the like.
 
-    def mass_matrix(self, at: State | Sequence[float]) -> Array:
+        Args:
+            at: a state of a simulation; or gamma [rad], shape (3,), for the admissible
+                assembly there; or the quaternion (x, y, z, w) of {E} in {B}, shape
+                (4,). Rows of angles or quaternions, shape (n, 3) or (n, 4), are n
+                poses, computed at once.
+
+        Returns:
+            Three torques; of rows an array, shape (n, 3), with the bits of pose by
+            pose.
+
+        Raises:
+            AssemblyError: a gamma has no unique admissible assembly.
+            SingularConfiguration: as in `torque`, of the first pose that is singular.
+            InputError: `at` is no pose.
+
+        """
+        quaternions = self._orientations(at)
+        if quaternions is None:
+            return self.torque(self._orientation(at), ZERO, ZERO)
+        return self._torques_at_rest(quaternions)
+
+    def mass_matrix(self, at: Pose | Poses) -> Array:
         """M of tau = M gamma_ddot + h [kg m^2], rotors included.
 
-        Symmetric, shape (3, 3).
+        Symmetric, shape (3, 3); of n poses, shape (n, 3, 3), with the bits of pose by
+        pose.
 
         `at` and what is raised are as in `gravity_torque`.
         """
-        inertia, reach = self._reduce(self._orientation(at))
+        quaternions = self._orientations(at)
+        if quaternions is None:
+            inertia, reach = self._reduce(self._orientation(at))
+        else:
+            self._torques_at_rest(quaternions)  # refuses singularities
+            numbers = self._dynamics.reduced_inertia_of_rows(quaternions)
+            inertia, reach = np.split(numbers.reshape(-1, 6, 3), 2, axis=1)
         back = np.linalg.inv(reach)
-        found = back.T @ inertia @ back
-        return np.asarray(0.5 * (found + found.T))
+        mass = np.swapaxes(back, -1, -2) @ inertia @ back
+        return np.asarray(0.5 * (mass + np.swapaxes(mass, -1, -2)))
 
     @check_kinds
     def bias(self, state: State, moment: Vector3 = ZERO) -> Vector3:
@@ -144,7 +177,7 @@ class InverseDynamics(Explained):
             "inverse dynamics", ("moment", moment, three, "must be three numbers [N m]")
         )
         q, rate = state.quaternion, state.body_rate
-        rest = kernel.actuator_acceleration(self._model, (*q, *rate), ZERO)
+        rest = kernel.actuator_acceleration(self._dynamics.model, (*q, *rate), ZERO)
         acceleration = np.linalg.solve(self._reduce(q)[1], np.negative(rest))
         return self.torque(q, rate, triple(acceleration.tolist()), moment)
 
@@ -167,10 +200,12 @@ class InverseDynamics(Explained):
         acting = rotation_matrix(q).T @ np.asarray(moment, dtype=float)
         return triple(np.linalg.solve(reach.T, acting).tolist())
 
-    def _orientation(self, at: State | Sequence[float]) -> Quaternion:
+    def _orientation(self, at: Pose | Poses) -> Quaternion:
         """Quaternion of {E} in {B} of a state, of angles gamma or of itself."""
         pose: Any = at.quaternion if isinstance(at, State) else at
-        allowed = "must be a State, three angles gamma or a quaternion"
+        allowed = (
+            "must be a State, three angles gamma or a quaternion, or rows of either"
+        )
         pose = read_numbers("inverse dynamics", "at", pose)
         fits = pose.shape in ((3,), (4,))
         refuse_unless("inverse dynamics", ("at", at, fits, allowed))
@@ -180,14 +215,47 @@ class InverseDynamics(Explained):
         x, y, z, w = pose.tolist()
         return x, y, z, w
 
+    def _orientations(self, at: Pose | Poses) -> Array | None:
+        """Quaternions of many poses, shape (n, 4); None where `at` is not rows."""
+        if isinstance(at, State):
+            return None
+        poses = read_numbers("inverse dynamics", "at", at)
+        if poses.ndim != 2:
+            return None
+        fits = poses.shape[1] in (3, 4)
+        allowed = "must be rows of three angles gamma or of quaternions"
+        refuse_unless("inverse dynamics", ("at", at, fits, allowed))
+        if poses.shape[1] == 4:
+            return poses
+        geometry = Geometry.of(self.scene)
+        return quaternion_of(kinematics.admissible_rotations(geometry, poses))
+
+    def _torques_at_rest(self, quaternions: Array) -> Array:
+        """Return torques [N m] that hold many poses, shape (n, 4) -> (n, 3).
+
+        Raises as `torque` of the first pose that has none.
+        """
+        count = len(quaternions)
+        at_rest = np.zeros((count, 3 * (3 if self._has_moment_topic else 2)))
+        results = self._dynamics.inverse_of_rows(np.hstack([quaternions, at_rest]))
+        torques, determinants, squares = np.split(results, [3, 4], axis=1)
+        with np.errstate(all="ignore"):  # what is not finite is refused
+            det_j2 = np.abs(determinants[:, 0]) * np.sqrt(squares.prod(axis=1))
+            sound = np.isfinite(torques.sum(axis=1)) & (det_j2 > SINGULAR_MASS)
+            sound &= squares.min(axis=1) > SINGULAR_MASS * SINGULAR_MASS
+        for row in np.flatnonzero(~sound):
+            x, y, z, w = quaternions[row].tolist()
+            self.torque((x, y, z, w), ZERO, ZERO)
+        return np.ascontiguousarray(torques)
+
     def _reduce(self, q: Quaternion) -> tuple[Array, Array]:
         """Return the inertia reduced to the star [kg m^2] and the rows g_k.
 
         Raises as `torque`.
         """
         self.torque(q, ZERO, ZERO)
-        inertia, _, reach = kernel.balance(self._model, q, ZERO, ZERO)
-        return np.array(symmetric_rows(inertia)), np.array(reach)
+        numbers = np.array(self._dynamics.reduced_inertia(*q)).reshape(6, 3)
+        return numbers[:3], numbers[3:]
 
     def _facts(self) -> dict[str, object]:
         actuators = ("torque limit", "actuator lag")

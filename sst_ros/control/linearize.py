@@ -24,13 +24,10 @@ import numpy as np
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import GRAZING, limits_of
-from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
+from sst_ros.dynamics.traced_dynamics import LEGS, Dynamics, recent_ode
 from sst_ros.dynamics.variational import trace_derivatives
 from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
-from sst_ros.integration.held_flow import HeldFlow, follow_held_torque
-from sst_ros.integration.method_steps import steps_of
-from sst_ros.integration.methods import DOP853
-from sst_ros.integration.point import Drive
+from sst_ros.integration.held_flow import HeldFlow, follow_held_torque, states_inside
 from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
@@ -208,7 +205,7 @@ def linearize(
             lasts = _find_limit(given, dynamics, flow, acting, dt)
         refuse_unless("linearize", ("dt", dt, not lasts, lasts))
         assert flow is not None
-        to_x = _differentiate(dynamics, by_star, flow.states[-1], acting).x_by_y
+        to_x = _coordinates_by_state(dynamics, flow.states[-1], acting, by_gamma)
         a = to_x @ flow.by_start @ begin.y_by_x
         b = to_x @ flow.by_torque
     lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []
@@ -220,20 +217,21 @@ def _find_limit(
     scene: Scene, dynamics: Dynamics, flow: HeldFlow, torque: Vector3, length: float
 ) -> str:
     """Say which limit a motion passes that it began inside of, "" if none."""
-    steps = steps_of(recent_ode(dynamics, work=True), DOP853)
-    drive = Drive((*torque, *(0.0 for _ in dynamics.drive[3:])))
-    states = flow.states.tolist()
-    angles = [dynamics.joints(*y[:7]) for y in (states[0], states[-1])]
-    for time in np.linspace(0.0, length, _CHECKS + 1)[1:-1].tolist():
-        last = int(np.searchsorted(flow.times, time, side="right")) - 1
-        x = time - float(flow.times[last])
-        y = steps.single(0.0, x, (*states[last], 0.0), drive)
-        angles.append(dynamics.joints(*y[:7]))
-    for limit in limits_of(scene, Geometry.of(scene)):
-        nearest = min(map(limit.distance, angles))
-        if nearest < -GRAZING <= limit.distance(angles[0]):
-            return f"must end before a limit: {limit.reason}"
-    return ""
+    inside = np.arange(1.0, _CHECKS) * (length / _CHECKS)
+    states = [
+        flow.states[0],
+        *states_inside(recent_ode(dynamics), flow, torque, inside),
+        flow.states[-1],
+    ]
+    angles = np.array([dynamics.joints(*y[:7].tolist()) for y in states])
+    limits = list(limits_of(scene, Geometry.of(scene)))
+    ends = np.array([limit.end for limit in limits])
+    signs = np.array([limit.sign for limit in limits])
+    distances = signs * (angles[:, [limit.joint for limit in limits]] - ends)
+    passed = (distances[0] >= -GRAZING) & (distances.min(axis=0) < -GRAZING)
+    if not passed.any():
+        return ""
+    return f"must end before a limit: {limits[int(passed.argmax())].reason}"
 
 
 class _Derivatives(NamedTuple):
@@ -257,17 +255,15 @@ def _differentiate(
     `by_star` gives the slope of y and its derivatives for coordinates of the star; None
     stands for those of gamma.
     """
-    size, q = len(y), y[:4]
-    turn = np.array([quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]).T
-    from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)
-    from_star[:4, :3], to_star[:3, :4] = turn, 4.0 * turn.T / (q @ q)
+    size = len(y)
+    from_star, to_star = _turns(y)
     if by_star is None:
-        drive = (*torque, *(0.0 for _ in dynamics.drive[3:]))
-        found = np.array(dynamics.actuator_motion(*y.tolist(), *drive)).reshape(
-            size + 4, -1
+        table = np.array(
+            dynamics.actuator_motion(*y.tolist(), *_drive(dynamics, torque))
         )
-        x, x_dot = np.split(found[1:].T, 2)
-        slope = np.split(found[0], 2)[1]
+        values_and_slopes = table.reshape(size + 4, -1)
+        x, x_dot = np.split(values_and_slopes[1:].T, 2)
+        slope = np.split(values_and_slopes[0], 2)[1]
         from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
         a = x_dot[:, :size] @ from_gamma
         return _Derivatives(x[:, :size], from_gamma, a, x_dot[:, size:], slope)
@@ -278,3 +274,31 @@ def _differentiate(
     a = slopes[:, :size] @ from_star
     a[:3, :3] = np.cross(y[4:7], np.eye(3))  # in the turning frame d' = dW - W x d
     return _Derivatives(to_star, from_star, a, slopes[:, size:], rows[0])
+
+
+def _coordinates_by_state(
+    dynamics: Dynamics, y: Array, torque: Sequence[float], by_gamma: bool
+) -> Array:
+    """Return the derivatives of the coordinates by a state, shape (n, n + 1)."""
+    if not by_gamma:
+        return _turns(y)[1]
+    columns = dynamics.coordinates_by_state(*y.tolist(), *_drive(dynamics, torque))
+    return np.asarray(np.array(columns).reshape(len(y), -1).T)
+
+
+def _drive(dynamics: Dynamics, torque: Sequence[float]) -> tuple[float, ...]:
+    """Return what acts from outside: torques, and no moment from a topic."""
+    return (*torque, *(0.0 for _ in dynamics.drive[LEGS:]))
+
+
+def _turns(y: Array) -> tuple[Array, Array]:
+    """Return derivatives of a state by deviations of the star, and those of the latter.
+
+    Shapes (n + 1, n) and (n, n + 1).
+    """
+    size, q = len(y), y[:4]
+    by_axis = [quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]
+    turn = np.array(by_axis).T
+    from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)
+    from_star[:4, :3], to_star[:3, :4] = turn, 4.0 * turn.T / (q @ q)
+    return from_star, to_star

@@ -19,9 +19,13 @@ from numpy.typing import NDArray
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.errors import Check, refuse_unless
-from sst_ros.mechanism.generic_math import Scalar, positive, sin, triple
+from sst_ros.mechanism.generic_math import Scalar, positive, sin, symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.programs.compiled import compile_functions, compile_rows
+from sst_ros.programs.compiled import (
+    RowsFunction,
+    compile_functions,
+    compile_rows,
+)
 from sst_ros.programs.expression import (
     Expression,
     Program,
@@ -30,11 +34,12 @@ from sst_ros.programs.expression import (
     mark_present,
     number_constants,
     trace,
+    trace_along,
 )
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import Place, leaves, rebuild
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.state import Joints, cached_property
+from sst_ros.state import ZERO, Joints, cached_property
 
 Function = Callable[..., Sequence[float]]
 
@@ -92,7 +97,7 @@ class Dynamics:
         return compile_functions({"joints": self.joints_program}, ("joints",))["joints"]
 
     @cached_property
-    def joints_of_rows(self) -> Callable[[Array], Array]:
+    def joints_of_rows(self) -> RowsFunction:
         """The same of rows of seven numbers each, shape (n, 7) -> (n, 18)."""
         return compile_rows({"joints": self.joints_program}, "joints")
 
@@ -112,7 +117,15 @@ class Dynamics:
         See `kernel.actuator_torque`. The inputs are the first seven numbers of the
         state, W_dot, and a moment if it comes from a topic.
         """
+        return compile_program(self._inverse_program)
 
+    @cached_property
+    def inverse_of_rows(self) -> RowsFunction:
+        """The same of rows of inputs, shape (n, inputs) -> (n, 7)."""
+        return compile_rows({"inverse": self._inverse_program}, "inverse")
+
+    @cached_property
+    def _inverse_program(self) -> Program:
         def torques(*inputs: Any) -> tuple[Any, ...]:
             x, y, z, w, wx, wy, wz, ax, ay, az, *moment = inputs
             torque, determinant = kernel.actuator_torque(
@@ -128,7 +141,28 @@ class Dynamics:
         names: tuple[str, ...] = (*MOTION, *BODY_ACCELERATION)
         if self.has_moment_topic:
             names = (*names, *MOMENT_SYMBOLS)
-        return compile_program(trace(torques, names))
+        return trace(torques, names)
+
+    @cached_property
+    def reduced_inertia(self) -> Function:
+        """Inertia reduced to the star in {E}, then the rows g_k, nine numbers each.
+
+        See `kernel.balance`. The input is a quaternion.
+        """
+        return compile_program(self._reduced_inertia_program)
+
+    @cached_property
+    def reduced_inertia_of_rows(self) -> RowsFunction:
+        """The same of rows of quaternions, shape (n, 4) -> (n, 18)."""
+        return compile_rows({"inertia": self._reduced_inertia_program}, "inertia")
+
+    @cached_property
+    def _reduced_inertia_program(self) -> Program:
+        def inertia_and_rows(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
+            inertia, _, reach = kernel.balance(self.model, (x, y, z, w), ZERO, ZERO)
+            return [*chain(*symmetric_rows(inertia)), *chain(*reach)]
+
+        return trace(inertia_and_rows, QUATERNION_SYMBOLS)
 
     @cached_property
     def actuator_motion(self) -> Function:
@@ -137,6 +171,25 @@ class Dynamics:
         x has gamma, gamma_dot, and the lagged torques if any. The inputs are the state
         and the drive.
         """
+        return compile_program(self._actuator_motion_program)
+
+    @cached_property
+    def coordinates_by_state(self) -> Function:
+        """Derivatives of the coordinates x by each number of the state.
+
+        The inputs are those of `actuator_motion`, of whose results they are a part.
+        """
+        program = self._actuator_motion_program
+        size = len(self.state)
+        numbers = 2 * (size - 1)  # x and its rates: a quaternion is three coordinates
+        by_number = [
+            program.outputs[numbers * k : numbers * (k + 1)] for k in range(1, size + 1)
+        ]
+        coordinates = [output for row in by_number for output in row[: size - 1]]
+        return compile_program(program.prune(coordinates))
+
+    @cached_property
+    def _actuator_motion_program(self) -> Program:
         size = len(self.state)
 
         def motion(*inputs: Any) -> tuple[Any, ...]:
@@ -154,7 +207,7 @@ class Dynamics:
             return (*x, *joints.gamma_dot, *gamma_ddot, *slope[STATE_SIZE:])
 
         inputs = (*self.state, *self.drive)
-        return compile_program(trace(motion, inputs, (*self.state, *TORQUE_SYMBOLS)))
+        return trace(motion, inputs, (*self.state, *TORQUE_SYMBOLS))
 
     @cached_property
     def energies(self) -> Function:
@@ -259,6 +312,17 @@ class ODE:
             self._of_numbers, self._inputs, ("t", *self.state, *TORQUE_SYMBOLS)
         )
         return compile_functions({"linearised": program}, ("linearised",))["linearised"]
+
+    @cached_property
+    def tangent(self) -> Program:
+        """The derivative, and how it changes where state and torques change.
+
+        After the inputs of `program` come the rates of change of the state and of the
+        drive's torques.
+        """
+        return trace_along(
+            self._of_numbers, self._inputs, (*self.state, *TORQUE_SYMBOLS)
+        )
 
     def derivative(
         self, time: Any, *inputs: Any, numbered: bool = False

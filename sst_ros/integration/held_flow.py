@@ -6,21 +6,26 @@ With the motion y' = f(y, u) the sensitivities S = dy/dy(0) and dy/du obey
     S' = (df/dy) S + df/du
 
 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section I.14).
-All numbers are one array, and the steps are those of DOP853 with Hairer's error
-estimate.
+Each column of S is integrated beside the motion: a step of DOP853 for both, traced
+whole, is one program, which runs for all columns at once. One error control, with
+Hairer's estimate, holds for the motion and all columns.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import ODE
+from sst_ros.dynamics.traced_dynamics import LEGS, ODE
 from sst_ros.integration.methods import DOP853
+from sst_ros.integration.steps import add_up, explicit_step
+from sst_ros.mechanism.generic_math import absolute, larger
 from sst_ros.mechanism.geometry import Array
+from sst_ros.programs.compiled import RowsFunction, compile_rows
+from sst_ros.programs.expression import Routine, trace
 from sst_ros.state import Vector3
 
 _TOLERANCE = 1e-12
@@ -30,17 +35,10 @@ _AT_STOPS = 0.1
 
 A step across a jump of derivatives loses its order.
 """
-_NO_DIVISION = 1e-300
-"""Added where all may be zero; less than what rounding takes off any other number."""
 _SAFETY, _LARGEST_GROWTH, _LARGEST_SHRINKAGE = 0.9, 5.0, 0.2
 """Factors by which a step changes."""
 _SHORTEST = 1e-16
 """Share of the period below which no step resolves the motion."""
-
-
-_STAGES = [np.array(weights) for weights in DOP853.a]
-_END = np.array(DOP853.b)
-_ERRORS = np.array([DOP853.error, DOP853.damping])
 
 
 class HeldFlow(NamedTuple):
@@ -83,54 +81,107 @@ def follow_held_torque(
         None where the motion does not last, or takes more evaluations.
 
     """
-    size, linearise = len(y), ode.linearised_by_torque
-    drive = (*torque, *(0.0 for _ in ode.drive[3:]))
-    columns = 1 + size + 3
-
-    def differentiate(t: float, table: Array) -> Array:
-        """Return the derivative of a table with the columns y, dy/dy(0) and dy/du."""
-        rows = np.array(linearise(t, *table[:, 0].tolist(), *drive))
-        rows = rows.reshape(size + 5, size)
-        slope = np.empty((size, columns))
-        slope[:, 0] = rows[0]
-        np.matmul(rows[2 : size + 2].T, table[:, 1:], out=slope[:, 1:])
-        slope[:, -3:] += rows[size + 2 :].T
-        return slope.ravel()
-
-    start = np.hstack([np.array(y)[:, None], np.eye(size), np.zeros((size, 3))])
-    table = start.ravel()
-    slopes = np.empty((len(DOP853.c), table.size))
+    size, step = len(y), _compile_step(ode)
+    columns = size + LEGS  # of S: by the state at the begin, then by the torques
+    rows = _rows_of_motion(ode, columns, torque)
+    moving = rows[:, 1 : 1 + 2 * size]  # the motion, and a column of S
+    moving[:, :size] = y
+    moving[:size, size:] = np.eye(size)
+    rows[size:, -LEGS:] = np.eye(LEGS)
     tolerance = _TOLERANCE * (_AT_STOPS if elastic else 1.0)
-    times, states = [0.0], [start[:, 0]]
+    times, states = [0.0], [moving[0, :size].copy()]
     t, h, evaluations = 0.0, length, 0
     while t < length:
         h = min(h, length - t)
-        evaluations += len(slopes)
+        evaluations += len(DOP853.c)
         if evaluations > most or h < _SHORTEST * length:
             return None
-        point = table
-        for stage, (node, weights) in enumerate(zip(DOP853.c, _STAGES, strict=True)):
-            if stage:
-                point = table + h * (weights @ slopes[:stage])
-            slopes[stage] = differentiate(t + node * h, point.reshape(size, -1))
-        after = table + h * (_END @ slopes)
-        fine, coarse = _ERRORS @ slopes
-        scales = np.maximum(1.0, np.maximum(np.abs(table), np.abs(after)))
-        error = h * fine * np.abs(fine)
-        error = error / np.sqrt(fine * fine + 0.01 * coarse * coarse + _NO_DIVISION)
-        size_of_error = float((np.abs(error) / scales).max()) / tolerance
-        if not math.isfinite(size_of_error):
+        rows[:, 0] = h
+        results = step(rows)
+        if not np.isfinite(results[:, -1]).all():
             h *= _LARGEST_SHRINKAGE
             continue
-        if size_of_error <= 1.0:
+        error = float(results[:, -2].max()) / tolerance
+        if error <= 1.0:
             t = length if h == length - t else t + h
-            table = after
+            moving[:] = results[:, : 2 * size]
             times.append(t)
-            states.append(table[::columns])
-        h *= _change_of_step(size_of_error)
-    ends = table.reshape(size, -1)
-    by_start, by_torque = ends[:, 1 : size + 1], ends[:, size + 1 :]
+            states.append(moving[0, :size].copy())
+        h *= _change_of_step(error)
+    by_number = moving[:, size:].T
+    by_start, by_torque = by_number[:, :size], by_number[:, size:]
     return HeldFlow(np.array(times), np.array(states), by_start, by_torque)
+
+
+def states_inside(ode: ODE, flow: HeldFlow, torque: Vector3, times: Array) -> Array:
+    """Return the states of a motion at times inside its period.
+
+    Each is reached by a shorter step from the begin of the step that it lies in.
+
+    Args:
+        ode: as for `follow_held_torque`.
+        flow: its result.
+        torque: what acted [N m].
+        times: after the begin of the period [s], shape (n,).
+
+    Returns:
+        States, shape (n, m).
+
+    """
+    begins = np.searchsorted(flow.times, times, side="right") - 1
+    size = flow.states.shape[1]
+    rows = _rows_of_motion(ode, len(times), torque)
+    rows[:, 0] = times - flow.times[begins]
+    rows[:, 1 : 1 + size] = flow.states[begins]
+    return _compile_step(ode)(rows)[:, :size]
+
+
+def _rows_of_motion(ode: ODE, count: int, torque: Vector3) -> Array:
+    """Return rows of inputs of a step: those of the drive, and zeros."""
+    size = len(ode.state)
+    rows = np.zeros((count, 1 + 2 * size + len(ode.drive) + LEGS))
+    first = 1 + 2 * size
+    rows[:, first : first + LEGS] = torque
+    return rows
+
+
+@lru_cache(maxsize=32)
+def _compile_step(ode: ODE) -> RowsFunction:
+    """Compile a step of DOP853 for a motion and one column of its derivatives.
+
+    Its inputs are the length of the step, the state, the column, the drive, and the
+    rates at which the torques change along the column. Its outputs are the new state
+    and column, their largest error relative to numbers above 1, and a total that is
+    finite where all numbers are.
+    """
+    size, drive_size = len(ode.state), len(ode.drive)
+    tangent = Routine("tangent", 1 + 2 * size + drive_size + LEGS, 2 * size)
+
+    def differentiate(
+        time: Any, point: Sequence[Any], held: Sequence[Any]
+    ) -> Sequence[Any]:
+        state, column = point[:size], point[size:]
+        drive, torque_rates = held[:drive_size], held[drive_size:]
+        return tangent(time, *state, *drive, *column, *torque_rates)
+
+    def take_step(h: Any, *numbers: Any) -> list[Any]:
+        before, held = numbers[: 2 * size], numbers[2 * size :]
+        each = [held] * len(DOP853.a)
+        # held torques: the motion does not depend on the time
+        after, errors = explicit_step(differentiate, DOP853, 0.0, h, before, each)
+        assert errors is not None
+        largest: Any = 0.0
+        for old, new, error in zip(before, after, errors, strict=True):
+            scale = larger(larger(1.0, absolute(old)), absolute(new))
+            largest = larger(largest, absolute(error) / scale)
+        return [*after, largest, add_up([*after, *errors])]
+
+    state = [f"y{i}" for i in range(size)]
+    column = [f"s{i}" for i in range(size)]
+    drive = [f"d{i}" for i in range(drive_size)]
+    torque_rates = [f"r{i}" for i in range(LEGS)]
+    program = trace(take_step, ("h", *state, *column, *drive, *torque_rates))
+    return compile_rows({"tangent": ode.tangent, "step": program}, "step")
 
 
 def _change_of_step(error: float) -> float:

@@ -226,6 +226,32 @@ def admissible(
     return candidates[0]
 
 
+def admissible_rotations(geometry: Geometry, gamma: ArrayLike) -> Array:
+    """Return the rotations of the admissible assemblies at many gamma.
+
+    Args:
+        geometry: of the manipulator.
+        gamma: actuator angles [rad], shape (n, 3).
+
+    Returns:
+        Rotations R, shape (n, 3, 3).
+
+    Raises:
+        AssemblyError: as `admissible` of the first gamma that has no unique admissible
+            assembly.
+
+    """
+    angles = np.asarray(gamma, dtype=float)
+    for row in np.flatnonzero(~np.isfinite(angles).all(axis=1)):
+        admissible(geometry, angles[row])
+    assemblies = direct_many(geometry, angles)
+    owners = assemblies.configuration[assemblies.admissible]
+    counts = np.bincount(owners, minlength=len(angles))
+    for row in np.flatnonzero((counts != 1) | ~assemblies.isolated):
+        admissible(geometry, angles[row])
+    return assemblies.rotation[assemblies.admissible]
+
+
 def describe_assemblies(
     geometry: Geometry, r: Array, rotation: Array
 ) -> tuple[Array, Array, Array, Mask]:

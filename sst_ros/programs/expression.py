@@ -449,27 +449,73 @@ def trace(
     names = tuple(inputs)
     outputs = tuple(function(*[graph.node("input", name) for name in names]))
     results, nodes = list(outputs), graph.nodes[:]
-    # forward mode: what a node makes of the slopes of its arguments
     for variable in by:
-        slopes: list[Value] = []
-        for index, (op, args) in enumerate(nodes):
-            d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
-            here = Expression(graph, index)
-            if isinstance(op, Routine):
-                raise TypeError(
-                    f"the program {op.name} is called: it has no derivative here"
-                )
-            if op == "input":
-                slopes.append(1.0 if args[0] == variable else 0.0)
-            elif len(args) > 1:
-                slopes.append(_SLOPE_RULES[op](here, *args, *d))
-            else:
-                slopes.append(
-                    0.0 if _is(d[0], 0.0) else _SLOPE_RULES[op](here, *args) * d[0]
-                )
-        results += [
-            slopes[out.index] if isinstance(out, Expression) else 0.0 for out in outputs
-        ]
+        results += _slopes_of(outputs, graph, nodes, {variable: 1.0})
+    return _program_of(graph, names, results)
+
+
+def trace_along(
+    function: Callable[..., Sequence[Value]],
+    inputs: Sequence[str],
+    moving: Sequence[str],
+) -> Program:
+    """Trace a function and how its outputs change where some inputs change.
+
+    Args:
+        function: as for `trace`.
+        inputs: names of its inputs.
+        moving: those of them that change. The program has a further input for each,
+            after all others: its rate of change.
+
+    Returns:
+        The program of the outputs and then of their rates of change, which are exact.
+
+    """
+    graph = Graph()
+    expressions = [graph.node("input", name) for name in inputs]
+    names = (*inputs, *(f"rate_of_{name}" for name in moving))
+    rates = {
+        name: graph.node("input", rate_name)
+        for name, rate_name in zip(moving, names[len(inputs) :], strict=True)
+    }
+    outputs = tuple(function(*expressions))
+    slopes = _slopes_of(outputs, graph, graph.nodes[:], rates)
+    return _program_of(graph, names, [*outputs, *slopes])
+
+
+def _slopes_of(
+    outputs: Sequence[Value],
+    graph: Graph,
+    nodes: Sequence[tuple[Operation, tuple[Value, ...]]],
+    slopes_of_inputs: Mapping[str, Value],
+) -> list[Value]:
+    """Return the slopes of outputs by forward mode, of those of the inputs by name."""
+    slopes: list[Value] = []
+    for index, (op, args) in enumerate(nodes):
+        d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
+        here = Expression(graph, index)
+        if isinstance(op, Routine):
+            raise TypeError(
+                f"the program {op.name} is called: it has no derivative here"
+            )
+        if op == "input":
+            slopes.append(slopes_of_inputs.get(args[0], 0.0))
+        elif len(args) > 1:
+            slopes.append(_SLOPE_RULES[op](here, *args, *d))
+        elif _is(d[0], 0.0):
+            slopes.append(0.0)
+        else:
+            slopes.append(_SLOPE_RULES[op](here, *args) * d[0])
+    return [
+        slopes[output.index] if isinstance(output, Expression) else 0.0
+        for output in outputs
+    ]
+
+
+def _program_of(
+    graph: Graph, names: tuple[str, ...], results: Sequence[Value]
+) -> Program:
+    """Return the program of a graph's results, without what they do not need."""
 
     def operand(value: Value) -> float | int:
         if isinstance(value, Expression):

@@ -125,6 +125,7 @@ class RowFunction:
         self._call = signature(code.address(row_name(name, shared)))
         self._code = code
         self._numbers = np.array([*module.numbers, 0.0])
+        self._numbers_address = self._numbers.ctypes.data
 
     def __call__(
         self,
@@ -145,7 +146,7 @@ class RowFunction:
         self._check_rows(inputs, outputs)
         begin, end, _ = columns.indices(len(outputs[0]))
         whole = begin + (end - begin) // LANES * LANES
-        scalars = np.array([*shared, 0.0], dtype=float)
+        scalars = (ctypes.c_double * (len(shared) + 1))(*shared)
         if whole > begin:
             ins = _addresses(inputs, begin)
             self._run(whole - begin, scalars, ins, _addresses(outputs, begin))
@@ -174,8 +175,7 @@ class RowFunction:
         if count == 0:  # the loop is made for one column at least
             return
         ins, outs = _row_addresses(inputs), _row_addresses(outputs)
-        scalars = np.zeros(1)
-        self._run(count, scalars, ins.ctypes.data, outs.ctypes.data)
+        self._run(count, (ctypes.c_double * 1)(), ins.ctypes.data, outs.ctypes.data)
 
     def bind(
         self,
@@ -196,7 +196,7 @@ class RowFunction:
         ins, outs = _addresses(inputs, 0), _addresses(outputs, 0)
         scalars = (ctypes.c_double * self.shared)()
         call = self._call
-        fixed = count, ctypes.addressof(scalars), self._numbers.ctypes.data, ins, outs
+        fixed = count, ctypes.addressof(scalars), self._numbers_address, ins, outs
 
         def run(*shared: float, _rows: Any = rows) -> None:
             scalars[:] = [*shared]
@@ -208,10 +208,8 @@ class RowFunction:
         if len(inputs) != self.rows or len(outputs) != self.outputs:
             raise ValueError("as many rows as the program has inputs and outputs")
 
-    def _run(
-        self, count: int, scalars: NDArray[np.float64], ins: Any, outs: Any
-    ) -> None:
-        self._call(count, scalars.ctypes.data, self._numbers.ctypes.data, ins, outs)
+    def _run(self, count: int, scalars: Any, ins: Any, outs: Any) -> None:
+        self._call(count, ctypes.addressof(scalars), self._numbers_address, ins, outs)
 
 
 def _addresses(rows: Sequence[NDArray[np.float64]], first: int) -> Any:

@@ -17,14 +17,15 @@ from mechanism.test_loads import laden, loaded
 from models import FAST, folding_star, samples, seeded_samples
 from scipy.spatial.transform import Rotation
 
+from benchmark.plain_python import without_llvmlite
 from sst_ros import Trajectory, simulate
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
-from sst_ros.errors import InputError, SingularConfiguration
-from sst_ros.mechanism import virtual_work
+from sst_ros.errors import AssemblyError, InputError, SingularConfiguration
+from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.generic_math import symmetric_rows
-from sst_ros.mechanism.geometry import quaternion_of
+from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.loads import Moment
 from sst_ros.scene.scene import load
 from sst_ros.simulation.simulation import Simulation
@@ -207,3 +208,70 @@ def test_gravity_torque_takes_a_state_angles_or_a_quaternion():
     )
     with pytest.raises(InputError, match="three angles gamma or a quaternion"):
         inverse.gravity_torque((0.1, 0.2))
+
+
+POSES = np.random.default_rng(5).uniform(-0.12, 0.12, (23, 3)) + 0.785
+
+
+@pytest.mark.parametrize("name", ["general", "example2_heavy", "gravity_payload"])
+@pytest.mark.parametrize("kind", ["angles", "quaternions"])
+def test_many_poses_have_the_bits_of_each(name, kind):
+    moment = Moment(topic=True) if name == "gravity_payload" else None
+    scene = dataclasses.replace(load(name), moment=moment)
+    inverse, geometry = InverseDynamics(scene), Geometry.of(scene)
+    poses = POSES + (np.array(scene.initial.gamma) - 0.785)
+    if kind == "quaternions":
+        rotations = [kinematics.admissible(geometry, row).rotation for row in poses]
+        poses = quaternion_of(np.array(rotations))
+    torques, masses = inverse.gravity_torque(poses), inverse.mass_matrix(poses)
+    assert torques.shape == (23, 3)
+    assert masses.shape == (23, 3, 3)
+    assert (torques == [inverse.gravity_torque(row) for row in poses]).all()
+    assert (masses == [inverse.mass_matrix(row) for row in poses]).all()
+    assert (inverse.gravity_torque(poses.tolist()) == torques).all()
+
+
+def test_many_poses_have_the_same_bits_without_llvmlite():
+    pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
+    compiled = InverseDynamics(load("gravity_payload")).mass_matrix(POSES)
+    with without_llvmlite():
+        plain = InverseDynamics(load("gravity_payload")).mass_matrix(POSES)
+    assert (compiled == plain).all()
+
+
+def test_the_potential_energy_of_many_poses_has_their_torques_as_slope():
+    samples_of_poses = seeded_samples(85, 2)
+    for sample in samples_of_poses:
+        scene = dataclasses.replace(laden(sample), friction=None)
+        truth = Lagrange(laden(sample), sample.rotation)
+        expected = -np.array(truth.loads(sample.gamma, np.zeros(3)))
+        rows = np.tile(sample.quaternion, (3, 1))
+        for torque in InverseDynamics(scene).gravity_torque(rows):
+            assert np.abs(torque - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+def test_no_poses_have_no_torques():
+    inverse = InverseDynamics(load("example1"))
+    assert inverse.gravity_torque(np.empty((0, 3))).shape == (0, 3)
+    assert inverse.mass_matrix(np.empty((0, 4))).shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize("method", ["gravity_torque", "mass_matrix"])
+def test_the_first_pose_of_many_without_a_torque_is_told(method):
+    inverse = InverseDynamics(load("example1"))
+    compute = getattr(inverse, method)
+    for wrong, error, said in (
+        ([[0.8, 0.8]], InputError, "rows of three angles gamma or of quaternions"),
+        ([[0.8, 0.8, 0.8], [0.8, 0.8]], InputError, "at = "),
+        ([[0.8, 0.8, 0.8], [0.8, 0.8, math.nan]], AssemblyError, "three finite"),
+        ([["a", "b", "c"]], InputError, "at = "),
+        (np.zeros((2, 2, 3)), InputError, "or rows of either"),
+        ([[0.8, 0.8, 0.8], [9.0, 9.0, 0.0]], AssemblyError, r"gamma = \[9\. 9\. 0\.\]"),
+        ([[0.0, 0.0, 0.0, 0.0]], InputError, "length > 0"),
+    ):
+        with pytest.raises(error, match=said):
+            compute(wrong)
+    scene, poses = folding_star()
+    quaternion = quaternion_of(poses[0])
+    with pytest.raises(SingularConfiguration, match="parallel"):
+        getattr(InverseDynamics(scene), method)([quaternion.tolist()] * 2)

@@ -11,6 +11,7 @@ from mechanism.test_loads import loaded
 from models import folding_star, seeded_samples
 from mpmath import mp, mpf
 
+from benchmark.plain_python import without_llvmlite
 from sst_ros import (
     InputError,
     SingularConfiguration,
@@ -22,6 +23,7 @@ from sst_ros import (
 from sst_ros.control.actuator_space import ActuatorSpaceMap
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.integration import held_flow
 from sst_ros.mechanism.generic_math import quaternion_product
 from sst_ros.mechanism.geometry import Geometry, quaternion_of
 from sst_ros.scene.bodies import Stroke
@@ -143,6 +145,37 @@ def test_a_period_across_a_contact_has_the_model_of_differences(seed):
     truth = np.transpose(columns)
     error = np.abs(np.hstack([found.A, found.B]) - truth).max()
     assert error <= 1e-5 * np.abs(truth).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "most_calls"), [("example2_heavy", 1), ("friction", 2), ("stiff", 25)]
+)
+def test_a_period_takes_a_call_of_a_program_a_step(monkeypatch, name, most_calls):
+    calls, compile_step = [], held_flow._compile_step
+
+    def compile_counted(ode):
+        step = compile_step(ode)
+
+        def counted(rows):
+            calls.append(len(rows))
+            return step(rows)
+
+        return counted
+
+    monkeypatch.setattr(held_flow, "_compile_step", compile_counted)
+    linearize(name, None, (0.01, 0.0, 0.0), dt=1e-3)
+    *steps, checks = calls
+    assert len(steps) <= most_calls
+    assert checks == 7
+
+
+def test_a_period_has_the_same_bits_without_llvmlite():
+    pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
+    compiled = linearize("friction", None, (0.01, 0.0, 0.0), dt=2e-3)
+    with without_llvmlite():
+        plain = linearize("friction", None, (0.01, 0.0, 0.0), dt=2e-3)
+    assert (compiled.A == plain.A).all()
+    assert (compiled.B == plain.B).all()
 
 
 def test_a_period_across_a_limit_has_no_model():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sst_ros.mechanism.generic_math import atan2, exp, positive, sqrt, tanh
-from sst_ros.programs.expression import compile_program, trace
+from sst_ros.programs.expression import compile_program, trace, trace_along
 
 FINITE = st.floats(-10.0, 10.0)
 
@@ -53,6 +53,23 @@ def test_derivatives_equal_the_complex_step(x, y):
     by_y = [np.imag(f) / step for f in everything(complex(x), complex(y, step))]
     assert values[:3] == everything(x, y)
     assert values[3:] == pytest.approx([*by_x, *by_y], rel=1e-12, abs=1e-14)
+
+
+@given(FINITE, FINITE.filter(lambda y: abs(y - 1.0) > 1e-6), FINITE, FINITE)
+def test_rates_of_outputs_equal_the_complex_step(x, y, x_rate, y_rate):
+    program = trace_along(everything, ("x", "y"), ("y", "x"))
+    assert program.inputs == ("x", "y", "rate_of_y", "rate_of_x")
+    values = compile_program(program)(x, y, y_rate, x_rate)
+    step = 1e-200
+    moved = everything(complex(x, step * x_rate), complex(y, step * y_rate))
+    assert values[:3] == everything(x, y)
+    rates = [np.imag(f) / step for f in moved]
+    assert values[3:] == pytest.approx(rates, rel=1e-12, abs=1e-13)
+
+
+def test_an_input_that_does_not_change_gives_outputs_no_rate():
+    program = trace_along(lambda x, y: (x * y, x), ("x", "y"), ("y",))
+    assert compile_program(program)(3.0, 5.0, 2.0) == (15.0, 3.0, 6.0, 0.0)
 
 
 def test_a_branch_on_a_traced_number_is_refused():
