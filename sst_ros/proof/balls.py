@@ -25,6 +25,7 @@ arb, arb_mat, arb_poly, arb_series, ctx = (
 
 PRECISION = 128  # bits of all balls
 LONGEST_SERIES = 100  # coefficients of a series, at most
+PERCENT = 2  # exponent of ten
 _CONTEXT_LOCK = threading.RLock()
 """python-flint has one context for all threads, so one proof runs at a time."""
 
@@ -91,10 +92,29 @@ def write_down(number: float, digits: int = 12) -> str:
     return _write(number, digits, ROUND_FLOOR)
 
 
-def _write(number: float, digits: int, rounding: str) -> str:
+def percent_up(share: float, digits: int) -> str:
+    """Write a share in percent, not less than it."""
+    return f"{_write(share, digits, ROUND_CEILING, PERCENT)} %"
+
+
+def percent_down(share: float, digits: int) -> str:
+    """Write a share in percent, not greater than it."""
+    return f"{_write(share, digits, ROUND_FLOOR, PERCENT)} %"
+
+
+def degrees_up(angle: float, digits: int) -> str:
+    """Write an angle [rad] in degrees, not less than it."""
+    with precision():
+        return f"{write_up(upper(arb(angle) * 180 / arb.pi()), digits)} deg"
+
+
+def _write(number: float, digits: int, rounding: str, exponent: int = 0) -> str:
+    """Write a number times ten to an exponent; it is rounded once."""
     if not math.isfinite(number):
         return str(number)
     rounded = Context(prec=digits, rounding=rounding).create_decimal(Decimal(number))
+    if exponent:
+        rounded = rounded.scaleb(exponent) + 0  # exact; 100, not 1E+2
     text = f"{rounded:.{digits}g}"
     assert Decimal(text) == rounded
     return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
@@ -106,8 +126,14 @@ def between(low: Any, high: Any) -> Any:
 
 
 def norm(numbers: Sequence[Any]) -> Any:
-    """Return the root of the sum of squares."""
-    return sum((x * x for x in numbers), arb(0)).sqrt()
+    """Return the root of the sum of squares.
+
+    The ball of a sum that may be zero has negative numbers, too, which have no root.
+    """
+    total = sum((x * x for x in numbers), arb(0))
+    if total > 0:
+        return total.sqrt()
+    return between(0, total.upper().max(arb(0)).sqrt())
 
 
 def column(numbers: Sequence[Any]) -> Any:

@@ -33,7 +33,14 @@ from sst_ros.dynamics.traced_dynamics import (
     TORQUE_SYMBOLS,
     Dynamics,
 )
-from sst_ros.errors import SstError, check_kinds, refuse_unless, require
+from sst_ros.errors import (
+    InputError,
+    Problem,
+    SstError,
+    check_kinds,
+    refuse_unless,
+    require,
+)
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -61,7 +68,7 @@ from sst_ros.proof.scene_balls import (
     range_balls,
 )
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.schema import Place
+from sst_ros.scene.schema import Place, key_of
 from sst_ros.scene.torque_profile import (
     FunctionTorque,
     LostTorque,
@@ -77,6 +84,7 @@ Span = tuple[float, float, int]
 PARALLEL = "parallel singularity, det J2 = 0"
 LIMIT_ORDER = 6  # of expansions whose signs say where limits are
 SPLITS = 200  # of a step, most of them near a limit
+TURN_SPLITS = 80  # of a step in which a joint may turn back: a joint may be at rest
 TURN_SYMBOLS = ("turn_x", "turn_y", "turn_z")
 GAMMA_SYMBOLS, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
 _UNIT_QUATERNIONS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -85,8 +93,12 @@ AT_START = "the posture at the start is not proven to be the only one near"
 MOST_BOX_PARTS = 10_000  # of the box of ranges
 ORDER = -1.6
 PROOF_ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
-# proofs by which the width of ranges is looked for that would do, each by half
-NARROWER = 8
+# how often ranges are halved where a width is looked for that would do; then bisected
+HALVINGS = (1, 2, 4, 8, 16, 32)
+SHARE_DIGITS = 3  # of a share of a width that would do
+# most steps of a proof with narrower ranges: so many times those without, and some
+NARROW_STEPS = 4
+SPARE_STEPS = 10
 JOINT_COUNT = 18  # angles and rates of the joints
 
 
@@ -308,6 +320,48 @@ class BallEquations:
         return names
 
     @cached_property
+    def turn_names(self) -> list[str]:
+        """Names of the joints with dry friction, where they turn back."""
+        return [
+            f"{JOINT_QUANTITIES[kind]}_{leg} turns back under dry friction"
+            for kind in self._rubbing
+            for leg in (1, 2, 3)
+        ]
+
+    @cached_property
+    def _rubbing(self) -> list[int]:
+        """Kinds of joints (0 to 2) that have dry friction."""
+        friction = self.scene.friction
+        if friction is None:
+            return []
+        laws = (friction.gamma, friction.mu, friction.beta)
+        return [
+            kind
+            for kind, law in enumerate(laws)
+            if law is not None and (law.coulomb or law.static)
+        ]
+
+    def turns_between(self, begin: float, end: float) -> Function:
+        """Return the rates of the joints that are named by `turn_names`.
+
+        They are functions of time and state.
+        """
+        return self._commanded(self._rubbing_rates, begin, end)
+
+    @cached_property
+    def _rubbing_rates(self) -> Function:
+        """Compile the rates of the joints with dry friction [rad/s]."""
+
+        def rates(parts: Parts, time: Any, *given: Any) -> list[Any]:
+            legs = list(kernel.leg_motions(parts.model, given))
+            return [
+                kernel.joint_rate(leg, kind) for kind in self._rubbing for leg in legs
+            ]
+
+        inputs = ("t", *self.state, *(self._held or TORQUE_SYMBOLS))
+        return self.balls.compile(rates, inputs)
+
+    @cached_property
     def _limits(self) -> Function:
         """Compile numbers that are zero at a limit and positive inside.
 
@@ -362,7 +416,8 @@ class Follower:
         self._left = trajectory.t.tolist()
         self.rows: list[Row] = []
         self.tracking: list[TrackingRow] = []
-        self.signs: dict[str, list[Span]] = {name: [] for name in equations.limit_names}
+        names = [*equations.limit_names, *equations.turn_names]
+        self.signs: dict[str, list[Span]] = {name: [] for name in names}
         self.until, self.reason, self.steps = 0.0, "", 0
 
     @property
@@ -386,28 +441,42 @@ class Follower:
         This goes on as long as steps can be proven.
         """
         order = max(14, math.ceil(ORDER * math.log10(tolerance)))
+        # What overflows in doubles is no number, and is refused as one.
         try:
-            loop = self._equations.loop
-            here = self._equations.start()
-            for begin, end in pairwise(breaks):
-                if loop is not None:
-                    here = self._sample(loop, here)
-                f, jacobian = self._equations.between(begin, end)
-                limits = self._equations.limits_between(begin, end)
-                for step in ProvenSteps(f, jacobian, here, end, tolerance, order):
-                    self._take(step, limits)
-                    bar.draw(step.end / breaks[-1])
-                    if self.reason:
-                        return
-                    if self.steps >= max_steps and step.end < breaks[-1]:
-                        raise Refused(f"{max_steps} steps are not enough")
-                here = enclosure.region_at_end(step, boxed=loop is not None)
-            if loop is not None:
-                self._sample(loop, here)
+            with np.errstate(all="ignore"):
+                self._follow(breaks, tolerance, order, max_steps, bar)
         except (Refused, SstError) as refused:
             self.reason = str(refused)
         except (ArithmeticError, ValueError):
             self.reason = enclosure.UNBOUNDED
+
+    def _follow(
+        self,
+        breaks: Sequence[float],
+        tolerance: float,
+        order: int,
+        max_steps: int,
+        bar: Bar,
+    ) -> None:
+        loop = self._equations.loop
+        here = self._equations.start()
+        for begin, end in pairwise(breaks):
+            if loop is not None:
+                here = self._sample(loop, here)
+            f, jacobian = self._equations.between(begin, end)
+            limits = self._equations.limits_between(begin, end)
+            for step in ProvenSteps(f, jacobian, here, end, tolerance, order):
+                self._take(step, limits)
+                if self._equations.turn_names:
+                    self._note_turns(step, begin, end)
+                bar.draw(step.end / breaks[-1])
+                if self.reason:
+                    return
+                if self.steps >= max_steps and step.end < breaks[-1]:
+                    raise Refused(f"{max_steps} steps are not enough")
+            here = enclosure.region_at_end(step, boxed=loop is not None)
+        if loop is not None:
+            self._sample(loop, here)
 
     def _sample(self, loop: SampledLoop, here: Region) -> Region:
         """Return the region behind a tick of the controller.
@@ -422,7 +491,7 @@ class Follower:
         """Take what a step proves, up to where the motion meets an end of the scene."""
         self.steps, end = self.steps + 1, step.end
         names, stops = self._equations.limit_names, self._equations.stop_names
-        for low, high, signs in _signs(step, limits, len(names)):
+        for low, high, signs in _signs(step, limits, len(names), SPLITS):
             for name, sign in zip(names, signs, strict=True):
                 self.signs[name].append((low, high, sign))
                 if name in stops and sign <= 0 and low < end:
@@ -430,6 +499,17 @@ class Follower:
         self.until = end
         while self._left and self._left[0] <= end:
             self.rows.append(self._row(step, self._left.pop(0)))
+
+    def _note_turns(self, step: Advance, begin: float, end: float) -> None:
+        """Note when joints with dry friction may turn back in a step.
+
+        Begin and end are the kinks in time between which it lies.
+        """
+        names = self._equations.turn_names
+        rates = self._equations.turns_between(begin, end)
+        for low, high, signs in _signs(step, rates, len(names), TURN_SPLITS):
+            for name, sign in zip(names, signs, strict=True):
+                self.signs[name].append((low, high, sign))
 
     def _row(self, step: Advance, time: float) -> Row:
         p, e = step.at(time)
@@ -536,8 +616,8 @@ class ProvenMotion(Explained):
         reason: why it ends there; "" where that is the duration.
         limits: for each limit of the mechanism the spans of time [s] in which the
             motion may be on it; at all other times until `until` it is proven not to
-            be. Contacts with elastic stops and torques at their limit are among them:
-            they begin and end in these spans.
+            be. Contacts with elastic stops, torques at their limit and the turns of
+            joints with dry friction are among them: they begin and end in these spans.
         tracking: under a controller, by name, shape (m,): t [s], its ticks and the end;
             error_1 to _3 [rad], desired - true gamma, and torque_1 to _3 [N m], what it
             commands, each with NAME_bound, how far the true one can be from it.
@@ -669,13 +749,13 @@ def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
 
 
 def _signs(
-    step: Advance, run: Function, count: int
+    step: Advance, run: Function, count: int, splits: int
 ) -> Iterator[tuple[float, float, Sequence[int]]]:
     """Split a step into spans of time by the signs of numbers.
 
     Numbers are > 0 (1), < 0 (-1), or unknown (0).
     """
-    begin, left = step.begin.time, SPLITS
+    begin, left = step.begin.time, splits
     todo = [(begin, step.end)]
     while todo:
         low, high = todo.pop()
@@ -717,6 +797,7 @@ class ProofTask(NamedTuple):
     max_steps: int
     progress: bool
     control: CertifiedControl | None = None
+    split: int = 1  # parts of the box of ranges, of which one is proven
 
     def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
         """Prove the motion for all numbers of ranges."""
@@ -739,29 +820,94 @@ class ProofTask(NamedTuple):
     def prove_part(self, ranges: Mapping[Place, Any]) -> Follower:
         """Prove the motion for all numbers of ranges.
 
-        Where they are too wide, say what is not.
+        Where they are too wide, the reason says so, with a width that would do.
+
+        Raises:
+            InputError: the scene cannot even be enclosed for all of them.
+
         """
-        follower = self.prove(ranges)
+        try:
+            follower = self.prove(ranges)
+        except (ArithmeticError, ValueError):
+            if not ranges:
+                raise
+            too_wide = self._too_wide_alone(ranges) or list(ranges)
+            names = ", ".join(dict.fromkeys(map(_key_without_index, too_wide)))
+            exact = self.prove(_narrowed(ranges, 0.0), "no range")
+            advice = f"must be narrower: {self._advise(ranges, exact.steps)}"
+            raise InputError("certify", [Problem("ranges", names, advice)]) from None
         if not ranges or not follower.reason or follower.steps >= self.max_steps:
             return follower
-        exact = {place: arb(x.mid()) for place, x in ranges.items()}
-        if follower.is_whole and self.prove(exact, "no range").until <= follower.until:
-            return follower  # a limit that ends the motion without a range, too
-        share = 1.0
-        for halvings in range(1, NARROWER + 1):
-            share = 0.5**halvings
-            narrow = {
-                place: arb(x.mid(), x.rad() * share) for place, x in ranges.items()
-            }
-            if self.prove(narrow, "narrower").is_whole:
-                advice = (
-                    f"{share:g} of their width would do, or split={2**halvings} or more"
-                )
-                break
-        else:
-            advice = f"{share:g} of their width would not do either"
-        follower.reason = f"the ranges are too wide: {advice} ({follower.reason})"
+        exact = self.prove(_narrowed(ranges, 0.0), "no range")
+        if not exact.is_whole or exact.reason == follower.reason:
+            return follower  # it ends so without a range, too
+        follower.reason = (
+            f"the ranges are too wide: {self._advise(ranges, exact.steps)}"
+            f" ({follower.reason})"
+        )
         return follower
+
+    def _too_wide_alone(self, ranges: Mapping[Place, Any]) -> list[Place]:
+        """Return the places of ranges for which the scene alone is not enclosed."""
+        places = []
+        for place, ball in ranges.items():
+            others = _narrowed(ranges, 0.0)
+            try:
+                SceneBalls(self.trajectory.scene, self.profile, others | {place: ball})
+            except (ArithmeticError, ValueError):
+                places.append(place)
+        return places
+
+    def _advise(self, ranges: Mapping[Place, Any], steps: int) -> str:
+        """Say what share of the width of ranges would do; `steps` are those of none."""
+        most = min(self.max_steps, NARROW_STEPS * (steps + SPARE_STEPS))
+        halvings = self._replace(max_steps=most)._needed_halvings(ranges)
+        if halvings is None:
+            share = write_down(0.5 ** HALVINGS[-1], SHARE_DIGITS)
+            return f"{share} of their width would not do either"
+        share = write_down(0.5**halvings, SHARE_DIGITS)
+        advice = f"{share} of their width would do"
+        wide = sum(ball.rad() > 0 for ball in ranges.values())
+        parts = self.split * 2 ** (halvings * wide)
+        if parts <= MOST_BOX_PARTS:
+            advice = f"{advice}, or split={parts} or more"
+        return advice
+
+    def _needed_halvings(self, ranges: Mapping[Place, Any]) -> int | None:
+        """Return how often ranges must be halved; None where that is in vain."""
+        too_few = 0
+        for halvings in HALVINGS:
+            if self._is_proven(_narrowed(ranges, 0.5**halvings)):
+                break
+            too_few = halvings
+        else:
+            return None
+        enough = halvings
+        while enough - too_few > 1:
+            middle = (enough + too_few) // 2
+            if self._is_proven(_narrowed(ranges, 0.5**middle)):
+                enough = middle
+            else:
+                too_few = middle
+        return enough
+
+    def _is_proven(self, ranges: Mapping[Place, Any]) -> bool:
+        try:
+            return self.prove(ranges, "narrower").is_whole
+        except (ArithmeticError, ValueError):
+            return False
+
+
+def _key_without_index(place: Place) -> str:
+    """Return the key of a number, or of all numbers of the list that it is in."""
+    while isinstance(place[-1], int):
+        place = place[:-1]
+    return key_of(place)
+
+
+def _narrowed(ranges: Mapping[Place, Any], share: float) -> dict[Place, Any]:
+    """Return a share of the width of ranges, about their middles."""
+    return {place: arb(x.mid(), x.rad() * share) for place, x in ranges.items()}
 
 
 @check_kinds
@@ -863,7 +1009,7 @@ def certify(
             origin="certify",
         )
         task = ProofTask(
-            trajectory, profile, breaks, bound, max_steps, progress, control
+            trajectory, profile, breaks, bound, max_steps, progress, control, split
         )
         wide = {place: x for place, x in balls.items() if x.rad() > 0}
         boxes = split_ranges(wide, split) if wide else [{}]

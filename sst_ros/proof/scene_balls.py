@@ -40,6 +40,7 @@ from sst_ros.scene.yaml_document import find_fields
 Range = float | tuple[float, float] | str
 """A half-width, an interval, or "digits": half a unit of the last digit written."""
 
+LARGEST_RANGE = 1e300  # magnitude of the numbers of a range
 READING = "r"  # input of programs: how numbers are taken, see `SceneBalls`
 DEGREE: Place = ("degree",)  # place of pi / 180 among the constants
 DAMPING: Place = ("stroke", "damping")
@@ -292,9 +293,7 @@ def _balls_of(
         return
     allowed = 'must be a half-width >= 0, an interval (low, high), or "digits"'
     if isinstance(width, (tuple, list)):
-        is_interval = len(width) == 2 and all(
-            isinstance(x, (int, float)) for x in width
-        )
+        is_interval = len(width) == 2 and all(map(_is_bounded, width))
         refuse_unless(
             origin, (name, width, is_interval and width[0] <= width[1], allowed)
         )
@@ -305,13 +304,17 @@ def _balls_of(
             refuse_unless(origin, (name, width, inside, number))
             yield place, between(arb(low), arb(high)).union(number_ball(numbers[place]))
         return
-    is_number = isinstance(width, (int, float)) and not isinstance(width, bool)
-    refuse_unless(
-        origin, (name, width, is_number and 0.0 <= float(width) < 1e300, allowed)
-    )
+    is_width = _is_bounded(width) and width >= 0
+    refuse_unless(origin, (name, width, is_width, allowed))
     for place in places:
         digits = document.texts.get(place)
         yield place, number_ball(numbers[place], digits) + arb(0, float(width))
+
+
+def _is_bounded(number: Any) -> bool:
+    """Whether a number of a range is one, and far from the largest double."""
+    is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
+    return is_number and -LARGEST_RANGE < number < LARGEST_RANGE
 
 
 class NumberReading(NamedTuple):

@@ -53,7 +53,15 @@ from sst_ros.mechanism.geometry import (
 )
 from sst_ros.mechanism.workspace import measures, orientations
 from sst_ros.progress import Bar
-from sst_ros.proof.balls import arb, precision, upper, write_down, write_up
+from sst_ros.proof.balls import (
+    arb,
+    degrees_up,
+    percent_down,
+    percent_up,
+    precision,
+    upper,
+    write_down,
+)
 from sst_ros.proof.scene_balls import Parts, SceneBalls, WrittenDocument, range_balls
 from sst_ros.scene.scene import Scene, scene_of
 from sst_ros.scene.schema import Place, key_of
@@ -734,11 +742,11 @@ class ProvenZone(Explained):
     @property
     def shares(self) -> str:
         """The shares in words, rounded outward."""
-        words = [f"{write_down(100.0 * self.proven, 6)} % proven"]
+        words = [f"{percent_down(self.proven, 6)} proven"]
         if self.refuted:
-            words.append(f"{write_down(100.0 * self.refuted, 6)} % refuted")
+            words.append(f"{percent_down(self.refuted, 6)} refuted")
         if self.open:
-            words.append(f"{write_up(100.0 * self.open, 6)} % open")
+            words.append(f"{percent_up(self.open, 6)} open")
         return ", ".join(words)
 
     def status_of(self, poses: ArrayLike) -> NDArray[np.int8]:
@@ -790,7 +798,7 @@ class ProvenZone(Explained):
 
     def _facts(self) -> dict[str, object]:
         about = ", ".join(
-            f"{name} {math.degrees(low):.6g} to {math.degrees(high):.6g} deg"
+            f"{name} {low!r} to {high!r} rad"
             for name, (low, high) in self._extent().items()
         )
         facts: dict[str, object] = {"scene": self.scene.name, "zone": about}
@@ -798,16 +806,14 @@ class ProvenZone(Explained):
         shares = {name: share for name, share in self.refuted_by.items() if share}
         if shares:
             largest = sorted(shares, key=shares.__getitem__, reverse=True)[:3]
-            words = [f"{write_down(100.0 * shares[x], 3)} % {x}" for x in largest]
+            words = [f"{percent_down(shares[x], 3)} {x}" for x in largest]
             facts["refuted by"] = ", ".join(words)
         if self.proven:
             facts["abs(det J2)"] = f"above {write_down(self.least_det_j2, 3)}"
             facts["sin(mu)"] = f"above {write_down(self.least_sine_mu, 3)}"
         if self.nearest:
-            away = write_up(math.degrees(self.nearest.distance), 4)
-            facts["beyond"] = (
-                f"{self.nearest.limit}, {away} deg from the reference pose"
-            )
+            away = degrees_up(self.nearest.distance, 4)
+            facts["beyond"] = f"{self.nearest.limit}, {away} from the reference pose"
         return facts | {"boxes": self.examined}
 
     def _extent(self) -> dict[str, tuple[float, float]]:

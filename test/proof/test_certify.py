@@ -583,6 +583,15 @@ def test_all_that_is_printed_of_a_motion_is_outward():
     assert float(str(facts["proven"]).split()[1]) <= proven.until
 
 
+def test_the_length_of_what_may_be_zero_is_a_number():
+    with balls.precision():
+        for number in (arb(0), arb(0, 1e-30), arb(1e-40, 1e-30)):
+            length = balls.norm([number] * 4)
+            assert length.is_finite() and length.contains(2 * abs(number).upper())
+        turn = certify_module._turn([arb(x) / 3 for x in (1, 2, 3, 4)], [1, 2, 3, 4])
+        assert turn.is_finite() and turn.upper() < 1e-30
+
+
 def test_two_threads_prove_at_once():
     alone = certify("example2", **SHORT).columns["angle"]
     with ThreadPoolExecutor(3) as pool:
