@@ -133,6 +133,14 @@ def test_no_home_is_needed(home):
     assert run_code(BEGIN + "print(bits())", HOME=home) == [bits_here()]
 
 
+def test_a_home_that_cannot_be_written_to_is_no_hindrance(tmp_path):
+    home = tmp_path / "home"
+    home.mkdir()
+    home.chmod(0o500)
+    assert run_code(BEGIN + "print(bits())", HOME=str(home)) == [bits_here()]
+    assert list(home.iterdir()) == []
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
 @pytest.mark.parametrize("repeat", range(REPEATS))
 def test_processes_forked_while_a_thread_compiles_have_its_bits(repeat):
